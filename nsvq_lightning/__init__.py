@@ -1,0 +1,45 @@
+"""Train 3D Gaussian splatting scenes and store them small (NSVQ-GS) with PyTorch Lightning.
+
+The public names are loaded on first use, so that light commands such as ``nsvq info`` start without torch.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Camera": "nsvq_lightning.render.camera",
+    "ColmapDataModule": "nsvq_lightning.data.datamodule",
+    "Render": "nsvq_lightning.render.rasterize",
+    "SplatModule": "nsvq_lightning.module",
+    "Splats": "nsvq_lightning.splats",
+    "load": "nsvq_lightning.io.formats",
+    "render": "nsvq_lightning.render.rasterize",
+    "save": "nsvq_lightning.io.formats",
+}
+
+if TYPE_CHECKING:
+    from nsvq_lightning.data.datamodule import ColmapDataModule
+    from nsvq_lightning.io.formats import load, save
+    from nsvq_lightning.module import SplatModule
+    from nsvq_lightning.render.camera import Camera
+    from nsvq_lightning.render.rasterize import Render, render
+    from nsvq_lightning.splats import Splats
+
+__all__ = ["Camera", "ColmapDataModule", "Render", "SplatModule", "Splats", "load", "render", "save"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    # `render` and the sub-package of that name must both work: the function wins as attribute.
+    value = getattr(importlib.import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

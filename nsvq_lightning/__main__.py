@@ -1,0 +1,8 @@
+"""``python -m nsvq_lightning``: the ``nsvq`` command."""
+
+import sys
+
+from nsvq_lightning.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())
