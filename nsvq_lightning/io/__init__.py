@@ -1,0 +1,28 @@
+"""Scenes on disk: the compressed ``.nsvq`` file, the plain ``.ply``, and the registry of formats.
+
+Nothing here imports torch before a scene is turned into :class:`nsvq_lightning.Splats`.
+"""
+
+from nsvq_lightning.io.arrays import SplatArrays
+from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.container import CompressedScene, read_header, read_nsvq, write_nsvq
+from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.formats import FORMATS, Format, load, save
+from nsvq_lightning.io.ply import plain_ply_bytes, read_ply, write_ply
+
+__all__ = [
+    "FORMATS",
+    "CompressedScene",
+    "Format",
+    "FormatError",
+    "SplatArrays",
+    "atomic_write",
+    "load",
+    "plain_ply_bytes",
+    "read_header",
+    "read_nsvq",
+    "read_ply",
+    "save",
+    "write_nsvq",
+    "write_ply",
+]

@@ -1,0 +1,62 @@
+"""Files that are either complete or not there."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+__all__ = ["atomic_write"]
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Open a binary file for writing that takes the name ``path`` only when the block ends without an error.
+
+    The bytes go to a temporary file in the same folder, reach the disk (fsync), and are renamed over ``path`` in one
+    step (:func:`os.replace`). A block that raises, a full disk or a killed process leave the previous file as it was;
+    an exception also removes the temporary file. A symbolic link is followed: its target is replaced, the link stays.
+
+    Args:
+        path: Final name; the folder must exist. A new file gets the permissions of any new file, a replaced one keeps
+            its own.
+
+    Yields:
+        The temporary file, opened for writing.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        IsADirectoryError: ``path`` is a folder.
+    """
+    target = Path(os.path.realpath(path))
+    if target.is_dir():
+        raise IsADirectoryError(f"cannot write {path}: it is a folder; add a file name")
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: the folder {target.parent} does not exist; create it first")
+    # Not mkstemp: it makes files that only their owner can read, and rename would keep that.
+    temporary = target.parent / f".{secrets.token_hex(8)}.tmp"
+    try:
+        with open(temporary, "xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        with suppress(FileNotFoundError):
+            temporary.chmod(target.stat().st_mode & 0o7777)
+        os.replace(temporary, target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    _sync_folder(target.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the new name itself survive a power failure, where the system can open folders."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,157 @@
+"""A vector-quantized scene: what a ``.nsvq`` file holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nsvq_lightning.io.arrays import SplatArrays, check_floats, sh_coefficients
+from nsvq_lightning.io.ply import plain_ply_bytes
+
+if TYPE_CHECKING:
+    from nsvq_lightning.splats import Splats
+
+__all__ = ["QUANTIZABLE", "CompressedScene", "attribute_dims"]
+
+QUANTIZABLE = ("quats", "scales", "sh0", "shN")
+"""Attributes that may be codes into a codebook, in file order; positions and opacities never are (paper, section 3)."""
+
+
+def attribute_dims(sh_degree: int) -> dict[str, int]:
+    """Numbers a splat, D, of each attribute in :data:`QUANTIZABLE`; ``shN`` is the flattened ``[coefficients, 3]``."""
+    return {"quats": 4, "scales": 3, "sh0": 3, "shN": 3 * sh_coefficients(sh_degree)}
+
+
+@dataclass(frozen=True, eq=False)
+class CompressedScene:
+    """N splats whose attributes are partly codes into codebooks.
+
+    Every attribute of :data:`QUANTIZABLE` is either in ``codes`` and ``codebooks`` or in ``raw``; spaces are those of
+    :meth:`nsvq_lightning.Splats.from_tensors` (log-scales, quaternions wxyz, SH coefficients).
+
+    Attributes:
+        means: Positions ``[N, 3]`` float32, relative to ``origin``.
+        opacities: Opacity logits ``[N]`` float32.
+        codes: Codebook row of each splat, ``[N]`` of any integer type, by attribute.
+        codebooks: Codebooks ``[K, D]`` float32 by attribute; ``shN`` as row-major ``[coefficients, 3]``.
+        raw: Attributes that are not quantized, ``[N, D]`` float32.
+        sh_degree: Degree of the spherical harmonics, 0 to 3.
+        config: Settings of the run; JSON values only, keys are strings.
+        metrics: Quality measured on the decoded scene; not finite values are stored as None.
+        origin: World coordinates of the zero of ``means``, float64.
+        stored_bytes: Bytes of the file the scene was read from, None if it was not.
+
+    Raises:
+        ValueError: Shapes do not fit each other, a code is not a row of its codebook, or an attribute is missing or
+            given twice.
+        TypeError: An array is not float32 (codes: not of an integer type).
+    """
+
+    means: NDArray[np.float32]
+    opacities: NDArray[np.float32]
+    codes: Mapping[str, NDArray[np.integer]] = field(default_factory=dict)
+    codebooks: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    raw: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    sh_degree: int = 3
+    config: Mapping[str, Any] = field(default_factory=dict)
+    metrics: Mapping[str, float | None] = field(default_factory=dict)
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    stored_bytes: int | None = None
+
+    def __post_init__(self) -> None:
+        n, dims = len(self.means), attribute_dims(self.sh_degree)
+        check_floats("means", self.means, (n, 3))
+        check_floats("opacities", self.opacities, (n,))
+        if len(self.origin) != 3 or not np.isfinite(self.origin).all():
+            raise ValueError(f"origin must be three finite numbers, got {self.origin}")
+        if self.codes.keys() != self.codebooks.keys():
+            raise ValueError(f"codes of {sorted(self.codes)} but codebooks of {sorted(self.codebooks)}")
+        if sorted([*self.codes, *self.raw]) != sorted(QUANTIZABLE):
+            raise ValueError(
+                f"each of {', '.join(QUANTIZABLE)} must be either in codes and codebooks or in raw; "
+                f"got codes of {sorted(self.codes)} and raw {sorted(self.raw)}"
+            )
+        for name, values in self.raw.items():
+            check_floats(f"raw[{name!r}]", values, (n, dims[name]))
+        for name, codes in self.codes.items():
+            _check_codes(name, codes, self.codebooks[name], n, dims[name])
+
+    @classmethod
+    def from_arrays(cls, arrays: SplatArrays, **header: Any) -> CompressedScene:
+        """A scene without any codebook: valid, and no smaller than its numbers.
+
+        Args:
+            arrays: The scene.
+            header: ``config``, ``metrics`` and ``origin``.
+        """
+        raw = {name: getattr(arrays, name).reshape(len(arrays), -1) for name in QUANTIZABLE if name != "shN"}
+        # -1 cannot be inferred where an axis is empty.
+        raw["shN"] = arrays.shN.reshape(len(arrays), attribute_dims(arrays.sh_degree)["shN"])
+        return cls(arrays.means, arrays.opacities, raw=raw, sh_degree=arrays.sh_degree, **header)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def arrays(self) -> SplatArrays:
+        """The decoded scene, bit for bit the rows of the codebooks; positions stay relative to ``origin``."""
+        rows = {name: self.raw[name] if name in self.raw else self._look_up(name) for name in QUANTIZABLE}
+        return SplatArrays(
+            means=self.means,
+            quats=rows["quats"],
+            scales=rows["scales"],
+            opacities=self.opacities,
+            sh0=rows["sh0"].reshape(len(self), 1, 3),
+            shN=rows["shN"].reshape(len(self), sh_coefficients(self.sh_degree), 3),
+        )
+
+    def decode(self) -> Splats:
+        """The decoded scene as :class:`nsvq_lightning.Splats`.
+
+        Positions stay relative to ``origin``: adding a large origin in float32 would lose the detail that it was taken
+        off to keep.
+        """
+        return self.arrays().to_splats()
+
+    @property
+    def plain_bytes(self) -> int:
+        """Bytes of the plain ``.ply`` of the same scene."""
+        return plain_ply_bytes(len(self), self.sh_degree)
+
+    @property
+    def file_bytes(self) -> int:
+        """Bytes of the file: the one it was read from, else the one that level ``paper`` would give."""
+        if self.stored_bytes is not None:
+            return self.stored_bytes
+        from nsvq_lightning.io.paper import paper_header
+
+        return paper_header(self).file_bytes
+
+    @property
+    def ratio(self) -> float:
+        """How many times smaller than the plain ``.ply``."""
+        return self.plain_bytes / self.file_bytes
+
+    def _look_up(self, name: str) -> NDArray[np.float32]:
+        rows: NDArray[np.float32] = self.codebooks[name][self.codes[name]]
+        return rows
+
+
+def _check_codes(name: str, codes: NDArray[np.integer], codebook: NDArray[np.float32], n: int, dim: int) -> None:
+    if dim == 0:
+        raise ValueError(
+            f"{name} has no coefficients at SH degree 0, so no codebook; give it in raw with shape [{n}, 0]"
+        )
+    rows = len(codebook)
+    check_floats(f"codebooks[{name!r}]", codebook, (rows, dim))
+    if codes.shape != (n,):
+        raise ValueError(f"codes[{name!r}] must have shape [{n}], got {list(codes.shape)}")
+    if not np.issubdtype(codes.dtype, np.integer):
+        raise TypeError(f"codes[{name!r}] must be integers, got {codes.dtype}")
+    if rows == 0:
+        raise ValueError(f"codebooks[{name!r}] is empty; a codebook needs at least one row")
+    if n and not (int(codes.min()) >= 0 and int(codes.max()) < rows):
+        raise ValueError(f"codes[{name!r}] must be in 0..{rows - 1}, got {codes.min()}..{codes.max()}")

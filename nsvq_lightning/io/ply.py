@@ -1,0 +1,168 @@
+"""The ``.ply`` of 3D Gaussian Splatting, which every viewer reads (Kerbl et al. 2023, the authors' layout)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nsvq_lightning.io.arrays import SplatArrays, sh_coefficients
+from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.errors import FormatError, naming_file
+from nsvq_lightning.io.ply_header import PlyHeader, read_ply_header
+
+__all__ = ["plain_ply_bytes", "read_ply", "read_ply_size", "write_ply"]
+
+_ROWS = 1 << 12
+"""Rows converted at a time, about 1 MB: they stay in the cache, and memory at one copy of the scene."""
+
+_OPAQUE = 20.0
+"""Logit that stands for ±inf: its sigmoid is 1 in float32, and training can still move it."""
+
+
+def read_ply(path: str | os.PathLike[str]) -> SplatArrays:
+    """Read the splats of a ``.ply`` file.
+
+    Properties may come in any order and any number type, binary (either byte order) or ascii; with or without normals,
+    SH degree 0 to 3 by the number of ``f_rest`` properties, further properties and elements are skipped.
+
+    Raises:
+        FormatError: The file is truncated, or not a ``.ply`` of Gaussian splats.
+    """
+    header, _ = read_ply_size(path)
+    splats = _empty(header.count, header.sh_degree)
+    start = 0
+    # A double beyond float32 becomes inf, which is what a float file would hold.
+    with naming_file(path), open(path, "rb") as file, np.errstate(over="ignore"):
+        file.seek(header.offset)
+        for table in (_read_ascii if header.encoding == "ascii" else _read_binary)(file, header):
+            _store(table, splats, slice(start, start + len(table)))
+            start += len(table)
+    return splats
+
+
+def read_ply_size(path: str | os.PathLike[str]) -> tuple[PlyHeader, int]:
+    """Header and bytes of a ``.ply`` file that is long enough for its splats.
+
+    Raises:
+        FormatError: The file is truncated, or not a ``.ply`` of Gaussian splats.
+    """
+    with naming_file(path):
+        header, file_bytes = read_ply_header(path), Path(path).stat().st_size
+        _check_room(header, file_bytes)
+    return header, file_bytes
+
+
+def write_ply(path: str | os.PathLike[str], splats: SplatArrays, *, normals: bool = True) -> int:
+    """Write splats as little-endian ``.ply``, 62 float32 a splat at SH degree 3.
+
+    Splats with a non-finite value are left out with a warning; viewers fail on them.
+
+    Args:
+        path: File to write, replaced atomically.
+        splats: The scene.
+        normals: Write the three unused normals (zeros) of the authors' layout; without them 59 float32 a splat.
+
+    Returns:
+        Bytes of the file.
+    """
+    splats = splats.finite()
+    header = _header_text(len(splats), splats.sh_degree, normals)
+    with atomic_write(path) as file:
+        file.write(header)
+        for start in range(0, len(splats), _ROWS):
+            file.write(_rows(splats, slice(start, start + _ROWS), normals).tobytes())
+        return file.tell()
+
+
+def plain_ply_bytes(splats: int, sh_degree: int, *, normals: bool = True) -> int:
+    """Bytes of the file :func:`write_ply` makes: what a compressed scene is compared with."""
+    return len(_header_text(splats, sh_degree, normals)) + 4 * splats * len(_property_names(sh_degree, normals))
+
+
+def _property_names(sh_degree: int, normals: bool) -> list[str]:
+    return [
+        *"xyz",
+        *(["nx", "ny", "nz"] if normals else []),
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(3 * sh_coefficients(sh_degree))),
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]
+
+
+def _header_text(count: int, sh_degree: int, normals: bool) -> bytes:
+    properties = "".join(f"property float {name}\n" for name in _property_names(sh_degree, normals))
+    return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n".encode("ascii")
+
+
+def _rows(splats: SplatArrays, rows: slice, normals: bool) -> NDArray[np.float32]:
+    means = splats.means[rows]
+    # Channel-major: all red coefficients first; ours are [coefficient, channel].
+    rest = splats.shN[rows].transpose(0, 2, 1).reshape(len(means), -1)
+    columns = [
+        means,
+        *([np.zeros_like(means)] if normals else []),
+        splats.sh0[rows, 0],
+        rest,
+        splats.opacities[rows, None],
+        splats.scales[rows],
+        splats.quats[rows],
+    ]
+    return np.concatenate(columns, axis=1).astype("<f4", copy=False)
+
+
+def _check_room(header: PlyHeader, file_bytes: int) -> None:
+    # An ascii value takes at least one digit and one separator; the last separator may be missing.
+    row_bytes = 2 * len(header.properties) if header.encoding == "ascii" else header.dtype.itemsize
+    needed = header.offset + header.count * row_bytes - (header.encoding == "ascii" and header.count > 0)
+    if needed > file_bytes:
+        raise FormatError(f"truncated: {header.count} splats need {needed} bytes, the file has {file_bytes}")
+
+
+def _read_binary(file: BinaryIO, header: PlyHeader) -> Iterator[NDArray[np.float32]]:
+    """Tables ``[rows, P]`` of the properties of :attr:`PlyHeader.splat_properties`."""
+    for start in range(0, header.count, _ROWS):
+        rows = min(_ROWS, header.count - start)
+        data = file.read(rows * header.dtype.itemsize)
+        if len(data) < rows * header.dtype.itemsize:
+            raise FormatError("truncated while it was read")
+        table = np.frombuffer(data, header.dtype)
+        columns = [table[name] for name in header.splat_properties]
+        yield np.stack(columns, axis=1, dtype=np.float32, casting="unsafe")
+
+
+def _read_ascii(file: BinaryIO, header: PlyHeader) -> Iterator[NDArray[np.float32]]:
+    if header.count == 0:
+        return
+    try:
+        table = np.loadtxt(file, np.float64, comments=None, skiprows=header.lines, max_rows=header.count, ndmin=2)
+    except ValueError as error:
+        raise FormatError(f"bad ascii data: {error}") from None
+    if table.shape != (header.count, len(header.properties)):
+        raise FormatError(
+            f"expected {header.count} lines of {len(header.properties)} values, got {' x '.join(map(str, table.shape))}"
+        )
+    yield table[:, [header.properties.index(name) for name in header.splat_properties]].astype(np.float32)
+
+
+def _empty(count: int, sh_degree: int) -> SplatArrays:
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 1, 3), (count, sh_coefficients(sh_degree), 3))
+    return SplatArrays(*(np.empty(shape, np.float32) for shape in shapes))
+
+
+def _store(table: NDArray[np.float32], splats: SplatArrays, rows: slice) -> None:
+    """Distribute a table in the order of :attr:`PlyHeader.splat_properties`."""
+    means, sh0, opacities, scales, quats, rest = np.split(table, np.cumsum([3, 3, 1, 3, 4]), axis=1)
+    splats.means[rows] = means
+    splats.sh0[rows, 0] = sh0
+    # Writers that store opacity as a byte turn 0 and 255 into an infinite logit.
+    splats.opacities[rows] = np.where(np.isinf(opacities), np.copysign(_OPAQUE, opacities), opacities)[:, 0]
+    splats.scales[rows] = scales
+    splats.quats[rows] = quats
+    splats.shN[rows] = rest.reshape(len(table), 3, -1 if rest.size else 0).transpose(0, 2, 1)

@@ -1,0 +1,149 @@
+"""The text header of a ``.ply`` file with Gaussian splats."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from nsvq_lightning.io.arrays import sh_coefficients, shN_degree
+from nsvq_lightning.io.errors import FormatError
+
+__all__ = ["PLY_MAGIC", "PlyHeader", "attribute_of", "read_ply_header"]
+
+PLY_MAGIC = b"ply"
+
+_HEADER_LIMIT = 1 << 20
+_BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+_REQUIRED = (
+    *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """Where the splats of a ``.ply`` file lie and what they hold.
+
+    Attributes:
+        encoding: ``binary_little_endian``, ``binary_big_endian`` or ``ascii``.
+        count: Number of splats N.
+        dtype: Structured type of one row (of numbers of that type, where the encoding is ascii).
+        offset: Byte of the first row; for ascii, of the first line after the header.
+        lines: Lines of other elements between ``offset`` and the first splat (ascii only).
+        sh_degree: Degree of the spherical harmonics, 0 to 3.
+    """
+
+    encoding: str
+    count: int
+    dtype: np.dtype[np.void]
+    offset: int
+    lines: int
+    sh_degree: int
+
+    @property
+    def properties(self) -> tuple[str, ...]:
+        """Names of all properties in file order."""
+        return self.dtype.names or ()
+
+    @property
+    def splat_properties(self) -> tuple[str, ...]:
+        """Names of the properties that make up the splats."""
+        return (*_REQUIRED, *(f"f_rest_{i}" for i in range(3 * sh_coefficients(self.sh_degree))))
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    fields: list[tuple[str, str]]
+    has_list: bool = False
+
+    def dtype(self) -> np.dtype[np.void]:
+        names = [name for name, _ in self.fields]
+        doubled = sorted(a for a, b in pairwise(sorted(names)) if a == b)
+        if doubled:
+            raise FormatError(f"element {self.name} has the property {doubled[0]!r} twice")
+        return np.dtype(self.fields)
+
+
+def read_ply_header(path: str | os.PathLike[str]) -> PlyHeader:
+    """Parse the header only; the size of the data is not looked at.
+
+    Raises:
+        FormatError: The header is truncated, malformed, or not that of Gaussian splats.
+    """
+    with open(path, "rb") as file:
+        start = file.read(_HEADER_LIMIT)
+    end = re.search(rb"\nend_header[ \t]*\r?\n", start)
+    if not re.match(rb"ply[ \t]*\r?\n", start):
+        raise FormatError("not a .ply file: it does not start with the line 'ply'")
+    if end is None:
+        raise FormatError("truncated or damaged: the header has no end_header line")
+    lines = [line.split() for line in start[: end.start()].decode("latin-1").split("\n")[1:]]
+    encoding = _encoding(lines)
+    return _locate(encoding, _elements(lines, _BYTE_ORDER[encoding]), end.end())
+
+
+def attribute_of(name: str) -> str:
+    """Attribute that a property belongs to; the other properties are called ``other``."""
+    families = {"f_dc": "sh0", "f_rest": "shN", "scale": "scales", "rot": "quats"}
+    singles = {"x": "means", "y": "means", "z": "means", "opacity": "opacities"}
+    return singles.get(name) or families.get(re.sub(r"_[0-9]+$", "", name), "other")
+
+
+def _encoding(lines: list[list[str]]) -> str:
+    formats = [line[1] for line in lines if line and line[0] == "format" and len(line) > 1]
+    if len(formats) != 1 or formats[0] not in _BYTE_ORDER:
+        raise FormatError(f"the header needs one format line with {', '.join(_BYTE_ORDER)}; got {formats}")
+    return formats[0]
+
+
+def _elements(lines: list[list[str]], byte_order: str) -> list[_Element]:
+    elements: list[_Element] = []
+    for line in lines:
+        match line:
+            case [] | ["comment" | "obj_info" | "format", *_]:
+                pass
+            case ["element", name, count] if re.fullmatch(r"[0-9]{1,15}", count):
+                elements.append(_Element(name, int(count), []))
+            case ["property", "list", _, _, _] if elements:
+                elements[-1].has_list = True
+            case ["property", kind, name] if elements and kind in _TYPES:
+                elements[-1].fields.append((name, byte_order + _TYPES[kind]))
+            case _:
+                raise FormatError(f"bad header line {' '.join(line)[:80]!r}")
+    return elements
+
+
+def _locate(encoding: str, elements: list[_Element], offset: int) -> PlyHeader:
+    lines = 0
+    for element in elements:
+        if element.has_list:
+            raise FormatError(f"element {element.name} holds lists; Gaussian splats have plain numbers only")
+        dtype = element.dtype()
+        if element.name == "vertex":
+            return PlyHeader(encoding, element.count, dtype, offset, lines, _sh_degree(dtype.names or ()))
+        if encoding == "ascii":
+            lines += element.count
+        else:
+            offset += element.count * dtype.itemsize
+    raise FormatError("the header has no element vertex")
+
+
+def _sh_degree(names: tuple[str, ...]) -> int:
+    missing = [name for name in _REQUIRED if name not in names]
+    if missing:
+        raise FormatError(f"not a .ply of Gaussian splats: it has no property {', '.join(missing)}")
+    rest = sorted(int(name[7:]) for name in names if re.fullmatch(r"f_rest_[0-9]{1,4}", name))
+    if rest not in ([], [*range(9)], [*range(24)], [*range(45)]):
+        raise FormatError(f"SH degrees 0 to 3 have 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ...; got {len(rest)}")
+    return shN_degree(len(rest) // 3)

@@ -1,0 +1,274 @@
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nsvq_lightning.io import CompressedScene, FormatError, plain_ply_bytes, read_header, read_nsvq, write_nsvq
+
+DIMS = {"quats": 4, "scales": 3, "sh0": 3, "shN": 45}
+SIZES_16K = {"quats": 16384, "scales": 16384, "sh0": 4096, "shN": 4096}
+
+
+def scene(n: int, sizes: dict[str, int], degree: int = 3, **header: Any) -> CompressedScene:
+    rng = np.random.default_rng([n, degree, *sizes.values()])
+    dims = {**DIMS, "shN": 3 * ((degree + 1) ** 2 - 1)}
+    return CompressedScene(
+        means=rng.standard_normal((n, 3), np.float32),
+        opacities=rng.standard_normal(n, np.float32),
+        codes={name: rng.integers(0, k, n) for name, k in sizes.items()},
+        codebooks={name: rng.standard_normal((k, dims[name]), np.float32) for name, k in sizes.items()},
+        raw={name: rng.standard_normal((n, dim), np.float32) for name, dim in dims.items() if name not in sizes},
+        sh_degree=degree,
+        **header,
+    )
+
+
+def assert_same(a: CompressedScene, b: CompressedScene) -> None:
+    for name in ("means", "opacities"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), strict=True)
+    for table in ("codes", "codebooks", "raw"):
+        assert getattr(a, table).keys() == getattr(b, table).keys()
+        for name, values in getattr(a, table).items():
+            np.testing.assert_array_equal(values, getattr(b, table)[name])
+    assert (a.sh_degree, a.origin, a.config, a.metrics) == (b.sh_degree, b.origin, b.config, b.metrics)
+
+
+@pytest.mark.parametrize("sizes", [SIZES_16K, {"quats": 512, "scales": 512, "sh0": 128, "shN": 128}])
+def test_file_bytes_are_the_formula_of_the_paper(tmp_path: Path, sizes: dict[str, int]) -> None:
+    n, path = 12_345, tmp_path / "x.nsvq"
+    written = write_nsvq(path, scene(n, sizes))
+    bits = sum(int(np.ceil(np.log2(k))) for k in sizes.values())
+    codebooks = sum(4 * k * DIMS[name] for name, k in sizes.items())
+    json_bytes = struct.unpack_from("<I", path.read_bytes(), 28)[0]
+    assert written == path.stat().st_size == 16 * n + -(-n * bits // 8) + codebooks + 32 + json_bytes
+    assert read_header(path).size == 32 + json_bytes < 2000
+
+
+def test_unquantized_attributes_add_their_floats(tmp_path: Path) -> None:
+    n, path = 100, tmp_path / "x.nsvq"
+    written = write_nsvq(path, scene(n, {"shN": 1000}))
+    assert written - read_header(path).size == 16 * n + -(-n * 10 // 8) + 4 * 1000 * 45 + 4 * n * (4 + 3 + 3)
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("sizes", [{}, {"quats": 1}, {"quats": 1, "sh0": 2}, {"scales": 70_000, "sh0": 3}])
+def test_round_trip_is_exact(tmp_path: Path, sizes: dict[str, int], degree: int) -> None:
+    path = tmp_path / "x.nsvq"
+    for n in (0, 1, 257):
+        original = scene(
+            n,
+            sizes,
+            degree,
+            config={"seed": 3, "name": "Zürich", "nested": {"a": [1, 2.5, None, True]}},
+            metrics={"psnr": 27.25},
+            origin=(0.1, -4_834_001.123456789, 2.0**-60),
+        )
+        assert write_nsvq(path, original) == original.file_bytes
+        back = read_nsvq(path)
+        assert_same(back, original)
+        assert back.file_bytes == path.stat().st_size
+        assert back.ratio == plain_ply_bytes(n, degree) / path.stat().st_size
+
+
+def test_an_independent_reader_understands_the_file(tmp_path: Path) -> None:
+    """Oracle: the layout as documented, read with the standard library only."""
+    original, path = scene(50, {"quats": 33, "scales": 17, "sh0": 9, "shN": 5}), tmp_path / "x.nsvq"
+    write_nsvq(path, original)
+    data = path.read_bytes()
+    magic, digest, version, json_bytes = struct.unpack_from("<8s16sII", data)
+    assert (magic, version) == (b"\x89NSVQ\r\n\x1a", 1)
+    assert digest == hashlib.blake2b(data[24:], digest_size=16).digest()
+    header = json.loads(data[32 : 32 + json_bytes])
+    start = {s["name"]: 32 + json_bytes + s["offset"] for s in header["streams"]}
+    fields = [(a["name"], a["codes"], a["bits"], a["dim"]) for a in header["attributes"] if a["storage"] == "codes"]
+    length = next(s["length"] for s in header["streams"] if s["name"] == "codes")
+    stream = int.from_bytes(data[start["codes"] : start["codes"] + length], "little")
+    for row in range(50):
+        assert struct.unpack_from("<3f", data, start["means"] + 12 * row) == tuple(original.means[row])
+        for name, k, bits, dim in fields:
+            code, stream = stream & ((1 << bits) - 1), stream >> bits
+            assert code == original.codes[name][row] < k
+            entry = struct.unpack_from(f"<{dim}f", data, start[f"{name}.codebook"] + 4 * dim * code)
+            assert entry == tuple(original.codebooks[name][code])
+    assert stream == 0
+
+
+def test_decode_gives_the_rows_of_the_codebooks(tmp_path: Path) -> None:
+    original = scene(40, {"quats": 8, "scales": 7, "sh0": 6, "shN": 5})
+    write_nsvq(tmp_path / "x.nsvq", original)
+    splats = read_nsvq(tmp_path / "x.nsvq").decode()
+    for name in DIMS:
+        expected = original.codebooks[name][original.codes[name]].reshape(getattr(splats, name).shape)
+        np.testing.assert_array_equal(getattr(splats, name).detach().numpy(), expected)
+    np.testing.assert_array_equal(splats.means.detach().numpy(), original.means)
+    np.testing.assert_array_equal(splats.opacities.detach().numpy(), original.opacities)
+
+
+def test_same_scene_same_bytes(tmp_path: Path) -> None:
+    first = scene(30, {"quats": 8, "sh0": 6}, config={"b": 1, "a": {"d": 2, "c": 3}})
+    other = CompressedScene(
+        first.means.copy(),
+        np.asfortranarray(first.opacities),
+        {name: first.codes[name].astype(np.uint16) for name in reversed([*first.codes])},
+        {name: first.codebooks[name] for name in reversed([*first.codebooks])},
+        {name: np.asfortranarray(first.raw[name]) for name in reversed([*first.raw])},
+        config={"a": {"c": 3, "d": 2}, "b": 1},
+    )
+    write_nsvq(tmp_path / "a.nsvq", first)
+    write_nsvq(tmp_path / "b.nsvq", other)
+    assert (tmp_path / "a.nsvq").read_bytes() == (tmp_path / "b.nsvq").read_bytes()
+
+
+def test_every_truncation_and_every_changed_byte_is_one_clear_error(tmp_path: Path) -> None:
+    path = tmp_path / "hurt.nsvq"
+    write_nsvq(path, scene(3, {"quats": 3, "scales": 2, "sh0": 2}, degree=0))
+    data = path.read_bytes()
+    for position in range(len(data)):
+        damaged = bytearray(data)
+        damaged[position] ^= 0x10
+        for content in (data[:position], bytes(damaged)):
+            path.write_bytes(content)
+            with pytest.raises(FormatError, match=r"hurt\.nsvq: (not a \.nsvq|truncated)"):
+                read_nsvq(path)
+    path.write_bytes(data + b"\0")
+    with pytest.raises(FormatError, match="altered"):
+        read_nsvq(path)
+
+
+def _forge(path: Path, change: Callable[[dict[str, Any]], object], tail: bytes = b"") -> None:
+    """Rewrite the header with a valid checksum."""
+    data = path.read_bytes()
+    size = struct.unpack_from("<I", data, 28)[0]
+    header = json.loads(data[32 : 32 + size])
+    change(header)
+    text = json.dumps(header).encode()
+    body = struct.pack("<II", 1, len(text)) + text + data[32 + size :] + tail
+    path.write_bytes(data[:8] + hashlib.blake2b(body, digest_size=16).digest() + body)
+
+
+def test_forged_headers_are_refused_before_anything_is_allocated(tmp_path: Path) -> None:
+    path = tmp_path / "x.nsvq"
+    write_nsvq(path, scene(3, {"quats": 3, "sh0": 2}, config={"a": 1}, metrics={"psnr": 1.0}))
+    good = path.read_bytes()
+    header = json.loads(good[32 : 32 + struct.unpack_from("<I", good, 28)[0]])
+    wrong: list[Any] = [None, -1, 10**15, 10**400, 1.5, "x", True, [], {}, [[]], 0]
+    places = [*([key] for key in header if key not in ("config", "metrics"))]
+    places += [["attributes", i, key] for i in range(6) for key in header["attributes"][i]]
+    places += [["streams", i, key] for i in range(7) for key in header["streams"][i]]
+    for place in places:
+        for value in wrong:
+
+            def change(table: Any, place: list[Any] = place, value: Any = value) -> None:
+                for key in place[:-1]:
+                    table = table[key]
+                if table[place[-1]] == value and type(table[place[-1]]) is type(value):
+                    value = 77
+                table[place[-1]] = value
+
+            path.write_bytes(good)
+            _forge(path, change)
+            with pytest.raises(FormatError, match=r"x\.nsvq: "):
+                read_nsvq(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda h: h.update(level="compact+"), "compression level 'compact\\+'"),
+        (lambda h: h["streams"].append(copy.deepcopy(h["streams"][-1])), "same name"),
+        (lambda h: h["streams"].reverse(), "starts at"),
+        (lambda h: h["attributes"].reverse(), "attribute table"),
+        (lambda h: h["attributes"][2].update(bits=5), "impossible attribute"),
+        (lambda h: h["attributes"][0].update(storage="codes", codes=3, bits=2), "impossible attribute"),
+        (lambda h: h.update(config=[]), "config"),
+        (lambda h: h.update(metrics={"psnr": "good"}), "numbers only"),
+        (lambda h: h.update(origin=[0, 0]), "origin"),
+        (lambda h: h.update(origin=[0, 0, 10**400]), "origin"),
+        (lambda h: h.update(splats=4), "stream table"),
+    ],
+)
+def test_forged_tables(tmp_path: Path, change: Callable[[dict[str, Any]], object], message: str) -> None:
+    path = tmp_path / "x.nsvq"
+    write_nsvq(path, scene(3, {"quats": 3, "sh0": 2}))
+    _forge(path, change)
+    with pytest.raises(FormatError, match=message):
+        read_nsvq(path)
+
+
+def test_bytes_outside_the_stream_table_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.nsvq"
+    write_nsvq(path, scene(3, {"quats": 3}))
+    _forge(path, lambda header: None, tail=b"hidden")
+    with pytest.raises(FormatError, match="the file holds"):
+        read_nsvq(path)
+
+
+def test_a_code_beyond_its_codebook_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.nsvq"
+    write_nsvq(path, scene(4, {"quats": 3}))
+    header = read_header(path)
+    codes = next(stream for stream in header.streams if stream.name == "codes")
+    data = bytearray(path.read_bytes())
+    data[header.size + codes.offset] = 0xFF
+    path.write_bytes(data[:8] + hashlib.blake2b(data[24:], digest_size=16).digest() + data[24:])
+    with pytest.raises(FormatError, match=r"codes\['quats'\] must be in 0\.\.2, got \d\.\.3"):
+        read_nsvq(path)
+
+
+def test_a_newer_version_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "x.nsvq"
+    write_nsvq(path, scene(4, {}))
+    body = struct.pack("<I", 2) + path.read_bytes()[28:]
+    path.write_bytes(path.read_bytes()[:8] + hashlib.blake2b(body, digest_size=16).digest() + body)
+    with pytest.raises(FormatError, match="reads version 1: update"):
+        read_nsvq(path)
+
+
+def test_wrong_scenes_are_refused_at_construction() -> None:
+    good = vars(scene(5, {"quats": 4, "sh0": 2}))
+
+    def broken(**change: Any) -> CompressedScene:
+        return CompressedScene(**{**good, **change})
+
+    codes, codebooks, raw = good["codes"], good["codebooks"], good["raw"]
+    with pytest.raises(ValueError, match=r"means must have shape \[5, 3\]|opacities must have shape \[4\]"):
+        broken(means=good["means"][:4])
+    with pytest.raises(TypeError, match="float64"):
+        broken(means=good["means"].astype(np.float64))
+    with pytest.raises(ValueError, match=r"must be in 0\.\.3"):
+        broken(codes={**codes, "quats": codes["quats"] + 4})
+    with pytest.raises(TypeError, match="integers"):
+        broken(codes={**codes, "quats": codes["quats"].astype(np.float32)})
+    with pytest.raises(ValueError, match="but codebooks of"):
+        broken(codebooks={"quats": codebooks["quats"]})
+    with pytest.raises(ValueError, match="either in codes"):
+        broken(raw={**raw, "quats": np.zeros((5, 4), np.float32)})
+    with pytest.raises(ValueError, match="either in codes"):
+        broken(raw={"scales": raw["scales"]})
+    with pytest.raises(ValueError, match="origin"):
+        broken(origin=(0.0, np.nan, 0.0))
+    with pytest.raises(ValueError, match="SH degree must be"):
+        broken(sh_degree=4)
+    with pytest.raises(ValueError, match="no coefficients at SH degree 0"):
+        scene(5, {"shN": 2}, degree=0)
+
+
+def test_settings_must_be_json_and_metrics_may_be_infinite(tmp_path: Path) -> None:
+    path = tmp_path / "x.nsvq"
+    with pytest.raises(ValueError, match="plain JSON values"):
+        write_nsvq(path, scene(2, {}, config={"callback": object()}))
+    with pytest.raises(ValueError, match="plain JSON values"):
+        write_nsvq(path, scene(2, {}, config={"clip": float("nan")}))
+    assert not path.exists()
+    write_nsvq(path, scene(2, {}, metrics={"psnr": float("inf"), "ssim": 1.0}))
+    assert read_nsvq(path).metrics == {"psnr": None, "ssim": 1.0}
+    with pytest.raises(ValueError, match="unknown compression level 'tiny'; there is paper"):
+        write_nsvq(path, scene(2, {}), level="tiny")

@@ -1,0 +1,189 @@
+from __future__ import annotations
+
+import logging
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nsvq_lightning.io import FormatError, SplatArrays, plain_ply_bytes, read_ply, write_ply
+
+ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+def scene(n: int, degree: int = 3) -> SplatArrays:
+    rng = np.random.default_rng([n, degree])
+    shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, (degree + 1) ** 2 - 1, 3))
+    return SplatArrays(*(rng.standard_normal(shape, np.float32) for shape in shapes))
+
+
+def assert_same(a: SplatArrays, b: SplatArrays) -> None:
+    for name in ATTRIBUTES:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+def _names(degree: int) -> list[str]:
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    return [
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *(f"f_rest_{i}" for i in range(rest)),
+        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    ]
+
+
+def _values(splats: SplatArrays, row: int) -> dict[str, float]:
+    """Oracle: what each property of one splat must be, number by number from the description of the layout."""
+    coefficients = splats.shN.shape[1]
+    rest = {f"f_rest_{c * coefficients + k}": splats.shN[row, k, c] for c in range(3) for k in range(coefficients)}
+    values = {
+        **dict(zip("xyz", splats.means[row], strict=True)),
+        **dict.fromkeys(("nx", "ny", "nz"), 0.0),
+        **{f"f_dc_{c}": splats.sh0[row, 0, c] for c in range(3)},
+        **rest,
+        "opacity": splats.opacities[row],
+        **{f"scale_{i}": splats.scales[row, i] for i in range(3)},
+        **{f"rot_{i}": splats.quats[row, i] for i in range(4)},
+    }
+    return {name: float(value) for name, value in values.items()}
+
+
+def _header(properties: list[str], count: int, encoding: str = "binary_little_endian", before: str = "") -> bytes:
+    body = "".join(f"property {line}\n" for line in properties)
+    return f"ply\nformat {encoding} 1.0\n{before}element vertex {count}\n{body}end_header\n".encode()
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_written_bytes_are_the_layout_of_the_authors(tmp_path: Path, degree: int) -> None:
+    splats, path = scene(5, degree), tmp_path / "x.ply"
+    names = _names(degree)
+    rows = [struct.pack(f"<{len(names)}f", *(_values(splats, row)[name] for name in names)) for row in range(5)]
+    expected = _header([f"float {name}" for name in names], 5) + b"".join(rows)
+    assert write_ply(path, splats) == len(expected) == plain_ply_bytes(5, degree)
+    assert path.read_bytes() == expected
+    assert_same(read_ply(path), splats)
+
+
+def test_without_normals_it_is_59_floats(tmp_path: Path) -> None:
+    splats, path = scene(4), tmp_path / "x.ply"
+    assert write_ply(path, splats, normals=False) == plain_ply_bytes(4, 3, normals=False)
+    data = path.read_bytes()
+    assert len(data) - data.index(b"end_header\n") - 11 == 4 * 59 * 4
+    assert_same(read_ply(path), splats)
+
+
+def test_any_order_type_and_byte_order_and_further_properties_and_elements(tmp_path: Path) -> None:
+    splats, path = scene(6, 1), tmp_path / "x.ply"
+    names = sorted(_names(1), reverse=True)
+    kinds = ["double" if i % 2 else "float32" for i in range(len(names))]
+    properties = ["uchar red", *(f"{kind} {name}" for kind, name in zip(kinds, names, strict=True)), "short label"]
+    code = "".join("d" if kind == "double" else "f" for kind in kinds)
+    for encoding, order in (("binary_little_endian", "<"), ("binary_big_endian", ">")):
+        rows = [
+            struct.pack(f"{order}B{code}h", 255, *(_values(splats, row)[name] for name in names), -7)
+            for row in range(6)
+        ]
+        before = "comment made elsewhere\nelement camera 2\nproperty int id\nproperty uint8 kind\n"
+        head = _header(properties, 6, encoding, before).replace(b"\n", b"\r\n")
+        path.write_bytes(head + bytes(10) + b"".join(rows) + b"more elements")
+        assert_same(read_ply(path), splats)
+
+
+def test_ascii(tmp_path: Path) -> None:
+    splats, path = scene(3, 2), tmp_path / "x.ply"
+    names = _names(2)
+    lines = [" ".join(repr(_values(splats, row)[name]) for name in names) for row in range(3)]
+    head = _header([f"float {name}" for name in names], 3, "ascii", "element note 1\nproperty int a\n")
+    path.write_bytes(head + ("17\n" + "\n".join(lines)).encode())
+    assert_same(read_ply(path), splats)
+    path.write_bytes(head + ("17\n" + "\n".join(lines[:2]) + 3000 * " ").encode())
+    with pytest.raises(FormatError, match="3 lines"):
+        read_ply(path)
+    path.write_bytes(head + ("17\n" + "\n".join(lines).replace(".", "x", 1)).encode())
+    with pytest.raises(FormatError, match=r"x\.ply: bad ascii data"):
+        read_ply(path)
+
+
+def test_empty_scene(tmp_path: Path) -> None:
+    write_ply(tmp_path / "x.ply", scene(0, 2))
+    back = read_ply(tmp_path / "x.ply")
+    assert (len(back), back.sh_degree) == (0, 2)
+
+
+def test_non_finite_rows_stay_out_of_the_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    splats = scene(10)
+    splats.scales[3, 1] = np.nan
+    splats.shN[3, 7, 2] = np.inf
+    splats.means[8, 0] = -np.inf
+    with caplog.at_level(logging.WARNING):
+        write_ply(tmp_path / "x.ply", splats)
+    assert "dropped 2 of 10 splats" in caplog.text
+    assert "scales 1" in caplog.text
+    keep = [0, 1, 2, 4, 5, 6, 7, 9]
+    assert_same(read_ply(tmp_path / "x.ply"), SplatArrays(*(getattr(splats, name)[keep] for name in ATTRIBUTES)))
+
+
+def test_infinite_logits_of_byte_opacities_become_finite(tmp_path: Path) -> None:
+    splats, path = scene(3), tmp_path / "x.ply"
+    write_ply(path, splats)
+    data = bytearray(path.read_bytes())
+    column = len(data) - 3 * 62 * 4 + 4 * _names(3).index("opacity")
+    data[column : column + 4] = struct.pack("<f", np.inf)
+    data[column + 248 : column + 252] = struct.pack("<f", -np.inf)
+    path.write_bytes(data)
+    np.testing.assert_array_equal(read_ply(path).opacities, np.array([20.0, -20.0, splats.opacities[2]]))
+
+
+def test_every_truncation_is_one_clear_error(tmp_path: Path) -> None:
+    path = tmp_path / "cut.ply"
+    write_ply(path, scene(2, 0))
+    data = path.read_bytes()
+    for length in range(len(data)):
+        path.write_bytes(data[:length])
+        with pytest.raises(FormatError, match=r"cut\.ply: "):
+            read_ply(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"ply\n", b"PLY\n", "does not start"),
+        (b"vertex 2", b"vertex 2000000000000", "truncated: 2000000000000 splats"),
+        (b"vertex 2", b"vertex -2", "bad header line"),
+        (b"vertex 2", b"vertex 1e3", "bad header line"),
+        (b"vertex 2", b"points 2", "no element vertex"),
+        (b"binary_little_endian", b"binary_middle_endian", "format line"),
+        (b"property float opacity\n", b"", "no property opacity"),
+        (b"property float opacity", b"property half opacity", "bad header line"),
+        (b"property float opacity", b"property list uchar float opacity", "holds lists"),
+        (b"property float nx", b"property float x", "'x' twice"),
+        (b"property float f_rest_8\n", b"", "0, 9, 24 or 45"),
+        (b"end_header\n", b"end_heather\n", "no end_header"),
+    ],
+)
+def test_garbled_headers(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
+    path = tmp_path / "x.ply"
+    write_ply(path, scene(2, 1))
+    data = path.read_bytes()
+    assert old in data
+    path.write_bytes(data.replace(old, new, 1))
+    with pytest.raises(FormatError, match=message):
+        read_ply(path)
+
+
+def test_random_damage_never_ends_in_another_error(tmp_path: Path) -> None:
+    path = tmp_path / "x.ply"
+    write_ply(path, scene(3, 0))
+    data = path.read_bytes()
+    rng = np.random.default_rng(7)
+    refused = 0
+    for _ in range(500):
+        damaged = bytearray(data)
+        for position in rng.integers(0, data.index(b"end_header"), 2):
+            damaged[position] = rng.integers(256)
+        path.write_bytes(damaged)
+        try:
+            read_ply(path)
+        except FormatError:
+            refused += 1
+    assert refused > 250
