@@ -1,0 +1,141 @@
+"""Reads a COLMAP model. The only place that imports pycolmap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2  # noqa: F401  (before pycolmap, see import_pycolmap)
+import numpy as np
+import PIL.Image
+from numpy.typing import NDArray
+
+from nsvq_lightning.data.model_files import ModelFiles, SceneError, announced_rows, check_binary_files, find_model
+
+__all__ = ["ColmapImage", "ColmapModel", "import_pycolmap", "read_model"]
+
+# What pycolmap throws at a file it cannot read: its own checks arrive as ValueError, those of the C++ library as these.
+_READ_ERRORS = (ValueError, RuntimeError, IndexError, KeyError, OSError, MemoryError)
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapImage:
+    """A registered image.
+
+    Attributes:
+        name: File name relative to the image folder.
+        camera_id: Key into :attr:`ColmapModel.cameras`.
+        viewmat: World to camera, rigid, ``[4, 4]`` float64, scene units.
+    """
+
+    name: str
+    camera_id: int
+    viewmat: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapModel:
+    """A COLMAP reconstruction in COLMAP's own world frame.
+
+    Attributes:
+        images: Registered images, sorted by name.
+        cameras: ``pycolmap.Camera`` by id.
+        points: Sparse points ``[P, 3]`` float64, scene units, sorted by COLMAP's point id.
+        colors: Their colours ``[P, 3]`` uint8 RGB.
+    """
+
+    images: tuple[ColmapImage, ...]
+    cameras: dict[int, Any]
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+
+
+def import_pycolmap() -> Any:
+    """Import pycolmap, late and after OpenCV and Pillow.
+
+    The wheels carry different copies of libpng and zlib. With pycolmap's loaded first, writing any PNG with OpenCV or
+    Pillow aborts the process; the imports at the head of this module keep the order right.
+    """
+    PIL.Image.preinit()  # loads Pillow's own image libraries, which a bare import leaves for later
+    import pycolmap
+
+    return pycolmap
+
+
+def read_model(root: Path) -> ColmapModel:
+    """Read the model of a scene folder, see :func:`nsvq_lightning.data.model_files.find_model` for where it may stand.
+
+    Raises:
+        SceneError: There is no model, a file is damaged, or the model has no registered image or no point.
+    """
+    pycolmap = import_pycolmap()
+    files = find_model(root)
+    reconstruction = pycolmap.Reconstruction()
+    try:
+        if files.suffix == ".bin":
+            check_binary_files(files, _parameter_counts(pycolmap))
+            reconstruction.read_binary(str(files.folder))
+        else:
+            reconstruction.read_text(str(files.folder))
+    except SceneError:
+        raise
+    except _READ_ERRORS as error:
+        raise SceneError(
+            f"COLMAP cannot read the {files.suffix} model in {files.folder} ({error}): a file is damaged or files of "
+            "two models are mixed; copy the model again or run COLMAP again"
+        ) from error
+    if files.suffix == ".txt":
+        _check_rows(files, reconstruction)
+    return _plain_model(files, reconstruction)
+
+
+def _parameter_counts(pycolmap: Any) -> dict[int, int]:
+    """Number of parameters by camera model id, as this pycolmap knows them."""
+    models = [model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"]
+    return {int(m.value): len(pycolmap.Camera.create_from_model_id(1, m, 1.0, 1, 1).params) for m in models}
+
+
+def _check_rows(files: ModelFiles, reconstruction: Any) -> None:
+    """A text table cut between two lines reads without complaint; its head still tells how long it was."""
+    for table in ("cameras", "images", "points3D"):
+        path, rows = files.path(table), len(getattr(reconstruction, table))
+        announced = announced_rows(path)
+        if announced is not None and announced > rows:
+            raise SceneError(
+                f"{path} announces {announced} rows but has {rows}: it is truncated; copy it again or export it anew"
+            )
+
+
+def _plain_model(files: ModelFiles, reconstruction: Any) -> ColmapModel:
+    images = tuple(
+        ColmapImage(image.name, image.camera_id, _viewmat(image))
+        for image in sorted(reconstruction.images.values(), key=lambda image: image.name)
+        if image.has_pose
+    )
+    if not images:
+        raise SceneError(f"{files.path('images')} lists no registered image: run COLMAP's mapper again")
+    points = sorted(reconstruction.points3D.items())
+    if not points:
+        raise SceneError(
+            f"{files.path('points3D')} has no points, and training starts from them: triangulate with COLMAP "
+            "(`colmap point_triangulator`) or run its mapper again"
+        )
+    broken = [image.name for image in images if not np.isfinite(image.viewmat).all()]
+    if broken:
+        raise SceneError(
+            f"{files.path('images')}: {len(broken)} poses are not finite, first {broken[0]}: run COLMAP again"
+        )
+    return ColmapModel(
+        images=images,
+        cameras=dict(reconstruction.cameras.items()),
+        points=np.array([point.xyz for _, point in points], np.float64),
+        colors=np.array([point.color for _, point in points], np.uint8),
+    )
+
+
+def _viewmat(image: Any) -> NDArray[np.float64]:
+    pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+    viewmat = np.eye(4)
+    viewmat[:3] = pose.matrix()
+    return viewmat

@@ -1,0 +1,209 @@
+"""Lightning data modules: a COLMAP folder, and the embedded demo scene."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TypeVar
+
+from lightning.pytorch import LightningDataModule
+from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
+from lightning.pytorch.utilities import rank_zero_info
+from torch.utils.data import DataLoader, Dataset, IterableDataset
+
+from nsvq_lightning.data.sampler import ViewSampler
+from nsvq_lightning.data.scene import Factor, Scene, SceneError, View, load_scene
+from nsvq_lightning.data.synthetic import write_synthetic_scene
+
+__all__ = ["ColmapDataModule", "DemoDataModule"]
+
+T = TypeVar("T")
+
+
+def _identity(batch: T) -> T:
+    return batch
+
+
+class ColmapDataModule(LightningDataModule):
+    """Views of a COLMAP scene, one a batch.
+
+    Every 8th of the sorted image names is a test view (validated and tested on, never trained on). The train views come
+    in the endless order of :class:`~nsvq_lightning.data.sampler.ViewSampler`, which starts at the trainer's step: a
+    resumed run sees the views that the uninterrupted run would have seen. With several processes each takes its own
+    draws of that one sequence, and every R-th of the test views.
+
+    Args:
+        root: Scene folder: ``images/`` and a COLMAP model (``.bin`` or ``.txt``) in ``sparse/0``, ``sparse`` or itself.
+        factor: Divide the image size by 1, 2, 4 or 8 (from ``images_2`` … where it exists); None: see ``max_width``.
+        max_width: Images wider than this many pixels are scaled to it where ``factor`` is None; None for no limit.
+        test_every: Every ``test_every``-th view is a test view, at least 2.
+        seed: Seed of the order of the train views.
+        cache_bytes: Memory for decoded images in bytes; what does not fit is decoded anew, in the background.
+        images_folder: Name of the image folder.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        factor: Factor | None = None,
+        max_width: int | None = 1600,
+        test_every: int = 8,
+        seed: int = 0,
+        cache_bytes: int = 4 << 30,
+        images_folder: str = "images",
+    ) -> None:
+        super().__init__()
+        self.root = Path(root)
+        self.factor, self.max_width, self.test_every, self.seed = factor, max_width, test_every, seed
+        self.cache_bytes, self.images_folder = cache_bytes, images_folder
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene, loaded at first use.
+
+        Raises:
+            SceneError: The folder cannot be used.
+        """
+        scene = load_scene(
+            self.root, self.factor, self.max_width, self.test_every, self.cache_bytes, self.images_folder
+        )
+        rank_zero_info(_summary(scene, self.test_every))
+        return scene
+
+    def setup(self, stage: str | None = None) -> None:
+        """Load the scene; a second call does nothing."""
+        _ = self.scene
+
+    def train_dataloader(self) -> DataLoader[View]:
+        """Endless train views from the trainer's step on; limit the run with ``max_steps``."""
+        return DataLoader(_TrainViews(self), batch_size=None, collate_fn=_identity)
+
+    def val_dataloader(self) -> DataLoader[View]:
+        """Test views in the order of their names, this process's share."""
+        return self._ordered(self.scene.test)
+
+    def test_dataloader(self) -> DataLoader[View]:
+        """Test views in the order of their names, this process's share."""
+        return self._ordered(self.scene.test)
+
+    def predict_dataloader(self) -> DataLoader[View]:
+        """All views in the order of their names, this process's share."""
+        return self._ordered(range(len(self.scene)))
+
+    @property
+    def process(self) -> tuple[int, int]:
+        """Rank of this process and their number; ``(0, 1)`` without a trainer."""
+        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer is not None else (0, 1)
+
+    @property
+    def draw(self) -> int:
+        """Number of train views each process has drawn before the trainer's current step."""
+        return self.trainer.global_step * self.trainer.accumulate_grad_batches if self.trainer is not None else 0
+
+    def _ordered(self, indices: Sequence[int]) -> DataLoader[View]:
+        rank, world_size = self.process
+        if len(indices) < world_size:
+            raise SceneError(
+                f"{len(indices)} views cannot be shared by {world_size} processes: use at most {len(indices)} devices"
+            )
+        views = _OrderedViews(self.scene, indices, stride=world_size)
+        # Lightning leaves a DistributedSampler alone, whatever use_distributed_sampler says; this one pads nothing.
+        sampler = UnrepeatedDistributedSampler(views, num_replicas=world_size, rank=rank, shuffle=False)
+        return DataLoader(views, batch_size=None, sampler=sampler, collate_fn=_identity)
+
+
+class DemoDataModule(ColmapDataModule):
+    """The embedded demo scene: a ray-traced room, written as a COLMAP folder when it is first needed.
+
+    Args:
+        root: Folder of the scene; built by ``prepare_data`` where there is none.
+        views: Number of views, at least 2.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        test_every: Every ``test_every``-th view is a test view, at least 2.
+        seed: Seed of the order of the train views.
+        cache_bytes: Memory for decoded images in bytes.
+    """
+
+    def __init__(
+        self,
+        root: str = "runs/demo_scene",
+        views: int = 40,
+        width: int = 320,
+        height: int = 240,
+        test_every: int = 8,
+        seed: int = 0,
+        cache_bytes: int = 4 << 30,
+    ) -> None:
+        super().__init__(root, factor=1, test_every=test_every, seed=seed, cache_bytes=cache_bytes)
+        self.views, self.width, self.height = views, width, height
+
+    def prepare_data(self) -> None:
+        """Build the scene unless it is there."""
+        if not self.root.exists():
+            rank_zero_info(f"rendering the demo scene into {self.root} (once, some seconds)")
+            try:
+                write_synthetic_scene(self.root, views=self.views, width=self.width, height=self.height)
+            except OSError:
+                if not self.root.exists():  # else another node has built it meanwhile
+                    raise
+
+    def setup(self, stage: str | None = None) -> None:
+        """Load the scene.
+
+        Raises:
+            SceneError: The folder holds a scene of another size.
+        """
+        super().setup(stage)
+        camera = self.scene.cameras[0]
+        found, wanted = (len(self.scene), camera.width, camera.height), (self.views, self.width, self.height)
+        if found != wanted:
+            raise SceneError(
+                f"{self.root} holds {found[0]} views of {found[1]}x{found[2]}, asked for are {wanted[0]} views of "
+                f"{wanted[1]}x{wanted[2]}: remove the folder or give another root"
+            )
+
+
+class _TrainViews(IterableDataset[View]):
+    """Train views in the sampler's order; a new iterator starts at the trainer's step."""
+
+    def __init__(self, data: ColmapDataModule) -> None:
+        self._data = data
+
+    def __iter__(self) -> Iterator[View]:
+        data, (rank, world_size) = self._data, self._data.process
+        scene = data.scene
+        order = iter(ViewSampler(len(scene.train), data.seed, rank, world_size, start=data.draw))
+        current = scene.train[next(order)]
+        for position in order:
+            following = scene.train[position]
+            scene.images.prefetch(following)
+            yield scene.view(current)
+            current = following
+
+
+class _OrderedViews(Dataset[View]):
+    """Given views of a scene; each access starts to decode the one ``stride`` further."""
+
+    def __init__(self, scene: Scene, indices: Sequence[int], stride: int) -> None:
+        self._scene, self._indices, self._stride = scene, indices, stride
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def __getitem__(self, position: int) -> View:
+        if position + self._stride < len(self):
+            self._scene.images.prefetch(self._indices[position + self._stride])
+        return self._scene.view(self._indices[position])
+
+
+def _summary(scene: Scene, test_every: int) -> str:
+    sizes = sorted({(camera.width, camera.height) for camera in scene.cameras})
+    size = f"{sizes[0][0]}x{sizes[0][1]}" + (f" to {sizes[-1][0]}x{sizes[-1][1]}" if len(sizes) > 1 else "")
+    names = [scene.names[i] for i in scene.test]
+    shown = ", ".join(names) if len(names) <= 8 else f"{', '.join(names[:3])}, …, {names[-1]}"
+    return (
+        f"{scene.root}: {len(scene)} views of {size}, {len(scene.points)} points, extent {scene.extent:.3g}; "
+        f"{len(scene.train)} train views, {len(scene.test)} test views (every {test_every}th by name: {shown})"
+    )

@@ -1,0 +1,168 @@
+"""Image files: decoding to RGB bytes, and a cache of them with a byte budget."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import PIL.Image
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nsvq_lightning.data.model_files import SceneError
+from nsvq_lightning.data.undistort import Pinhole, Undistortion
+
+__all__ = ["ImageSource", "ImageStore", "image_size", "read_image"]
+
+# COLMAP works on the pixels as stored, so the EXIF orientation must not turn them.
+_READ = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+
+
+def _undecodable(path: Path, reason: str) -> SceneError:
+    return SceneError(f"image {path} cannot be decoded ({reason}): copy it again, or remove it and run COLMAP again")
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height in pixels as stored, read from the head of the file.
+
+    Raises:
+        SceneError: The file is not an image.
+    """
+    try:
+        with PIL.Image.open(path) as image:
+            return image.size
+    except (OSError, ValueError, SyntaxError) as error:
+        raise _undecodable(path, str(error)) from error
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """Decode an image to RGB ``[H, W, 3]`` uint8: grey is repeated, alpha dropped, 16 bit scaled to 8.
+
+    Raises:
+        SceneError: The file is damaged or has floating-point pixels.
+    """
+    data = path.read_bytes()  # imread itself fails on names outside the locale's character set
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), _READ) if data and not _is_cut_jpeg(data) else None
+    if image is None:
+        raise _undecodable(path, f"truncated, damaged or of an unknown format, {len(data)} bytes")
+    if image.dtype == np.uint16:
+        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise _undecodable(path, f"its pixels are {image.dtype}, accepted are 8 and 16 bit integers")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)  # type: ignore[no-any-return]
+
+
+def _is_cut_jpeg(data: bytes) -> bool:
+    """Whether a JPEG has no end marker behind its first scan: OpenCV 4 would fill what is missing with grey."""
+    position = 2
+    while data.startswith(b"\xff\xd8") and data[position : position + 1] == b"\xff":
+        if data[position + 1 : position + 2] == b"\xda":
+            return b"\xff\xd9" not in data[position:]
+        position += 2 + max(2, int.from_bytes(data[position + 2 : position + 4], "big"))
+    return False
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSource:
+    """How the picture of one view comes from its file.
+
+    Attributes:
+        path: Image file.
+        size: Its width and height in pixels.
+        undistortion: Applied first, None for a pinhole camera.
+        pinhole: Camera of the picture that comes out; the picture is resized to its size.
+    """
+
+    path: Path
+    size: tuple[int, int]
+    undistortion: Undistortion | None
+    pinhole: Pinhole
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the picture in memory."""
+        return 3 * self.pinhole.width * self.pinhole.height
+
+    def load(self) -> Tensor:
+        """The picture, ``[H, W, 3]`` uint8 RGB.
+
+        Raises:
+            SceneError: The file is damaged or has changed its size since the scene was loaded.
+        """
+        image = read_image(self.path)
+        height, width = image.shape[:2]
+        if (width, height) != self.size:
+            raise _undecodable(self.path, f"decoded to {width}x{height}, its head says {self.size[0]}x{self.size[1]}")
+        if self.undistortion is not None:
+            image = self.undistortion(image)
+        if image.shape[:2] != (self.pinhole.height, self.pinhole.width):
+            image = cv2.resize(image, (self.pinhole.width, self.pinhole.height), interpolation=cv2.INTER_AREA)
+        return torch.from_numpy(np.ascontiguousarray(image))
+
+
+class ImageStore:
+    """Pictures by number, decoded at first use and kept while the byte budget lasts.
+
+    What is kept stays: under a random order without replacement, an LRU cache smaller than the scene throws out what
+    the next epoch needs first. Pictures beyond the budget are decoded anew each time; :meth:`prefetch` does that in the
+    background, one thread a picture, so that nothing lives on in a forked process.
+
+    Args:
+        sources: One entry a view.
+        cache_bytes: Budget for the kept pictures in bytes; 0 keeps none.
+
+    Raises:
+        ValueError: ``cache_bytes`` is negative.
+    """
+
+    def __init__(self, sources: Sequence[ImageSource], cache_bytes: int = 4 << 30) -> None:
+        if cache_bytes < 0:
+            raise ValueError(f"cache_bytes must be at least 0, got {cache_bytes}")
+        self.sources = tuple(sources)
+        self._free = cache_bytes
+        self._kept: dict[int, Tensor] = {}
+        self._coming: dict[int, Future[Tensor]] = {}
+
+    def __len__(self) -> int:
+        return len(self.sources)
+
+    def __getitem__(self, index: int) -> Tensor:
+        """Picture ``index``, ``[H, W, 3]`` uint8 RGB on the CPU; treat it as read-only.
+
+        Raises:
+            SceneError: The file cannot be decoded.
+        """
+        if index in self._kept:
+            return self._kept[index]
+        coming = self._coming.pop(index, None)
+        image = coming.result() if coming is not None else self.sources[index].load()
+        if image.nbytes <= self._free:
+            self._kept[index] = image
+            self._free -= image.nbytes
+        return image
+
+    def prefetch(self, index: int) -> None:
+        """Start to decode picture ``index`` in the background; errors surface when it is asked for."""
+        if index in self._kept or index in self._coming:
+            return
+        while len(self._coming) > 1:  # what was announced and never asked for
+            self._coming.pop(next(iter(self._coming)))
+        future: Future[Tensor] = Future()
+        self._coming[index] = future
+        threading.Thread(target=_load_into, args=(future, self.sources[index]), name="nsvq-image").start()
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_coming": {}}
+
+
+def _load_into(future: Future[Tensor], source: ImageSource) -> None:
+    try:
+        future.set_result(source.load())
+    except Exception as error:  # handed on to whoever asks for the picture
+        future.set_exception(error)

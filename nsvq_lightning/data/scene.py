@@ -1,0 +1,228 @@
+"""A scene: registered views with pinhole cameras, sparse points, the split into train and test."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, read_model
+from nsvq_lightning.data.images import ImageSource, ImageStore, image_size
+from nsvq_lightning.data.model_files import SceneError
+from nsvq_lightning.data.undistort import Pinhole, Undistortion, rectify
+from nsvq_lightning.render.camera import Camera
+
+__all__ = ["Factor", "Scene", "SceneError", "View", "load_scene"]
+
+Factor = Literal[1, 2, 4, 8]
+
+_FACTORS = (1, 2, 4, 8)
+_CAMERAS_WITH_KEPT_MAPS = 8
+"""With more distorted cameras than this (each photo its own, say) the undistortion maps would outweigh the images."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One photo and its camera.
+
+    Attributes:
+        name: Name of the image in the COLMAP model.
+        index: Position among all views of the scene, sorted by name.
+        camera: Pinhole camera of the picture.
+        image: ``[H, W, 3]`` uint8 RGB; shared with the scene's cache, so read-only.
+    """
+
+    name: str
+    index: int
+    camera: Camera
+    image: Tensor
+
+    def to(self, device: torch.device | str, **kwargs: object) -> View:
+        """The view on another device; Lightning calls it to move a batch."""
+        return replace(self, camera=self.camera.to(device), image=self.image.to(device))
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A posed photo set in COLMAP's world frame.
+
+    Attributes:
+        root: Scene folder.
+        names: Names of the views, sorted.
+        cameras: Pinhole camera of each view, float32.
+        images: Pictures of the views, decoded at first use.
+        points: Sparse points ``[P, 3]`` float32, scene units.
+        colors: Their colours ``[P, 3]`` float32, RGB in [0, 1].
+        train: Indices of the train views, ascending.
+        test: Indices of the test views, ascending.
+        extent: 1.1 × the largest distance of a train camera centre from the mean of the train camera centres.
+    """
+
+    root: Path
+    names: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    images: ImageStore
+    points: Tensor
+    colors: Tensor
+    train: tuple[int, ...]
+    test: tuple[int, ...]
+    extent: float
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def view(self, index: int) -> View:
+        """View ``index`` of all views.
+
+        Raises:
+            SceneError: Its image cannot be decoded.
+        """
+        return View(self.names[index], index, self.cameras[index], self.images[index])
+
+
+def load_scene(
+    root: str | Path,
+    factor: Factor | None = None,
+    max_width: int | None = 1600,
+    test_every: int = 8,
+    cache_bytes: int = 4 << 30,
+    images_folder: str = "images",
+) -> Scene:
+    """Load a COLMAP scene: ``images/`` and a model (binary or text) in ``sparse/0``, ``sparse`` or the folder itself.
+
+    Pinhole images pass straight through; those of any other camera model are undistorted when they are decoded, as by
+    COLMAP's ``image_undistorter``.
+
+    Args:
+        root: Scene folder.
+        factor: Divide the image size by 1, 2, 4 or 8, from the folder ``images_2`` (4, 8) where there is one. None
+            scales images wider than ``max_width`` to that width and leaves the others alone.
+        max_width: Largest width in pixels where ``factor`` is None; None for no limit.
+        test_every: Every ``test_every``-th of the sorted image names is a test view, starting with the first.
+        cache_bytes: Memory for decoded images in bytes, see :class:`~nsvq_lightning.data.images.ImageStore`.
+        images_folder: Name of the image folder.
+
+    Raises:
+        SceneError: The folder, the model or an image is missing or damaged, or the split leaves no train view.
+        ValueError: An argument is out of range.
+    """
+    _check_arguments(factor, max_width, test_every)
+    root = Path(root)
+    model = read_model(root)
+    train, test = split_views([image.name for image in model.images], test_every)
+    folder, divisor = _image_folder(root, images_folder, factor)
+    sources = _image_sources(model, _locate(model.images, folder), divisor, max_width if factor is None else None)
+    return Scene(
+        root=root,
+        names=tuple(image.name for image in model.images),
+        cameras=tuple(_camera(image, source.pinhole) for image, source in zip(model.images, sources, strict=True)),
+        images=ImageStore(sources, cache_bytes),
+        points=torch.from_numpy(model.points).float(),
+        colors=torch.from_numpy(model.colors).float() / 255,
+        train=train,
+        test=test,
+        extent=_extent([model.images[i] for i in train]),
+    )
+
+
+def split_views(names: Sequence[str], test_every: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Train and test indices of sorted names: index % ``test_every`` == 0 is test, as in the published tables.
+
+    Raises:
+        SceneError: There is no train view left.
+    """
+    train = tuple(i for i in range(len(names)) if i % test_every != 0)
+    test = tuple(range(0, len(names), test_every))
+    if not train or not test:
+        raise SceneError(
+            f"{len(names)} registered image(s) split with test_every={test_every} leave {len(train)} train and "
+            f"{len(test)} test views, needed is at least 1 of each: register more photos"
+        )
+    return train, test
+
+
+def _check_arguments(factor: int | None, max_width: int | None, test_every: int) -> None:
+    if factor is not None and factor not in _FACTORS:
+        raise ValueError(f"factor must be None, 1, 2, 4 or 8, got {factor}")
+    if max_width is not None and max_width < 1:
+        raise ValueError(f"max_width must be None or at least 1 pixel, got {max_width}")
+    if test_every < 2:
+        raise ValueError(f"test_every must be at least 2 (1 leaves no train view), got {test_every}")
+
+
+def _image_folder(root: Path, name: str, factor: int | None) -> tuple[Path, int]:
+    """Folder to read from and the divisor that is left to do on load."""
+    scaled = root / f"{name}_{factor}"
+    if factor is not None and factor > 1 and scaled.is_dir():
+        return scaled, 1
+    folder = root / name
+    if not folder.is_dir():
+        others = sorted(path.name for path in root.iterdir() if path.is_dir() and path.name.startswith(f"{name}_"))
+        hint = (
+            f"; there is {', '.join(others)}: set factor" if others else ": copy the photos there or set images_folder"
+        )
+        raise SceneError(f"image folder {folder} does not exist{hint}")
+    return folder, factor or 1
+
+
+def _locate(images: Sequence[ColmapImage], folder: Path) -> list[Path]:
+    """Path of each image; in a downscaled copy of the folder the suffix may differ."""
+    found = [folder / image.name for image in images]
+    absent = [i for i, path in enumerate(found) if not path.is_file()]
+    if absent:
+        by_stem = {
+            path.relative_to(folder).with_suffix(""): path for path in sorted(folder.rglob("*")) if path.is_file()
+        }
+        for i in absent:
+            found[i] = by_stem.get(Path(images[i].name).with_suffix(""), found[i])
+        lost = [images[i].name for i in absent if not found[i].is_file()]
+        if lost:
+            raise SceneError(
+                f"{len(lost)} of {len(images)} images of the model are not in {folder}, first {lost[0]}: "
+                "copy the photos that COLMAP was run on into that folder, under the same names"
+            )
+    return found
+
+
+def _image_sources(model: ColmapModel, paths: list[Path], divisor: int, max_width: int | None) -> list[ImageSource]:
+    """One source a view; views with one camera and one file size share their undistortion."""
+    sizes = [image_size(path) for path in paths]
+    kinds = [(image.camera_id, size) for image, size in zip(model.images, sizes, strict=True)]
+    rectified: dict[tuple[int, tuple[int, int]], tuple[Pinhole, Undistortion | None]] = {}
+    keep_maps = len(Counter(kinds)) <= _CAMERAS_WITH_KEPT_MAPS
+    for camera_id, size in dict.fromkeys(kinds):
+        camera = model.cameras[camera_id]
+        rectified[camera_id, size] = rectify(camera, *size, keep_maps=keep_maps)
+    sources = []
+    for path, kind in zip(paths, kinds, strict=True):
+        full, undistortion = rectified[kind]
+        pinhole = full.resized(*target_size(full.width, full.height, divisor, max_width))
+        sources.append(ImageSource(path, kind[1], undistortion, pinhole))
+    return sources
+
+
+def target_size(width: int, height: int, divisor: int, max_width: int | None) -> tuple[int, int]:
+    """Size in pixels at which an undistorted image is used."""
+    scale = 1 / divisor
+    if max_width is not None and width > max_width:
+        scale = max_width / width
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def _camera(image: ColmapImage, pinhole: Pinhole) -> Camera:
+    K, viewmat = torch.from_numpy(pinhole.K).float(), torch.from_numpy(image.viewmat).float()
+    try:
+        return Camera(K, viewmat, pinhole.width, pinhole.height)
+    except ValueError as error:
+        raise SceneError(f"camera {image.camera_id} of image {image.name}: {error}; run COLMAP again") from error
+
+
+def _extent(train: Sequence[ColmapImage]) -> float:
+    centres = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in train])
+    return float(1.1 * np.linalg.norm(centres - centres.mean(0), axis=1).max())

@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from nsvq_lightning.data.colmap import import_pycolmap
+from nsvq_lightning.data.synthetic import write_synthetic_scene
+
+SceneFactory = Callable[..., Path]
+
+
+@pytest.fixture(scope="session")
+def shared_scenes() -> Path:
+    """Folder of the real captures."""
+    folder = Path(__file__).resolve().parents[2] / "shared" / "scenes"
+    if not folder.is_dir():
+        pytest.skip(f"the real captures are not here ({folder} is missing)")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def demo_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small ray-traced scene of 9 views, 96x72, rendered once; read-only."""
+    return write_synthetic_scene(tmp_path_factory.mktemp("demo") / "scene", views=9, width=96, height=72, points=500)
+
+
+@pytest.fixture
+def make_scene(tmp_path: Path) -> SceneFactory:
+    """Writes a COLMAP scene of noise pictures; keyword arguments say what is in it."""
+
+    def make(
+        name: str = "scene",
+        views: int = 9,
+        model: str = "PINHOLE",
+        params: tuple[float, ...] = (30.0, 31.0, 21.0, 15.0),
+        size: tuple[int, int] = (40, 32),
+        image_size: tuple[int, int] | None = None,
+        points: int = 20,
+    ) -> Path:
+        pycolmap = import_pycolmap()
+        rng = np.random.default_rng(0)
+        root = tmp_path / name
+        (root / "images").mkdir(parents=True)
+        (root / "sparse" / "0").mkdir(parents=True)
+        reconstruction = pycolmap.Reconstruction()
+        camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params), camera_id=1)
+        reconstruction.add_camera_with_trivial_rig(camera)
+        width, height = image_size or size
+        for i in range(views):
+            pose = np.eye(4)[:3]
+            pose[:, 3] = rng.normal(size=3)
+            image = pycolmap.Image(name=f"{i:03d}.png", camera_id=1, image_id=views - i)  # ids against the names
+            reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+            small = rng.integers(0, 256, (4, 5, 3), dtype=np.uint8)
+            picture = cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
+            assert cv2.imwrite(str(root / "images" / f"{i:03d}.png"), picture)
+        for xyz, rgb in zip(
+            rng.normal(size=(points, 3)), rng.integers(0, 256, (points, 3), dtype=np.uint8), strict=True
+        ):
+            reconstruction.add_point3D(xyz, pycolmap.Track(), rgb)
+        reconstruction.write_binary(str(root / "sparse" / "0"))
+        return root
+
+    return make

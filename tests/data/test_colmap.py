@@ -1,0 +1,179 @@
+from __future__ import annotations
+
+import shutil
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nsvq_lightning.data.colmap import import_pycolmap, read_model
+from nsvq_lightning.data.model_files import SceneError
+
+SceneFactory = Callable[..., Path]
+
+
+def _as_text(root: Path) -> Path:
+    """The same scene with a text model."""
+    model = root / "sparse" / "0"
+    reconstruction = import_pycolmap().Reconstruction(str(model))
+    for file in model.iterdir():
+        file.unlink()
+    reconstruction.write_text(str(model))
+    return root
+
+
+def test_text_and_binary_models_are_equal(make_scene: SceneFactory) -> None:
+    binary, text = read_model(make_scene("a")), read_model(_as_text(make_scene("b")))
+    assert [i.name for i in binary.images] == [i.name for i in text.images] == [f"{i:03d}.png" for i in range(9)]
+    for one, other in zip(binary.images, text.images, strict=True):
+        np.testing.assert_allclose(one.viewmat, other.viewmat, rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(binary.points, text.points)
+    np.testing.assert_array_equal(binary.colors, text.colors)
+    assert binary.cameras[1].params.tolist() == text.cameras[1].params.tolist()
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "."])
+def test_model_may_stand_in_three_places(make_scene: SceneFactory, place: str) -> None:
+    root = make_scene()
+    files = root / "sparse" / "0"
+    kept = root / "kept"
+    shutil.move(files, kept)
+    (root / place).mkdir(parents=True, exist_ok=True)
+    for file in kept.iterdir():
+        shutil.move(file, root / place / file.name)
+    assert len(read_model(root).images) == 9
+
+
+def test_poses_are_world_to_camera_in_colmaps_frame(make_scene: SceneFactory) -> None:
+    root = make_scene()
+    reconstruction = import_pycolmap().Reconstruction(str(root / "sparse" / "0"))  # oracle: COLMAP's own projection
+    point = np.array([0.1, -0.2, 9.0])
+    for image in read_model(root).images:
+        camera = image.viewmat @ [*point, 1.0]
+        pixel = (30 * camera[0] / camera[2] + 21, 31 * camera[1] / camera[2] + 15)
+        np.testing.assert_allclose(
+            pixel, reconstruction.find_image_with_name(image.name).project_point(point), atol=1e-9
+        )
+
+
+def test_legacy_models_without_rigs_load(make_scene: SceneFactory) -> None:
+    root = make_scene()
+    with_rigs = read_model(root)
+    for name in ("rigs.bin", "frames.bin"):
+        (root / "sparse" / "0" / name).unlink()
+    for one, other in zip(with_rigs.images, read_model(root).images, strict=True):
+        np.testing.assert_array_equal(one.viewmat, other.viewmat)
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-5])
+
+
+def _empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def _noise(path: Path) -> None:
+    path.write_bytes(np.random.default_rng(0).bytes(400))
+
+
+def _longer(path: Path) -> None:
+    path.write_bytes(path.read_bytes() + b"\0" * 16)
+
+
+def _boasting(path: Path) -> None:
+    path.write_bytes(struct.pack("<Q", 1 << 60) + path.read_bytes()[8:])
+
+
+@pytest.mark.parametrize("damage", [_cut, _empty, _noise, _longer, _boasting])
+@pytest.mark.parametrize("table", ["cameras", "images", "points3D", "rigs", "frames"])
+def test_damaged_binary_table(make_scene: SceneFactory, table: str, damage: Callable[[Path], None]) -> None:
+    root = make_scene()
+    damage(root / "sparse" / "0" / f"{table}.bin")
+    with pytest.raises(SceneError, match=rf"{table}\.bin.*(truncated|garbled|too few).*model_converter"):
+        read_model(root)
+
+
+def test_every_truncation_of_every_table_is_found(make_scene: SceneFactory) -> None:
+    root = make_scene(views=2, points=2)
+    for table in ("cameras", "images", "points3D", "frames"):
+        path = root / "sparse" / "0" / f"{table}.bin"
+        whole = path.read_bytes()
+        for length in range(0, len(whole), 7):
+            path.write_bytes(whole[:length])
+            with pytest.raises(SceneError, match=f"{table}.bin"):
+                read_model(root)
+        path.write_bytes(whole)
+    read_model(root)
+
+
+@pytest.mark.parametrize("table", ["cameras", "images", "points3D"])
+def test_damaged_text_table(make_scene: SceneFactory, table: str) -> None:
+    root = _as_text(make_scene())
+    path = root / "sparse" / "0" / f"{table}.txt"
+    path.write_text("what is this\nno numbers\n")
+    with pytest.raises(SceneError, match=r"cannot read.*damaged"):
+        read_model(root)
+
+
+def test_text_table_cut_between_two_lines(make_scene: SceneFactory) -> None:
+    root = _as_text(make_scene())
+    path = root / "sparse" / "0" / "points3D.txt"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-3]))
+    with pytest.raises(SceneError, match=r"points3D\.txt announces 20 rows but has 17"):
+        read_model(root)
+
+
+def test_no_points(make_scene: SceneFactory) -> None:
+    with pytest.raises(SceneError, match=r"points3D\.bin has no points.*point_triangulator"):
+        read_model(make_scene(points=0))
+
+
+def test_missing_folder_and_missing_model(tmp_path: Path, make_scene: SceneFactory) -> None:
+    with pytest.raises(SceneError, match="does not exist"):
+        read_model(tmp_path / "nowhere")
+    with pytest.raises(SceneError, match=r"no COLMAP model.*sparse/0, sparse, \."):
+        read_model(tmp_path)
+    root = make_scene()
+    (root / "sparse" / "0" / "points3D.bin").unlink()
+    with pytest.raises(SceneError, match=r"sparse/0 has a \.bin model without points3D\.bin"):
+        read_model(root)
+
+
+def test_png_files_can_be_written_after_a_model_was_read(make_scene: SceneFactory, tmp_path: Path) -> None:
+    # with pycolmap imported before OpenCV and Pillow this process would abort
+    program = f"""
+from pathlib import Path
+from nsvq_lightning.data.scene import load_scene
+scene = load_scene({str(make_scene())!r})
+import cv2, numpy, PIL.Image
+image = numpy.random.default_rng(0).integers(0, 256, (300, 400, 3), dtype=numpy.uint8)
+assert cv2.imwrite({str(tmp_path / "cv2.png")!r}, image)
+PIL.Image.fromarray(image).save({str(tmp_path / "pil.png")!r})
+assert (cv2.imread({str(tmp_path / "cv2.png")!r}) == image).all()
+print("done", tuple(scene.view(0).image.shape))
+"""
+    run = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).resolve().parents[2],
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.strip() == "done (32, 40, 3)"
+
+
+def test_pycolmap_is_imported_in_one_place_and_late() -> None:
+    package = Path(__file__).resolve().parents[2] / "nsvq_lightning"
+    importing = [
+        (path.name, line)
+        for path in package.rglob("*.py")
+        for line in path.read_text().splitlines()
+        if line.strip().startswith(("import pycolmap", "from pycolmap"))
+    ]
+    assert importing == [("colmap.py", "    import pycolmap")]

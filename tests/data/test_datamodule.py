@@ -1,0 +1,150 @@
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from torch import Tensor, nn
+
+from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
+from nsvq_lightning.data.sampler import ViewSampler
+from nsvq_lightning.data.scene import SceneError, View
+
+SceneFactory = Callable[..., Path]
+
+
+class _Recorder(LightningModule):
+    """Writes down the views it gets."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(1))
+        self.trained: list[str] = []
+        self.validated: list[str] = []
+        self.predicted: list[str] = []
+
+    def training_step(self, view: View, index: int) -> Tensor:
+        self.trained.append(view.name)
+        return self.weight.sum() + view.image.float().mean()
+
+    def validation_step(self, view: View, index: int) -> None:
+        self.validated.append(view.name)
+
+    def predict_step(self, view: View, index: int) -> None:
+        self.predicted.append(view.name)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), 0.1)
+
+
+def _trainer(folder: Path, steps: int, **arguments: Any) -> Trainer:
+    return Trainer(
+        accelerator="cpu",
+        devices=1,
+        max_steps=steps,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=folder,
+        **arguments,
+    )
+
+
+def _on(data: ColmapDataModule, step: int, rank: int, world_size: int) -> ColmapDataModule:
+    """The data module as it is on one of several processes."""
+    trainer = SimpleNamespace(global_step=step, accumulate_grad_batches=1, global_rank=rank, world_size=world_size)
+    data.trainer = cast(Trainer, trainer)
+    return data
+
+
+@pytest.mark.parametrize("accumulate", [1, 2])
+def test_run_resumed_sees_the_views_of_the_run_not_interrupted(
+    make_scene: SceneFactory, tmp_path: Path, accumulate: int
+) -> None:
+    root = str(make_scene())
+    whole, first, second = _Recorder(), _Recorder(), _Recorder()
+    _trainer(tmp_path, 20, accumulate_grad_batches=accumulate).fit(whole, ColmapDataModule(root, seed=4))
+    trainer = _trainer(tmp_path, 7, accumulate_grad_batches=accumulate)
+    trainer.fit(first, ColmapDataModule(root, seed=4))
+    trainer.save_checkpoint(tmp_path / "a.ckpt")
+    _trainer(tmp_path, 20, accumulate_grad_batches=accumulate).fit(
+        second, ColmapDataModule(root, seed=4), ckpt_path=tmp_path / "a.ckpt", weights_only=True
+    )
+    assert len(first.trained) == 7 * accumulate
+    assert first.trained + second.trained == whole.trained
+    scene = ColmapDataModule(root).scene
+    order = islice(ViewSampler(len(scene.train), seed=4), 20 * accumulate)  # oracle: the sampler
+    assert whole.trained == [scene.names[scene.train[i]] for i in order]
+    assert not {scene.names[i] for i in scene.test} & set(whole.trained)
+
+
+def test_validation_within_a_fit_and_prediction(make_scene: SceneFactory, tmp_path: Path) -> None:
+    data, module = ColmapDataModule(str(make_scene(views=18))), _Recorder()
+    trainer = _trainer(tmp_path, 10, val_check_interval=5, check_val_every_n_epoch=None, num_sanity_val_steps=0)
+    trainer.fit(module, data)
+    assert module.validated == ["000.png", "008.png", "016.png"] * 2
+    trainer.predict(module, data, return_predictions=False)
+    assert module.predicted == list(data.scene.names)
+
+
+def test_processes_share_the_train_sequence_and_the_test_views(make_scene: SceneFactory) -> None:
+    root = str(make_scene(views=30))
+    whole = [view.name for view in islice(ColmapDataModule(root).train_dataloader(), 40)]
+    ranks = [_on(ColmapDataModule(root), 0, rank, 2) for rank in (0, 1)]
+    draws = [[view.name for view in islice(data.train_dataloader(), 20)] for data in ranks]
+    assert [name for pair in zip(*draws, strict=True) for name in pair] == whole
+    shares = [[view.index for view in _on(ColmapDataModule(root), 0, r, 3).val_dataloader()] for r in range(3)]
+    assert shares == [[0, 24], [8], [16]]  # nothing padded
+
+
+def test_more_processes_than_test_views(make_scene: SceneFactory) -> None:
+    with pytest.raises(SceneError, match="2 views cannot be shared by 4 processes"):
+        _on(ColmapDataModule(str(make_scene())), 0, 0, 4).test_dataloader()
+
+
+def test_setup_is_idempotent_and_prints_the_split_once(
+    make_scene: SceneFactory, caplog: pytest.LogCaptureFixture
+) -> None:
+    data = ColmapDataModule(str(make_scene()))
+    with caplog.at_level(logging.INFO):
+        data.setup("fit")
+        scene = data.scene
+        data.setup("test")
+    assert data.scene is scene
+    texts = [record.getMessage() for record in caplog.records if "test views" in record.getMessage()]
+    assert len(texts) == 1
+    assert "7 train views, 2 test views (every 8th by name: 000.png, 008.png)" in texts[0]
+
+
+def test_order_does_not_depend_on_the_cache(make_scene: SceneFactory) -> None:
+    root = str(make_scene())
+    for cache_bytes in (0, 10_000):
+        views = list(islice(ColmapDataModule(root, cache_bytes=cache_bytes).train_dataloader(), 30))
+        expected = list(islice(ColmapDataModule(root).train_dataloader(), 30))
+        assert [view.name for view in views] == [view.name for view in expected]
+        assert all(torch.equal(a.image, b.image) for a, b in zip(views, expected, strict=True))
+
+
+def test_scene_with_a_single_train_view(make_scene: SceneFactory) -> None:
+    data = ColmapDataModule(str(make_scene(views=2)), cache_bytes=0)
+    assert [view.name for view in islice(data.train_dataloader(), 3)] == ["001.png"] * 3
+
+
+def test_demo_is_built_once_and_checked(tmp_path: Path) -> None:
+    root = tmp_path / "runs" / "demo"
+    data = DemoDataModule(str(root), views=3, width=32, height=24)
+    data.prepare_data()
+    stamp = (root / "sparse" / "0" / "points3D.bin").stat().st_mtime_ns
+    data.prepare_data()
+    assert (root / "sparse" / "0" / "points3D.bin").stat().st_mtime_ns == stamp
+    data.setup()
+    assert tuple(data.scene.view(0).image.shape) == (24, 32, 3)
+    with pytest.raises(SceneError, match="holds 3 views of 32x24, asked for are 40 views of 320x240"):
+        DemoDataModule(str(root)).setup()

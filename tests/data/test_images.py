@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+import pickle
+import threading
+from pathlib import Path
+
+import cv2
+import numpy as np
+import PIL.Image
+import pytest
+import torch
+from torch import Tensor
+
+from nsvq_lightning.data.images import ImageSource, ImageStore, image_size, read_image
+from nsvq_lightning.data.model_files import SceneError
+from nsvq_lightning.data.undistort import Pinhole
+
+RGB = np.random.default_rng(0).integers(0, 256, (6, 9, 3), dtype=np.uint8)
+
+
+def test_colour_picture_is_rgb(tmp_path: Path) -> None:
+    path = tmp_path / "müller 1.png"  # a name outside ASCII
+    PIL.Image.fromarray(RGB).save(path)  # oracle: Pillow
+    np.testing.assert_array_equal(read_image(path), RGB)
+    assert image_size(path) == (9, 6)
+
+
+def test_grey_alpha_palette_and_16_bit_pictures(tmp_path: Path) -> None:
+    grey = RGB[..., 0]
+    PIL.Image.fromarray(grey).save(tmp_path / "grey.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "grey.png"), np.repeat(grey[..., None], 3, 2))
+    PIL.Image.fromarray(np.dstack([RGB, grey])).save(tmp_path / "alpha.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "alpha.png"), RGB)
+    palette = PIL.Image.fromarray(RGB).quantize(8)
+    palette.save(tmp_path / "palette.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "palette.png"), np.array(palette.convert("RGB")))
+    deep = RGB.astype(np.uint16) * 257  # 0..65535, exactly representable in 8 bit
+    deep[0, 0] = (127, 129, 65535)  # rounds to 0, 1 and 255
+    assert cv2.imwrite(str(tmp_path / "deep.png"), deep[..., ::-1])
+    expected = RGB.copy()
+    expected[0, 0] = (0, 1, 255)
+    np.testing.assert_array_equal(read_image(tmp_path / "deep.png"), expected)
+
+
+def test_exif_orientation_is_ignored_as_colmap_does(tmp_path: Path) -> None:
+    exif = PIL.Image.Exif()
+    exif[0x0112] = 6  # turn by 90 degrees
+    picture = PIL.Image.fromarray(cv2.resize(RGB, (64, 48)))
+    picture.save(tmp_path / "turned.jpg", quality=95, exif=exif)
+    assert image_size(tmp_path / "turned.jpg") == (64, 48)
+    assert read_image(tmp_path / "turned.jpg").shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.02, 0.5, 0.9])
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_damaged_pictures_are_named(tmp_path: Path, suffix: str, kept: float) -> None:
+    path = tmp_path / f"broken{suffix}"
+    PIL.Image.fromarray(cv2.resize(RGB, (200, 150))).save(path)
+    path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
+    with pytest.raises(SceneError, match=rf"broken\{suffix} cannot be decoded"):
+        read_image(path)
+
+
+def test_what_is_no_picture_is_found_by_its_head(tmp_path: Path) -> None:
+    (tmp_path / "text.jpg").write_text("no picture")
+    with pytest.raises(SceneError, match=r"text\.jpg cannot be decoded"):
+        image_size(tmp_path / "text.jpg")
+
+
+def test_floating_point_pictures_are_refused(tmp_path: Path) -> None:
+    assert cv2.imwrite(str(tmp_path / "deep.tiff"), RGB.astype(np.float32))
+    with pytest.raises(SceneError, match="float32"):
+        read_image(tmp_path / "deep.tiff")
+
+
+def test_downscaling_averages_areas(tmp_path: Path) -> None:
+    image = np.random.default_rng(1).integers(0, 256, (8, 12, 3), dtype=np.uint8)
+    PIL.Image.fromarray(image).save(tmp_path / "a.png")
+    source = ImageSource(tmp_path / "a.png", (12, 8), None, Pinhole(np.eye(3), 6, 4))
+    expected = image.reshape(4, 2, 6, 2, 3).astype(float).mean(axis=(1, 3))
+    assert np.abs(source.load().numpy() - expected).max() <= 0.5
+    assert source.nbytes == source.load().nbytes
+
+
+def test_picture_that_changed_its_size_since_loading(tmp_path: Path) -> None:
+    PIL.Image.fromarray(RGB).save(tmp_path / "a.png")
+    with pytest.raises(SceneError, match="decoded to 9x6, its head says 10x6"):
+        ImageSource(tmp_path / "a.png", (10, 6), None, Pinhole(np.eye(3), 10, 6)).load()
+
+
+class _Counting(ImageSource):
+    """A source that remembers on which threads it was decoded."""
+
+    threads: list[str]
+
+    def load(self) -> Tensor:
+        self.threads.append(threading.current_thread().name)
+        return super().load()
+
+
+@pytest.fixture
+def sources(tmp_path: Path) -> list[_Counting]:
+    made = []
+    for i in range(4):
+        path = tmp_path / f"{i}.png"
+        PIL.Image.fromarray(np.full((2, 3, 3), i, np.uint8)).save(path)
+        source = _Counting(path, (3, 2), None, Pinhole(np.eye(3), 3, 2))
+        object.__setattr__(source, "threads", [])
+        made.append(source)
+    return made
+
+
+def _decodings(sources: list[_Counting]) -> list[int]:
+    return [len(source.threads) for source in sources]
+
+
+@pytest.mark.parametrize(
+    ("budget", "decodings"),
+    [(0, [3, 3, 3, 3]), (17, [3, 3, 3, 3]), (36, [1, 1, 3, 3]), (71, [1, 1, 1, 3]), (72, [1, 1, 1, 1])],
+)
+def test_budget_keeps_what_fits(sources: list[_Counting], budget: int, decodings: list[int]) -> None:
+    store = ImageStore(sources, cache_bytes=budget)  # 18 bytes a picture
+    for _ in range(3):
+        for i in range(4):
+            assert set(store[i].flatten().tolist()) == {i}
+    assert _decodings(sources) == decodings
+
+
+def test_prefetched_pictures_are_decoded_once_and_elsewhere(sources: list[_Counting]) -> None:
+    store = ImageStore(sources, cache_bytes=0)
+    store.prefetch(2)
+    store.prefetch(2)
+    assert set(store[2].flatten().tolist()) == {2}
+    assert sources[2].threads == ["nsvq-image"]
+    for i in range(4):  # announced and never fetched: few are held
+        store.prefetch(i)
+    assert len(store._coming) <= 2
+
+
+def test_errors_of_prefetched_pictures_surface_when_asked_for(sources: list[_Counting]) -> None:
+    store = ImageStore(sources)
+    sources[1].path.write_bytes(b"gone")
+    store.prefetch(1)
+    with pytest.raises(SceneError, match=r"1\.png cannot be decoded"):
+        store[1]
+
+
+def test_store_survives_pickling_with_a_prefetch_under_way(sources: list[_Counting]) -> None:
+    store = ImageStore([ImageSource(s.path, s.size, None, s.pinhole) for s in sources])
+    store.prefetch(1)
+    torch.testing.assert_close(pickle.loads(pickle.dumps(store))[1], store[1])
+
+
+def test_negative_budget(sources: list[_Counting]) -> None:
+    with pytest.raises(ValueError, match="cache_bytes must be at least 0, got -1"):
+        ImageStore(sources, cache_bytes=-1)

@@ -1,0 +1,177 @@
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import PIL.Image
+import pytest
+import torch
+from lightning.fabric.utilities import move_data_to_device
+
+from nsvq_lightning.data.colmap import import_pycolmap
+from nsvq_lightning.data.scene import SceneError, load_scene, split_views
+
+SceneFactory = Callable[..., Path]
+
+
+def test_every_eighth_name_is_a_test_view(make_scene: SceneFactory) -> None:
+    scene = load_scene(make_scene(views=18))
+    assert scene.names == tuple(f"{i:03d}.png" for i in range(18))
+    assert scene.test == (0, 8, 16)
+    assert sorted(scene.train + scene.test) == list(range(18))
+
+
+def test_view_carries_its_own_name_pose_and_picture(make_scene: SceneFactory) -> None:
+    root = make_scene()
+    scene = load_scene(root)
+    reconstruction = import_pycolmap().Reconstruction(str(root / "sparse" / "0"))
+    for i in range(len(scene)):
+        view = scene.view(i)
+        assert (view.index, view.name) == (i, f"{i:03d}.png")
+        np.testing.assert_array_equal(view.image.numpy(), np.array(PIL.Image.open(root / "images" / view.name)))
+        pose = reconstruction.find_image_with_name(view.name).cam_from_world().matrix()
+        np.testing.assert_allclose(view.camera.viewmat[:3].numpy(), pose, rtol=1e-6)
+    moved = move_data_to_device(scene.view(3), torch.device("cpu"))  # Lightning's way to move a batch
+    assert (moved.name, moved.index, moved.image.dtype) == ("003.png", 3, torch.uint8)
+
+
+def test_points_and_extent(make_scene: SceneFactory) -> None:
+    root = make_scene()
+    scene = load_scene(root)
+    reconstruction = import_pycolmap().Reconstruction(str(root / "sparse" / "0"))
+    ids = sorted(reconstruction.points3D)
+    np.testing.assert_allclose(scene.points.numpy(), [reconstruction.points3D[i].xyz for i in ids], rtol=1e-6)
+    np.testing.assert_allclose(scene.colors.numpy() * 255, [reconstruction.points3D[i].color for i in ids], atol=1e-4)
+    assert scene.points.dtype == scene.colors.dtype == torch.float32
+    centres = np.stack([-scene.cameras[i].viewmat[:3, 3].numpy() for i in scene.train])  # rotations are 1
+    expected = 1.1 * np.linalg.norm(centres - centres.mean(0), axis=1).max()
+    assert scene.extent == pytest.approx(expected, rel=1e-6)
+
+
+def test_test_cameras_do_not_enter_the_extent(make_scene: SceneFactory) -> None:
+    scene = load_scene(make_scene(), test_every=2)
+    everything = load_scene(make_scene("other"), test_every=9)
+    assert scene.extent != everything.extent
+
+
+@pytest.mark.parametrize(
+    ("arguments", "size"),
+    [
+        ({}, (40, 32)),
+        ({"max_width": 30}, (30, 24)),
+        ({"max_width": None}, (40, 32)),
+        ({"factor": 1, "max_width": 30}, (40, 32)),
+        ({"factor": 2}, (20, 16)),
+        ({"factor": 8}, (5, 4)),
+    ],
+)
+def test_size_and_intrinsics(make_scene: SceneFactory, arguments: dict[str, int], size: tuple[int, int]) -> None:
+    view = load_scene(make_scene(), **arguments).view(1)  # type: ignore[arg-type]
+    assert tuple(view.image.shape) == (size[1], size[0], 3)
+    assert (view.camera.width, view.camera.height) == size
+    s = size[0] / 40
+    assert view.camera.intrinsics == pytest.approx((30 * s, 31 * s, 21 * s, 15 * s))
+
+
+def test_pictures_of_another_size_than_the_model_says(make_scene: SceneFactory) -> None:
+    camera = load_scene(make_scene(image_size=(20, 8))).cameras[0]
+    assert (camera.width, camera.height) == (20, 8)
+    assert camera.intrinsics == pytest.approx((15, 31 / 4, 10.5, 15 / 4))
+
+
+def test_published_rule_for_wide_pictures(make_scene: SceneFactory) -> None:
+    camera = load_scene(make_scene(views=2, image_size=(1700, 100))).cameras[0]
+    assert (camera.width, camera.height) == (1600, 94)
+    assert camera.intrinsics == pytest.approx((30 * 40, 31 * 94 / 32, 21 * 40, 15 * 94 / 32))
+
+
+def test_downscaled_folder_is_used_where_there_is_one(make_scene: SceneFactory) -> None:
+    root = make_scene()
+    (root / "images_4").mkdir()
+    for path in (root / "images").iterdir():  # another suffix and an odd size, as some data sets have it
+        picture = np.full((8, 11, 3), int(path.stem), np.uint8)
+        assert cv2.imwrite(str(root / "images_4" / f"{path.stem}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    view = load_scene(root, factor=4).view(5)
+    assert tuple(view.image.shape) == (8, 11, 3)
+    assert view.name == "005.png"
+    assert set(view.image.flatten().tolist()) == {5}
+    assert view.camera.intrinsics == pytest.approx((30 * 11 / 40, 31 / 4, 21 * 11 / 40, 15 / 4))
+    assert tuple(load_scene(root, factor=2).view(5).image.shape) == (16, 20, 3)
+
+
+def test_missing_and_damaged_pictures(make_scene: SceneFactory) -> None:
+    root = make_scene()
+    (root / "images" / "003.png").unlink()
+    (root / "images" / "007.png").unlink()
+    with pytest.raises(SceneError, match=r"2 of 9 images .* first 003\.png"):
+        load_scene(root)
+    root = make_scene("other")
+    (root / "images" / "004.png").write_bytes(b"")
+    with pytest.raises(SceneError, match=r"004\.png cannot be decoded"):
+        load_scene(root)
+
+
+def test_missing_image_folder(make_scene: SceneFactory) -> None:
+    root = make_scene()
+    shutil.move(root / "images", root / "images_2")
+    with pytest.raises(SceneError, match="there is images_2: set factor"):
+        load_scene(root)
+    assert len(load_scene(root, factor=2)) == 9
+    assert len(load_scene(root, images_folder="images_2")) == 9
+
+
+def test_split_without_train_views(make_scene: SceneFactory) -> None:
+    with pytest.raises(SceneError, match="leave 0 train and 1 test views"):
+        load_scene(make_scene(views=1))
+    assert split_views(["a", "b"], 8) == ((1,), (0,))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"factor": 3}, "factor must be .* got 3"),
+        ({"test_every": 1}, "test_every must be at least 2"),
+        ({"max_width": 0}, "max_width"),
+    ],
+)
+def test_arguments_out_of_range(make_scene: SceneFactory, arguments: dict[str, int], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_scene(make_scene(), **arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("name", "views", "test", "points", "size"),
+    [
+        ("flower25", 25, 4, 19679, (696, 521)),
+        ("fox", 50, 7, 13450, (448, 800)),
+        ("fox_raw", 50, 7, 13450, (1061, 1894)),
+        ("horns", 62, 8, 5527, (499, 374)),
+        ("kitchen25", 25, 4, 11414, (779, 520)),
+        ("plush", 60, 8, 18329, (800, 600)),
+    ],
+)
+def test_real_captures(
+    shared_scenes: Path, name: str, views: int, test: int, points: int, size: tuple[int, int]
+) -> None:
+    if not (shared_scenes / name).is_dir():
+        pytest.skip(f"the capture {name} is not here")
+    scene = load_scene(shared_scenes / name)
+    assert (len(scene), len(scene.test), len(scene.points)) == (views, test, points)
+    view = scene.view(scene.test[1])
+    assert (view.camera.width, view.camera.height) == size
+    assert tuple(view.image.shape) == (size[1], size[0], 3)
+    # the points this photo was matched at must project onto pixels of their colour; one model comes without matches
+    reconstruction = import_pycolmap().Reconstruction(str(shared_scenes / name / "sparse" / "0"))
+    ids = {p.point3D_id for p in reconstruction.find_image_with_name(view.name).points2D if p.has_point3D()}
+    rows = torch.tensor([not ids or i in ids for i in sorted(reconstruction.points3D)])
+    local = scene.points[rows] @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]
+    pixels = local @ view.camera.K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    inside = (pixels >= 0).all(1) & (pixels < torch.tensor(size)).all(1)
+    assert inside.float().mean() > (0.99 if ids else 0.7)
+    x, y = pixels[inside].long().T
+    pair = view.image[y, x].double().mean(1), scene.colors[rows][inside].double().mean(1)
+    assert torch.corrcoef(torch.stack(pair))[0, 1] > (0.85 if ids else 0.6)
