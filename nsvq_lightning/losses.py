@@ -1,0 +1,82 @@
+"""The photometric loss: (1 - λ)·L1 + λ·(1 - SSIM) (Kerbl et al. 2023, eq. 7)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+__all__ = ["SSIM_C1", "SSIM_C2", "SSIM_RADIUS", "photometric_loss", "ssim", "ssim_window"]
+
+SSIM_RADIUS = 5
+SSIM_SIGMA = 1.5
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+
+
+def ssim_window() -> Tensor:
+    """The 11 taps of the Gaussian window with σ = 1.5, summing to 1; float64."""
+    offsets = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, dtype=torch.float64)
+    taps = torch.exp(-offsets.square() / (2 * SSIM_SIGMA**2))
+    return taps / taps.sum()
+
+
+def ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Structural similarity as the splatting papers measure it: Gaussian window, σ 1.5, zero padding, mean over RGB.
+
+    Args:
+        image: ``[H, W, 3]`` in [0, 1].
+        target: ``[H, W, 3]`` in [0, 1].
+
+    Returns:
+        Scalar, 1 for equal images (Wang et al. 2004, eq. 13; beyond the border the images count as 0).
+    """
+    taps = ssim_window().to(image)
+    planes = [image, target, image * image, target * target, image * target]
+    stacked = torch.cat([plane.movedim(-1, 0) for plane in planes])[:, None]
+    stacked = functional.conv2d(stacked, taps.view(1, 1, -1, 1), padding=(SSIM_RADIUS, 0))
+    stacked = functional.conv2d(stacked, taps.view(1, 1, 1, -1), padding=(0, SSIM_RADIUS))
+    mean_x, mean_y, square_x, square_y, product = stacked.squeeze(1).chunk(5)
+    variance_x, variance_y = square_x - mean_x**2, square_y - mean_y**2
+    covariance = product - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
+    structure = (2 * covariance + SSIM_C2) / (variance_x + variance_y + SSIM_C2)
+    return (luminance * structure).mean()
+
+
+def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2) -> Tensor:
+    """(1 - λ)·mean |image - target| + λ·(1 - SSIM), differentiable in ``image``.
+
+    float32 images on the CPU take one fused sweep for loss and gradient; everything else is plain torch.
+
+    Args:
+        image: Rendered ``[H, W, 3]``, clamped to [0, 1].
+        target: Photo ``[H, W, 3]`` in [0, 1].
+        dssim_weight: λ in [0, 1].
+
+    Raises:
+        ValueError: The shapes differ.
+    """
+    if image.shape != target.shape or image.dim() != 3 or image.shape[-1] != 3:
+        raise ValueError(f"image and target must both be [H, W, 3], got {list(image.shape)} and {list(target.shape)}")
+    fused = image.device.type == "cpu" and image.dtype == target.dtype == torch.float32
+    if fused and not target.requires_grad and 3 * image.shape[1] >= 16:
+        loss: Tensor = _FusedLoss.apply(image, target, dssim_weight)  # type: ignore[no-untyped-call]
+        return loss
+    return (1 - dssim_weight) * (image - target).abs().mean() + dssim_weight * (1 - ssim(image, target))
+
+
+class _FusedLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor, dssim_weight: float) -> Tensor:
+        from nsvq_lightning.render.cpu.dssim import l1_dssim
+
+        loss, gradient = l1_dssim(image.detach().contiguous(), target.contiguous(), dssim_weight)
+        ctx.save_for_backward(gradient)
+        return image.new_tensor(loss)
+
+    @staticmethod
+    def backward(ctx: Any, scale: Tensor) -> tuple[Tensor, None, None]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * scale, None, None

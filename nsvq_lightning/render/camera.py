@@ -1,0 +1,63 @@
+"""A pinhole camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+__all__ = ["Camera"]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Pinhole camera in COLMAP's conventions: x right, y down, z forward; pixel centres at .5.
+
+    Attributes:
+        K: Intrinsics ``[3, 3]`` in pixels, principal point included; skew must be 0.
+        viewmat: World to camera, rigid, ``[4, 4]``, scene units.
+        width: Image width in pixels.
+        height: Image height in pixels.
+
+    Raises:
+        ValueError: A matrix has another shape, the image is empty, or the focal lengths are not positive.
+    """
+
+    K: Tensor
+    viewmat: Tensor
+    width: int
+    height: int
+    _intrinsics: tuple[float, float, float, float] | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        for name, matrix, side in (("K", self.K, 3), ("viewmat", self.viewmat, 4)):
+            if tuple(matrix.shape) != (side, side):
+                raise ValueError(f"Camera.{name} must have shape [{side}, {side}], got {list(matrix.shape)}")
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"Camera needs at least one pixel, got {self.width}x{self.height}")
+        if self._intrinsics is not None:
+            return
+        fx, fy = float(self.K[0, 0]), float(self.K[1, 1])
+        # Kept as numbers: reading them from an accelerator would stall it at every render.
+        object.__setattr__(self, "_intrinsics", (fx, fy, float(self.K[0, 2]), float(self.K[1, 2])))
+        if not (fx > 0 and fy > 0):
+            raise ValueError(f"Camera.K needs positive focal lengths, got fx={fx}, fy={fy}")
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """``(fx, fy, cx, cy)`` in pixels."""
+        assert self._intrinsics is not None  # set by __post_init__
+        return self._intrinsics
+
+    @property
+    def position(self) -> Tensor:
+        """Camera centre ``[3]`` in world coordinates."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def to(
+        self, device: torch.device | str | None = None, dtype: torch.dtype | None = None, **kwargs: object
+    ) -> Camera:
+        """The camera with both matrices on ``device`` and in ``dtype``."""
+        K, viewmat = (matrix.to(device=device, dtype=dtype) for matrix in (self.K, self.viewmat))
+        return Camera(K, viewmat, self.width, self.height, self._intrinsics)

@@ -1,0 +1,26 @@
+"""Constants of 3D Gaussian Splatting's rasterizer (Kerbl et al. 2023); every back-end shares them."""
+
+from __future__ import annotations
+
+__all__ = ["ALPHA_MAX", "ALPHA_MIN", "BLUR", "FRUSTUM_MARGIN", "MIN_SQUARED_NORM", "NEAR", "TRANSMITTANCE_MIN"]
+
+NEAR = 0.2
+"""Splats whose centre is nearer than this along the viewing axis are culled, scene units."""
+
+BLUR = 0.3
+"""Added to both variances of the projected Gaussian, square pixels."""
+
+ALPHA_MIN = 1.0 / 255.0
+"""Contributions below one 8-bit step are skipped."""
+
+ALPHA_MAX = 0.99
+"""Opacity of one splat at one pixel is capped here; the cap has no gradient."""
+
+TRANSMITTANCE_MIN = 1e-4
+"""A pixel is finished in front of the splat that would bring its transmittance below this."""
+
+FRUSTUM_MARGIN = 0.3
+"""The Jacobian of the projection is taken at most this fraction of the half image outside the image."""
+
+MIN_SQUARED_NORM = 1e-24
+"""Squared quaternion norms are floored here, so that a zero quaternion is the identity and has no gradient."""

@@ -1,0 +1,1 @@
+"""The CPU back-end: Numba kernels on explicit 16-lane vectors, compiled where they run."""

@@ -1,0 +1,114 @@
+"""Which splats touch which tile, front to back: one radix sort by depth, then a stable counting sort into tiles."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from nsvq_lightning.render.cpu.jit import inline, kernel
+from nsvq_lightning.render.cpu.lanes import get, prefetch, put
+from nsvq_lightning.render.cpu.records import EXTENT, GROUP_SHIFT, GROUP_TILES, ORIGIN, RECORD
+
+DIGIT_BITS = 11
+DIGITS = 1 << DIGIT_BITS
+AHEAD = 16
+"""How many records ahead the scattered reads are asked for."""
+
+
+@kernel
+def sort_by_depth(threads, count, keys, ids, keys2, ids2, histogram):
+    """Stable radix sort of ``ids`` by ``keys`` (bits of positive floats); returns whether the result is in ``ids2``.
+
+    Only the digits in which the keys differ are sorted. ``histogram`` is [threads, DIGITS].
+    """
+    low, high = np.int64(keys[0]), np.int64(keys[0])
+    for i in range(count):
+        low, high = min(low, np.int64(keys[i])), max(high, np.int64(keys[i]))
+    shift = 0
+    swapped = False
+    while (high - low) >> shift != 0:
+        source, target = (keys2, keys) if swapped else (keys, keys2)
+        from_ids, to_ids = (ids2, ids) if swapped else (ids, ids2)
+        for thread in prange(threads):
+            row = histogram[thread]
+            row[:] = 0
+            for i in range(count * thread // threads, count * (thread + 1) // threads):
+                row[((np.int64(get(source, i)) - low) >> shift) & (DIGITS - 1)] += 1
+        total = 0
+        for digit in range(DIGITS):
+            for thread in range(threads):
+                here = histogram[thread, digit]
+                histogram[thread, digit] = total
+                total += here
+        for thread in prange(threads):
+            row = histogram[thread]
+            for i in range(count * thread // threads, count * (thread + 1) // threads):
+                key = get(source, i)
+                digit = ((np.int64(key) - low) >> shift) & (DIGITS - 1)
+                place = row[digit]
+                row[digit] = place + 1
+                put(target, place, key)
+                put(to_ids, place, get(from_ids, i))
+        swapped = not swapped
+        shift += DIGIT_BITS
+    return swapped
+
+
+@inline
+def tile_index(x, y, group_columns):
+    """Number of a tile: tiles of one group are consecutive."""
+    inside = (1 << GROUP_SHIFT) - 1
+    group = (y >> GROUP_SHIFT) * group_columns + (x >> GROUP_SHIFT)
+    return group * GROUP_TILES + ((y & inside) << GROUP_SHIFT) + (x & inside)
+
+
+@kernel
+def count_tiles(threads, count, ids, integers, group_columns, histogram, offsets):
+    """How many splats touch each tile: ``offsets[t]`` is where the list of tile t begins; returns the length of all.
+
+    ``histogram`` [threads, tiles] becomes the place of each thread's first entry in every tile.
+    """
+    tiles = offsets.shape[0] - 1
+    for thread in prange(threads):
+        row = histogram[thread]
+        row[:] = 0
+        last = count * (thread + 1) // threads
+        for i in range(count * thread // threads, last):
+            if i + AHEAD < last:
+                prefetch(integers, RECORD * np.int64(get(ids, i + AHEAD)) + ORIGIN)
+            o = RECORD * np.int64(get(ids, i))
+            origin, extent = np.int64(get(integers, o + ORIGIN)), np.int64(get(integers, o + EXTENT))
+            x0, y0 = origin & 0xFFFF, origin >> 16
+            for y in range(y0, y0 + (extent >> 16)):
+                for x in range(x0, x0 + (extent & 0xFFFF)):
+                    row[tile_index(x, y, group_columns)] += 1
+    total = 0
+    for tile in range(tiles):
+        offsets[tile] = total
+        for thread in range(threads):
+            here = histogram[thread, tile]
+            histogram[thread, tile] = total
+            total += here
+    offsets[tiles] = total
+    return total
+
+
+@kernel
+def fill_tiles(threads, count, ids, integers, group_columns, histogram, entries):
+    """Write every splat into the lists of its tiles, keeping the order of ``ids``."""
+    for thread in prange(threads):
+        row = histogram[thread]
+        last = count * (thread + 1) // threads
+        for i in range(count * thread // threads, last):
+            if i + AHEAD < last:
+                prefetch(integers, RECORD * np.int64(get(ids, i + AHEAD)) + ORIGIN)
+            splat_row = get(ids, i)
+            o = RECORD * np.int64(splat_row)
+            origin, extent = np.int64(get(integers, o + ORIGIN)), np.int64(get(integers, o + EXTENT))
+            x0, y0 = origin & 0xFFFF, origin >> 16
+            for y in range(y0, y0 + (extent >> 16)):
+                for x in range(x0, x0 + (extent & 0xFFFF)):
+                    tile = tile_index(x, y, group_columns)
+                    place = row[tile]
+                    row[tile] = place + 1
+                    put(entries, place, splat_row)

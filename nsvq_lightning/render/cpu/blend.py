@@ -1,0 +1,530 @@
+"""Front-to-back blending of sorted splats and its backward pass, a 4x4 block of pixels a vector.
+
+Forward: a tile takes its splats in batches; an exact test tells which of its 16 blocks each splat can reach, then
+each block runs through its own splats with transmittance and colour in registers. The blocks that a splat really
+changed are kept as a 16-bit mask for the backward pass, which goes through the splats once more from front to back:
+with d = g·colour and ``rest`` = what all splats from here on (and the background) add to g·image, dL/dα = (T·d - rest
+after this splat/(1 - α)), so neither the last contributor nor any atomic is needed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from nsvq_lightning.render import constants
+from nsvq_lightning.render.cpu.jit import inline, kernel
+from nsvq_lightning.render.cpu.lanes import (
+    any_lane,
+    column_bits,
+    divide_fast,
+    exp2,
+    fetch_add,
+    fma,
+    fnma,
+    get,
+    lane_sums,
+    load,
+    load_block,
+    load_rgb_block,
+    lowest_bit,
+    mask_bits,
+    prefetch,
+    put,
+    select,
+    splat,
+    store,
+    store_block,
+    store_rgb_block,
+    vmax,
+    vmin,
+)
+from nsvq_lightning.render.cpu.records import (
+    BLUE,
+    DEPTH,
+    EXTENT,
+    GREEN,
+    GROUP_SHIFT,
+    GROUP_TILES,
+    LOG2_ALPHA_MIN,
+    LOG2_OPACITY,
+    ORIGIN,
+    RECORD,
+    RED,
+    SLOPE_X,
+    SLOPE_Y,
+    SLOT,
+    SUM_U,
+    SUM_V,
+    TILE,
+    A,
+    B,
+    C,
+    F,
+    X,
+    Y,
+)
+
+ALPHA_MAX = F(constants.ALPHA_MAX)
+TRANSMITTANCE_MIN = F(constants.TRANSMITTANCE_MIN)
+BATCH = 128
+AHEAD = 24
+"""How many entries ahead a record is asked for; its slot, whose number stands in the record, a little later."""
+SLOT_AHEAD = 10
+BLOCKS = 16
+BLOCK_SIDE = 4
+
+# Planes of the per-thread scratch of the forward pass, one vector a block each.
+T, T_STOPPED, R_SUM, G_SUM, B_SUM, Z_SUM = (256 * plane for plane in range(6))
+FORWARD_SCRATCH = 6 * 256 + BATCH * RECORD
+# Vectors a block owns in the scratch of the backward pass.
+B_T, B_REST, B_RED, B_GREEN, B_BLUE, B_DEPTH, B_STOP, B_X, B_Y = (16 * part for part in range(9))
+BLOCK_STATE = 16 * 9
+BACKWARD_SCRATCH = BLOCKS * BLOCK_STATE
+TWO_LN2 = F(2 * np.log(2.0))
+
+
+def pixel_grid() -> np.ndarray[tuple[int], np.dtype[np.float32]]:
+    """Pixel centres in a tile: x of block k at 16·k, y at 256 + 16·k; first x and y of the blocks at 512 and 528."""
+    block, lane = np.arange(BLOCKS)[:, None], np.arange(16)[None]
+    x = (block % 4) * BLOCK_SIDE + lane % 4 + 0.5
+    y = (block // 4) * BLOCK_SIDE + lane // 4 + 0.5
+    return np.concatenate([x.ravel(), y.ravel(), x[:, 0], y[:, 0]]).astype(np.float32)
+
+
+@inline
+def exponent(a, b, c, peak, dx, dy):
+    """log2 α and the two factors of the exponent."""
+    u = fma(b, dy, a * dx)
+    v = c * dy
+    return fnma(u, u, fnma(v, v, peak)), u, v
+
+
+@inline
+def highest_exponent(a, b, c, slope_x, slope_y, left, right, top, bottom):
+    """Largest value of -(u² + v²) on rectangles relative to the splat's centre: it lies on the edges facing it."""
+    zero = splat(F(0))
+    dx, dy = vmax(left, vmin(right, zero)), vmax(top, vmin(bottom, zero))
+    along_y = vmax(top, vmin(bottom, slope_x * dx))
+    along_x = vmax(left, vmin(right, slope_y * dy))
+    first, _, _ = exponent(a, b, c, zero, dx, along_y)
+    second, _, _ = exponent(a, b, c, zero, along_x, dy)
+    return vmax(first, second)
+
+
+@inline
+def reachable_blocks(batch, o, grid):
+    """Mask of the blocks of a tile in which a splat can reach α = 1/255."""
+    left, top = load(grid, 512) - splat(get(batch, o + X)), load(grid, 528) - splat(get(batch, o + Y))
+    side = splat(F(BLOCK_SIDE - 1))
+    peak = highest_exponent(
+        splat(get(batch, o + A)),
+        splat(get(batch, o + B)),
+        splat(get(batch, o + C)),
+        splat(get(batch, o + SLOPE_X)),
+        splat(get(batch, o + SLOPE_Y)),
+        left,
+        left + side,
+        top,
+        top + side,
+    )
+    return mask_bits(peak >= splat(LOG2_ALPHA_MIN - get(batch, o + LOG2_OPACITY)))
+
+
+@inline
+def blend_block(block, count, masks, batch, grid, state, touched, first):
+    """Blend a batch into one block; returns whether a pixel of it is still open."""
+    zero, open_, never = splat(F(0)), splat(TRANSMITTANCE_MIN), splat(F(-1))
+    lowest, highest = splat(LOG2_ALPHA_MIN), splat(ALPHA_MAX)
+    o = 16 * block
+    t = load(state, T + o)
+    red, green, blue = load(state, R_SUM + o), load(state, G_SUM + o), load(state, B_SUM + o)
+    depth = load(state, Z_SUM + o)
+    x, y = load(grid, o), load(grid, 256 + o)
+    live = t > zero
+    limit = select(live, open_, never)
+    bit = 1 << block
+    half = 0
+    while half < count:
+        queue = column_bits(masks, half, block)
+        while queue != 0:
+            j = half + lowest_bit(queue)
+            queue &= queue - 1
+            r = RECORD * j
+            dx, dy = x - splat(get(batch, r + X)), y - splat(get(batch, r + Y))
+            power, _, _ = exponent(
+                splat(get(batch, r + A)),
+                splat(get(batch, r + B)),
+                splat(get(batch, r + C)),
+                splat(get(batch, r + LOG2_OPACITY)),
+                dx,
+                dy,
+            )
+            hit = live & (power >= lowest)
+            alpha = select(hit, vmin(exp2(power), highest), zero)
+            after = fnma(alpha, t, t)
+            stopped = after < limit
+            # Where a pixel stops the backward pass has to come by, too.
+            put(touched, first + j, get(touched, first + j) | (np.int64(any_lane(hit)) << block))
+            if any_lane(stopped):
+                store(state, T_STOPPED + o, select(stopped, t, load(state, T_STOPPED + o)))
+                live = live & ~stopped
+                alpha = select(stopped, zero, alpha)
+                after = select(stopped, zero, after)
+                limit = select(stopped, never, limit)
+                if not any_lane(live):
+                    bit = 0
+                    queue = 0
+                    half = count
+            weight = alpha * t
+            red = fma(weight, splat(get(batch, r + RED)), red)
+            green = fma(weight, splat(get(batch, r + GREEN)), green)
+            blue = fma(weight, splat(get(batch, r + BLUE)), blue)
+            depth = fma(weight, splat(get(batch, r + DEPTH)), depth)
+            t = after
+        half += 64
+    store(state, T + o, t)
+    store(state, R_SUM + o, red)
+    store(state, G_SUM + o, green)
+    store(state, B_SUM + o, blue)
+    store(state, Z_SUM + o, depth)
+    return bit
+
+
+@inline
+def write_block(block, left, top, width, height, background, state, image, transmittance, depth):
+    """Add the background and write one block, pixel by pixel where it sticks out of the image."""
+    o = 16 * block
+    x0, y0 = left + (block & 3) * BLOCK_SIDE, top + (block >> 2) * BLOCK_SIDE
+    # A pixel's transmittance is in one of the two planes, 0 in the other.
+    t = load(state, T + o) + load(state, T_STOPPED + o)
+    red = fma(t, splat(get(background, 0)), load(state, R_SUM + o))
+    green = fma(t, splat(get(background, 1)), load(state, G_SUM + o))
+    blue = fma(t, splat(get(background, 2)), load(state, B_SUM + o))
+    if x0 + BLOCK_SIDE <= width and y0 + BLOCK_SIDE <= height:
+        pixel = y0 * width + x0
+        store_rgb_block(image, 3 * pixel, 3 * width, red, green, blue)
+        store_block(transmittance, pixel, width, t)
+        store_block(depth, pixel, width, load(state, Z_SUM + o))
+        return
+    store(state, T + o, t)
+    store(state, R_SUM + o, red)
+    store(state, G_SUM + o, green)
+    store(state, B_SUM + o, blue)
+    for lane in range(16):
+        x, y = x0 + (lane & 3), y0 + (lane >> 2)
+        if x < width and y < height:
+            pixel, s = y * width + x, o + lane
+            put(transmittance, pixel, get(state, T + s))
+            put(depth, pixel, get(state, Z_SUM + s))
+            put(image, 3 * pixel, get(state, R_SUM + s))
+            put(image, 3 * pixel + 1, get(state, G_SUM + s))
+            put(image, 3 * pixel + 2, get(state, B_SUM + s))
+
+
+@inline
+def blend_tile(
+    records,
+    entries,
+    begin,
+    end,
+    left,
+    top,
+    width,
+    height,
+    background,
+    grid,
+    touched,
+    image,
+    transmittance,
+    depth,
+    state,
+    masks,
+):
+    """Blend one tile; returns the end of the part of its list that was looked at."""
+    zero, one = splat(F(0)), splat(F(1))
+    columns, rows = splat(F(width - left)), splat(F(height - top))
+    alive = 0
+    for block in range(BLOCKS):
+        inside = (load(grid, 16 * block) < columns) & (load(grid, 256 + 16 * block) < rows)
+        store(state, T + 16 * block, select(inside, one, zero))
+        for plane in range(1, 6):
+            store(state, 256 * plane + 16 * block, zero)
+        if any_lane(inside):
+            alive |= 1 << block
+    batch = state[6 * 256 :]
+    fx, fy = F(left), F(top)
+    for i in range(begin, min(end, begin + AHEAD)):
+        prefetch(records, RECORD * np.int64(get(entries, i)))
+    i = begin
+    while i < end and alive != 0:
+        count = min(BATCH, end - i)
+        reached = 0
+        for j in range(count):
+            if i + j + AHEAD < end:
+                prefetch(records, RECORD * np.int64(get(entries, i + j + AHEAD)))
+            r = RECORD * np.int64(get(entries, i + j))
+            o = RECORD * j
+            store(batch, o, load(records, r))
+            put(batch, o + X, get(records, r + X) - fx)
+            put(batch, o + Y, get(records, r + Y) - fy)
+            mask = reachable_blocks(batch, o, grid) & alive
+            put(masks, j, mask)
+            put(touched, i + j, 0)
+            reached |= mask
+        for j in range(count, (count + 63) & ~63):
+            put(masks, j, 0)
+        while reached != 0:
+            block = lowest_bit(reached)
+            reached &= reached - 1
+            if blend_block(block, count, masks, batch, grid, state, touched, i) == 0:
+                alive &= ~(1 << block)
+        i += count
+    for block in range(BLOCKS):
+        write_block(block, left, top, width, height, background, state, image, transmittance, depth)
+    return i
+
+
+@inline
+def tile_corner(tile, group_columns):
+    """Left and top pixel of a tile."""
+    group, inside = tile // GROUP_TILES, tile % GROUP_TILES
+    side = 1 << GROUP_SHIFT
+    x = (group % group_columns) * side + inside % side
+    y = (group // group_columns) * side + inside // side
+    return x * TILE, y * TILE
+
+
+@kernel
+def blend(
+    threads,
+    records,
+    entries,
+    offsets,
+    group_columns,
+    width,
+    height,
+    background,
+    grid,
+    touched,
+    ends,
+    image,
+    transmittance,
+    depth,
+    scratch,
+    mask_scratch,
+    counter,
+):
+    """Blend all tiles, handed out dynamically; a pixel depends on its own tile only."""
+    tiles = offsets.shape[0] - 1
+    for thread in prange(threads):
+        while True:
+            tile = fetch_add(counter, 0, 1)
+            if tile >= tiles:
+                break
+            left, top = tile_corner(tile, group_columns)
+            if left < width and top < height:
+                ends[tile] = blend_tile(
+                    records, entries, np.int64(offsets[tile]), np.int64(offsets[tile + 1]), left, top, width, height,
+                    background, grid, touched, image, transmittance, depth, scratch[thread], mask_scratch[thread],
+                )  # fmt: skip
+            else:
+                ends[tile] = offsets[tile]
+
+
+@inline
+def start_block(
+    block, left, top, width, height, image, depth, transmittance, g_image, g_alpha, g_depth, with_depth, grid, state
+):
+    """Backward state of a block: transmittance 1, and ``rest`` = g · everything that this pixel received.
+
+    Alpha is 1 - T, so its gradient enters as -g_alpha·T at the far end.
+    """
+    s = BLOCK_STATE * block
+    x0, y0 = left + (block & 3) * BLOCK_SIDE, top + (block >> 2) * BLOCK_SIDE
+    store(state, s + B_X, load(grid, 16 * block))
+    store(state, s + B_Y, load(grid, 256 + 16 * block))
+    if x0 + BLOCK_SIDE <= width and y0 + BLOCK_SIDE <= height:
+        pixel = y0 * width + x0
+        red, green, blue = load_rgb_block(g_image, 3 * pixel, 3 * width)
+        r, g, b = load_rgb_block(image, 3 * pixel, 3 * width)
+        rest = fma(red, r, fma(green, g, blue * b))
+        rest = fnma(load_block(g_alpha, pixel, width), load_block(transmittance, pixel, width), rest)
+        if with_depth:
+            far = load_block(g_depth, pixel, width)
+            store(state, s + B_DEPTH, far)
+            rest = fma(far, load_block(depth, pixel, width), rest)
+        store(state, s + B_T, splat(F(1)))
+        store(state, s + B_REST, rest)
+        store(state, s + B_RED, red)
+        store(state, s + B_GREEN, green)
+        store(state, s + B_BLUE, blue)
+        store(state, s + B_STOP, splat(TRANSMITTANCE_MIN))
+        return
+    for part in range(0, B_X, 16):
+        store(state, s + part, splat(F(0)))
+    store(state, s + B_STOP, splat(F(-1)))
+    for lane in range(16):
+        x, y = x0 + (lane & 3), y0 + (lane >> 2)
+        if x < width and y < height:
+            pixel, o = y * width + x, s + lane
+            rest = -get(g_alpha, pixel) * get(transmittance, pixel)
+            for channel in range(3):
+                gradient = get(g_image, 3 * pixel + channel)
+                put(state, o + B_RED + 16 * channel, gradient)
+                rest += gradient * get(image, 3 * pixel + channel)
+            if with_depth:
+                put(state, o + B_DEPTH, get(g_depth, pixel))
+                rest += get(g_depth, pixel) * get(depth, pixel)
+            put(state, o + B_REST, rest)
+            put(state, o + B_T, F(1))
+            put(state, o + B_STOP, TRANSMITTANCE_MIN)
+
+
+@inline
+def slot_of(integers, row, group_x, group_y):
+    """The slot in which a group sums the gradients of a splat."""
+    o = RECORD * row
+    origin, extent = np.int64(get(integers, o + ORIGIN)), np.int64(get(integers, o + EXTENT))
+    x0, y0 = origin & 0xFFFF, origin >> 16
+    first_x, first_y = x0 >> GROUP_SHIFT, y0 >> GROUP_SHIFT
+    columns = ((x0 + (extent & 0xFFFF) - 1) >> GROUP_SHIFT) - first_x + 1
+    return np.int64(get(integers, o + SLOT)) + (group_y - first_y) * columns + group_x - first_x
+
+
+@inline
+def splat_backward(records, row, blocks, left, top, with_depth, state):
+    """Sums of one splat over the blocks it changed in a tile (the fields of a slot); moves the blocks' state on."""
+    zero, one, never = splat(F(0)), splat(F(1)), splat(F(-1))
+    lowest, highest = splat(LOG2_ALPHA_MIN), splat(ALPHA_MAX)
+    r = RECORD * row
+    centre_x, centre_y = splat(get(records, r + X) - F(left)), splat(get(records, r + Y) - F(top))
+    a, b, c = splat(get(records, r + A)), splat(get(records, r + B)), splat(get(records, r + C))
+    peak = splat(get(records, r + LOG2_OPACITY))
+    red, green, blue = splat(get(records, r + RED)), splat(get(records, r + GREEN)), splat(get(records, r + BLUE))
+    z = splat(get(records, r + DEPTH))
+    s_r, s_g, s_b, s_h, s_u, s_v, s_uu, s_uv, s_vv, s_z = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+    while blocks != 0:
+        s = BLOCK_STATE * lowest_bit(blocks)
+        blocks &= blocks - 1
+        power, u, v = exponent(a, b, c, peak, load(state, s + B_X) - centre_x, load(state, s + B_Y) - centre_y)
+        raw = exp2(power)
+        alpha = select(power >= lowest, vmin(raw, highest), zero)
+        g_r, g_g, g_b = load(state, s + B_RED), load(state, s + B_GREEN), load(state, s + B_BLUE)
+        d = fma(g_r, red, fma(g_g, green, g_b * blue))
+        if with_depth:
+            d = fma(load(state, s + B_DEPTH), z, d)
+        t, rest = load(state, s + B_T), load(state, s + B_REST)
+        after = fnma(alpha, t, t)
+        stopped = after < load(state, s + B_STOP)
+        if any_lane(stopped):
+            alpha = select(stopped, zero, alpha)
+            after = select(stopped, zero, after)
+            rest = select(stopped, zero, rest)
+            store(state, s + B_STOP, select(stopped, never, load(state, s + B_STOP)))
+        td = t * d
+        store(state, s + B_REST, fnma(alpha, td, rest))
+        store(state, s + B_T, after)
+        weight = alpha * t
+        h = select(raw <= highest, divide_fast(alpha, one - alpha) * (td - rest), zero)
+        s_r, s_g, s_b = fma(weight, g_r, s_r), fma(weight, g_g, s_g), fma(weight, g_b, s_b)
+        hu, hv = h * u, h * v
+        s_h, s_u, s_v = s_h + h, s_u + hu, s_v + hv
+        s_uu, s_uv, s_vv = fma(hu, u, s_uu), fma(hu, v, s_uv), fma(hv, v, s_vv)
+        if with_depth:
+            s_z = fma(weight, load(state, s + B_DEPTH), s_z)
+    return lane_sums((s_r, s_g, s_b, s_h, s_u, s_v, s_uu, s_uv, s_vv, s_z))
+
+
+@inline
+def tile_backward(
+    records, integers, entries, begin, end, left, top, group_x, group_y, with_depth, touched, sums, state
+):
+    """All splats of a tile, front to back."""
+    for i in range(begin, end):
+        if i + AHEAD < end:
+            prefetch(records, RECORD * np.int64(get(entries, i + AHEAD)))
+        if i + SLOT_AHEAD < end:
+            coming = np.int64(get(entries, i + SLOT_AHEAD))
+            prefetch(sums, RECORD * slot_of(integers, coming, group_x, group_y))
+        blocks = np.int64(get(touched, i))
+        if blocks == 0:
+            continue
+        row = np.int64(get(entries, i))
+        slot = RECORD * slot_of(integers, row, group_x, group_y)
+        store(sums, slot, load(sums, slot) + splat_backward(records, row, blocks, left, top, with_depth, state))
+
+
+@kernel
+def blend_backward(
+    threads,
+    records,
+    integers,
+    entries,
+    offsets,
+    ends,
+    group_columns,
+    width,
+    height,
+    grid,
+    touched,
+    image,
+    transmittance,
+    depth,
+    g_image,
+    g_alpha,
+    g_depth,
+    with_depth,
+    sums,
+    slots,
+    scratch,
+    counter,
+):
+    """Sums of every (splat, group) pair into its slot; groups are handed out dynamically, each is done in one order."""
+    tiles = offsets.shape[0] - 1
+    groups = tiles // GROUP_TILES
+    for thread in prange(threads):
+        first, last = slots * thread // threads, slots * (thread + 1) // threads
+        for slot in range(first, last):
+            store(sums, RECORD * slot, splat(F(0)))
+    for thread in prange(threads):
+        state = scratch[thread]
+        while True:
+            group = fetch_add(counter, 0, 1)
+            if group >= groups:
+                break
+            for tile in range(GROUP_TILES * group, GROUP_TILES * (group + 1)):
+                begin, end = np.int64(offsets[tile]), np.int64(ends[tile])
+                if end <= begin:
+                    continue
+                left, top = tile_corner(tile, group_columns)
+                for block in range(BLOCKS):
+                    start_block(
+                        block, left, top, width, height, image, depth, transmittance, g_image, g_alpha, g_depth,
+                        with_depth, grid, state,
+                    )  # fmt: skip
+                tile_backward(
+                    records, integers, entries, begin, end, left, top, group % group_columns, group // group_columns,
+                    with_depth, touched, sums, state,
+                )  # fmt: skip
+
+
+@kernel
+def total_slots(threads, ids, count, slots, records, integers, sums, g_means2d):
+    """Add up the slots of each splat into its first one, and derive the gradient of the projected centre ``[N·2]``."""
+    for thread in prange(threads):
+        last = count * (thread + 1) // threads
+        for i in range(count * thread // threads, last):
+            row = np.int64(get(ids, i))
+            r = RECORD * row
+            slot = np.int64(get(integers, r + SLOT))
+            end = np.int64(get(integers, RECORD * np.int64(get(ids, i + 1)) + SLOT)) if i + 1 < count else slots
+            o = RECORD * slot
+            if end > slot + 1:
+                total = load(sums, o)
+                for other in range(slot + 1, end):
+                    total = total + load(sums, RECORD * other)
+                store(sums, o, total)
+            u, v = get(sums, o + SUM_U), get(sums, o + SUM_V)
+            put(g_means2d, 2 * row, TWO_LN2 * get(records, r + A) * u)
+            put(g_means2d, 2 * row + 1, TWO_LN2 * (get(records, r + B) * u + get(records, r + C) * v))

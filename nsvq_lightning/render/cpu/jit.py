@@ -1,0 +1,51 @@
+"""How kernels are compiled, cached and run in parallel."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+import torch
+
+__all__ = ["inline", "kernel", "thread_count"]
+
+_OPTIONS: dict[str, Any] = {
+    # Products and sums may fuse; NaN and infinity keep their meaning because the guards of this package rely on them.
+    "fastmath": {"contract", "nsz"},
+    "error_model": "numpy",
+    "boundscheck": False,
+    "nogil": True,
+}
+
+_SOURCES = hashlib.sha256()
+for _path in sorted(Path(__file__).parent.glob("*.py")):
+    _SOURCES.update(_path.read_bytes())
+_STAMP = _SOURCES.hexdigest()
+
+
+def inline(function: Callable[..., Any]) -> Any:
+    """Compile a helper that only other kernels call."""
+    return numba.njit(forceinline=True, **_OPTIONS)(function)
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compile a parallel kernel once a machine and keep it on disk.
+
+    Numba looks only at a kernel's own file to tell whether a stored one is stale; here every file of the back-end
+    counts, because kernels contain the code of their helpers.
+    """
+    dispatcher = numba.njit(parallel=True, cache=True, **_OPTIONS)(function)
+    files = getattr(dispatcher._cache, "_cache_file", None)
+    if files is not None and hasattr(files, "_source_stamp"):
+        files._source_stamp = (files._source_stamp, _STAMP)
+    return dispatcher
+
+
+def thread_count() -> int:
+    """Threads that kernels use: torch's setting, so that one knob rules both."""
+    count = max(1, min(torch.get_num_threads(), int(numba.config.NUMBA_NUM_THREADS)))
+    numba.set_num_threads(count)
+    return count

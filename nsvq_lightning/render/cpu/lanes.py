@@ -1,0 +1,602 @@
+"""A vector of 16 floats for Numba kernels.
+
+Numba vectorizes plain loops only when LLVM feels like it; the kernels of this package say what they want instead.
+``Lanes`` and ``Mask`` are Numba types that hold one LLVM ``<16 x float>`` and ``<16 x i1>``. LLVM turns them into one
+AVX-512, two AVX2 or four NEON/SSE registers, so one source serves every CPU. Operators work between two vectors;
+scalars enter through :func:`splat`. All functions here are intrinsics: they only exist inside ``@njit`` code.
+
+Conventions: a memory argument is a pair (one-dimensional contiguous array, element offset); nothing is
+bounds-checked. Floating-point code may be contracted (a·b + c in one rounding), never reassociated, so NaN and
+infinity keep their meaning.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from llvmlite import binding, ir
+from numba import types
+from numba.core import cgutils
+from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
+
+WIDTH = 16
+
+_f32, _i1, _i8, _i16, _i32, _i64 = ir.FloatType(), *(ir.IntType(bits) for bits in (1, 8, 16, 32, 64))
+_VF, _VI, _VM = (ir.VectorType(kind, WIDTH) for kind in (_f32, _i32, _i1))
+_CONTRACT = ("contract", "nsz")
+
+_FEATURES = binding.get_host_cpu_features()
+HAS_FMA = bool(_FEATURES.get("fma", True)) or not any(name in _FEATURES for name in ("sse2", "avx"))
+"""Whether a fused multiply-add is one instruction here; without it LLVM would call a library function a lane."""
+
+
+class _VectorType(types.Type):
+    """A Numba type that is one LLVM vector register."""
+
+
+Lanes = _VectorType("float32x16")
+Mask = _VectorType("mask16")
+_LLVM_TYPE = {Lanes.name: _VF, Mask.name: _VM}
+
+
+@register_model(_VectorType)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, vector_type: _VectorType) -> None:
+        super().__init__(manager, vector_type, _LLVM_TYPE[vector_type.name])
+
+
+# ---- declaring operators and functions
+# --------------------------------------------------------------------------------
+
+
+def _operator(symbol: Callable[..., Any], result: types.Type, arguments: tuple[types.Type, ...], emit: Any) -> None:
+    """Give ``symbol`` a meaning for vector arguments; ``emit(builder, *values)`` builds the instructions."""
+    name = f"_{symbol.__name__}_{'_'.join(argument.name for argument in arguments)}"
+    infer_global(symbol)(type(name, (ConcreteTemplate,), {"cases": [signature(result, *arguments)]}))
+    lower_builtin(symbol, *arguments)(lambda context, builder, sig, values: emit(builder, *values))
+
+
+def _function(result: Any, arity: int) -> Callable[[Any], Any]:
+    """Turn ``emit(context, builder, sig, values)`` into an intrinsic of ``arity`` arguments.
+
+    ``result`` is the Numba type of the result, or a function from the argument types to it.
+    """
+
+    def decorate(emit: Any) -> Any:
+        names = ", ".join("abcdefgh"[:arity])
+
+        def declare(*arguments: Any) -> tuple[Any, Any]:
+            kind = result if isinstance(result, types.Type) else result(*arguments)
+            return signature(kind, *arguments), emit
+
+        # Numba reads the arity from the function itself, so it has to be spelled out.
+        namespace: dict[str, Any] = {"declare": declare}
+        exec(f"def {emit.__name__}(typingctx, {names}):\n    return declare({names})", namespace)
+        made = namespace[emit.__name__]
+        made.__doc__, made.__module__ = emit.__doc__, __name__
+        return intrinsic(made)
+
+    return decorate
+
+
+# ---- building blocks in LLVM
+# ------------------------------------------------------------------------------------------
+
+
+def _constant(value: float) -> ir.Constant:
+    return ir.Constant(_VF, [float(np.float32(value))] * WIDTH)
+
+
+def _integers(value: int) -> ir.Constant:
+    return ir.Constant(_VI, [value] * WIDTH)
+
+
+def _shuffle(builder: Any, first: Any, second: Any, lanes: Sequence[int]) -> Any:
+    return builder.shuffle_vector(first, second, ir.Constant(ir.VectorType(_i32, len(lanes)), list(lanes)))
+
+
+def _broadcast(builder: Any, kind: ir.VectorType, scalar: Any) -> Any:
+    undefined = ir.Constant(kind, ir.Undefined)
+    inserted = builder.insert_element(undefined, scalar, _i32(0))
+    return _shuffle(builder, inserted, undefined, [0] * kind.count)
+
+
+def _llvm(builder: Any, name: str, result: Any, values: Sequence[Any]) -> Any:
+    kind = ir.FunctionType(result, [value.type for value in values])
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), values)
+
+
+def _fused(builder: Any, x: Any, y: Any, z: Any) -> Any:
+    if HAS_FMA:
+        return _llvm(builder, "llvm.fma.v16f32", _VF, [x, y, z])
+    return builder.fadd(builder.fmul(x, y, flags=_CONTRACT), z, flags=_CONTRACT)
+
+
+def _polynomial(builder: Any, x: Any, coefficients: Sequence[float]) -> Any:
+    """Horner's rule, highest power first."""
+    value = _constant(coefficients[0])
+    for coefficient in coefficients[1:]:
+        value = _fused(builder, value, x, _constant(coefficient))
+    return value
+
+
+def _address(context: Any, builder: Any, array_type: Any, array: Any, offset: Any) -> Any:
+    return builder.gep(cgutils.create_struct_proxy(array_type)(context, builder, array).data, [offset])
+
+
+def _read(builder: Any, address: Any, count: int = WIDTH) -> Any:
+    return builder.load(builder.bitcast(address, ir.VectorType(_f32, count).as_pointer()), align=4)
+
+
+def _write(builder: Any, address: Any, value: Any) -> None:
+    builder.store(value, builder.bitcast(address, value.type.as_pointer()), align=4)
+
+
+# ---- operators
+# --------------------------------------------------------------------------------------------------------
+
+_operator(operator.add, Lanes, (Lanes, Lanes), lambda b, x, y: b.fadd(x, y, flags=_CONTRACT))
+_operator(operator.sub, Lanes, (Lanes, Lanes), lambda b, x, y: b.fsub(x, y, flags=_CONTRACT))
+_operator(operator.mul, Lanes, (Lanes, Lanes), lambda b, x, y: b.fmul(x, y, flags=_CONTRACT))
+_operator(operator.truediv, Lanes, (Lanes, Lanes), lambda b, x, y: b.fdiv(x, y))
+_operator(operator.neg, Lanes, (Lanes,), lambda b, x: b.fneg(x))
+for _symbol, _comparison in ((operator.ge, ">="), (operator.le, "<="), (operator.lt, "<"), (operator.gt, ">")):
+    _operator(_symbol, Mask, (Lanes, Lanes), lambda b, x, y, c=_comparison: b.fcmp_ordered(c, x, y))
+_operator(operator.and_, Mask, (Mask, Mask), lambda b, x, y: b.and_(x, y))
+_operator(operator.or_, Mask, (Mask, Mask), lambda b, x, y: b.or_(x, y))
+_operator(operator.invert, Mask, (Mask,), lambda b, x: b.not_(x))
+
+# ---- memory
+# -----------------------------------------------------------------------------------------------------------
+
+
+@_function(Lanes, 1)
+def splat(context, builder, sig, values):
+    """The scalar in every lane."""
+    return _broadcast(builder, _VF, context.cast(builder, values[0], sig.args[0], types.float32))
+
+
+@_function(Lanes, 2)
+def load(context, builder, sig, values):
+    """``load(array, offset)``: 16 consecutive floats."""
+    return _read(builder, _address(context, builder, sig.args[0], *values))
+
+
+@_function(types.void, 3)
+def store(context, builder, sig, values):
+    """``store(array, offset, lanes)``: 16 consecutive floats."""
+    _write(builder, _address(context, builder, sig.args[0], *values[:2]), values[2])
+    return context.get_dummy_value()
+
+
+@_function(lambda array, offset: array.dtype, 2)
+def get(context, builder, sig, values):
+    """``get(array, offset)``: one element, without the sign check of Numba's indexing."""
+    return builder.load(_address(context, builder, sig.args[0], *values))
+
+
+@_function(types.void, 3)
+def put(context, builder, sig, values):
+    """``put(array, offset, value)``: one element, without the sign check of Numba's indexing."""
+    value = context.cast(builder, values[2], sig.args[2], sig.args[0].dtype)
+    builder.store(value, _address(context, builder, sig.args[0], *values[:2]))
+    return context.get_dummy_value()
+
+
+@_function(types.void, 2)
+def prefetch(context, builder, sig, values):
+    """``prefetch(array, offset)``: ask for the cache line of one element."""
+    address = builder.bitcast(_address(context, builder, sig.args[0], *values), _i8.as_pointer())
+    _llvm(builder, "llvm.prefetch.p0", ir.VoidType(), [address, _i32(0), _i32(3), _i32(1)])
+    return context.get_dummy_value()
+
+
+@_function(types.int64, 3)
+def fetch_add(context, builder, sig, values):
+    """``fetch_add(int64_array, offset, amount)``: atomically add and return the old value (for handing out work)."""
+    address = _address(context, builder, sig.args[0], *values[:2])
+    return builder.atomic_rmw("add", address, values[2], "monotonic")
+
+
+# ---- arithmetic
+# -------------------------------------------------------------------------------------------------------
+
+
+@_function(Lanes, 3)
+def fma(context, builder, sig, values):
+    """``x * y + z`` in one rounding."""
+    return _fused(builder, *values)
+
+
+@_function(Lanes, 3)
+def fnma(context, builder, sig, values):
+    """``z - x * y`` in one rounding."""
+    return _fused(builder, builder.fneg(values[0]), values[1], values[2])
+
+
+@_function(Lanes, 2)
+def divide_fast(context, builder, sig, values):
+    """``x / y`` where the CPU may use its reciprocal estimate with a refinement step."""
+    return builder.fdiv(*values, flags=("contract", "nsz", "arcp", "reassoc", "afn"))
+
+
+@_function(Lanes, 2)
+def vmin(context, builder, sig, values):
+    """The smaller of two; the second one where the first is NaN."""
+    return builder.select(builder.fcmp_ordered("<", *values), *values)
+
+
+@_function(Lanes, 2)
+def vmax(context, builder, sig, values):
+    """The larger of two; the second one where the first is NaN."""
+    return builder.select(builder.fcmp_ordered(">", *values), *values)
+
+
+def _unary(name: str, doc: str) -> Any:
+    def emit(context, builder, sig, values):
+        return _llvm(builder, f"llvm.{name}.v16f32", _VF, values)
+
+    emit.__name__, emit.__doc__ = f"v{name}", doc
+    return _function(Lanes, 1)(emit)
+
+
+vsqrt = _unary("sqrt", "Square root; NaN below zero.")
+vfloor = _unary("floor", "Largest integer not above.")
+vceil = _unary("ceil", "Smallest integer not below.")
+vfabs = _unary("fabs", "Absolute value.")
+
+
+@_function(Lanes, 3)
+def select(context, builder, sig, values):
+    """``select(mask, x, y)``: x where the mask is set, else y."""
+    return builder.select(*values)
+
+
+@_function(Lanes, 1)
+def exp2(context, builder, sig, values):
+    """2**x for |x| < 126, relative error 2e-7; no check outside."""
+    return _exp2(builder, values[0])
+
+
+@_function(Lanes, 1)
+def exp2_clamped(context, builder, sig, values):
+    """2**x with x limited to [-125, 125]: never 0, never infinite; NaN becomes 2**-125."""
+    low, high, x = _constant(-125.0), _constant(125.0), values[0]
+    x = builder.select(builder.fcmp_ordered(">", x, low), x, low)
+    return _exp2(builder, builder.select(builder.fcmp_ordered("<", x, high), x, high))
+
+
+def _exp2(builder: Any, x: Any) -> Any:
+    # Adding 1.5·2^23 rounds to an integer that stands in the low bits of the sum, ready to become an exponent.
+    magic = _constant(12582912.0)
+    shifted = builder.fadd(x, magic)
+    fraction = builder.fsub(x, builder.fsub(shifted, magic))
+    # Minimax polynomial of 2**f on [-1/2, 1/2].
+    power = _polynomial(
+        builder,
+        fraction,
+        (1.32764715e-3, 9.67554133e-3, 5.55071327e-2, 2.40221197e-1, 6.93146967e-1, 1.00000007),
+    )
+    exponent = builder.shl(builder.bitcast(shifted, _VI), _integers(23))
+    return builder.bitcast(builder.add(builder.bitcast(power, _VI), exponent), _VF)
+
+
+@_function(Lanes, 1)
+def log2(context, builder, sig, values):
+    """Binary logarithm of a positive normal number, absolute error 1e-7."""
+    bits = builder.bitcast(values[0], _VI)
+    # Split into m·2^e with m in [1/√2, √2): the offset moves the split from 1 to 1/√2.
+    offset = _integers(0x3F3504F3)
+    exponent = builder.ashr(builder.sub(bits, offset), _integers(23))
+    mantissa = builder.bitcast(builder.sub(bits, builder.shl(exponent, _integers(23))), _VF)
+    one = _constant(1.0)
+    s = builder.fdiv(builder.fsub(mantissa, one), builder.fadd(mantissa, one))
+    squared = builder.fmul(s, s)
+    # log m = 2 artanh(s), s = (m - 1)/(m + 1)
+    series = _polynomial(builder, squared, (1 / 11, 1 / 9, 1 / 7, 1 / 5, 1 / 3, 1.0))
+    scaled = builder.fmul(s, _constant(2 * 1.4426950408889634))
+    return _fused(builder, scaled, series, builder.sitofp(exponent, _VF))
+
+
+# ---- masks
+# ------------------------------------------------------------------------------------------------------------
+
+
+@_function(types.int64, 1)
+def mask_bits(context, builder, sig, values):
+    """The mask as an integer, lane 0 in the lowest bit."""
+    return builder.zext(builder.bitcast(values[0], _i16), _i64)
+
+
+@_function(types.boolean, 1)
+def any_lane(context, builder, sig, values):
+    """Whether any lane is set."""
+    return builder.icmp_unsigned("!=", builder.bitcast(values[0], _i16), _i16(0))
+
+
+@_function(types.int64, 1)
+def lowest_bit(context, builder, sig, values):
+    """Position of the lowest set bit of an integer that is not 0."""
+    return builder.cttz(values[0], _i1(1))
+
+
+@_function(types.int64, 3)
+def column_bits(context, builder, sig, values):
+    """``column_bits(uint16_array, offset, k)``: bit k of 64 consecutive elements as one 64-bit integer."""
+    kind = ir.VectorType(_i16, 64)
+    address = _address(context, builder, sig.args[0], *values[:2])
+    elements = builder.load(builder.bitcast(address, kind.as_pointer()), align=2)
+    bit = _broadcast(builder, kind, builder.shl(_i16(1), builder.trunc(values[2], _i16)))
+    return builder.bitcast(builder.icmp_unsigned("!=", builder.and_(elements, bit), ir.Constant(kind, [0] * 64)), _i64)
+
+
+# ---- sums and layout
+# --------------------------------------------------------------------------------------------------
+
+
+@_function(types.float32, 1)
+def lane_sum(context, builder, sig, values):
+    """Sum of the 16 lanes, always in the same order."""
+    total = values[0]
+    for step in (8, 4, 2, 1):
+        rotated = _shuffle(builder, total, total, [(lane + step) % WIDTH for lane in range(WIDTH)])
+        total = builder.fadd(total, rotated, flags=_CONTRACT)
+    return builder.extract_element(total, _i32(0))
+
+
+def _interleave_step(step: int) -> tuple[list[int], list[int]]:
+    """Lanes to take from two vectors so that adding both picks halves their blocks of ``step`` lanes pairwise."""
+    if step == 1:
+        low = [lane for q in range(0, WIDTH, 4) for lane in (q, 16 + q, q + 1, 17 + q)]
+        high = [lane for q in range(0, WIDTH, 4) for lane in (q + 2, 18 + q, q + 3, 19 + q)]
+    elif step == 2:
+        low = [lane for q in range(0, WIDTH, 4) for lane in (q, q + 1, 16 + q, 17 + q)]
+        high = [lane for q in range(0, WIDTH, 4) for lane in (q + 2, q + 3, 18 + q, 19 + q)]
+    else:
+        low = [start + lane for start in (0, 8, 16, 24) for lane in range(4)]
+        high = [start + lane for start in (4, 12, 20, 28) for lane in range(4)]
+    return low, high
+
+
+@_function(Lanes, 1)
+def lane_sums(context, builder, sig, values):
+    """``lane_sums((v0, v1, …))``: lane i of the result is the sum of the lanes of vector i, 0 beyond the last."""
+    vectors: list[Any] = list(cgutils.unpack_tuple(builder, values[0], len(sig.args[0])))
+    vectors += [None] * (WIDTH - len(vectors))
+    zero = _constant(0.0)
+    step = 1
+    while len(vectors) > 1:
+        low, high = _interleave_step(step)
+        merged: list[Any] = []
+        for first, second in zip(vectors[0::2], vectors[1::2], strict=True):
+            if first is None and second is None:
+                merged.append(None)
+                continue
+            first, second = (zero if part is None else part for part in (first, second))
+            parts = _shuffle(builder, first, second, low), _shuffle(builder, first, second, high)
+            merged.append(builder.fadd(*parts, flags=_CONTRACT))
+        vectors, step = merged, 2 * step
+    return vectors[0]
+
+
+def _transposed(builder: Any, rows: Sequence[Any]) -> list[Any]:
+    """Transpose 16 vectors as a 16x16 matrix: four rounds that swap blocks of 8, 4, 2 and 1 lanes."""
+    rows = list(rows)
+    for block in (8, 4, 2, 1):
+        low = [lane if not lane & block else WIDTH + lane - block for lane in range(WIDTH)]
+        high = [lane + block if not lane & block else WIDTH + lane for lane in range(WIDTH)]
+        swapped: list[Any] = [None] * WIDTH
+        for i in range(WIDTH):
+            if not i & block:
+                swapped[i] = _shuffle(builder, rows[i], rows[i + block], low)
+                swapped[i + block] = _shuffle(builder, rows[i], rows[i + block], high)
+        rows = swapped
+    return rows
+
+
+_SIXTEEN = types.UniTuple(Lanes, WIDTH)
+
+
+@_function(_SIXTEEN, 1)
+def transpose(context, builder, sig, values):
+    """``transpose((v0, …, v15))``: vector i of the result holds lane i of every argument."""
+    rows = _transposed(builder, cgutils.unpack_tuple(builder, values[0], WIDTH))
+    return context.make_tuple(builder, sig.return_type, rows)
+
+
+@_function(_SIXTEEN, 5)
+def gather_columns(context, builder, sig, values):
+    """``gather_columns(array, indices, start, stride, column)``: 16 columns of 16 chosen rows.
+
+    Vector c of the result holds ``array[indices[start + lane] * stride + column + c]`` for each lane.
+    """
+    array, indices, start, stride, column = values
+    rows = []
+    for lane in range(WIDTH):
+        index = builder.load(_address(context, builder, sig.args[1], indices, builder.add(start, _i64(lane))))
+        index = context.cast(builder, index, sig.args[1].dtype, types.int64)
+        offset = builder.add(builder.mul(index, stride), column)
+        rows.append(_read(builder, _address(context, builder, sig.args[0], array, offset)))
+    return context.make_tuple(builder, sig.return_type, _transposed(builder, rows))
+
+
+def _gatherer(columns: int) -> Any:
+    def emit(context, builder, sig, values):
+        array, indices, start = values
+        vectors = [ir.Constant(_VF, ir.Undefined)] * columns
+        for lane in range(WIDTH):
+            index = builder.load(_address(context, builder, sig.args[1], indices, builder.add(start, _i64(lane))))
+            index = context.cast(builder, index, sig.args[1].dtype, types.int64)
+            address = _address(context, builder, sig.args[0], array, builder.mul(index, _i64(columns)))
+            for column in range(columns):
+                element = builder.load(builder.gep(address, [_i64(column)]))
+                vectors[column] = builder.insert_element(vectors[column], element, _i32(lane))
+        if columns == 1:
+            return vectors[0]
+        return context.make_tuple(builder, sig.return_type, vectors)
+
+    emit.__name__ = f"gather_rows{columns}"
+    emit.__doc__ = f"``gather_rows{columns}(array, indices, start)``: 16 chosen rows of {columns} floats as vectors."
+    return _function(Lanes if columns == 1 else types.UniTuple(Lanes, columns), 3)(emit)
+
+
+def _scatterer(columns: int) -> Any:
+    def emit(context, builder, sig, values):
+        array, indices, start, rows = values
+        vectors = [rows] if columns == 1 else cgutils.unpack_tuple(builder, rows, columns)
+        for lane in range(WIDTH):
+            index = builder.load(_address(context, builder, sig.args[1], indices, builder.add(start, _i64(lane))))
+            index = context.cast(builder, index, sig.args[1].dtype, types.int64)
+            address = _address(context, builder, sig.args[0], array, builder.mul(index, _i64(columns)))
+            for column in range(columns):
+                element = builder.extract_element(vectors[column], _i32(lane))
+                builder.store(element, builder.gep(address, [_i64(column)]))
+        return context.get_dummy_value()
+
+    emit.__name__ = f"scatter_rows{columns}"
+    emit.__doc__ = (
+        f"``scatter_rows{columns}(array, indices, start, vectors)``: the inverse of ``gather_rows{columns}``."
+    )
+    return _function(types.void, 4)(emit)
+
+
+gather_rows1, gather_rows3, gather_rows4 = (_gatherer(columns) for columns in (1, 3, 4))
+scatter_rows1, scatter_rows2, scatter_rows3, scatter_rows4 = (_scatterer(columns) for columns in (1, 2, 3, 4))
+
+
+def _split_columns(builder: Any, parts: Sequence[Any], columns: int) -> list[Any]:
+    """From vectors of consecutive memory, element (row, column) at row·columns + column, to one vector a column."""
+    flat = [(part, lane) for part in range(columns) for lane in range(WIDTH)]
+    result = []
+    for column in range(columns):
+        source = [flat[row * columns + column] for row in range(WIDTH)]
+        value = parts[0]
+        lanes = [lane if part == 0 else 0 for part, lane in source]
+        value = _shuffle(builder, value, value, lanes)
+        for part in range(1, columns):
+            lanes = [WIDTH + lane if at == part else row for row, (at, lane) in enumerate(source)]
+            value = _shuffle(builder, value, parts[part], lanes)
+        result.append(value)
+    return result
+
+
+def _join_columns(builder: Any, vectors: Sequence[Any]) -> list[Any]:
+    """The inverse of :func:`_split_columns`."""
+    columns = len(vectors)
+    result = []
+    for part in range(columns):
+        positions = [divmod(part * WIDTH + lane, columns) for lane in range(WIDTH)]
+        value = _shuffle(builder, vectors[0], vectors[0], [row if column == 0 else 0 for row, column in positions])
+        for at in range(1, columns):
+            lanes = [WIDTH + row if column == at else lane for lane, (row, column) in enumerate(positions)]
+            value = _shuffle(builder, value, vectors[at], lanes)
+        result.append(value)
+    return result
+
+
+def _row_loader(columns: int) -> Any:
+    def emit(context, builder, sig, values):
+        array, offset = values
+        parts = [
+            _read(builder, _address(context, builder, sig.args[0], array, builder.add(offset, _i64(WIDTH * part))))
+            for part in range(columns)
+        ]
+        return context.make_tuple(builder, sig.return_type, _split_columns(builder, parts, columns))
+
+    emit.__name__ = f"load_rows{columns}"
+    emit.__doc__ = (
+        f"``load_rows{columns}(array, offset)``: 16 consecutive rows of {columns} floats as {columns} vectors."
+    )
+    return _function(types.UniTuple(Lanes, columns), 2)(emit)
+
+
+load_rows3 = _row_loader(3)
+load_rows4 = _row_loader(4)
+
+
+@_function(types.UniTuple(Lanes, 3), 3)
+def load_rgb_block(context, builder, sig, values):
+    """``load_rgb_block(image, offset, stride)``: a 4x4 block of an interleaved RGB image as three vectors.
+
+    ``offset`` is the element of the block's first pixel, ``stride`` the floats from one image row to the next.
+    """
+    image, offset, stride = values
+    rows = []
+    for row in range(4):
+        address = _address(context, builder, sig.args[0], image, builder.add(offset, builder.mul(_i64(row), stride)))
+        first = _read(builder, address, 8)
+        last = _read(builder, builder.gep(address, [_i64(8)]), 4)
+        last = _shuffle(builder, last, last, [0, 1, 2, 3, 0, 0, 0, 0])
+        rows.append(_shuffle(builder, first, last, list(range(WIDTH))))
+    upper, lower = (_shuffle(builder, rows[k], rows[k + 1], list(range(32))) for k in (0, 2))
+    channels = [
+        _shuffle(builder, upper, lower, [16 * row + 3 * column + channel for row in range(4) for column in range(4)])
+        for channel in range(3)
+    ]
+    return context.make_tuple(builder, sig.return_type, channels)
+
+
+@_function(types.void, 6)
+def store_rgb_block(context, builder, sig, values):
+    """``store_rgb_block(image, offset, stride, r, g, b)``: the inverse of :func:`load_rgb_block`."""
+    image, offset, stride, r, g, b = values
+    undefined = ir.Constant(_VF, ir.Undefined)
+    red_green = _shuffle(builder, r, g, list(range(32)))
+    blue = _shuffle(builder, b, undefined, list(range(32)))
+    for row in range(4):
+        order = [16 * channel + 4 * row + column for column in range(4) for channel in range(3)]
+        pixels = _shuffle(builder, red_green, blue, order)
+        address = _address(context, builder, sig.args[0], image, builder.add(offset, builder.mul(_i64(row), stride)))
+        _write(builder, address, _shuffle(builder, pixels, pixels, list(range(8))))
+        _write(builder, builder.gep(address, [_i64(8)]), _shuffle(builder, pixels, pixels, list(range(8, 12))))
+    return context.get_dummy_value()
+
+
+@_function(Lanes, 3)
+def load_block(context, builder, sig, values):
+    """``load_block(image, offset, stride)``: a 4x4 block of a single-channel image as one vector."""
+    image, offset, stride = values
+    rows = [
+        _read(
+            builder,
+            _address(context, builder, sig.args[0], image, builder.add(offset, builder.mul(_i64(row), stride))),
+            4,
+        )
+        for row in range(4)
+    ]
+    upper, lower = (_shuffle(builder, rows[k], rows[k + 1], list(range(8))) for k in (0, 2))
+    return _shuffle(builder, upper, lower, list(range(WIDTH)))
+
+
+@_function(types.void, 4)
+def store_block(context, builder, sig, values):
+    """``store_block(image, offset, stride, lanes)``: the inverse of :func:`load_block`."""
+    image, offset, stride, lanes = values
+    for row in range(4):
+        address = _address(context, builder, sig.args[0], image, builder.add(offset, builder.mul(_i64(row), stride)))
+        _write(builder, address, _shuffle(builder, lanes, lanes, list(range(4 * row, 4 * row + 4))))
+    return context.get_dummy_value()
+
+
+def _row_storer(columns: int) -> Any:
+    def emit(context, builder, sig, values):
+        array, offset, rows = values
+        vectors = cgutils.unpack_tuple(builder, rows, columns)
+        for part, value in enumerate(_join_columns(builder, vectors)):
+            place = builder.add(offset, _i64(WIDTH * part))
+            _write(builder, _address(context, builder, sig.args[0], array, place), value)
+        return context.get_dummy_value()
+
+    emit.__name__ = f"store_rows{columns}"
+    emit.__doc__ = (
+        f"``store_rows{columns}(array, offset, ({columns} vectors))``: the inverse of ``load_rows{columns}``."
+    )
+    return _function(types.void, 3)(emit)
+
+
+store_rows3 = _row_storer(3)
+store_rows4 = _row_storer(4)

@@ -1,0 +1,229 @@
+"""The CPU back-end as differentiable functions: projection, then binning and blend."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from nsvq_lightning.render.camera import Camera
+from nsvq_lightning.render.constants import FRUSTUM_MARGIN
+from nsvq_lightning.render.cpu.binning import DIGITS, count_tiles, fill_tiles, sort_by_depth
+from nsvq_lightning.render.cpu.blend import (
+    BACKWARD_SCRATCH,
+    BATCH,
+    FORWARD_SCRATCH,
+    blend,
+    blend_backward,
+    pixel_grid,
+    total_slots,
+)
+from nsvq_lightning.render.cpu.jit import thread_count
+from nsvq_lightning.render.cpu.projection import finish_records, project_backward, project_splats
+from nsvq_lightning.render.cpu.records import CAMERA, GROUP_TILES, RECORD, group_grid
+from nsvq_lightning.render.cpu.workspace import Array, Workspace, recycled
+from nsvq_lightning.splats import SplatTensors
+
+__all__ = ["render_cpu", "visible_cpu"]
+
+PROJECTION_SCRATCH = 2048 + 64
+MAX_ENTRIES = 2**31 - 1
+
+
+def _pack_camera(camera: Camera) -> Array:
+    fx, fy, cx, cy = camera.intrinsics
+    view = camera.viewmat.detach().cpu().double().numpy()
+    rotation, translation = view[:3, :3], view[:3, 3]
+    margin_x, margin_y = (FRUSTUM_MARGIN * 0.5 * side / f for side, f in ((camera.width, fx), (camera.height, fy)))
+    limits = [-cx / fx - margin_x, (camera.width - cx) / fx + margin_x]
+    limits += [-cy / fy - margin_y, (camera.height - cy) / fy + margin_y]
+    position = -rotation.T @ translation
+    packed = [*rotation.ravel(), *translation, *position, fx, fy, cx, cy, *limits, camera.width, camera.height]
+    return np.array(packed, np.float32).reshape(CAMERA)
+
+
+def _flat(tensor: Tensor) -> Array:
+    return tensor.detach().contiguous().numpy().reshape(-1)
+
+
+class _Frame:
+    """One view of the splats on its way through the stages; holds its workspace as long as it lives."""
+
+    def __init__(self, splats: SplatTensors, camera: Camera) -> None:
+        self.camera = _pack_camera(camera)
+        self.width, self.height = camera.width, camera.height
+        self.group_columns, group_rows = group_grid(camera.width, camera.height)
+        self.tiles = self.group_columns * group_rows * GROUP_TILES
+        self.n = splats.means.shape[0]
+        self.geometry = tuple(_flat(t) for t in (splats.means, splats.quats, splats.scales, splats.opacities))
+        self.threads = thread_count()
+        self.work = Workspace.borrow()
+        self.records = self.work.array("records", RECORD * self.n)
+        self.integers = self.records.view(np.int32)
+        self.scratch = self.work.rows("projection", self.threads, PROJECTION_SCRATCH)
+        self.count = self.slots = 0
+        nothing = np.empty(0, np.int32)
+        self.ids = self.sorted_ids = self.entries = self.offsets = self.touched = self.ends = self.sums = nothing
+
+    def __del__(self) -> None:
+        work = getattr(self, "work", None)
+        if work is not None:
+            work.give_back()
+
+    def project(self) -> tuple[Array, Array, Array]:
+        """Find the visible splats; returns their rows in one run a thread, the lengths of the runs and their slots."""
+        found = self.work.array("found", self.n, np.int32)
+        counts, slots = (self.work.array(name, self.threads, np.int64) for name in ("counts", "slot_counts"))
+        project_splats(
+            self.threads, self.camera, *self.geometry, self.records, self.integers, found, counts, slots, self.scratch
+        )
+        self.count, self.slots = int(counts.sum()), int(slots.sum())
+        return found, counts, slots
+
+    def finish(self, sh0: Array, shN: Array, stride: int, degree: int, means2d: Array, radii: Array) -> None:
+        """Complete the records and list the visible splats by row (``ids``) and by depth (``sorted_ids``)."""
+        runs = self.project()
+        self.ids = self.work.array("ids", self.count + 16, np.int32)
+        keys = self.work.array("keys", self.count + 1, np.int32)
+        finish_records(
+            self.threads, self.camera, self.geometry[0], sh0, shN, stride, degree, *runs, self.records, self.integers,
+            self.ids, keys, means2d, radii, self.scratch,
+        )  # fmt: skip
+        order = self.work.array("order", self.count, np.int32)
+        other = self.work.array("order2", self.count, np.int32)
+        order[:] = self.ids[: self.count]
+        if self.count:
+            keys2 = self.work.array("keys2", self.count + 1, np.int32)
+            histogram = self.work.rows("digits", self.threads, DIGITS, np.int64)
+            if sort_by_depth(self.threads, self.count, keys, order, keys2, other, histogram):
+                order = other
+        self.sorted_ids = order
+
+    def bin(self) -> None:
+        """List the splats of every tile, front to back."""
+        histogram = self.work.rows("tile_counts", self.threads, self.tiles, np.int64)
+        self.offsets = self.work.array("offsets", self.tiles + 1, np.int64)
+        listed = self.threads, self.count, self.sorted_ids, self.integers, self.group_columns, histogram
+        total = count_tiles(*listed, self.offsets)
+        if total > MAX_ENTRIES:
+            raise RuntimeError(
+                f"{self.count} splats cover {total} tiles of the {self.width}x{self.height} image, more than can be "
+                "listed; the scales have probably diverged (lower their learning rate or prune large splats)"
+            )
+        self.entries = self.work.array("entries", total, np.int32)
+        fill_tiles(*listed, self.entries)
+
+
+_GRID = pixel_grid()
+
+
+class _Project(torch.autograd.Function):
+    """Raw attributes to projected centres; the records travel in the frame, the token ties the graph together."""
+
+    @staticmethod
+    def forward(ctx: Any, frame: _Frame, degree: int, *attributes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        means, *_, sh0, shN = attributes
+        means2d = means.new_zeros(frame.n, 2)
+        radii = torch.zeros(frame.n, dtype=torch.int32)
+        ctx.frame, ctx.degree, ctx.stride = frame, degree, 3 * shN.shape[1]
+        ctx.save_for_backward(*attributes)
+        frame.finish(_flat(sh0), _flat(shN), ctx.stride, degree, _flat(means2d), _flat(radii))
+        ctx.mark_non_differentiable(radii)
+        return means2d, means.new_zeros(()), radii
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_means2d: Tensor, g_token: Tensor, g_radii: Tensor) -> tuple[Any, ...]:
+        frame: _Frame = ctx.frame
+        *_, sh0, shN = ctx.saved_tensors
+        gradients = [recycled(tuple(tensor.shape)) for tensor in ctx.saved_tensors]
+        project_backward(
+            frame.threads, frame.camera, *frame.geometry, _flat(sh0), _flat(shN), ctx.stride, ctx.degree,
+            frame.ids, frame.count, frame.records, frame.integers, frame.sums, _flat(g_means2d),
+            *(_flat(gradient) for gradient in gradients), frame.scratch,
+        )  # fmt: skip
+        return None, None, *gradients
+
+
+class _Blend(torch.autograd.Function):
+    """Projected splats to image, alpha and depth."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, frame: _Frame, means2d: Tensor, token: Tensor, background: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        shape = frame.height, frame.width
+        image, transmittance, depth = (means2d.new_empty(*shape, *last) for last in ((3,), (), ()))
+        frame.bin()
+        work = frame.work
+        frame.touched = work.array("touched", frame.entries.size, np.uint16)
+        frame.ends = work.array("ends", frame.tiles, np.int64)
+        blend(
+            frame.threads, frame.records, frame.entries, frame.offsets, frame.group_columns, frame.width, frame.height,
+            _flat(background), _GRID, frame.touched, frame.ends, _flat(image), _flat(transmittance), _flat(depth),
+            work.rows("blend", frame.threads, FORWARD_SCRATCH),
+            work.rows("masks", frame.threads, BATCH + 64, np.uint16), np.zeros(1, np.int64),
+        )  # fmt: skip
+        ctx.frame = frame
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(image, transmittance, depth)
+        return image, 1 - transmittance, depth
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, g_depth: Tensor | None) -> tuple[Any, ...]:
+        frame: _Frame = ctx.frame
+        image, transmittance, depth = ctx.saved_tensors
+        nothing = torch.zeros_like(transmittance) if g_alpha is None or g_depth is None else transmittance
+        with_depth = g_depth is not None
+        g_image = torch.zeros_like(image) if g_image is None else g_image
+        g_alpha = nothing if g_alpha is None else g_alpha
+        g_depth = nothing if g_depth is None else g_depth
+        work = frame.work
+        frame.sums = work.array("sums", RECORD * frame.slots)
+        g_means2d = torch.zeros(frame.n, 2)
+        blend_backward(
+            frame.threads, frame.records, frame.integers, frame.entries, frame.offsets, frame.ends,
+            frame.group_columns, frame.width, frame.height, _GRID, frame.touched,
+            *(_flat(tensor) for tensor in (image, transmittance, depth, g_image, g_alpha, g_depth)), with_depth,
+            frame.sums, frame.slots, work.rows("blend_backward", frame.threads, BACKWARD_SCRATCH),
+            np.zeros(1, np.int64),
+        )  # fmt: skip
+        total_slots(
+            frame.threads, frame.ids, frame.count, frame.slots, frame.records, frame.integers, frame.sums,
+            _flat(g_means2d),
+        )  # fmt: skip
+        g_background = None
+        if ctx.needs_input_grad[3]:
+            g_background = (g_image * transmittance[..., None]).sum((0, 1))
+        return None, g_means2d, torch.zeros(()), g_background
+
+
+def render_cpu(
+    splats: SplatTensors, camera: Camera, sh_degree: int, background: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
+
+    See :func:`nsvq_lightning.render` for the meaning of arguments and results.
+    """
+    attributes = splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN
+    frame = _Frame(splats, camera)
+    means2d, token, radii = _Project.apply(frame, sh_degree, *attributes)
+    image, alpha, depth = _Blend.apply(frame, means2d, token, background)
+    return image, alpha, radii, means2d, depth
+
+
+def visible_cpu(splats: SplatTensors, camera: Camera) -> Tensor:
+    """Which splats can change the image ``[N]`` bool."""
+    frame = _Frame(splats, camera)
+    found, counts, _ = frame.project()
+    mask = torch.zeros(frame.n, dtype=torch.bool)
+    rows = mask.numpy()
+    blocks = (frame.n + 15) // 16
+    for thread in range(frame.threads):
+        first = 16 * (blocks * thread // frame.threads)
+        rows[found[first : first + counts[thread]]] = True
+    return mask

@@ -1,0 +1,53 @@
+"""What the stages of the CPU back-end hand to one another.
+
+A *record* is one visible splat on the image plane, 16 floats (one cache line), written by the projection at the
+splat's own row. Its exponent is kept as a sum of squares, ``log2 α = LOG2_OPACITY - u² - v²`` with ``u = A·dx +
+B·dy`` and ``v = C·dy``: (A, B; 0, C) is the Cholesky factor of the inverse covariance times √(½·log2 e). The usual
+conic form loses 10 to 40 times more digits on needles and on splats of hundreds of pixels.
+
+A *group* is a square of 4x4 tiles of 16x16 pixels, the unit of work of the blend. A *slot* is 16 floats in which one
+group sums the gradients of one splat. Slots are numbered splat by splat, so that every splat's total is taken in one
+fixed order, whatever thread did which group: results have the same bits for any number of threads.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+F = np.float32
+
+RECORD = 16
+"""Floats in a record and in a slot."""
+
+# Fields of a record.
+X, Y, A, B, C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, SLOPE_X, SLOPE_Y, SLOT, ORIGIN, EXTENT, RADIUS = range(RECORD)
+"""SLOPE_X, SLOPE_Y: dy/dx and dx/dy of the exponent's ridges, for the largest value on a rectangle. The last four hold
+integers: first slot; first tile column and row; tile columns and rows (16 bits each); radius in pixels."""
+
+# Fields of a slot: with h = α·dL/dα, sums over pixels of w·g (colour), h, h·u, h·v, h·u², h·u·v, h·v², w·g (depth).
+SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_DEPTH = range(10)
+
+TILE_SHIFT = 4
+TILE = 1 << TILE_SHIFT
+GROUP_SHIFT = 2
+GROUP_TILES = 1 << 2 * GROUP_SHIFT
+"""Tiles in a group."""
+
+LOG2_ALPHA_MIN = F(-math.log2(255))
+LOG2_E = F(math.log2(math.e))
+FACTOR_SCALE = F(math.sqrt(0.5 * math.log2(math.e)))
+"""√(½·log2 e): turns the Cholesky factor of the inverse covariance into that of the binary exponent."""
+
+# Elements of the camera array of `pack_camera`.
+ROTATION, TRANSLATION, POSITION, FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, WIDTH, HEIGHT = (
+    0, 9, 12, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24,
+)  # fmt: skip
+CAMERA = 25
+
+
+def group_grid(width: int, height: int) -> tuple[int, int]:
+    """Columns and rows of groups that cover an image."""
+    side = TILE << GROUP_SHIFT
+    return -(-width // side), -(-height // side)

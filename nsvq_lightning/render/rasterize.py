@@ -1,0 +1,124 @@
+"""One function renders splats; the device chooses the back-end."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from nsvq_lightning.render.camera import Camera
+from nsvq_lightning.render.reference import render_reference, visible_rows
+from nsvq_lightning.splats import SplatTensors, sh_degree_of
+
+__all__ = ["BACKENDS", "Render", "render", "resolve_backend", "visible"]
+
+_Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+
+BACKENDS = ("auto", "reference", "cpu")
+"""Names that ``render(backend=...)`` takes; ``auto`` is the fastest one for the device of the splats."""
+
+
+class Render(NamedTuple):
+    """What :func:`render` returns.
+
+    Attributes:
+        image: Blended colour over the background, not clamped ``[H, W, 3]``.
+        alpha: Opacity of the pixel, 1 - transmittance ``[H, W]``.
+        radii: Radius in pixels of the area a splat can change, rounded up; 0 for splats that are not in view ``[N]``
+            int32.
+        means2d: Projected centres ``[N, 2]`` in pixels, x right, y down. Call ``retain_grad()`` on it before the
+        backward
+            pass to get screen-space gradients.
+        depth: Σ weight · view-space z ``[H, W]``; divide by ``alpha`` for the mean depth.
+    """
+
+    image: Tensor
+    alpha: Tensor
+    radii: Tensor
+    means2d: Tensor
+    depth: Tensor
+
+
+def render(
+    splats: SplatTensors,
+    camera: Camera,
+    *,
+    sh_degree: int | None = None,
+    background: Tensor | None = None,
+    backend: str = "auto",
+) -> Render:
+    """Render splats as a camera sees them (3D Gaussian Splatting, eq. 3), differentiable in all six raw attributes.
+
+    Args:
+        splats: Raw attributes, see :class:`nsvq_lightning.splats.SplatTensors` for shapes and spaces.
+        camera: Where to look from; COLMAP axes.
+        sh_degree: Highest degree of the spherical harmonics that is evaluated; all stored ones by default.
+        background: RGB ``[3]`` behind the splats; black by default.
+        backend: One of :data:`BACKENDS`.
+
+    Returns:
+        Image, alpha, radii, projected centres and depth; see :class:`Render`.
+
+    Raises:
+        ValueError: Unknown back-end, or a back-end that cannot take the device or type of the splats; ``sh_degree``
+        above
+            the stored degree; a background that is not ``[3]``.
+    """
+    stored = sh_degree_of(splats.shN)
+    degree = stored if sh_degree is None else sh_degree
+    if not 0 <= degree <= stored:
+        raise ValueError(f"sh_degree must be between 0 and the stored degree {stored}, got {sh_degree}")
+    means = splats.means
+    if background is None:
+        background = torch.zeros(3, dtype=means.dtype, device=means.device)
+    elif tuple(background.shape) != (3,):
+        raise ValueError(f"background must be one RGB colour of shape [3], got {list(background.shape)}")
+    return Render(*_rasterizer(resolve_backend(backend, means))(splats, camera, degree, background))
+
+
+@torch.no_grad()
+def visible(splats: SplatTensors, camera: Camera, *, backend: str = "auto") -> Tensor:
+    """Which splats can change the image: ``radii > 0`` without rendering ``[N]`` bool.
+
+    Args:
+        splats: Raw attributes; only means, quats, scales and opacities are read.
+        camera: Where to look from.
+        backend: One of :data:`BACKENDS`.
+    """
+    if resolve_backend(backend, splats.means) == "cpu":
+        from nsvq_lightning.render.cpu.rasterizer import visible_cpu
+
+        return visible_cpu(splats, camera)
+    mask = torch.zeros(splats.means.shape[0], dtype=torch.bool, device=splats.means.device)
+    mask[visible_rows(splats, camera)] = True
+    return mask
+
+
+def resolve_backend(backend: str, like: Tensor) -> str:
+    """The back-end that ``backend`` means for tensors such as ``like``.
+
+    Raises:
+        ValueError: It is unknown, or cannot take this device or floating-point type.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"unknown render backend {backend!r}; choose one of {', '.join(BACKENDS)}")
+    fits_cpu = like.device.type == "cpu" and like.dtype == torch.float32
+    if backend == "auto":
+        return "cpu" if fits_cpu else "reference"
+    if backend == "cpu" and not fits_cpu:
+        raise ValueError(
+            f"backend 'cpu' renders float32 tensors on the CPU, got {like.dtype} on {like.device}; "
+            "use backend='reference' or move the splats"
+        )
+    return backend
+
+
+def _rasterizer(backend: str) -> Callable[[SplatTensors, Camera, int, Tensor], _Outputs]:
+    if backend == "reference":
+        return render_reference
+    module = importlib.import_module("nsvq_lightning.render.cpu.rasterizer")
+    rasterizer: Callable[[SplatTensors, Camera, int, Tensor], _Outputs] = module.render_cpu
+    return rasterizer

@@ -1,0 +1,167 @@
+"""The oracle: Gaussian splatting in plain torch, on any device and in any floating-point type.
+
+Written for trust, not for speed: the fast back-ends are tested against it in float64.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from nsvq_lightning.render.camera import Camera
+from nsvq_lightning.render.constants import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    BLUR,
+    FRUSTUM_MARGIN,
+    MIN_SQUARED_NORM,
+    NEAR,
+    TRANSMITTANCE_MIN,
+)
+from nsvq_lightning.render.sh import sh_colors
+from nsvq_lightning.splats import RawSplats, SplatTensors
+
+__all__ = ["Projection", "project", "render_reference", "rotation_matrices", "visible_rows"]
+
+TILE = 32
+"""Side of the squares of pixels that are blended at a time."""
+
+
+class Projection(NamedTuple):
+    """Splats on the image plane.
+
+    Attributes:
+        means2d: Projected centres ``[N, 2]``, pixels.
+        covariances: Variances and covariance with the blur ``[N, 3]``: xx, xy, yy, square pixels.
+        determinants: Their determinants ``[N]``.
+        depths: View-space z ``[N]``.
+        half_sizes: Half width and height ``[N, 2]`` in pixels of the box outside which α stays below 1/255; 0 for a
+            splat that never reaches it.
+    """
+
+    means2d: Tensor
+    covariances: Tensor
+    determinants: Tensor
+    depths: Tensor
+    half_sizes: Tensor
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Rotations ``[N, 3, 3]`` of quaternions ``[N, 4]`` (wxyz, any norm; zero is the identity)."""
+    norm = quats.square().sum(-1, keepdim=True).clamp_min(MIN_SQUARED_NORM).sqrt()
+    w, x, y, z = (quats / norm).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def project(splats: SplatTensors, camera: Camera) -> Projection:
+    """Project splats through the local affine approximation of the camera (EWA splatting).
+
+    The determinant uses Lagrange's identity, |u|²|v|² - (u·v)² = |u × v|²: the naive difference loses every digit for
+    splats of thousands of pixels.
+    """
+    means = splats.means
+    viewmat = camera.viewmat.to(means)
+    fx, fy, cx, cy = camera.intrinsics
+    rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
+    x, y, z = (means @ rotation.T + translation).unbind(-1)
+    margin_x, margin_y = (FRUSTUM_MARGIN * 0.5 * side / f for side, f in ((camera.width, fx), (camera.height, fy)))
+    slope_x = (x / z).clamp(-cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
+    slope_y = (y / z).clamp(-cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack([fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], -1).view(-1, 2, 3)
+    axes = rotation_matrices(splats.quats) * splats.scales.exp()[:, None, :]
+    u, v = (jacobian @ rotation @ axes).unbind(1)
+    xx, xy, yy = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
+    determinant = torch.linalg.cross(u, v).square().sum(-1) + BLUR * (xx + yy) + BLUR * BLUR
+    covariance = torch.stack([xx + BLUR, xy, yy + BLUR], -1)
+    reach = 2 * (torch.sigmoid(splats.opacities.detach()) / ALPHA_MIN).log().clamp_min(0)
+    half = (reach[:, None] * covariance.detach()[:, [0, 2]]).sqrt()
+    return Projection(torch.stack([fx * x / z + cx, fy * y / z + cy], -1), covariance, determinant, z, half)
+
+
+def _on_image(projection: Projection, camera: Camera) -> Tensor:
+    """Which splats are in front of the near plane and reach 1/255 at a pixel centre of the image ``[N]`` bool."""
+    low = (projection.means2d - projection.half_sizes - 0.5).ceil().clamp_min(0)
+    size = projection.means2d.new_tensor([camera.width - 1, camera.height - 1])
+    high = torch.minimum((projection.means2d + projection.half_sizes - 0.5).floor(), size)
+    reached = (projection.half_sizes > 0).all(-1) & (low <= high).all(-1)
+    return (projection.depths > NEAR) & reached & torch.isfinite(projection.determinants)
+
+
+@torch.no_grad()
+def visible_rows(splats: SplatTensors, camera: Camera) -> Tensor:
+    """Rows of the splats that can change the image ``[V]``; splats with a non-finite geometry are not among them."""
+    return _on_image(project(splats, camera), camera).nonzero()[:, 0]
+
+
+def render_reference(
+    splats: SplatTensors, camera: Camera, sh_degree: int, background: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``, differentiable.
+
+    See :func:`nsvq_lightning.render` for the meaning of arguments and results.
+    """
+    rows = visible_rows(splats, camera)
+    seen = RawSplats(*(getattr(splats, name)[rows] for name in ("means", "quats", "scales", "opacities", "sh0", "shN")))
+    projection = project(seen, camera)
+    n = splats.means.shape[0]
+    means2d = splats.means.new_zeros(n, 2).index_copy(0, rows, projection.means2d)
+    radii = torch.zeros(n, dtype=torch.int32, device=rows.device)
+    radii[rows] = projection.half_sizes.amax(-1).ceil().clamp_max(2**30).to(torch.int32)
+
+    direction = seen.means - camera.to(seen.means.device, seen.means.dtype).position
+    direction = direction / direction.square().sum(-1, keepdim=True).clamp_min(1e-20).sqrt()
+    colors = sh_colors(direction, seen.sh0, seen.shN, sh_degree)
+    features = torch.cat([colors, projection.depths[:, None]], -1)
+    xx, xy, yy = projection.covariances.unbind(-1)
+    conics = torch.stack([yy, -xy, xx], -1) / projection.determinants[:, None]
+    opacities = torch.sigmoid(seen.opacities)
+    centres = means2d[rows]
+
+    order = torch.sort(projection.depths.detach(), stable=True).indices
+    low = (centres - projection.half_sizes).detach()[order]
+    high = (centres + projection.half_sizes).detach()[order]
+    strips = []
+    for top in range(0, camera.height, TILE):
+        bottom = min(top + TILE, camera.height)
+        tiles = []
+        for left in range(0, camera.width, TILE):
+            right = min(left + TILE, camera.width)
+            here = (low[:, 0] <= right) & (high[:, 0] >= left) & (low[:, 1] <= bottom) & (high[:, 1] >= top)
+            near = order[here]
+            ys, xs = torch.meshgrid(
+                torch.arange(top, bottom).to(centres), torch.arange(left, right).to(centres), indexing="ij"
+            )
+            pixels = torch.stack([xs, ys], -1).reshape(-1, 2) + 0.5
+            inputs = (pixels, centres[near], conics[near], opacities[near], features[near])
+            blended = checkpoint(_blend, *inputs, use_reentrant=False) if torch.is_grad_enabled() else _blend(*inputs)
+            tiles.append(blended.view(bottom - top, right - left, 5))
+        strips.append(torch.cat(tiles, 1))
+    blended = torch.cat(strips, 0)
+    transmittance = blended[..., 4]
+    image = blended[..., :3] + transmittance[..., None] * background.to(blended)
+    return image, 1 - transmittance, radii, means2d, blended[..., 3]
+
+
+def _blend(pixels: Tensor, centres: Tensor, conics: Tensor, opacities: Tensor, features: Tensor) -> Tensor:
+    """Front-to-back blend of sorted splats at ``pixels [P, 2]``: Σ w·feature and the transmittance left ``[P, 5]``."""
+    if centres.shape[0] == 0:
+        return torch.cat([pixels.new_zeros(pixels.shape[0], 4), pixels.new_ones(pixels.shape[0], 1)], 1)
+    dx, dy = (pixels[:, None] - centres[None]).unbind(-1)
+    power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy
+    alpha = (opacities * power.clamp_max(0).exp()).clamp_max(ALPHA_MAX)
+    alpha = torch.where(alpha >= ALPHA_MIN, alpha, torch.zeros_like(alpha))
+    with torch.no_grad():
+        running = (1 - alpha).cumprod(1) >= TRANSMITTANCE_MIN
+    alpha = torch.where(running, alpha, torch.zeros_like(alpha))
+    transmittance = (1 - alpha).cumprod(1)
+    before = torch.cat([torch.ones_like(transmittance[:, :1]), transmittance[:, :-1]], 1)
+    return torch.cat([(alpha * before) @ features, transmittance[:, -1:]], 1)

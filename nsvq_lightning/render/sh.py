@@ -1,0 +1,48 @@
+"""Real spherical harmonics up to degree 3, in the order and sign of 3D Gaussian Splatting."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["C0", "C1", "C2", "C3", "sh_basis", "sh_colors"]
+
+C0 = 0.28209479177387814
+C1 = 0.4886025119029199
+C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """Values ``[N, (degree + 1)²]`` of the basis at unit ``directions [N, 3]``."""
+    x, y, z = directions.unbind(-1)
+    basis = [torch.full_like(x, C0)]
+    if degree > 0:
+        basis += [-C1 * y, C1 * z, -C1 * x]
+    if degree > 1:
+        xx, yy, zz = x * x, y * y, z * z
+        basis += [C2[0] * x * y, -C2[0] * y * z, C2[1] * (2 * zz - xx - yy), -C2[0] * x * z, C2[2] * (xx - yy)]
+    if degree > 2:
+        basis += [
+            -C3[0] * y * (3 * xx - yy),
+            C3[1] * x * y * z,
+            -C3[2] * y * (4 * zz - xx - yy),
+            C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+            -C3[2] * x * (4 * zz - xx - yy),
+            C3[4] * z * (xx - yy),
+            -C3[0] * x * (xx - 3 * yy),
+        ]
+    return torch.stack(basis, -1)
+
+
+def sh_colors(directions: Tensor, sh0: Tensor, shN: Tensor, degree: int) -> Tensor:
+    """Colours ``[N, 3]`` seen along unit ``directions [N, 3]``: 0.5 + Σ coefficient · basis, not below 0.
+
+    Args:
+        directions: From the camera to the splat, unit length ``[N, 3]``.
+        sh0: Constant coefficients ``[N, 1, 3]``.
+        shN: Higher coefficients ``[N, ≥ (degree + 1)² - 1, 3]``; those above ``degree`` are ignored.
+        degree: Highest degree used.
+    """
+    coefficients = torch.cat([sh0, shN[:, : (degree + 1) ** 2 - 1]], 1)
+    return ((sh_basis(directions, degree)[..., None] * coefficients).sum(1) + 0.5).clamp_min(0)

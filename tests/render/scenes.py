@@ -1,0 +1,43 @@
+"""Small random scenes for the rasterizer tests."""
+
+from __future__ import annotations
+
+import torch
+
+from nsvq_lightning.render.camera import Camera
+from nsvq_lightning.splats import RawSplats
+
+
+def random_splats(n: int, seed: int = 0, sh_degree: int = 3, log_scale: float = -2.5) -> RawSplats:
+    """Splats in a ball around the origin, seen well by :func:`front_camera`."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    return RawSplats(
+        means=normal(n, 3) * 0.8,
+        quats=normal(n, 4),
+        scales=log_scale + 0.6 * normal(n, 3),
+        opacities=1.5 * normal(n),
+        sh0=normal(n, 1, 3),
+        shN=0.2 * normal(n, (sh_degree + 1) ** 2 - 1, 3),
+    )
+
+
+def front_camera(width: int = 70, height: int = 45, cx: float | None = None, cy: float | None = None) -> Camera:
+    """A camera four units in front of the origin, slightly turned."""
+    focal = 0.9 * width
+    K = torch.tensor(
+        [
+            [focal, 0, width / 2 if cx is None else cx],
+            [0, 1.1 * focal, height / 2 if cy is None else cy],
+            [0, 0, 1],
+        ]
+    )
+    angle = torch.tensor(0.3)
+    viewmat = torch.eye(4)
+    viewmat[0, 0] = viewmat[2, 2] = angle.cos()
+    viewmat[0, 2], viewmat[2, 0] = angle.sin(), -angle.sin()
+    viewmat[:3, 3] = torch.tensor([0.1, -0.05, 4.0])
+    return Camera(K, viewmat, width, height)

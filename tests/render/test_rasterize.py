@@ -1,0 +1,220 @@
+"""The CPU back-end against the float64 oracle, and the oracle against finite differences."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numba
+import pytest
+import torch
+
+from nsvq_lightning.render.camera import Camera
+from nsvq_lightning.render.rasterize import Render, render, resolve_backend, visible
+from nsvq_lightning.splats import ATTRIBUTES, RawSplats, Splats
+
+sys.path.insert(0, str(Path(__file__).parent))
+from scenes import front_camera, random_splats
+
+Gradients = dict[str, torch.Tensor]
+
+
+def run(
+    splats: RawSplats,
+    camera: Camera,
+    backend: str,
+    dtype: torch.dtype,
+    background: torch.Tensor | None = None,
+    **options: int,
+) -> tuple[Render, Gradients]:
+    """Render, and differentiate a random combination of image, alpha and depth."""
+    leaves = RawSplats(*(tensor.to(dtype).clone().requires_grad_() for tensor in splats))
+    background = None if background is None else background.to(dtype)
+    result = render(leaves, camera, backend=backend, background=background, **options)  # type: ignore[arg-type]
+    result.means2d.retain_grad()
+    generator = torch.Generator().manual_seed(99)
+    weights = [torch.randn(camera.height, camera.width, k, generator=generator).to(dtype) for k in (3, 1, 1)]
+    outputs = (result.image, result.alpha[..., None], result.depth[..., None])
+    torch.stack([(weight * output).sum() for weight, output in zip(weights, outputs, strict=True)]).sum().backward()
+    gradients = {name: leaf.grad for name, leaf in zip(ATTRIBUTES, leaves, strict=True) if leaf.grad is not None}
+    assert result.means2d.grad is not None
+    return result, {**gradients, "means2d": result.means2d.grad}
+
+
+def assert_same(splats: RawSplats, camera: Camera, tolerance: float = 1e-4, **options: object) -> None:
+    """Images within 1e-4, gradients within a relative L2 error of 1e-4 of the float64 oracle."""
+    fast, fast_gradients = run(splats, camera, "cpu", torch.float32, **options)  # type: ignore[arg-type]
+    oracle, gradients = run(splats, camera, "reference", torch.float64, **options)  # type: ignore[arg-type]
+    torch.testing.assert_close(fast.image.double(), oracle.image, atol=tolerance, rtol=0)
+    torch.testing.assert_close(fast.alpha.double(), oracle.alpha, atol=tolerance, rtol=0)
+    torch.testing.assert_close(fast.depth.double(), oracle.depth, atol=10 * tolerance, rtol=tolerance)
+    torch.testing.assert_close(fast.means2d.double(), oracle.means2d, atol=1e-3, rtol=1e-5)
+    torch.testing.assert_close(fast.radii, oracle.radii, atol=1, rtol=0)
+    for name, expected in gradients.items():
+        norm = expected.norm().item()
+        assert torch.isfinite(fast_gradients[name]).all(), name
+        error = (fast_gradients[name].double() - expected).norm().item()
+        assert error <= tolerance * max(norm, 1e-12), f"{name}: relative error {error / max(norm, 1e-12):.1e}"
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("stored", [0, 1, 2, 3])
+def test_sh_degrees(sh_degree: int, stored: int) -> None:
+    if sh_degree <= stored:
+        assert_same(random_splats(150, sh_degree=stored), front_camera(), sh_degree=sh_degree)
+
+
+@pytest.mark.parametrize(
+    ("width", "height"), [(64, 64), (70, 45), (16, 16), (17, 31), (6, 3), (1, 1), (1, 50), (129, 5)]
+)
+def test_image_sizes(width: int, height: int) -> None:
+    assert_same(random_splats(120, seed=2), front_camera(width, height))
+
+
+@pytest.mark.parametrize("background", [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.2, 0.5, 0.9]])
+def test_backgrounds(background: list[float]) -> None:
+    assert_same(random_splats(100, seed=3), front_camera(), background=torch.tensor(background))
+
+
+def test_principal_point_off_centre() -> None:
+    assert_same(random_splats(150, seed=4), front_camera(90, 60, cx=20.3, cy=51.7))
+
+
+def test_saturated_pixels_stop_early() -> None:
+    splats = random_splats(400, seed=5, log_scale=-1.0)
+    splats = splats._replace(opacities=splats.opacities + 5)
+    camera = front_camera()
+    assert float(render(splats, camera).alpha.max()) > 0.999
+    assert_same(splats, camera)
+
+
+def test_tiny_and_huge_splats() -> None:
+    splats = random_splats(200, seed=6)
+    scales = splats.scales.clone()
+    scales[:40], scales[40:50], scales[50:80, 0] = -12.0, 1.0, 0.5
+    assert_same(splats._replace(scales=scales), front_camera())
+
+
+@pytest.mark.parametrize("count", [1, 2, 15, 16, 17, 33])
+def test_counts_around_the_vector_width(count: int) -> None:
+    assert_same(random_splats(count, seed=7), front_camera())
+
+
+def test_splats_behind_and_beside_the_camera() -> None:
+    splats = random_splats(200, seed=8)
+    means = splats.means.clone()
+    means[:50, 2] -= 8
+    means[50:100, 0] += 5
+    assert_same(splats._replace(means=means), front_camera())
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("count", [1, 40, 300])
+def test_bits_do_not_depend_on_the_number_of_threads(threads: int, count: int) -> None:
+    if threads > numba.config.NUMBA_NUM_THREADS:
+        pytest.skip("this machine has one core")
+    before = torch.get_num_threads()
+    splats, camera = random_splats(count, seed=9), front_camera(150, 100)
+    expected, gradients = run(splats, camera, "cpu", torch.float32)
+    try:
+        torch.set_num_threads(threads)
+        result, again = run(splats, camera, "cpu", torch.float32)
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for a, b in zip(expected, result, strict=True))
+    assert all(torch.equal(gradients[name], again[name]) for name in gradients)
+
+
+def test_no_splat_in_view_is_background() -> None:
+    splats = random_splats(20)
+    behind = splats._replace(means=splats.means - torch.tensor([0.0, 0.0, 50.0]))
+    background = torch.tensor([0.1, 0.2, 0.3])
+    result, gradients = run(behind, front_camera(), "cpu", torch.float32, background=background)
+    assert not visible(behind, front_camera()).any()
+    torch.testing.assert_close(result.image, background.expand_as(result.image))
+    assert all((gradient == 0).all() for gradient in gradients.values())
+    nothing = RawSplats(*(tensor[:0] for tensor in splats))
+    torch.testing.assert_close(render(nothing, front_camera(), background=background).image, result.image.detach())
+
+
+@pytest.mark.parametrize("attribute", ["means", "quats", "scales", "opacities"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_broken_splats_leave_the_rest_alone(attribute: str, value: float) -> None:
+    splats = random_splats(100, seed=10)
+    broken = splats._replace(**{attribute: splats._asdict()[attribute].clone()})
+    getattr(broken, attribute)[:7] = value
+    result, gradients = run(broken, front_camera(), "cpu", torch.float32)
+    assert torch.isfinite(result.image).all()
+    assert all(torch.isfinite(gradient).all() for gradient in gradients.values())
+    if attribute in ("means", "scales") and value != -float("inf"):
+        rest = RawSplats(*(tensor[7:] for tensor in splats))
+        torch.testing.assert_close(result.image, render(rest, front_camera()).image, atol=1e-6, rtol=0)
+
+
+def test_zero_quaternion_is_the_identity() -> None:
+    splats = random_splats(10)
+    zero = splats._replace(quats=torch.zeros_like(splats.quats))
+    identity = splats._replace(quats=torch.tensor([1.0, 0, 0, 0]).repeat(10, 1))
+    torch.testing.assert_close(render(zero, front_camera()).image, render(identity, front_camera()).image)
+    _, gradients = run(zero, front_camera(), "cpu", torch.float32)
+    assert torch.isfinite(gradients["quats"]).all()
+
+
+def test_visible_is_radii() -> None:
+    splats, camera = random_splats(200, seed=11), front_camera(40, 30, cx=3.0)
+    result = render(splats, camera)
+    for backend in ("cpu", "reference"):
+        torch.testing.assert_close(visible(splats, camera, backend=backend), result.radii > 0)
+    assert 0 < int((result.radii > 0).sum()) < 200
+
+
+def test_two_renders_are_alive_at_once() -> None:
+    splats = random_splats(100, seed=12)
+    leaves = RawSplats(*(tensor.clone().requires_grad_() for tensor in splats))
+    cameras = front_camera(), front_camera(50, 60)
+    images = [render(leaves, camera).image for camera in cameras]
+    sum(image.square().sum() for image in images).backward()
+    together = leaves.means.grad
+    apart = torch.zeros_like(leaves.means)
+    for camera in cameras:
+        single = RawSplats(*(tensor.clone().requires_grad_() for tensor in splats))
+        render(single, camera).image.square().sum().backward()
+        assert single.means.grad is not None
+        apart += single.means.grad
+    torch.testing.assert_close(together, apart)
+
+
+def test_backward_twice_gives_the_same() -> None:
+    leaves = RawSplats(*(tensor.clone().requires_grad_() for tensor in random_splats(50)))
+    loss = render(leaves, front_camera()).image.sum()
+    first = torch.autograd.grad(loss, leaves, retain_graph=True)
+    second = torch.autograd.grad(loss, leaves)
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+def test_oracle_against_finite_differences() -> None:
+    splats = random_splats(6, seed=13, sh_degree=1, log_scale=-1.2)
+    leaves = RawSplats(*(tensor.double().requires_grad_() for tensor in splats))
+    camera = front_camera(12, 9)
+
+    def image(*tensors: torch.Tensor) -> torch.Tensor:
+        return render(RawSplats(*tensors), camera, backend="reference").image
+
+    assert torch.autograd.gradcheck(image, tuple(leaves), eps=1e-6, atol=1e-5)
+
+
+def test_auto_takes_the_fast_backend() -> None:
+    assert resolve_backend("auto", torch.zeros(1)) == "cpu"
+    assert resolve_backend("auto", torch.zeros(1, dtype=torch.float64)) == "reference"
+
+
+def test_bad_arguments_say_what_to_do() -> None:
+    splats, camera = Splats.from_tensors(*random_splats(3)), front_camera()
+    with pytest.raises(ValueError, match="choose one of"):
+        render(splats, camera, backend="vulkan")
+    with pytest.raises(ValueError, match="sh_degree"):
+        render(splats, camera, sh_degree=4)
+    with pytest.raises(ValueError, match="background"):
+        render(splats, camera, background=torch.zeros(4))
+    with pytest.raises(ValueError, match="float64"):
+        render(RawSplats(*(tensor.double() for tensor in splats.raw())), camera, backend="cpu")

@@ -1,0 +1,74 @@
+"""The photometric loss against scikit-image and against plain torch in float64."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+
+from nsvq_lightning.losses import photometric_loss, ssim
+
+
+def pair(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(height * 1000 + width)
+    image = torch.rand(height, width, 3, generator=generator)
+    return image, (image + 0.2 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1)
+
+
+def test_ssim_is_scikit_images_on_a_zero_padded_image() -> None:
+    image, target = pair(40, 50)
+    padded = [np.pad(x.double().numpy(), ((5, 5), (5, 5), (0, 0))) for x in (image, target)]
+    _, full = structural_similarity(
+        *padded,
+        channel_axis=-1,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        full=True,
+    )
+    expected = full[5:-5, 5:-5].mean()
+    assert float(ssim(image.double(), target.double())) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(("height", "width"), [(64, 70), (1, 6), (3, 20), (12, 33), (30, 6), (200, 7), (9, 5)])
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_fused_loss_and_gradient(height: int, width: int, weight: float) -> None:
+    image, target = pair(height, width)
+    fused, oracle = image.clone().requires_grad_(), image.double().requires_grad_()
+    loss = photometric_loss(fused, target, weight)
+    expected = photometric_loss(oracle, target.double(), weight)
+    (3 * loss).backward()
+    (3 * expected).backward()
+    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-6, abs=2e-7)
+    assert fused.grad is not None
+    assert oracle.grad is not None
+    assert float((fused.grad - oracle.grad).norm() / oracle.grad.norm()) < 1e-6
+
+
+def test_bits_do_not_depend_on_the_number_of_threads() -> None:
+    image, target = pair(100, 64)
+    results = []
+    before = torch.get_num_threads()
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        leaf = image.clone().requires_grad_()
+        loss = photometric_loss(leaf, target)
+        loss.backward()
+        results.append((loss.detach(), leaf.grad))
+    torch.set_num_threads(before)
+    assert torch.equal(results[0][0], results[1][0])
+    assert results[0][1] is not None
+    assert results[1][1] is not None
+    assert torch.equal(results[0][1], results[1][1])
+
+
+def test_equal_images_have_no_loss() -> None:
+    image, _ = pair(20, 20)
+    assert float(photometric_loss(image, image)) == pytest.approx(0, abs=1e-6)
+
+
+def test_shapes_must_agree() -> None:
+    with pytest.raises(ValueError, match=r"\[H, W, 3\]"):
+        photometric_loss(torch.zeros(4, 5, 3), torch.zeros(5, 4, 3))
