@@ -32,6 +32,10 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     Returns:
         Scalar, 1 for equal images (Wang et al. 2004, eq. 13; beyond the border the images count as 0).
     """
+    if _is_fusible(image, target) and not (torch.is_grad_enabled() and image.requires_grad):
+        from nsvq_lightning.render.cpu.dssim import l1_dssim
+
+        return image.new_tensor(1 - l1_dssim(image.contiguous(), target.contiguous(), 1.0)[0])
     taps = ssim_window().to(image)
     planes = [image, target, image * image, target * target, image * target]
     stacked = torch.cat([plane.movedim(-1, 0) for plane in planes])[:, None]
@@ -60,11 +64,16 @@ def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2) -
     """
     if image.shape != target.shape or image.dim() != 3 or image.shape[-1] != 3:
         raise ValueError(f"image and target must both be [H, W, 3], got {list(image.shape)} and {list(target.shape)}")
-    fused = image.device.type == "cpu" and image.dtype == target.dtype == torch.float32
-    if fused and not target.requires_grad and 3 * image.shape[1] >= 16:
+    if _is_fusible(image, target):
         loss: Tensor = _FusedLoss.apply(image, target, dssim_weight)  # type: ignore[no-untyped-call]
         return loss
     return (1 - dssim_weight) * (image - target).abs().mean() + dssim_weight * (1 - ssim(image, target))
+
+
+def _is_fusible(image: Tensor, target: Tensor) -> bool:
+    """Whether the fused sweep can take the images: float32 on the CPU, and rows of at least one vector."""
+    fits = image.device.type == "cpu" and image.dtype == target.dtype == torch.float32 and 3 * image.shape[1] >= 16
+    return fits and not target.requires_grad
 
 
 class _FusedLoss(torch.autograd.Function):

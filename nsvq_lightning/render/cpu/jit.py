@@ -20,8 +20,9 @@ _OPTIONS: dict[str, Any] = {
     "nogil": True,
 }
 
+_PACKAGE = Path(__file__).parents[2]
 _SOURCES = hashlib.sha256()
-for _path in sorted(Path(__file__).parent.glob("*.py")):
+for _path in sorted([*Path(__file__).parent.glob("*.py"), *(_PACKAGE / "quantize").glob("*.py")]):
     _SOURCES.update(_path.read_bytes())
 _STAMP = _SOURCES.hexdigest()
 

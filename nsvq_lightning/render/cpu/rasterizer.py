@@ -156,7 +156,7 @@ class _Blend(torch.autograd.Function):
         ctx: Any, frame: _Frame, means2d: Tensor, token: Tensor, background: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         shape = frame.height, frame.width
-        image, transmittance, depth = (means2d.new_empty(*shape, *last) for last in ((3,), (), ()))
+        image, transmittance, depth, alpha = (recycled((*shape, *last)) for last in ((3,), (), (), ()))
         frame.bin()
         work = frame.work
         frame.touched = work.array("touched", frame.entries.size, np.uint16)
@@ -170,7 +170,7 @@ class _Blend(torch.autograd.Function):
         ctx.frame = frame
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(image, transmittance, depth)
-        return image, 1 - transmittance, depth
+        return image, torch.sub(1, transmittance, out=alpha), depth
 
     @staticmethod
     @once_differentiable

@@ -52,7 +52,7 @@ class Workspace:
 
 
 _RECYCLED: dict[tuple[int, ...], list[Array]] = {}
-_SPARE = 2
+_SPARE = 4
 """Buffers of one shape that are kept when nobody holds them."""
 _REFERENCES_OF_IDLE = 3
 """References to an idle buffer while it is looked at: the list's, the loop's and getrefcount's own."""
@@ -61,8 +61,8 @@ _REFERENCES_OF_IDLE = 3
 def recycled(shape: tuple[int, ...]) -> Tensor:
     """A float32 tensor with unspecified content, in memory whose former tensor is gone.
 
-    Gradients of large scenes come and go at every step; taking them from the system each time would cost more in page
-    faults than computing them.
+    Images and the gradients of large scenes come and go at every step; taking them from the system each time would cost
+    more in page faults than computing them.
     """
     if shape not in _RECYCLED:
         # The number of splats changes at densification: the buffers of old shapes are of no more use.

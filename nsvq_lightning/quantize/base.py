@@ -1,0 +1,52 @@
+"""What a quantizer must offer to be driven by the callbacks."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+__all__ = ["Quantizer"]
+
+
+@runtime_checkable
+class Quantizer(Protocol):
+    """Vector quantizer of one attribute: rows ``[N, D]`` to codes ``[N]`` into a codebook ``[K, D]``.
+
+    Implementations are ``nn.Module``s whose ``codebook`` is an ``nn.Parameter`` and whose usage counters and frozen
+    codes are buffers, so that checkpoints and device moves carry them.
+    """
+
+    codebook: Tensor
+    """Codebook ``[K, D]`` in the raw space of the attribute."""
+    codes: Tensor
+    """Frozen codes ``[N]`` int64, empty until :meth:`freeze`."""
+    usage: Tensor
+    """Iterations of the current window in which each code was hit at least once, ``[K]`` int64."""
+    window: Tensor
+    """Iterations in the current window, scalar int64."""
+
+    def fit(self, x: Tensor, weight: Tensor | None = None, generator: torch.Generator | None = None) -> None:
+        """Place the codebook on the rows ``x [N, D]`` (k-means); ``K`` shrinks to the number of distinct rows."""
+
+    def forward(
+        self, x: Tensor, generator: torch.Generator | None = None, rows: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Quantize ``x [V, D]`` for training: differentiable ``x_q [V, D]`` and codes ``[V]``; counts the usage.
+
+        ``rows [V]`` are the numbers of these rows among all N where only some are given: frozen codes are looked up by
+        them, and a search may start from what it knows about them.
+        """
+
+    def encode(self, x: Tensor) -> Tensor:
+        """Nearest codes ``[N]`` int64 of ``x [N, D]``."""
+
+    def decode(self, codes: Tensor) -> Tensor:
+        """Codebook rows ``[N, D]`` of ``codes [N]``, differentiable in the codebook."""
+
+    def replace_unused(self, generator: torch.Generator) -> Tensor:
+        """Replace inactive codes by active ones, restart the window; returns the replaced codes ``[R]``."""
+
+    def freeze(self, codes: Tensor) -> None:
+        """Fix the codes ``[N]``; from now on only the codebook is trained."""

@@ -1,0 +1,243 @@
+"""A codebook that is fitted, counted, repaired, frozen and stored: what every vector quantizer here shares."""
+
+from __future__ import annotations
+
+import logging
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from nsvq_lightning.quantize.kmeans import kmeans
+from nsvq_lightning.quantize.nearest import nearest
+from nsvq_lightning.quantize.replacement import choose_replacements, inactive_codes
+from nsvq_lightning.quantize.sums import lookup
+from nsvq_lightning.quantize.tracking import NearestTracker
+from nsvq_lightning.random import generator as seeded
+
+__all__ = ["CodebookQuantizer"]
+
+_log = logging.getLogger(__name__)
+
+
+class CodebookQuantizer(nn.Module, ABC):
+    """Base of the quantizers with one codebook; a subclass says how training sees the quantization.
+
+    Args:
+        num_codes: Codes K, at least 1; :meth:`fit` may leave fewer.
+        dim: Numbers in a row, D.
+        kmeans_steps: Lloyd steps of :meth:`fit`.
+
+    Attributes:
+        codebook: Codes ``[K, D]`` in the raw space of the attribute, 0 until :meth:`fit`.
+        usage: Iterations of the window in which each code was hit at least once, ``[K]`` int64.
+        window: Iterations in the window, scalar int64.
+        codes: Frozen codes ``[N]`` int64, empty until :meth:`freeze`.
+        fitted: Whether the codebook has been placed, scalar bool.
+
+    Raises:
+        ValueError: An argument is out of range.
+    """
+
+    codebook: nn.Parameter
+    usage: Tensor
+    window: Tensor
+    codes: Tensor
+    fitted: Tensor
+
+    def __init__(self, num_codes: int, dim: int, *, kmeans_steps: int = 10) -> None:
+        super().__init__()
+        for name, value, least in (("num_codes", num_codes, 1), ("dim", dim, 1), ("kmeans_steps", kmeans_steps, 0)):
+            if value < least:
+                raise ValueError(f"{name} must be at least {least}, got {value}")
+        self.kmeans_steps = kmeans_steps
+        self._tracker = NearestTracker()
+        self.codebook = nn.Parameter(torch.zeros(num_codes, dim))
+        self.register_buffer("usage", torch.zeros(num_codes, dtype=torch.int64))
+        self.register_buffer("window", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("codes", torch.zeros(0, dtype=torch.int64))
+        self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
+
+    @abstractmethod
+    def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator) -> Tensor:
+        """Differentiable stand-in ``[N, D]`` for the codes ``[N]`` of the rows ``x [N, D]`` in training."""
+
+    @property
+    def num_codes(self) -> int:
+        """Codes K."""
+        return self.codebook.shape[0]
+
+    @property
+    def dim(self) -> int:
+        """Numbers in a row, D."""
+        return self.codebook.shape[1]
+
+    @property
+    def bits(self) -> int:
+        """Bits of a stored code: ⌈log2 K⌉, at least 1."""
+        return max(1, (self.num_codes - 1).bit_length())
+
+    @property
+    def frozen(self) -> bool:
+        """Whether :meth:`freeze` has fixed the codes."""
+        return self.codes.numel() > 0
+
+    def extra_repr(self) -> str:
+        """Sizes, for ``print(module)``."""
+        return f"num_codes={self.num_codes}, dim={self.dim}, frozen={self.frozen}"
+
+    def fit(self, x: Tensor, weight: Tensor | None = None, generator: torch.Generator | None = None) -> None:
+        """Place the codebook on rows by k-means; K becomes at most the number of distinct rows.
+
+        The parameter stays the same object, as an optimiser group refers to it; fit before its first optimiser step.
+
+        Args:
+            x: Rows ``[N, D]``.
+            weight: Weight of each row, ``[N]``, not negative.
+            generator: Source of the start; by default a fixed one.
+
+        Raises:
+            ValueError: ``x`` does not have D columns, has no row, or has a number that is not finite.
+        """
+        if x.dim() != 2 or x.shape[1] != self.dim:
+            raise ValueError(f"rows must have shape [N, {self.dim}], got {list(x.shape)}")
+        centroids = kmeans(x, self.num_codes, generator or seeded(0), weight, self.kmeans_steps)
+        self._resize(centroids.shape[0])
+        with torch.no_grad():
+            self.codebook.copy_(centroids)
+        self.fitted.fill_(True)
+        self.reset_usage()
+
+    def forward(
+        self, x: Tensor, generator: torch.Generator | None = None, rows: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Quantize rows; in training this counts the codes that are hit.
+
+        Args:
+            x: Rows ``[V, D]``.
+            generator: Source of the noise, needed in training.
+            rows: Numbers ``[V]`` int64 of these rows among the N rows of the scene: frozen codes need them where they
+                are only some of them, and they let the search use what it knows from earlier steps.
+
+        Returns:
+            ``x_q [V, D]``, differentiable, and the codes ``[V]`` int64.
+
+        Raises:
+            ValueError: In training no generator is given, or codes are frozen for another number of rows.
+        """
+        if self.frozen:
+            codes = self._frozen_codes(x.shape[0], rows)
+            return self.decode(codes), codes
+        codes = self._tracker.search(x, self.codebook, rows)
+        if not self.training:
+            return self.decode(codes), codes
+        if generator is None:
+            raise ValueError(
+                "a quantizer in training needs a generator: pass nsvq_lightning.random.generator(seed, step)"
+            )
+        self.count(codes)
+        return self.approximate(x, codes, generator), codes
+
+    def encode(self, x: Tensor) -> Tensor:
+        """Nearest codes ``[N]`` int64 of ``x [N, D]``."""
+        return nearest(x.detach(), self.codebook.detach())
+
+    def decode(self, codes: Tensor) -> Tensor:
+        """Codebook rows ``[N, D]`` of ``codes [N]``, differentiable in the codebook."""
+        return lookup(self.codebook, codes)
+
+    @torch.no_grad()
+    def count(self, codes: Tensor) -> None:
+        """Count one iteration in which ``codes [N]`` were hit."""
+        hit = torch.zeros_like(self.usage)
+        hit[codes] = 1
+        self.usage += hit
+        self.window += 1
+
+    def reset_usage(self) -> None:
+        """Start a new window."""
+        self.usage.zero_()
+        self.window.zero_()
+
+    def perplexity(self) -> float:
+        """Effective number of codes, exp of the entropy of the usage in this window; 0 before the first count."""
+        total = int(self.usage.sum())
+        if total == 0:
+            return 0.0
+        share = self.usage[self.usage > 0].double() / total
+        return math.exp(-float((share * share.log()).sum()))
+
+    @torch.no_grad()
+    def replace_unused(self, generator: torch.Generator, threshold: float = 0.01) -> Tensor:
+        """Replace inactive codes by copies of active ones and start a new window (paper, section 3.1).
+
+        A code is inactive if it was hit in less than ``threshold`` of the window's iterations. The copies are a
+        permutation of a random set of active codes, plus noise of 1e-12. The optimiser's state is not touched.
+
+        Args:
+            generator: Source of the choice and of the noise.
+            threshold: Share of the iterations, in [0, 1].
+
+        Returns:
+            The replaced codes ``[R]`` int64; none, with a warning, where no code was active.
+
+        Raises:
+            ValueError: ``threshold`` is not in [0, 1].
+        """
+        inactive = inactive_codes(self.usage, self.window, threshold)
+        replaced = inactive.nonzero()[:, 0]
+        active = (~inactive).nonzero()[:, 0]
+        if len(replaced) and not len(active):
+            _log.warning("no code was active in %d iterations; the codebook is left as it is", int(self.window))
+            replaced = replaced[:0]
+        if len(replaced):
+            source = choose_replacements(active, len(replaced), generator)
+            noise = torch.randn(len(replaced), self.dim, generator=generator, device=generator.device)
+            self._tracker.forget()
+            self.codebook[replaced] = self.codebook[source] + 1e-12 * noise.to(self.codebook)
+        self.reset_usage()
+        return replaced
+
+    def freeze(self, codes: Tensor) -> None:
+        """Fix the codes ``[N]`` int64; from now on only the codebook is trained.
+
+        Raises:
+            ValueError: There is no code, or one is not in [0, K).
+            TypeError: The codes are not int64.
+        """
+        if codes.dtype != torch.int64:
+            raise TypeError(f"codes must be int64, got {codes.dtype}")
+        if codes.dim() != 1 or codes.numel() == 0:
+            raise ValueError(f"codes must have shape [N] with N > 0, got {list(codes.shape)}")
+        low, high = int(codes.min()), int(codes.max())
+        if low < 0 or high >= self.num_codes:
+            raise ValueError(f"codes must be in [0, {self.num_codes}), got {low} to {high}")
+        self.codes = codes.detach().clone().to(self.codebook.device)
+
+    def _frozen_codes(self, count: int, rows: Tensor | None) -> Tensor:
+        if rows is not None:
+            return self.codes[rows]
+        if count != self.codes.shape[0]:
+            raise ValueError(
+                f"codes are frozen for {self.codes.shape[0]} rows, got {count}; pass their numbers as `rows`"
+            )
+        return self.codes
+
+    def _resize(self, num_codes: int) -> None:
+        if num_codes != self.num_codes:
+            self.codebook.data = self.codebook.data.new_zeros(num_codes, self.dim)
+            self.usage = self.usage.new_zeros(num_codes)
+        self.codebook.grad = None
+
+    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
+        """Take over the stored number of codes and rows before the values are copied."""
+        stored = state_dict.get(f"{prefix}codebook")
+        if stored is not None and stored.dim() == 2 and stored.shape[1] == self.dim:
+            self._resize(stored.shape[0])
+        codes = state_dict.get(f"{prefix}codes")
+        if codes is not None:
+            self.codes = self.codes.new_zeros(codes.shape)
+        super()._load_from_state_dict(state_dict, prefix, *args)

@@ -1,0 +1,116 @@
+"""k-means as the paper starts its codebooks: distinct random rows, Lloyd steps, an empty cluster keeps its centroid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nsvq_lightning.quantize.nearest import nearest
+from nsvq_lightning.quantize.sums import sum_by_code
+
+__all__ = ["distinct_rows", "kmeans"]
+
+AllReduce = Callable[[Tensor], Tensor]
+"""Sum of a tensor over the processes."""
+
+
+@torch.no_grad()
+def kmeans(
+    x: Tensor,
+    k: int,
+    generator: torch.Generator,
+    weight: Tensor | None = None,
+    steps: int = 10,
+    all_reduce: AllReduce | None = None,
+    start: Tensor | None = None,
+) -> Tensor:
+    """Centroids of the rows under the (weighted) squared distance.
+
+    Sums are taken in float64 in the order of the rows, so the result is the same for any number of threads.
+
+    Args:
+        x: Rows ``[N, D]``, finite.
+        k: Number of centroids wanted.
+        generator: Source of the start.
+        weight: Weight of each row, ``[N]``, not negative; rows of weight 0 are left out.
+        steps: Lloyd steps.
+        all_reduce: Sum over processes that hold different rows; then every process must pass the same ``start``.
+        start: Initial centroids ``[k, D]``; by default a random sample of the distinct rows.
+
+    Returns:
+        Centroids ``[k', D]`` with k' = min(k, number of distinct rows); where k is not smaller, the distinct rows
+        themselves, in the order of their first occurrence.
+
+    Raises:
+        ValueError: A shape does not fit, there is no row, a number is not finite, a weight is negative, or rows are
+            spread over processes without a common start.
+    """
+    x, weight = _checked(x, k, weight)
+    if start is None:
+        if all_reduce is not None:
+            raise ValueError("k-means over several processes needs a common `start`, broadcast from one of them")
+        first = distinct_rows(x)
+        if len(first) <= k:
+            return x[first]
+        chosen = torch.randperm(len(first), generator=generator, device=generator.device)[:k].to(x.device)
+        start = x[first[chosen]]
+    centroids = start.detach().clone()
+    for _ in range(steps):
+        centroids = _lloyd_step(x, centroids, weight, all_reduce)
+    return centroids
+
+
+def _checked(x: Tensor, k: int, weight: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    x = x.detach()
+    if x.dim() != 2 or x.shape[0] == 0 or k < 1:
+        raise ValueError(f"k-means needs rows [N, D] with N > 0 and k > 0, got shape {list(x.shape)} and k = {k}")
+    if not bool(torch.isfinite(x).all()):
+        bad = int((~torch.isfinite(x).all(1)).sum())
+        raise ValueError(f"{bad} of {x.shape[0]} rows have a number that is not finite; drop them before k-means")
+    if weight is None:
+        return x, None
+    if weight.shape != x.shape[:1] or not bool((weight >= 0).all()) or not bool((weight > 0).any()):
+        raise ValueError(f"weight must have shape [{x.shape[0]}], no negative and some positive number")
+    used = weight > 0
+    return x[used], weight.detach()[used].double()
+
+
+def _lloyd_step(x: Tensor, centroids: Tensor, weight: Tensor | None, all_reduce: AllReduce | None) -> Tensor:
+    """Mean of the rows nearest to each centroid; a centroid without rows stays."""
+    codes = nearest(x, centroids)
+    k = centroids.shape[0]
+    if weight is None:
+        sums, mass = sum_by_code(x, codes, k, torch.float64), torch.bincount(codes, minlength=k).double()
+    else:
+        sums = sum_by_code(x * weight[:, None], codes, k)
+        mass = sum_by_code(weight[:, None], codes, k)[:, 0]
+    if all_reduce is not None:
+        sums, mass = all_reduce(sums), all_reduce(mass)
+    means = sums / mass.clamp_min(torch.finfo(torch.float64).tiny)[:, None]
+    return torch.where(mass[:, None] > 0, means.to(centroids.dtype), centroids)
+
+
+def distinct_rows(x: Tensor) -> Tensor:
+    """Numbers ``[M]`` int64, ascending, of the first occurrence of every distinct row of ``x [N, D]``.
+
+    Rows are compared by a 64-bit hash of their bits, which is then verified, because sorting rows of 45 numbers would
+    take longer than k-means itself.
+    """
+    rows = (x.detach().cpu() + 0.0).contiguous().numpy()  # + 0.0 makes -0 and 0 the same bits
+    bits = rows.view(np.uint32 if rows.itemsize == 4 else np.uint64).astype(np.uint64, copy=False)
+    _, first, inverse = np.unique(_hash(bits), return_index=True, return_inverse=True)
+    if not np.array_equal(rows[first][inverse], rows):
+        _, first = np.unique(rows, axis=0, return_index=True)
+    return torch.from_numpy(np.sort(first)).to(x.device)
+
+
+def _hash(bits: np.ndarray) -> np.ndarray:
+    """One 64-bit number a row of integers ``[N, D]``, by multiplication and xor-shift."""
+    value = np.full(bits.shape[0], 0x9E3779B97F4A7C15, np.uint64)
+    for column in bits.T:
+        value = (value ^ column) * np.uint64(0xBF58476D1CE4E5B9)
+        value ^= value >> np.uint64(29)
+    return value

@@ -1,0 +1,86 @@
+"""Exact nearest code: the search every training step of the quantize phase rests on.
+
+TF32 and bfloat16 products give half to nine tenths of the rows a wrong code, so nothing here is ever subject to
+autocast or to a lowered matmul precision.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nsvq_lightning.quantize.box_search import MAX_DIM, box_search
+from nsvq_lightning.quantize.boxes import build_boxes
+from nsvq_lightning.quantize.scores import centre_codes, score_search
+
+__all__ = ["check_rows", "nearest", "nearest_reference"]
+
+_CPU_CHUNK, _DEVICE_CHUNK = 1 << 22, 1 << 26
+"""Distances held at once by the plain formulation: on a CPU what its caches hold, elsewhere enough to keep it busy."""
+
+
+def check_rows(x: Tensor, codebook: Tensor) -> None:
+    """Refuse rows and codes that do not fit together.
+
+    Raises:
+        ValueError: ``x`` is not ``[N, D]``, ``codebook`` not ``[K, D]`` with at least one code.
+        TypeError: They differ in dtype or are not floating point.
+    """
+    if x.dim() != 2 or codebook.dim() != 2 or x.shape[1] != codebook.shape[1] or x.shape[1] == 0:
+        raise ValueError(
+            f"x [N, D] and codebook [K, D] must share D > 0, got {list(x.shape)} and {list(codebook.shape)}"
+        )
+    if codebook.shape[0] == 0:
+        raise ValueError(f"the codebook has no code, shape {list(codebook.shape)}; fit it first")
+    if x.dtype != codebook.dtype or not x.dtype.is_floating_point:
+        raise TypeError(f"x and codebook must have one floating-point dtype, got {x.dtype} and {codebook.dtype}")
+
+
+def nearest_reference(x: Tensor, codebook: Tensor) -> Tensor:
+    """Nearest codes by the definition: all distances, as sums of squared differences, in chunks.
+
+    Any device, any floating-point dtype; in float64 the oracle of the fast searches.
+
+    Args:
+        x: Rows ``[N, D]``.
+        codebook: Codes ``[K, D]``.
+
+    Returns:
+        Codes ``[N]`` int64; of equally near codes the lowest.
+    """
+    check_rows(x, codebook)
+    rows = max(1, (_CPU_CHUNK if x.device.type == "cpu" else _DEVICE_CHUNK) // codebook.shape[0])
+    mode = "donot_use_mm_for_euclid_dist"
+    with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+        distances = (torch.cdist(part, codebook, compute_mode=mode) for part in torch.split(x.detach(), rows))
+        # argmin would take a NaN for the smallest
+        return torch.cat([part.nan_to_num(nan=torch.inf, posinf=torch.inf).argmin(1) for part in distances])
+
+
+def nearest(x: Tensor, codebook: Tensor) -> Tensor:
+    """Nearest codes in exact float32: a code differs from the float64 one only between equals to rounding.
+
+    Args:
+        x: Rows ``[N, D]``.
+        codebook: Codes ``[K, D]``, same dtype and device.
+
+    Returns:
+        Codes ``[N]`` int64; of equally near codes the lowest. A row with a NaN gets code 0.
+
+    Raises:
+        ValueError: The shapes do not fit together, or there is no code.
+        TypeError: The dtypes differ or are not floating point.
+    """
+    check_rows(x, codebook)
+    x, codebook = x.detach().contiguous(), codebook.detach().contiguous()
+    if x.device.type == "cpu" and x.dtype == torch.float32:
+        return torch.from_numpy(_search(x.numpy(), codebook.numpy()))
+    return nearest_reference(x, codebook)
+
+
+def _search(x: NDArray[np.float32], codebook: NDArray[np.float32]) -> NDArray[np.int64]:
+    if x.shape[1] <= MAX_DIM:
+        return box_search(x, build_boxes(codebook))
+    return score_search(x, centre_codes(codebook))[0]

@@ -1,0 +1,73 @@
+"""Sums of rows by code: the gradient of a codebook, and the means of k-means. Repeatable to the bit on every device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from numba import prange
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from nsvq_lightning.render.cpu.jit import kernel, thread_count
+
+__all__ = ["lookup", "sum_by_code"]
+
+
+@kernel
+def _sum_rows(values, codes, sums, parts):  # type: ignore[no-untyped-def]
+    """A part owns a range of codes and looks at all rows, so the order of the threads cannot change a sum."""
+    for part in prange(parts):
+        first, last = part * sums.shape[0] // parts, (part + 1) * sums.shape[0] // parts
+        for i in range(codes.shape[0]):
+            code = codes[i]
+            if first <= code < last:
+                for j in range(values.shape[1]):
+                    sums[code, j] += values[i, j]
+
+
+def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype | None = None) -> Tensor:
+    """Sum the rows of each code, in the order of the rows.
+
+    Args:
+        values: Rows ``[N, D]``.
+        codes: Codes ``[N]`` int64 in [0, K); not checked.
+        num_codes: K.
+        dtype: Dtype of the sums, that of ``values`` by default.
+
+    Returns:
+        Sums ``[K, D]``; 0 for a code without rows.
+    """
+    values, dtype = values.detach(), dtype or values.dtype
+    if values.device.type == "cpu":
+        sums = torch.zeros(num_codes, values.shape[1], dtype=dtype)
+        _sum_rows(values.contiguous().numpy(), codes.contiguous().numpy(), sums.numpy(), thread_count())
+        return sums
+    return _sum_segments(values.to(dtype), codes, num_codes)
+
+
+def _sum_segments(values: Tensor, codes: Tensor, num_codes: int) -> Tensor:
+    """Sort the rows by code, then sum segments: no atomics, whose order would change from run to run."""
+    order = torch.argsort(codes, stable=True)
+    lengths = torch.bincount(codes, minlength=num_codes)
+    return torch.segment_reduce(values[order], "sum", lengths=lengths, axis=0, unsafe=True, initial=0)
+
+
+def lookup(codebook: Tensor, codes: Tensor) -> Tensor:
+    """Codes' rows ``[N, D]`` of ``codebook [K, D]``, with a gradient that is summed in a fixed order."""
+    result: Tensor = _Lookup.apply(codebook, codes)  # type: ignore[no-untyped-call]
+    return result
+
+
+class _Lookup(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, codebook: Tensor, codes: Tensor) -> Tensor:
+        ctx.save_for_backward(codes)
+        ctx.num_codes = codebook.shape[0]
+        return codebook.index_select(0, codes)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        (codes,) = ctx.saved_tensors
+        return sum_by_code(grad, codes, ctx.num_codes), None

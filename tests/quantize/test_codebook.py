@@ -1,0 +1,161 @@
+from __future__ import annotations
+
+import logging
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from nsvq_lightning.quantize import NSVQ, Quantizer
+from nsvq_lightning.quantize.replacement import choose_replacements
+from nsvq_lightning.quantize.sums import lookup
+from nsvq_lightning.random import generator
+
+
+def fitted(num_codes: int = 8, dim: int = 3, count: int = 100) -> tuple[NSVQ, Tensor]:
+    x = torch.randn(count, dim, generator=generator(0))
+    quantizer = NSVQ(num_codes, dim)
+    quantizer.fit(x, generator=generator(1))
+    return quantizer, x
+
+
+def test_is_a_quantizer() -> None:
+    assert isinstance(NSVQ(4, 3), Quantizer)
+
+
+@pytest.mark.parametrize(
+    ("num_codes", "bits"), [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3), (4096, 12), (16384, 14), (16385, 15)]
+)
+def test_bits(num_codes: int, bits: int) -> None:
+    assert NSVQ(num_codes, 2).bits == bits
+
+
+def test_fit_shrinks_and_keeps_the_parameter() -> None:
+    quantizer = NSVQ(16, 3)
+    parameter = quantizer.codebook
+    optimizer = torch.optim.Adam([parameter], eps=1e-15)
+    x = torch.eye(3).repeat(10, 1)
+    assert not quantizer.fitted
+    quantizer.fit(x)
+    assert quantizer.codebook is parameter
+    assert quantizer.num_codes == 3
+    assert quantizer.usage.shape == (3,)
+    assert quantizer.fitted
+    assert torch.equal(quantizer.decode(quantizer.encode(x)), x)
+    x_q, _ = quantizer((x + 0.1).requires_grad_(), generator(0))
+    x_q.square().sum().backward()
+    optimizer.step()
+    assert torch.isfinite(quantizer.codebook).all()
+
+
+def test_gradient_of_decode_sums_by_code() -> None:
+    codebook = torch.randn(10, 5, generator=generator(0)).requires_grad_()
+    codes = torch.randint(9, (200,), generator=generator(1))
+    grad = torch.randn(200, 5, generator=generator(2))
+    lookup(codebook, codes).backward(grad)
+    found, codebook.grad = codebook.grad, None
+    codebook[codes].backward(grad)
+    torch.testing.assert_close(found, codebook.grad, rtol=1e-5, atol=1e-6)
+    assert torch.equal(found[9], torch.zeros(5))
+
+
+def test_usage_counts_iterations_not_rows() -> None:
+    quantizer, x = fitted()
+    _, codes = quantizer(x, generator(0))
+    quantizer(x[codes == 2], generator(1))
+    assert int(quantizer.window) == 2
+    assert quantizer.usage.tolist() == [2 if code == 2 else 1 for code in range(8)]
+    quantizer.eval()
+    quantizer(x)
+    assert int(quantizer.window) == 2
+
+
+def test_perplexity_counts_equally_used_codes() -> None:
+    quantizer, _ = fitted()
+    assert quantizer.perplexity() == 0.0
+    quantizer.count(torch.tensor([1, 1, 3, 5]))
+    assert math.isclose(quantizer.perplexity(), 3.0)
+
+
+def test_replacement_rule() -> None:
+    """A code hit in less than 1 % of 200 iterations, that is fewer than 2, is replaced by an active one."""
+    quantizer, _ = fitted()
+    before = quantizer.codebook.detach().clone()
+    quantizer.window.fill_(200)
+    quantizer.usage.copy_(torch.tensor([0, 1, 2, 3, 200, 0, 50, 1]))
+    replaced = quantizer.replace_unused(generator(0))
+    assert replaced.tolist() == [0, 1, 5, 7]
+    active = torch.tensor([2, 3, 4, 6])
+    after = quantizer.codebook.detach()
+    assert torch.equal(after[active], before[active])
+    source = torch.cdist(after[replaced], before[active]).argmin(1)
+    assert sorted(source.tolist()) == [0, 1, 2, 3]
+    torch.testing.assert_close(after[replaced], before[active][source], rtol=0, atol=1e-7)
+    assert int(quantizer.window) == 0
+    assert int(quantizer.usage.sum()) == 0
+
+
+def test_replacement_is_a_function_of_the_generator() -> None:
+    results = []
+    for seed in (5, 5, 6):
+        quantizer, _ = fitted()
+        quantizer.window.fill_(100)
+        quantizer.usage[:4] = 100
+        quantizer.replace_unused(generator(seed))
+        results.append(quantizer.codebook.detach())
+    assert torch.equal(results[0], results[1])
+    assert not torch.equal(results[0], results[2])
+
+
+def test_more_to_replace_than_active() -> None:
+    chosen = choose_replacements(torch.tensor([3, 5, 9]), 7, generator(0))
+    counts = torch.bincount(chosen, minlength=10)
+    assert chosen.shape == (7,)
+    assert sorted(counts[[3, 5, 9]].tolist()) == [2, 2, 3]
+
+
+def test_no_active_code_warns_and_changes_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    quantizer, _ = fitted()
+    before = quantizer.codebook.detach().clone()
+    quantizer.window.fill_(100)
+    with caplog.at_level(logging.WARNING):
+        assert quantizer.replace_unused(generator(0)).numel() == 0
+    assert "no code was active in 100 iterations" in caplog.text
+    assert torch.equal(quantizer.codebook, before)
+
+
+def test_an_empty_window_replaces_nothing() -> None:
+    quantizer, _ = fitted()
+    assert quantizer.replace_unused(generator(0)).numel() == 0
+
+
+def test_state_of_another_size_loads() -> None:
+    source, x = fitted(num_codes=200, count=50)
+    source(x, generator(0))
+    source.freeze(source.encode(x))
+    target = NSVQ(7, 3)
+    parameter = target.codebook
+    target.load_state_dict(source.state_dict())
+    assert target.codebook is parameter
+    for name, value in source.state_dict().items():
+        assert torch.equal(target.state_dict()[name], value), name
+    assert target.frozen
+    with pytest.raises(RuntimeError, match="codebook"):
+        NSVQ(7, 4).load_state_dict(source.state_dict())
+
+
+def test_refusals() -> None:
+    quantizer, x = fitted()
+    with pytest.raises(ValueError, match="num_codes must be at least 1"):
+        NSVQ(0, 3)
+    with pytest.raises(ValueError, match=r"\[N, 3\]"):
+        quantizer.fit(x[:, :2])
+    with pytest.raises(ValueError, match=r"\[0, 8\)"):
+        quantizer.freeze(torch.tensor([0, 8]))
+    with pytest.raises(ValueError, match="N > 0"):
+        quantizer.freeze(torch.zeros(0, dtype=torch.int64))
+    with pytest.raises(TypeError, match="int64"):
+        quantizer.freeze(torch.tensor([0], dtype=torch.int32))
+    with pytest.raises(ValueError, match="share"):
+        quantizer.replace_unused(generator(0), threshold=1.5)

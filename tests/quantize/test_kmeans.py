@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from nsvq_lightning.quantize import kmeans, nearest_reference
+from nsvq_lightning.quantize.kmeans import distinct_rows
+from nsvq_lightning.quantize.sums import _sum_segments, sum_by_code
+from nsvq_lightning.random import generator
+
+
+def rows(count: int, dim: int, seed: int = 0) -> Tensor:
+    return torch.randn(count, dim, generator=generator(seed))
+
+
+def lloyd(x: Tensor, start: Tensor, steps: int, weight: Tensor | None = None) -> Tensor:
+    """Oracle: textbook k-means in float64, code by code."""
+    x, centroids = x.double(), start.double().clone()
+    weight = torch.ones(len(x)).double() if weight is None else weight.double()
+    for _ in range(steps):
+        codes = nearest_reference(x, centroids)
+        for code in range(len(centroids)):
+            hit = codes == code
+            if weight[hit].sum() > 0:
+                centroids[code] = (weight[hit, None] * x[hit]).sum(0) / weight[hit].sum()
+    return centroids
+
+
+@pytest.mark.parametrize("dim", [3, 45])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_equals_textbook(dim: int, weighted: bool) -> None:
+    x = rows(600, dim)
+    weight = torch.rand(600, generator=generator(5)) if weighted else None
+    found = kmeans(x, 20, generator(0), weight, steps=4, start=x[:20])
+    torch.testing.assert_close(found.double(), lloyd(x, x[:20], 4, weight), rtol=1e-5, atol=1e-6)
+
+
+def test_error_falls_with_every_step() -> None:
+    x = rows(2000, 3)
+    errors = []
+    for steps in range(5):
+        c = kmeans(x, 50, generator(1), steps=steps)
+        errors.append(float((x - c[nearest_reference(x, c)]).square().sum()))
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 0.8 * errors[0]
+
+
+def test_start_is_distinct_rows() -> None:
+    x = rows(40, 3).repeat_interleave(5, 0)
+    centroids = kmeans(x, 30, generator(2), steps=0)
+    assert len(torch.unique(centroids, dim=0)) == 30
+    assert set(map(tuple, centroids.tolist())) <= set(map(tuple, x.tolist()))
+
+
+def test_no_more_codes_than_distinct_rows() -> None:
+    x = rows(7, 4)[torch.tensor([3, 1, 3, 3, 0, 1, 6])]
+    assert torch.equal(kmeans(x, 100, generator(0)), x[torch.tensor([0, 1, 4, 6])])
+    assert torch.equal(kmeans(x, 4, generator(0)), x[torch.tensor([0, 1, 4, 6])])
+
+
+def test_empty_cluster_keeps_its_centroid() -> None:
+    start = torch.tensor([[0.0], [100.0]])
+    assert kmeans(torch.tensor([[1.0], [3.0]]), 2, generator(0), start=start).tolist() == [[2.0], [100.0]]
+
+
+def test_rows_of_weight_zero_count_for_nothing() -> None:
+    x = torch.cat((rows(50, 3), torch.full((50, 3), 1e6)))
+    weight = torch.cat((torch.ones(50), torch.zeros(50)))
+    assert torch.equal(kmeans(x, 8, generator(0), weight), kmeans(x[:50], 8, generator(0), torch.ones(50)))
+
+
+def test_two_processes_equal_one() -> None:
+    """The reduction is played by adding what the other half of the rows contributes."""
+    x, start = rows(1000, 3), rows(10, 3, 1)
+    parts = x[:400], x[400:]
+    centroids = start
+    for _ in range(3):
+        contributions: list[list[Tensor]] = [[], []]
+        for part, seen in zip(parts, contributions, strict=True):
+            kmeans(part, 10, generator(0), steps=1, start=centroids, all_reduce=lambda t, s=seen: s.append(t) or t)
+        sums, mass = (a + b for a, b in zip(*contributions, strict=True))
+        reduced = [sums, mass]
+        centroids = kmeans(
+            parts[0], 10, generator(0), steps=1, start=centroids, all_reduce=lambda _, parts=reduced: parts.pop(0)
+        )
+    torch.testing.assert_close(centroids, kmeans(x, 10, generator(0), steps=3, start=start))
+
+
+def test_distinct_rows_of_signed_zeros_and_repeats() -> None:
+    x = torch.tensor([[0.0, 1.0], [-0.0, 1.0], [2.0, 1.0], [0.0, 1.0], [2.0, 1.0], [1.0, 0.0]])
+    assert distinct_rows(x).tolist() == [0, 2, 5]
+    assert distinct_rows(x.double()).tolist() == [0, 2, 5]
+
+
+def test_repeatable_for_any_threads() -> None:
+    x, before = rows(3000, 3), torch.get_num_threads()
+    try:
+        results = []
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            results.append(kmeans(x, 64, generator(3)))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(*results)
+
+
+def test_refusals() -> None:
+    with pytest.raises(ValueError, match="1 of 3 rows"):
+        kmeans(torch.tensor([[0.0], [float("nan")], [1.0]]), 2, generator(0))
+    with pytest.raises(ValueError, match="N > 0"):
+        kmeans(torch.zeros(0, 3), 2, generator(0))
+    with pytest.raises(ValueError, match="weight"):
+        kmeans(rows(3, 3), 2, generator(0), -torch.ones(3))
+    with pytest.raises(ValueError, match="start"):
+        kmeans(rows(3, 3), 2, generator(0), all_reduce=lambda t: t)
+
+
+def test_sums_agree_with_index_add() -> None:
+    values, codes = rows(500, 7), torch.randint(30, (500,), generator=generator(1))
+    expected = torch.zeros(31, 7).double().index_add_(0, codes, values.double())
+    for sums in (sum_by_code(values, codes, 31), _sum_segments(values, codes, 31)):
+        torch.testing.assert_close(sums.double(), expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(sum_by_code(values, codes, 31, torch.float64), expected, rtol=1e-12, atol=1e-12)

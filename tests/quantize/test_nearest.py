@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+import torch
+from torch import Tensor
+
+from nsvq_lightning.quantize import nearest, nearest_reference
+from nsvq_lightning.random import generator
+
+
+def clustered(count: int, dim: int, seed: int = 0) -> Tensor:
+    draw = generator(seed)
+    centres = 2 * torch.randn(20, dim, generator=draw) - 4
+    rows = centres[torch.randint(20, (count,), generator=draw)]
+    return rows + 0.3 * torch.randn(count, dim, generator=draw)
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def assert_nearest(x: Tensor, codebook: Tensor, codes: Tensor) -> None:
+    """Oracle: float64; another code is allowed only if it is as far to a relative 1e-6."""
+    wide, book = x.double(), codebook.double()
+    best = (wide - book[nearest_reference(wide, book)]).square().sum(1)
+    found = (wide - book[codes]).square().sum(1)
+    assert bool((found <= best * (1 + 1e-6)).all())
+
+
+@pytest.mark.parametrize("dim", [1, 3, 4, 9, 45])
+@pytest.mark.parametrize("num_codes", [1, 2, 15, 17, 300, 5000])
+def test_equals_float64_up_to_ties(dim: int, num_codes: int) -> None:
+    x, codebook = clustered(700, dim, 1), clustered(num_codes, dim, 2)
+    assert_nearest(x, codebook, nearest(x, codebook))
+
+
+@pytest.mark.parametrize("dim", [3, 4, 45])
+def test_far_from_the_origin(dim: int) -> None:
+    """Uncentred dot products would lose all digits here."""
+    x, codebook = clustered(500, dim, 1) + 1000, clustered(600, dim, 2) + 1000
+    assert_nearest(x, codebook, nearest(x, codebook))
+
+
+@pytest.mark.parametrize("dim", [3, 45])
+def test_ties_go_to_the_lower_code(dim: int) -> None:
+    codebook = clustered(400, dim)
+    doubled = torch.cat((codebook, codebook))[torch.randperm(800, generator=generator(3))]
+    codes = nearest(doubled, doubled)
+    first = [int((doubled == row).all(1).nonzero()[0, 0]) for row in doubled]
+    assert codes.tolist() == first
+
+
+@pytest.mark.parametrize("dim", [3, 45])
+def test_bits_do_not_depend_on_threads(dim: int) -> None:
+    x, codebook = clustered(3000, dim, 1), clustered(500, dim, 2)
+    codebook[250:] = codebook[:250]
+    with threads(1):
+        one = nearest(x, codebook)
+    with threads(2):
+        two = nearest(x, codebook)
+    assert torch.equal(one, two)
+    assert torch.equal(nearest(x[1000:1100].clone(), codebook), one[1000:1100])
+
+
+def test_reference_takes_the_lower_code_and_no_autocast() -> None:
+    x = clustered(50, 5, 1)
+    codebook = x[:20].repeat(2, 1)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert nearest_reference(x, codebook)[:20].tolist() == list(range(20))
+        assert nearest(x, codebook)[:20].tolist() == list(range(20))
+
+
+@pytest.mark.parametrize("dim", [3, 45])
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_bad_code_is_never_chosen(dim: int, bad: float) -> None:
+    x, codebook = clustered(100, dim, 1), clustered(60, dim, 2)
+    codebook[7, 1] = codebook[33, 0] = bad
+    codes = nearest(x, codebook)
+    assert not bool(((codes == 7) | (codes == 33)).any())
+    good = torch.tensor([c for c in range(60) if c not in (7, 33)])
+    assert torch.equal(codes, good[nearest(x, codebook[good])])
+
+
+@pytest.mark.parametrize("dim", [3, 45])
+def test_bad_rows_do_not_disturb_others(dim: int) -> None:
+    x, codebook = clustered(100, dim, 1), clustered(60, dim, 2)
+    expected = nearest(x, codebook)
+    x[5], x[6, 0] = float("nan"), float("inf")
+    codes = nearest(x, codebook)
+    rest = torch.tensor([i for i in range(100) if i not in (5, 6)])
+    assert torch.equal(codes[rest], expected[rest])
+    assert int(codes.min()) >= 0
+    assert int(codes.max()) < 60
+
+
+@pytest.mark.parametrize("dim", [3, 45])
+def test_no_rows(dim: int) -> None:
+    assert nearest(torch.zeros(0, dim), torch.zeros(5, dim)).shape == (0,)
+
+
+def test_refusals() -> None:
+    with pytest.raises(ValueError, match="share D"):
+        nearest(torch.zeros(2, 3), torch.zeros(2, 4))
+    with pytest.raises(ValueError, match="no code"):
+        nearest(torch.zeros(2, 3), torch.zeros(0, 3))
+    with pytest.raises(TypeError, match="dtype"):
+        nearest(torch.zeros(2, 3), torch.zeros(2, 3).double())

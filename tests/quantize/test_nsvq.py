@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from nsvq_lightning.quantize import NSVQ, nearest
+from nsvq_lightning.quantize.noise import draw_seed, normal_vectors
+from nsvq_lightning.quantize.nsvq import noise_substitution
+from nsvq_lightning.random import generator
+
+DIMS = [1, 4, 9, 16, 45]
+
+
+def problem(dim: int, dtype: torch.dtype = torch.float32, count: int = 523) -> tuple[Tensor, Tensor, Tensor]:
+    draw = generator(dim)
+    x = torch.randn(count, dim, generator=draw, dtype=torch.float64).to(dtype)
+    codebook = torch.randn(40, dim, generator=draw, dtype=torch.float64).to(dtype)
+    return x.requires_grad_(), codebook.requires_grad_(), nearest(x, codebook)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dim", DIMS)
+def test_error_has_the_length_of_the_quantization_error(dim: int, dtype: torch.dtype) -> None:
+    x, codebook, codes = problem(dim, dtype)
+    with torch.no_grad():
+        x_q = noise_substitution(x, codebook, codes, generator(1))
+        expected = (x.double() - codebook[codes].double()).norm(dim=1)
+    rounding = 4 * torch.finfo(dtype).eps
+    difference = (x_q.double() - x.double()).norm(dim=1) - expected
+    assert bool((difference.abs() <= rounding * (expected + x.double().norm(dim=1))).all())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dim", DIMS)
+def test_gradients_equal_autograd_of_the_formula(dim: int, dtype: torch.dtype) -> None:
+    x, codebook, codes = problem(dim, dtype)
+    grad = torch.randn(x.shape, generator=generator(2), dtype=torch.float64)
+    x_q = noise_substitution(x, codebook, codes, generator(1))
+    x_q.backward(grad.to(dtype))
+    x_wide = x.detach().double().requires_grad_()
+    book_wide = codebook.detach().double().requires_grad_()
+    noise = (x_q - x).detach().double()
+    length = (x_wide - book_wide[codes]).norm(dim=1, keepdim=True)
+    (x_wide + length * noise / noise.norm(dim=1, keepdim=True)).backward(grad)
+    # The direction is recovered from x_q - x, which rounding spoils where x is near its code.
+    tolerance = 1e-10 if dtype == torch.float64 else 2e-3 if dim == 1 else 2e-4
+    for found, expected in ((x.grad, x_wide.grad), (codebook.grad, book_wide.grad)):
+        assert found is not None
+        torch.testing.assert_close(found.double(), expected, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("dim", [3, 45])
+def test_kernel_gradient_equals_the_plain_formulation(dim: int) -> None:
+    """Same directions in both: the float32 kernel against the closed form in float64."""
+    from nsvq_lightning.quantize.substitution import substitute, substitute_backward
+
+    x, codebook, codes = (tensor.detach() for tensor in problem(dim))
+    grad = torch.randn(x.shape, generator=generator(2))
+    unit = substitute(7, torch.zeros_like(x).numpy(), torch.eye(dim)[:1].numpy(), torch.zeros_like(codes).numpy())
+    arrays = x.numpy(), codebook.numpy(), codes.numpy()
+    out = substitute(7, *arrays)
+    grad_x, grad_codebook = substitute_backward(7, grad.numpy(), *arrays)
+    v, r = torch.from_numpy(unit).double(), x.double() - codebook[codes].double()
+    length = r.norm(dim=1, keepdim=True)
+    radial = (grad.double() * v).sum(1, keepdim=True) * r / length
+    torch.testing.assert_close(v.norm(dim=1), torch.ones(len(v)).double(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(torch.from_numpy(out).double(), x + length * v, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(torch.from_numpy(grad_x).double(), grad + radial, rtol=1e-5, atol=1e-5)
+    expected = torch.zeros(codebook.shape).double().index_add_(0, codes, -radial)
+    torch.testing.assert_close(torch.from_numpy(grad_codebook).double(), expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dim", [3, 45])
+def test_no_error_no_noise_and_no_radial_gradient(dim: int, dtype: torch.dtype) -> None:
+    x, codebook, codes = problem(dim, dtype)
+    x = codebook.detach()[codes].clone().requires_grad_()
+    x_q = noise_substitution(x, codebook, codes, generator(1))
+    assert torch.equal(x_q, x)
+    grad = torch.randn(x.shape, generator=generator(2), dtype=torch.float64).to(dtype)
+    x_q.backward(grad)
+    assert torch.equal(x.grad, grad)
+    assert torch.equal(codebook.grad, torch.zeros_like(codebook))
+
+
+def test_gradient_of_a_code_is_zero_on_average() -> None:
+    """For a fixed gradient of the result the radial terms cancel: standard error 1/sqrt(draws · rows / dim)."""
+    x, codebook, codes = problem(3, count=4000)
+    total = torch.zeros(3)
+    for step in range(50):
+        codebook.grad = None
+        noise_substitution(x, codebook, codes, generator(0, step)).backward(torch.ones_like(x))
+        total += codebook.grad.abs().sum() * 0 + codebook.grad.sum(0)
+    assert bool((total.abs() / (50 * 4000) < 4 / (50 * 4000) ** 0.5).all())
+
+
+def test_noise_is_a_function_of_the_generator_alone() -> None:
+    x, codebook, codes = problem(45)
+    before = torch.get_num_threads()
+    try:
+        results = []
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            codebook.grad = None
+            x_q = noise_substitution(x, codebook, codes, generator(1))
+            x_q.backward(torch.ones_like(x_q))
+            results.append(torch.cat((x_q.detach(), codebook.grad)))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(*results)
+    assert not torch.equal(noise_substitution(x, codebook, codes, generator(1, 1)), x_q)
+    first_rows = noise_substitution(x[:300], codebook, codes[:300], generator(1))
+    assert torch.equal(first_rows, x_q[:300])
+
+
+def test_noise_is_normal() -> None:
+    """Moments, and Kolmogorov's distance to scipy's normal distribution, at about four standard errors."""
+    from scipy import stats
+
+    draws = normal_vectors(20240521, 2 * 8000)
+    count = draws.size
+    assert abs(draws.mean()) < 4 / count**0.5
+    assert abs(draws.var() - 1) < 4 * (2 / count) ** 0.5
+    assert abs(stats.skew(draws)) < 4 * (6 / count) ** 0.5
+    assert abs(stats.kurtosis(draws)) < 4 * (24 / count) ** 0.5
+    assert stats.kstest(draws, "norm").statistic < 2.0 / count**0.5
+    for lag in (1, 2, 15, 16, 17, 32, 45, 1024):
+        assert abs((draws[lag:] * draws[:-lag]).mean()) < 4 / (count - lag) ** 0.5
+    other = normal_vectors(20240522, 2 * 8000)
+    for lag in (0, 16, 32):
+        assert abs((draws[lag:] * other[: count - lag]).mean()) < 4 / count**0.5
+
+
+def test_direction_is_uniform_on_the_sphere() -> None:
+    """A unit vector has mean 0 and covariance I/D."""
+    for dim in (3, 4, 45):
+        x, codebook = torch.zeros(20000, dim), torch.ones(1, dim) / dim**0.5
+        unit = noise_substitution(x, codebook, torch.zeros(20000, dtype=torch.int64), generator(dim))
+        assert float(unit.mean(0).abs().max()) < 5 / (20000 * dim) ** 0.5
+        covariance = unit.T @ unit / 20000 - torch.eye(dim) / dim
+        assert float(covariance.abs().max()) < 6 * 2**0.5 / (dim * 20000**0.5)
+
+
+def test_seeds_are_63_bits_and_distinct() -> None:
+    seeds = {draw_seed(generator(0, step)) for step in range(100)}
+    assert len(seeds) == 100
+    assert all(0 <= seed < 2**63 for seed in seeds)
+    assert max(seeds) > 2**60
+
+
+def test_module_in_its_three_states() -> None:
+    x, _, _ = problem(3)
+    x = x.detach()
+    quantizer = NSVQ(64, 3)
+    quantizer.fit(x, generator=generator(0))
+    x_q, codes = quantizer(x, generator(1))
+    hard = quantizer.codebook[codes]
+    torch.testing.assert_close((x_q - x).norm(dim=1), (hard - x).norm(dim=1), rtol=1e-4, atol=1e-6)
+    assert not torch.equal(x_q, hard)
+    quantizer.eval()
+    assert torch.equal(quantizer(x)[0], hard)
+    quantizer.train()
+    quantizer.freeze(codes.flip(0))
+    rows = torch.tensor([4, 2, 500])
+    x_q, frozen = quantizer(x[rows], rows=rows)
+    assert torch.equal(frozen, codes.flip(0)[rows])
+    assert torch.equal(x_q, quantizer.codebook[frozen])
+    with pytest.raises(ValueError, match="rows"):
+        quantizer(x[:5])
+
+
+def test_training_without_a_generator_is_refused() -> None:
+    with pytest.raises(ValueError, match="generator"):
+        NSVQ(4, 3)(torch.zeros(2, 3))
