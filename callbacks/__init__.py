@@ -1,0 +1,32 @@
+"""Lightning callbacks: everything of a run that happens at certain steps.
+
+Each takes its decisions from the module's schedule and the trainer's step alone, through
+:class:`nsvq_lightning.host.SplatHost`; none knows another, and the order of their list does not matter.
+"""
+
+from .checkpoint import RunCheckpoint
+from .codebooks import CodebookInit, CodebookReplacement
+from .density import DensityControl
+from .density_rules import DensityRules
+from .export import ExportScene
+from .freeze import FreezeCodes
+from .opacity import OpacityRegularization
+from .phases import PhaseSchedule
+from .predictions import RenderWriter
+from .report import MetricReport
+from .sh_degree import ShDegreeSchedule
+
+__all__ = [
+    "CodebookInit",
+    "CodebookReplacement",
+    "DensityControl",
+    "DensityRules",
+    "ExportScene",
+    "FreezeCodes",
+    "MetricReport",
+    "OpacityRegularization",
+    "PhaseSchedule",
+    "RenderWriter",
+    "RunCheckpoint",
+    "ShDegreeSchedule",
+]

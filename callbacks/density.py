@@ -1,0 +1,198 @@
+"""Adaptive density control of warm-up and prune phase."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.strategies import DDPStrategy
+from torch import Tensor
+
+from nsvq_lightning.edit import append_rows, drop_non_finite, keep_rows, replace_attribute, reset_moments
+from nsvq_lightning.host import SplatHost, as_host, next_iteration, raw_optimizer, sum_over_processes
+from nsvq_lightning.random import generator
+from nsvq_lightning.render.rasterize import Render
+from nsvq_lightning.schedule import Phase
+from nsvq_lightning.splats import RawSplats
+
+from .density_rules import (
+    DensityRules,
+    clone_mask,
+    limit_growth,
+    lower_opacities,
+    prune_mask,
+    screen_gradient,
+    split,
+    split_mask,
+)
+from .latch import StepLatch
+
+__all__ = ["DensityControl"]
+
+log = logging.getLogger(__name__)
+
+GRADIENTS, VIEWS = "gradient_sum", "view_count"
+"""Side tables of the splats: sum of the screen-space gradient norms, and number of views that saw the splat."""
+
+
+class DensityControl(Callback):
+    """Clones, splits and prunes splats (Kerbl et al. 2023, section 5), and drops those that turn non-finite.
+
+    During warm-up the norm of the screen-space gradient is averaged over the views that see a splat; at the scheduled
+    iterations splats above the threshold are cloned or split, transparent and huge ones pruned, and opacities reset. In
+    the prune phase transparent splats are pruned and none are added.
+
+    Args:
+        rules: All numbers.
+        max_splats: Never grow beyond this many; those with the largest statistic go first. None for no limit, as in the
+            paper.
+        finite_every: Iterations between two searches for non-finite splats; a step whose loss is not finite always
+            causes one.
+
+    Raises:
+        ValueError: ``max_splats`` is below ``rules.min_splats``, or ``finite_every`` below 1.
+    """
+
+    def __init__(
+        self,
+        rules: DensityRules = DensityRules(),  # noqa: B008  frozen
+        max_splats: int | None = None,
+        finite_every: int = 100,
+    ) -> None:
+        if max_splats is not None and max_splats < rules.min_splats:
+            raise ValueError(f"max_splats must be at least min_splats={rules.min_splats}, got {max_splats}")
+        if finite_every < 1:
+            raise ValueError(f"finite_every must be at least 1, got {finite_every}")
+        self.rules = rules
+        self.max_splats = max_splats
+        self.finite_every = finite_every
+        self._latch = StepLatch()
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Refuse strategies that would lose the replaced parameters.
+
+        Raises:
+            ValueError: The strategy wraps the module in ``DistributedDataParallel``.
+        """
+        # A strategy that follows parameters when they are replaced says so with this attribute.
+        follows = getattr(trainer.strategy, "follows_replaced_parameters", False)
+        if stage == "fit" and isinstance(trainer.strategy, DDPStrategy) and not follows:
+            raise ValueError(
+                "DistributedDataParallel binds gradient hooks to the parameters it finds at the start: after the first "
+                "clone it crashes or silently stops averaging. Train on one device (--trainer.devices=1)"
+            )
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Ask for screen-space gradients while they are needed."""
+        host = as_host(pl_module)
+        host.wants_screen_gradients = next_iteration(trainer) <= host.schedule.iteration(self.rules.last)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Add the statistics of this view; after a complete step do what is due."""
+        host = as_host(pl_module)
+        render = outputs.get("render") if outputs else None
+        if host.wants_screen_gradients and render is not None and render.means2d.grad is not None:
+            self._observe(trainer, host, render)
+        iteration = trainer.global_step
+        phase = host.schedule.phase_at(max(iteration, 1))
+        if phase is Phase.FINETUNE or not self._latch.first_time(iteration):
+            return
+        if render is None or iteration % self.finite_every == 0:
+            drop_non_finite(host.splats, raw_optimizer(trainer), iteration)
+        if phase is Phase.WARMUP:
+            self._warmup_step(trainer, host, iteration)
+        elif phase is Phase.PRUNE:
+            self._prune_step(trainer, host, iteration)
+
+    def _observe(self, trainer: Trainer, host: SplatHost, render: Render) -> None:
+        """Add one view (of each process) to the statistics."""
+        assert render.means2d.grad is not None
+        height, width = render.alpha.shape
+        # Gradient accumulation divides the loss by the number of micro-batches; each is a view of its own here.
+        norm = screen_gradient(render.means2d.grad, width, height) * trainer.accumulate_grad_batches
+        seen = (render.radii > 0).float()
+        host.splats.add_table(GRADIENTS).add_(sum_over_processes(trainer, norm * seen))
+        host.splats.add_table(VIEWS).add_(sum_over_processes(trainer, seen))
+
+    def _warmup_step(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
+        rules, schedule = self.rules, host.schedule
+        if iteration in schedule.density_times(rules.start, rules.last, rules.every):
+            added = self._grow(trainer, host, iteration)
+            huge = iteration > schedule.iteration(rules.huge_after)
+            pruned = self._prune(trainer, host, iteration, huge)
+            log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(host.splats))
+        white = host.background == "white" and rules.white_reset and iteration == schedule.iteration(rules.white_reset)
+        if white or iteration in schedule.reset_times(rules.reset_last, rules.reset_every):
+            self._reset_opacities(trainer, host)
+
+    def _prune_step(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
+        rules = self.rules
+        if not rules.prune_every:
+            return
+        if iteration in host.schedule.times(rules.prune_start, rules.prune_last, rules.prune_every):
+            pruned = self._prune(trainer, host, iteration, huge=False)
+            level = logging.INFO if pruned else logging.DEBUG
+            log.log(level, "iteration %d: pruned %d splats, %d remain", iteration, pruned, len(host.splats))
+
+    @torch.no_grad()
+    def _grow(self, trainer: Trainer, host: SplatHost, iteration: int) -> int:
+        """Clone and split; returns how many splats were added. The statistics start anew."""
+        splats, rules, optimizer = host.splats, self.rules, raw_optimizer(trainer)
+        gradient_sum, views = splats.add_table(GRADIENTS), splats.add_table(VIEWS)
+        statistic = gradient_sum / views.clamp(min=1)
+        cloned = clone_mask(statistic, splats.scales, host.extent, rules)
+        divided = split_mask(statistic, splats.scales, host.extent, rules)
+        if self.max_splats is not None:
+            grown = limit_growth(cloned | divided, statistic, self.max_splats - len(splats))
+            cloned, divided = cloned & grown, divided & grown
+        before = len(splats)
+        draws = generator(host.seed, iteration, "split")
+        children = split(_rows(splats.raw(), divided), rules, draws)
+        new = (torch.cat(pair) for pair in zip(_rows(splats.raw(), cloned), children, strict=True))
+        append_rows(splats, optimizer, RawSplats(*new)._asdict())
+        keep_rows(splats, optimizer, torch.cat([~divided, divided.new_ones(len(splats) - before)]))
+        for table in (GRADIENTS, VIEWS):
+            splats.add_table(table).zero_()
+        return len(splats) - before
+
+    @torch.no_grad()
+    def _prune(self, trainer: Trainer, host: SplatHost, iteration: int, huge: bool) -> int:
+        """Prune; returns how many splats went."""
+        splats, rules = host.splats, self.rules
+        prune = prune_mask(splats.opacities, splats.scales, host.extent, rules, huge)
+        count = int(prune.sum())
+        if len(splats) - count < rules.min_splats:
+            log.warning(
+                "iteration %d: pruning %d of %d splats would leave fewer than min_splats=%d; skipped. Opacities or "
+                "scales have collapsed: lower the learning rates, or check the camera poses",
+                iteration,
+                count,
+                len(splats),
+                rules.min_splats,
+            )
+            return 0
+        keep_rows(splats, raw_optimizer(trainer), ~prune)
+        return count
+
+    @torch.no_grad()
+    def _reset_opacities(self, trainer: Trainer, host: SplatHost) -> None:
+        optimizer = raw_optimizer(trainer)
+        lowered = lower_opacities(host.splats.opacities, self.rules.reset_opacity)
+        replace_attribute(host.splats, optimizer, "opacities", lowered)
+        reset_moments(optimizer, "opacities")
+
+    def state_dict(self) -> dict[str, Any]:
+        """The last iteration acted on; the statistics are side tables of the splats."""
+        return {"last": self._latch.last}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Do not repeat what was done before the checkpoint."""
+        self._latch.last = state_dict["last"]
+
+
+def _rows(splats: RawSplats, mask: Tensor) -> RawSplats:
+    return RawSplats(*(tensor.detach()[mask] for tensor in splats))

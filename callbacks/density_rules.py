@@ -1,0 +1,180 @@
+"""Density control: the paper's numbers, and its decisions as functions of parameters and statistics."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nsvq_lightning.splats import RawSplats
+
+__all__ = [
+    "DensityRules",
+    "clone_mask",
+    "limit_growth",
+    "lower_opacities",
+    "prune_mask",
+    "screen_gradient",
+    "split",
+    "split_mask",
+]
+
+
+@dataclass(frozen=True)
+class DensityRules:
+    """Numbers of adaptive density control (Kerbl et al. 2023, section 5) and of the prune phase (paper, section 3.4).
+
+    Iterations are those of the reference run of 45 000; :class:`~nsvq_lightning.schedule.Schedule` scales them.
+
+    Attributes:
+        start: First iteration that clones and splits.
+        last: Last iteration that clones and splits.
+        every: Interval of cloning and splitting.
+        grad_threshold: A splat is cloned or split where the norm of its screen-space gradient (in normalised device
+            coordinates), averaged over the views that saw it, reaches this.
+        dense_fraction: Splats up to this share of the extent are cloned, larger ones split.
+        children: Splats that a split leaves in place of its parent.
+        shrink: Children are smaller than their parent by this factor.
+        min_opacity: Splats below are pruned.
+        huge_fraction: Splats larger than this share of the extent are pruned.
+        huge_after: They are pruned only after this iteration.
+        reset_every: Interval of opacity resets.
+        reset_last: Last opacity reset.
+        reset_opacity: Opacities are reset to at most this.
+        white_reset: Iteration of one more reset on a white background; 0 for none.
+        prune_start: First pruning of the prune phase.
+        prune_last: Last pruning of the prune phase.
+        prune_every: Interval of pruning in the prune phase; 0 prunes never.
+        min_splats: A pruning that would leave fewer splats is skipped with a warning.
+
+    Raises:
+        ValueError: A number is out of its range.
+    """
+
+    start: int = 600
+    last: int = 14_900
+    every: int = 100
+    grad_threshold: float = 2e-4
+    dense_fraction: float = 0.01
+    children: int = 2
+    shrink: float = 1.6
+    min_opacity: float = 0.005
+    huge_fraction: float = 0.1
+    huge_after: int = 3000
+    reset_every: int = 3000
+    reset_last: int = 12_000
+    reset_opacity: float = 0.01
+    white_reset: int = 500
+    prune_start: int = 16_000
+    prune_last: int = 20_000
+    prune_every: int = 1000
+    min_splats: int = 10
+
+    def __post_init__(self) -> None:
+        for name in ("start", "every", "reset_every", "children", "min_splats"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("white_reset", "prune_every", "huge_after", "grad_threshold", "dense_fraction"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
+        for name in ("min_opacity", "reset_opacity"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
+        for name in ("shrink", "huge_fraction"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be above 0, got {getattr(self, name)}")
+
+
+def screen_gradient(grad: Tensor, width: int, height: int) -> Tensor:
+    """Norm ``[N]`` of the gradient of projected centres in normalised device coordinates.
+
+    An image is 2 wide and 2 high in these coordinates, so a pixel gradient counts 0.5·width and 0.5·height times.
+
+    Args:
+        grad: Gradient of the loss ``[N, 2]`` by the centre in pixels.
+        width: Image width in pixels.
+        height: Image height in pixels.
+    """
+    return torch.hypot(grad[:, 0] * (0.5 * width), grad[:, 1] * (0.5 * height))
+
+
+def largest_scale(scales: Tensor) -> Tensor:
+    """Longest axis ``[N]`` in scene units of log-scales ``[N, 3]``."""
+    return scales.amax(1).exp()
+
+
+def clone_mask(statistic: Tensor, scales: Tensor, extent: float, rules: DensityRules) -> Tensor:
+    """Which splats ``[N]`` to clone: moved a lot on the screen, and small.
+
+    Args:
+        statistic: Mean screen-space gradient ``[N]``.
+        scales: Log-scales ``[N, 3]``.
+        extent: Extent of the scene, scene units.
+        rules: Thresholds.
+    """
+    return (statistic >= rules.grad_threshold) & (largest_scale(scales) <= rules.dense_fraction * extent)
+
+
+def split_mask(statistic: Tensor, scales: Tensor, extent: float, rules: DensityRules) -> Tensor:
+    """Which splats ``[N]`` to split: moved a lot on the screen, and large; arguments as in :func:`clone_mask`."""
+    return (statistic >= rules.grad_threshold) & (largest_scale(scales) > rules.dense_fraction * extent)
+
+
+def prune_mask(opacities: Tensor, scales: Tensor, extent: float, rules: DensityRules, huge: bool) -> Tensor:
+    """Which splats ``[N]`` to prune: nearly transparent ones, and huge ones where ``huge`` is set.
+
+    Args:
+        opacities: Opacity logits ``[N]``.
+        scales: Log-scales ``[N, 3]``.
+        extent: Extent of the scene, scene units.
+        rules: Thresholds.
+        huge: Whether size counts already.
+    """
+    prune = opacities.sigmoid() < rules.min_opacity
+    if huge:
+        prune |= largest_scale(scales) > rules.huge_fraction * extent
+    return prune
+
+
+def limit_growth(mask: Tensor, statistic: Tensor, budget: int) -> Tensor:
+    """The at most ``budget`` splats of ``mask [N]`` with the largest statistic; of equals the first."""
+    if int(mask.sum()) <= budget:
+        return mask
+    candidates = mask.nonzero()[:, 0]
+    order = statistic[candidates].argsort(descending=True, stable=True)
+    limited = torch.zeros_like(mask)
+    limited[candidates[order[: max(budget, 0)]]] = True
+    return limited
+
+
+def split(parents: RawSplats, rules: DensityRules, generator: torch.Generator) -> RawSplats:
+    """Children ``[children · M, ...]`` of ``M`` parents: centres drawn from each parent's own Gaussian, axes shrunk.
+
+    Args:
+        parents: Raw attributes of the parents; all first children come before all second ones.
+        rules: Number of children and shrinking factor.
+        generator: Where the draws come from, on the CPU.
+    """
+    count = parents.means.shape[0] * rules.children
+    repeated = RawSplats(*(t.repeat(rules.children, *([1] * (t.dim() - 1))) for t in parents))
+    draws = torch.randn(count, 3, generator=generator).to(parents.means)
+    offsets = torch.einsum("nij,nj->ni", rotation_matrices(repeated.quats), repeated.scales.exp() * draws)
+    return repeated._replace(means=repeated.means + offsets, scales=repeated.scales - math.log(rules.shrink))
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Rotation matrices ``[N, 3, 3]`` of quaternions ``[N, 4]``, wxyz, any norm."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1),
+    ]
+    return torch.stack(rows, 1)
+
+
+def lower_opacities(opacities: Tensor, ceiling: float) -> Tensor:
+    """Opacity logits ``[N]`` of opacities that are at most ``ceiling``."""
+    return opacities.clamp(max=math.log(ceiling / (1.0 - ceiling)))

@@ -1,0 +1,43 @@
+"""Write the scene when training ends."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from nsvq_lightning.compress import EXPORT_FORMATS, export_scene
+from nsvq_lightning.host import as_host, is_trial, output_folder
+
+__all__ = ["ExportScene"]
+
+log = logging.getLogger(__name__)
+
+
+class ExportScene(Callback):
+    """Writes ``scene.nsvq`` (the compressed scene) and ``scene.ply`` (its decoded splats, for any viewer).
+
+    Args:
+        formats: Which of the two.
+        folder: Where; None is the trainer's log folder.
+
+    Raises:
+        ValueError: An unknown format.
+    """
+
+    def __init__(self, formats: Sequence[str] = EXPORT_FORMATS, folder: str | None = None) -> None:
+        unknown = sorted(set(formats) - set(EXPORT_FORMATS))
+        if unknown:
+            raise ValueError(f"unknown export formats {', '.join(unknown)}; choose from {', '.join(EXPORT_FORMATS)}")
+        self.formats = tuple(formats)
+        self.folder = folder
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write the files, on the first process."""
+        folder = output_folder(trainer) if self.folder is None else Path(self.folder)
+        if is_trial(trainer) or not trainer.is_global_zero:
+            return
+        for path in export_scene(as_host(pl_module).compressed(), folder, self.formats).values():
+            log.info("wrote %s (%d bytes)", path, path.stat().st_size)

@@ -1,0 +1,37 @@
+"""Opacity regularisation of the prune phase."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from nsvq_lightning.host import as_host, next_iteration
+from nsvq_lightning.schedule import Phase
+
+__all__ = ["OpacityRegularization"]
+
+
+class OpacityRegularization(Callback):
+    """Adds λ · Σ opacity to the loss during the prune phase, so that needless splats fade and are pruned.
+
+    It is a sum over the splats (paper, section 3.4), so its strength grows with their number.
+
+    Args:
+        weight: λ.
+
+    Raises:
+        ValueError: λ is negative or not finite.
+    """
+
+    def __init__(self, weight: float = 1e-7) -> None:
+        if not (math.isfinite(weight) and weight >= 0):
+            raise ValueError(f"weight must be finite and at least 0, got {weight}")
+        self.weight = weight
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Switch the term on and off."""
+        host = as_host(pl_module)
+        pruning = host.schedule.phase_at(next_iteration(trainer)) is Phase.PRUNE
+        host.opacity_weight = self.weight if pruning else 0.0

@@ -1,0 +1,117 @@
+"""Phase of the run from the trainer's step."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from nsvq_lightning.host import as_host, next_iteration, splat_host
+from nsvq_lightning.schedule import Phase, Schedule
+
+__all__ = ["PhaseSchedule"]
+
+log = logging.getLogger(__name__)
+
+
+class PhaseSchedule(Callback):
+    """Gives the module its schedule, and writes the phase of each iteration into its buffer.
+
+    The ends of the phases are iterations of a reference run, the paper's of 45 000 iterations by default; a run of any
+    other length is that run, scaled (:mod:`nsvq_lightning.schedule` says what scales how).
+
+    Args:
+        total: Iterations of the run; None takes ``trainer.max_steps``.
+        reference_total: Iterations of the run the ends are written for; None means ``total``: nothing scales.
+        warmup_end: Last iteration of the warm-up phase in the reference run.
+        prune_end: Last iteration of the prune phase in the reference run.
+        quantize_end: Last iteration of the quantize phase in the reference run.
+        min_density_interval: Lower limit of the interval of density control in this run.
+        min_reset_interval: Lower limit of the interval of opacity resets in this run.
+        min_replacement_interval: Lower limit of the window of code replacement in this run.
+
+    Raises:
+        ValueError: See :class:`~nsvq_lightning.schedule.Schedule`.
+    """
+
+    def __init__(
+        self,
+        total: int | None = None,
+        reference_total: int | None = 45_000,
+        warmup_end: int = 15_000,
+        prune_end: int = 20_000,
+        quantize_end: int = 43_000,
+        min_density_interval: int = Schedule.min_density_interval,
+        min_reset_interval: int = Schedule.min_reset_interval,
+        min_replacement_interval: int = Schedule.min_replacement_interval,
+    ) -> None:
+        self.total = total
+        self.reference_total = reference_total
+        self.rules = {
+            "warmup_end": warmup_end,
+            "prune_end": prune_end,
+            "quantize_end": quantize_end,
+            "min_density_interval": min_density_interval,
+            "min_reset_interval": min_reset_interval,
+            "min_replacement_interval": min_replacement_interval,
+        }
+        if total is not None or reference_total is not None:
+            # Says at once what is wrong with the numbers, not after the scene is loaded.
+            self.schedule(total or reference_total or 1)
+
+    def schedule(self, total: int) -> Schedule:
+        """The schedule of a run of ``total`` iterations."""
+        return Schedule(total=total, reference_total=self.reference_total or total, **self.rules)
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Set the module's schedule.
+
+        Raises:
+            ValueError: ``trainer.max_steps`` is not set and neither is ``total``.
+        """
+        if stage != "fit":
+            return
+        host = splat_host(pl_module)
+        total = self.total if self.total is not None else trainer.max_steps
+        if total < 1:
+            raise ValueError(
+                f"the run has no length: trainer.max_steps is {trainer.max_steps}; set trainer.max_steps (45000 in the "
+                "paper) or PhaseSchedule.total"
+            )
+        host.schedule = self.schedule(total)
+        if 0 < trainer.max_steps < total:
+            log.warning(
+                "trainer.max_steps=%d ends this run in its %s phase, the schedule has %d: the scene will not "
+                "be fine-tuned to its codebooks; leave PhaseSchedule.total unset to scale the phases",
+                trainer.max_steps,
+                host.schedule.phase_at(trainer.max_steps).name.lower(),
+                total,
+            )
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Check that a resumed run goes on in the phase it was in.
+
+        Raises:
+            ValueError: This schedule has the last trained iteration in another phase.
+        """
+        host = as_host(pl_module)
+        step = trainer.global_step
+        expected = host.schedule.phase_at(step) if step else Phase.WARMUP
+        if host.phase is expected:
+            return
+        if step == 0:
+            raise ValueError(
+                f"this module was already trained into its {host.phase.name.lower()} phase; make a new one, or pass "
+                "ckpt_path to go on"
+            )
+        raise ValueError(
+            f"the checkpoint is at iteration {step} in its {host.phase.name.lower()} phase, but in a run of "
+            f"{host.schedule.total} iterations that is in the {expected.name.lower()} phase; keep the "
+            "length it was trained for (PhaseSchedule.total, --callbacks.phases.total); trainer.max_steps may be larger"
+        )
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Write the phase of the iteration that starts."""
+        host = as_host(pl_module)
+        host.phase = host.schedule.phase_at(next_iteration(trainer))

@@ -1,0 +1,38 @@
+"""Write the pictures of ``predict``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from nsvq_lightning.host import output_folder
+from nsvq_lightning.pictures import file_stem, write_png
+
+__all__ = ["RenderWriter"]
+
+
+class RenderWriter(Callback):
+    """Writes every predicted view as a PNG named after its photo.
+
+    Args:
+        folder: Where; None is ``predictions`` in the trainer's log folder.
+    """
+
+    def __init__(self, folder: str | None = None) -> None:
+        self.folder = folder
+
+    def on_predict_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Write one picture."""
+        folder = output_folder(trainer) / "predictions" if self.folder is None else Path(self.folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_png(folder / f"{file_stem(outputs['name'])}.png", outputs["image"])

@@ -1,0 +1,183 @@
+"""Measure the run: curves while it trains, and the quality of the decoded file at the end."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from torch import Tensor
+from torchmetrics import Metric
+
+from nsvq_lightning.compress import export_scene
+from nsvq_lightning.data.scene import View
+from nsvq_lightning.evaluation import ViewScore, evaluate
+from nsvq_lightning.host import SplatHost, as_host, is_trial, next_iteration, output_folder
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.container import read_nsvq
+from nsvq_lightning.metrics import build_lpips, eight_bit
+from nsvq_lightning.pictures import comparison, file_stem, write_png
+from nsvq_lightning.render.camera import Camera
+from nsvq_lightning.report_files import summarize, write_curve, write_curve_csv, write_metrics, write_views
+from nsvq_lightning.splats import RawSplats
+
+__all__ = ["MetricReport"]
+
+log = logging.getLogger(__name__)
+
+
+class MetricReport(Callback):
+    """Writes what a run achieved into the trainer's log folder.
+
+    While training: test PSNR and SSIM, number of splats and training seconds at the end of each phase and every
+    ``every`` iterations, in ``curve.csv`` and ``curve.png``. An evaluation renders what a file written at that moment
+    would decode to. Its time is not training time.
+
+    In ``test``: writes ``scene.nsvq``, reads it back, and lets the module render the **decoded file**; then
+    ``metrics.json``, ``views.csv`` and a picture (photo, render, error) of each view in ``renders/``.
+
+    Args:
+        every: Iterations of this run between two evaluations; None is a twentieth of the run, 0 only the phase ends.
+        lpips: Measure LPIPS in ``test`` where torchvision and its weights are installed.
+        pictures: Write a picture of each test view.
+
+    Raises:
+        ValueError: ``every`` is negative.
+    """
+
+    def __init__(self, every: int | None = None, lpips: bool = True, pictures: bool = True) -> None:
+        if every is not None and every < 0:
+            raise ValueError(f"every must be None or at least 0, got {every}")
+        self.every = every
+        self.lpips = lpips
+        self.pictures = pictures
+        self._scene: CompressedScene | None = None
+        self._scores: list[ViewScore] = []
+        self._lpips: Metric | None = None
+        self._lpips_reason: str | None = None
+
+    # While training
+
+    def is_due(self, host: SplatHost, iteration: int) -> bool:
+        """Whether the scene is evaluated after this iteration."""
+        total = host.schedule.total
+        every = max(1, total // 20) if self.every is None else self.every
+        return iteration > 0 and (iteration in host.schedule.ends or bool(every and iteration % every == 0))
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Evaluate the last iteration, now that every callback has finished with it."""
+        self._evaluate_if_due(trainer, as_host(pl_module), next_iteration(trainer) - 1)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Evaluate the end of the run."""
+        host = as_host(pl_module)
+        self._evaluate_if_due(trainer, host, trainer.global_step, always=True)
+        if trainer.is_global_zero and host.history and not is_trial(trainer):
+            write_curve(output_folder(trainer) / "curve.png", host.history, host.schedule)
+
+    def _evaluate_if_due(self, trainer: Trainer, host: SplatHost, iteration: int, always: bool = False) -> None:
+        done = host.history[-1]["iteration"] if host.history else 0
+        if iteration <= done or not (always or self.is_due(host, iteration)) or is_trial(trainer):
+            return
+        datamodule = getattr(trainer, "datamodule", None)
+        if datamodule is None or not datamodule.scene.test:
+            return
+        with host.stopwatch.paused(host.device):
+            self._evaluate(trainer, host, iteration, datamodule.test_dataloader())
+
+    @torch.no_grad()
+    def _evaluate(self, trainer: Trainer, host: SplatHost, iteration: int, views: Any) -> None:
+        phase = host.schedule.phase_at(iteration)
+        splats = host.hard_splats(phase)
+
+        def render_image(camera: Camera) -> Tensor:
+            return host.render_splats(splats, camera).image
+
+        quality = evaluate(render_image, views, host.device)
+        entry: dict[str, Any] = {
+            "iteration": iteration,
+            "phase": phase.name.lower(),
+            "splats": len(host.splats),
+            "psnr": quality.psnr,
+            "ssim": quality.ssim,
+            "seconds": host.train_seconds,
+        }
+        host.history.append(entry)
+        folder = output_folder(trainer)
+        if trainer.is_global_zero:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_curve_csv(folder / "curve.csv", host.history)
+        for logger in trainer.loggers:
+            logger.log_metrics({f"report/{name}": entry[name] for name in ("psnr", "ssim", "splats")}, iteration)
+
+    # In test
+
+    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write the file, read it back, and let the module test what was read."""
+        host = as_host(pl_module)
+        folder = output_folder(trainer)
+        path = folder / "scene.nsvq"
+        if trainer.is_global_zero:
+            export_scene(host.compressed(), folder, ("nsvq",))
+        trainer.strategy.barrier("scene.nsvq")
+        self._scene = read_nsvq(path)
+        # Detached tensors, not the module: as a submodule it would enter checkpoints.
+        decoded = self._scene.decode().to(host.device).raw()
+        host.evaluation_splats = RawSplats(*(tensor.detach() for tensor in decoded))
+        self._scores = []
+        self._lpips, self._lpips_reason = build_lpips() if self.lpips else (None, "switched off")
+        if self._lpips is not None:
+            self._lpips.to(host.device)
+
+    def on_test_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: View,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Keep the scores of one view and write its picture."""
+        image, photo = outputs["image"], eight_bit(batch.image)
+        score = ViewScore(batch.name, float(outputs["psnr"]), float(outputs["ssim"]))
+        self._scores.append(replace(score, lpips=self._lpips_of(image, photo)))
+        if self.pictures:
+            folder = output_folder(trainer) / "renders"
+            folder.mkdir(parents=True, exist_ok=True)
+            write_png(folder / f"{file_stem(batch.name)}.png", comparison(image, photo))
+
+    def _lpips_of(self, image: Tensor, photo: Tensor) -> float | None:
+        if self._lpips is None:
+            return None
+        return float(self._lpips(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]))
+
+    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write the numbers."""
+        host = as_host(pl_module)
+        scores = _gathered(trainer, self._scores)
+        if self._scene is None or not scores:
+            return
+        folder = output_folder(trainer)
+        if trainer.is_global_zero:
+            lpips = (None, self._lpips_reason) if self._lpips is None else (_mean(scores, "lpips"), None)
+            metrics = summarize(folder / "scene.nsvq", self._scene, scores, lpips, host)
+            write_metrics(folder / "metrics.json", metrics)
+            write_views(folder / "views.csv", scores)
+        self._scene, self._lpips = None, None
+
+
+def _mean(scores: list[ViewScore], name: str) -> float:
+    values = [getattr(score, name) for score in scores]
+    return float(sum(values) / len(values))
+
+
+def _gathered(trainer: Trainer, scores: list[ViewScore]) -> list[ViewScore]:
+    """The scores of all processes, by name of the view."""
+    if trainer.world_size > 1:
+        gathered: list[list[ViewScore]] = [[] for _ in range(trainer.world_size)]
+        torch.distributed.all_gather_object(gathered, scores)
+        scores = [score for part in gathered for score in part]
+    return sorted(scores, key=lambda score: score.name)

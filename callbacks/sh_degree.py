@@ -1,0 +1,34 @@
+"""The degree of the spherical harmonics grows during the run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from nsvq_lightning.host import as_host, next_iteration
+
+__all__ = ["ShDegreeSchedule"]
+
+
+class ShDegreeSchedule(Callback):
+    """Starts with constant colours and adds a degree every ``every`` iterations, up to that of the splats.
+
+    Args:
+        every: Iterations of the reference run between two degrees (the paper's 1000).
+
+    Raises:
+        ValueError: ``every`` is below 1.
+    """
+
+    def __init__(self, every: int = 1000) -> None:
+        if every < 1:
+            raise ValueError(f"every must be at least 1 iteration, got {every}")
+        self.every = every
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Set the degree of the iteration that starts."""
+        host = as_host(pl_module)
+        degree = host.schedule.sh_degree_at(next_iteration(trainer), self.every, host.splats.sh_degree)
+        # A run that starts from a trained scene keeps the degree it came with.
+        host.active_sh_degree = max(degree, host.active_sh_degree)

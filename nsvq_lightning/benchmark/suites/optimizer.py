@@ -1,0 +1,89 @@
+"""Implementations of Adam on all attributes of a scene, against Adam in float64."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nsvq_lightning.benchmark.errors import relative_l2, worst_first
+from nsvq_lightning.benchmark.row import Row
+from nsvq_lightning.benchmark.settings import Settings
+from nsvq_lightning.benchmark.timing import Case, measure, use_threads
+from nsvq_lightning.optim import EPS, LearningRates, build_adam, param_groups
+from nsvq_lightning.random import generator
+from nsvq_lightning.splats import ATTRIBUTES, Splats
+
+__all__ = ["METHODS", "errors_after", "run"]
+
+Groups = list[dict[str, Any]]
+
+SPLATS = {True: (100_000,), False: (100_000, 500_000)}
+CHECKED_SPLATS, CHECKED_STEPS = 5_000, 10
+
+METHODS: dict[str, Callable[[Groups], torch.optim.Optimizer]] = {
+    "build_adam": build_adam,
+    "foreach": lambda groups: torch.optim.Adam(groups, eps=EPS, foreach=True),
+    "for loop": lambda groups: torch.optim.Adam(groups, eps=EPS, foreach=False),
+}
+"""Optimisers by name; ``build_adam`` is what training uses."""
+
+
+def run(settings: Settings) -> list[Row]:
+    """Time one step of every implementation at every size with every number of threads."""
+    with use_threads(max(settings.threads)):
+        errors = {name: errors_after(CHECKED_STEPS, method) for name, method in METHODS.items()}
+    note = f"error of what {CHECKED_STEPS} steps add to {CHECKED_SPLATS} splats"
+    rows = []
+    for count in SPLATS[settings.quick]:
+        splats = random_splats(count)
+        gradients = _gradients(splats, 0)
+        cases = [_case(name, splats, gradients) for name in METHODS]
+        for threads in settings.threads:
+            timings = measure(cases, settings, threads)
+            workload = f"{count // 1000}k splats, SH 3"
+            rows += [Row("optimizer", workload, n, "step", threads, timings[n], errors[n], note) for n in METHODS]
+    return rows
+
+
+def random_splats(count: int, dtype: torch.dtype = torch.float32) -> Splats:
+    """Splats with random attributes of degree 3; the same numbers in every type."""
+    draw = generator(0, 0, "splats")
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 1, 3), (count, 15, 3))
+    return Splats.from_tensors(*(torch.randn(shape, generator=draw).to(dtype) for shape in shapes))
+
+
+def _gradients(splats: Splats, step: int) -> dict[str, Tensor]:
+    """Gradients by attribute, as small as those of a splat; the same numbers in every type."""
+    draw = generator(0, step, "gradients")
+    shapes = {name: parameter.shape for name, parameter in splats.attributes().items()}
+    return {name: 1e-6 * torch.randn(shape, generator=draw) for name, shape in shapes.items()}
+
+
+def _case(name: str, splats: Splats, gradients: dict[str, Tensor]) -> Case:
+    own = Splats.from_tensors(*(tensor.detach() for tensor in splats.raw()))
+    optimizer = METHODS[name](param_groups(own, {}, LearningRates(), extent=1.0))
+    for attribute, parameter in own.attributes().items():
+        parameter.grad = gradients[attribute]
+    return Case(name, optimizer.step)
+
+
+def errors_after(steps: int, method: Callable[[Groups], torch.optim.Optimizer]) -> dict[str, float]:
+    """Relative error of the sum of some updates, the worst attribute first."""
+    truth = _moved(steps, METHODS["for loop"], torch.float64)
+    moved = _moved(steps, method, torch.float32)
+    return worst_first("update error", {name: relative_l2(moved[name], truth[name]) for name in ATTRIBUTES})
+
+
+def _moved(steps: int, method: Callable[[Groups], torch.optim.Optimizer], dtype: torch.dtype) -> dict[str, Tensor]:
+    """How far some steps move each attribute, in float64."""
+    splats = random_splats(CHECKED_SPLATS, dtype)
+    before = {name: value.detach().double().clone() for name, value in splats.attributes().items()}
+    optimizer = method(param_groups(splats, {}, LearningRates(), extent=1.0))
+    for step in range(steps):
+        for name, gradient in _gradients(splats, step).items():
+            splats.attributes()[name].grad = gradient.to(dtype)
+        optimizer.step()
+    return {name: value.detach().double() - before[name] for name, value in splats.attributes().items()}

@@ -1,0 +1,100 @@
+"""The ``nsvq`` command. Kept light: ``nsvq info`` must answer before torch would be imported."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from importlib.resources import files
+from pathlib import Path
+
+__all__ = ["find_config", "main", "resolve_configs"]
+
+OWN_COMMANDS = {"info": "nsvq_lightning.info", "benchmark": "nsvq_lightning.benchmark"}
+"""Commands without a trainer: modules with a ``main(argv)``, which must not pay for Lightning's start."""
+
+NOT_ACTIONABLE = (
+    "does not have many workers",  # views come from a cache in memory; workers would each hold a copy
+    "args parameter is intended",  # we pass the arguments after looking configs up
+    "dataloader.*no length",
+    "LeafSpec",
+    "Checkpoint directory .* exists and is not empty",
+)
+"""Parts of warnings of Lightning and torch that a user of this command can do nothing about."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run ``nsvq ARGUMENTS``.
+
+    Args:
+        argv: Arguments; those of the process if None.
+
+    Returns:
+        Exit status: 0, or 1 after an error in the user's files.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments and arguments[0] in OWN_COMMANDS:
+        command: Callable[[Sequence[str]], int] = import_module(OWN_COMMANDS[arguments[0]]).main
+        return command(arguments[1:])
+    return _run_lightning(resolve_configs(arguments))
+
+
+def _run_lightning(arguments: list[str]) -> int:
+    for message in NOT_ACTIONABLE:
+        warnings.filterwarnings("ignore", f".*{message}.*")
+    from nsvq_lightning.data.model_files import SceneError
+    from nsvq_lightning.io.errors import FormatError
+    from nsvq_lightning.lightning_cli import SplatCLI
+
+    _quiet_lightning()
+    try:
+        SplatCLI(arguments)
+    except (SceneError, FormatError) as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 1
+    return 0
+
+
+def _quiet_lightning() -> None:
+    """Show our log messages; of Lightning's only those that are not advertisements."""
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
+
+    def keep(record: logging.LogRecord) -> bool:
+        text = record.getMessage()
+        return not any(part in text for part in ("Tip:", "TPU available", "HPU available", "litlogger", "litmodels"))
+
+    for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
+        logging.getLogger(name).addFilter(keep)
+
+
+def resolve_configs(arguments: Sequence[str]) -> list[str]:
+    """The arguments with every ``--config NAME`` that is no file replaced by the shipped one of that name."""
+    resolved: list[str] = []
+    expects_config = False
+    for argument in arguments:
+        option, equals, value = argument.partition("=")
+        if expects_config:
+            argument = find_config(argument)
+        elif option in ("--config", "-c") and equals:
+            argument = f"{option}={find_config(value)}"
+        expects_config = argument in ("--config", "-c")
+        resolved.append(argument)
+    return resolved
+
+
+def find_config(name: str) -> str:
+    """Path of a config: a file as given, else one shipped with the package (``nsvq_4k``, ``configs/nsvq_4k.yaml``).
+
+    A name that is neither is returned as it is, for the parser to complain about.
+    """
+    if Path(name).exists():
+        return name
+    shipped = files("nsvq_lightning") / "configs"
+    plain = name.removeprefix("configs/")
+    for candidate in (plain, f"{plain}.yaml"):
+        if (shipped / candidate).is_file():
+            return str(shipped / candidate)
+    return name

@@ -1,0 +1,103 @@
+"""From a trained module to the scene that is written to disk."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nsvq_lightning.io.compressed import QUANTIZABLE, CompressedScene
+from nsvq_lightning.io.container import write_nsvq
+from nsvq_lightning.io.formats import save
+from nsvq_lightning.quantize.base import Quantizer
+from nsvq_lightning.quantized import attribute_rows, codes_of
+from nsvq_lightning.splats import RawSplats, sh_degree_of
+
+__all__ = ["compress", "export_scene", "finite_scene", "formula_bytes"]
+
+log = logging.getLogger(__name__)
+
+EXPORT_FORMATS = ("nsvq", "ply")
+"""Formats that :func:`export_scene` writes: the compressed scene, and its decoded splats for any viewer."""
+
+
+@torch.no_grad()
+def compress(splats: RawSplats, quantizers: Mapping[str, Quantizer], config: Mapping[str, Any]) -> CompressedScene:
+    """The scene as it is stored: codes and codebooks where there are quantizers, plain float32 elsewhere.
+
+    Splats with non-finite values are left out with a warning.
+
+    Args:
+        splats: Raw attributes.
+        quantizers: Quantizer by attribute; empty stores everything as it is.
+        config: Settings of the run, JSON values; the same run must give the same ones.
+    """
+    finite = finite_scene(splats)
+    codes = {name: _numpy(codes_of(splats, name, quantizer)) for name, quantizer in quantizers.items()}
+    return CompressedScene(
+        means=_numpy(splats.means)[finite],
+        opacities=_numpy(splats.opacities)[finite],
+        codes={name: values[finite] for name, values in codes.items()},
+        codebooks={name: _numpy(quantizer.codebook) for name, quantizer in quantizers.items()},
+        raw={name: _numpy(attribute_rows(splats, name))[finite] for name in QUANTIZABLE if name not in quantizers},
+        sh_degree=sh_degree_of(splats.shN),
+        config=dict(config),
+    )
+
+
+def finite_scene(splats: RawSplats) -> NDArray[np.bool_]:
+    """Which splats ``[N]`` are finite in every attribute; the others are reported in a warning."""
+    finite = np.ones(splats.means.shape[0], dtype=bool)
+    found = []
+    for name, tensor in zip(splats._fields, splats, strict=True):
+        good = np.isfinite(_numpy(tensor)).reshape(finite.shape[0], -1).all(1)
+        if not good.all():
+            found.append(f"{name} in {int((~good).sum())} rows")
+            finite &= good
+    if found:
+        log.warning("%d splats with non-finite values are not stored: %s", int((~finite).sum()), ", ".join(found))
+    return finite
+
+
+def export_scene(scene: CompressedScene, folder: Path, formats: tuple[str, ...] = EXPORT_FORMATS) -> dict[str, Path]:
+    """Write ``scene.<format>`` into ``folder`` for each format, atomically; the same scene gives the same bytes.
+
+    Returns:
+        Path by format.
+
+    Raises:
+        ValueError: A format is not one of :data:`EXPORT_FORMATS`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = {}
+    for suffix in formats:
+        if suffix not in EXPORT_FORMATS:
+            raise ValueError(f"unknown export format {suffix!r}; choose from {', '.join(EXPORT_FORMATS)}")
+        paths[suffix] = folder / f"scene.{suffix}"
+        if suffix == "nsvq":
+            write_nsvq(paths[suffix], scene)
+        else:
+            save(scene.decode(), paths[suffix])
+    return paths
+
+
+def formula_bytes(scene: CompressedScene, header_bytes: int) -> int:
+    """Bytes the paper's count gives: 16·N + ⌈N·Σ bits / 8⌉ + Σ 4·K·D + header, plus 4·N·D of what is not quantized.
+
+    Counted here from the numbers of the scene alone, independently of the code that writes the file.
+    """
+    n = len(scene)
+    bits = sum((len(codebook) - 1).bit_length() for codebook in scene.codebooks.values())
+    floats = sum(codebook.size for codebook in scene.codebooks.values()) + sum(raw.size for raw in scene.raw.values())
+    return 16 * n + (n * bits + 7) // 8 + 4 * floats + header_bytes
+
+
+def _numpy(tensor: Tensor) -> NDArray[Any]:
+    array: NDArray[Any] = tensor.detach().cpu().numpy()
+    return array

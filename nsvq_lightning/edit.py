@@ -1,0 +1,165 @@
+"""The only code that changes the rows of the splats.
+
+A splat is one row of six parameters, of their Adam moments and of every side table. All of them change together here:
+new ``nn.Parameter`` objects are bound in the module, in their parameter group (found by its name) and in the state of
+the optimiser. The step count of Adam belongs to the parameter, not to a row, and is kept.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from nsvq_lightning.splats import ATTRIBUTES, Splats
+
+__all__ = ["append_rows", "drop_non_finite", "finite_rows", "keep_rows", "replace_attribute", "reset_moments"]
+
+log = logging.getLogger(__name__)
+
+MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq")
+"""Per-row state of Adam; everything else in its state belongs to the whole parameter."""
+
+
+def append_rows(splats: Splats, optimizer: Optimizer, new: Mapping[str, Tensor]) -> None:
+    """Add splats at the end; their Adam moments and side tables start at zero.
+
+    Args:
+        splats: The ``N`` splats to extend.
+        optimizer: Optimiser with one group per attribute, named after it.
+        new: Raw attributes ``[M, ...]`` by name, all six, see :class:`Splats`.
+
+    Raises:
+        ValueError: An attribute is missing or has another number of rows.
+    """
+    if set(new) != set(ATTRIBUTES):
+        raise ValueError(f"new splats need the attributes {', '.join(ATTRIBUTES)}, got {', '.join(sorted(new))}")
+    counts = {name: tensor.shape[0] for name, tensor in new.items()}
+    if len(set(counts.values())) > 1:
+        raise ValueError(f"all attributes of the new splats must have the same number of rows, got {counts}")
+    count = counts["means"]
+    if count == 0:
+        return
+
+    def extend_with_zeros(moment: Tensor) -> Tensor:
+        return torch.cat([moment, moment.new_zeros(count, *moment.shape[1:])])
+
+    for name, parameter in splats.attributes().items():
+        values = torch.cat([parameter.detach(), new[name].to(parameter)])
+        _rebind(splats, optimizer, name, values, extend_with_zeros)
+    _edit_tables(splats, extend_with_zeros)
+
+
+def keep_rows(splats: Splats, optimizer: Optimizer, mask: Tensor) -> None:
+    """Keep the splats where ``mask [N]`` (bool) is true, in their order, and drop the others.
+
+    Raises:
+        ValueError: The mask is not one boolean a splat.
+    """
+    if mask.dtype != torch.bool or mask.shape != (len(splats),):
+        raise ValueError(f"mask must be [{len(splats)}] bool, got {list(mask.shape)} {mask.dtype}")
+    rows = mask.nonzero()[:, 0]
+    if rows.shape[0] == len(splats):
+        return
+
+    def select(tensor: Tensor) -> Tensor:
+        return tensor.index_select(0, rows)
+
+    for name, parameter in splats.attributes().items():
+        _rebind(splats, optimizer, name, select(parameter.detach()), select)
+    _edit_tables(splats, select)
+
+
+def replace_attribute(splats: Splats, optimizer: Optimizer, name: str, values: Tensor) -> None:
+    """Overwrite all rows of one attribute; the moments stay, see :func:`reset_moments`.
+
+    Raises:
+        ValueError: ``values`` has another shape than the attribute.
+    """
+    parameter = splats.attributes()[name]
+    if values.shape != parameter.shape:
+        raise ValueError(f"{name} must keep its shape {list(parameter.shape)}, got {list(values.shape)}")
+    _rebind(splats, optimizer, name, values.detach().to(parameter), lambda moment: moment)
+
+
+def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -> None:
+    """Set the Adam moments of the group ``name`` to zero, of all rows or of ``rows`` (indices or a mask)."""
+    state = optimizer.state.get(_group(optimizer, name)["params"][0], {})
+    for key in MOMENTS:
+        if key in state:
+            if rows is None:
+                state[key].zero_()
+            else:
+                state[key][rows] = 0.0
+
+
+def finite_rows(splats: Splats) -> tuple[Tensor, dict[str, int]]:
+    """Which splats are finite in every attribute.
+
+    Returns:
+        A mask ``[N]`` (bool) and, for each attribute with non-finite rows, how many.
+    """
+    mask = torch.ones(len(splats), dtype=torch.bool, device=splats.means.device)
+    culprits: dict[str, int] = {}
+    for name, parameter in splats.attributes().items():
+        finite = torch.isfinite(parameter.detach()).flatten(1).all(1) if parameter.dim() > 1 else parameter.isfinite()
+        bad = int((~finite).sum())
+        if bad:
+            culprits[name] = bad
+            mask &= finite
+    return mask, culprits
+
+
+def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> int:
+    """Drop splats with a NaN or infinite attribute, with a warning that names attribute, rows and step.
+
+    Returns:
+        Number of dropped splats.
+
+    Raises:
+        FloatingPointError: No finite splat is left.
+    """
+    mask, culprits = finite_rows(splats)
+    if not culprits:
+        return 0
+    kept = int(mask.sum())
+    found = ", ".join(f"{name} in {count} rows" for name, count in culprits.items())
+    if kept == 0:
+        raise FloatingPointError(
+            f"step {step}: all {len(splats)} splats are non-finite ({found}); lower the learning rates"
+        )
+    dropped = len(splats) - kept
+    log.warning("step %d: dropped %d of %d splats with non-finite values: %s", step, dropped, len(splats), found)
+    keep_rows(splats, optimizer, mask)
+    return dropped
+
+
+def _group(optimizer: Optimizer, name: str) -> dict[str, Any]:
+    for group in optimizer.param_groups:
+        if group.get("name") == name:
+            return group
+    names = ", ".join(str(group.get("name")) for group in optimizer.param_groups)
+    raise ValueError(f"the optimiser has no parameter group {name!r}, only: {names}")
+
+
+def _rebind(
+    splats: Splats, optimizer: Optimizer, name: str, values: Tensor, edit_moment: Callable[[Tensor], Tensor]
+) -> None:
+    """Bind ``values`` as the new parameter ``name`` everywhere the old one was known."""
+    group = _group(optimizer, name)
+    old = group["params"][0]
+    new = nn.Parameter(values.contiguous(), requires_grad=old.requires_grad)
+    state = optimizer.state.pop(old, None)
+    if state is not None:
+        optimizer.state[new] = {key: edit_moment(value) if key in MOMENTS else value for key, value in state.items()}
+    group["params"][0] = new
+    setattr(splats, name, new)
+
+
+def _edit_tables(splats: Splats, edit: Callable[[Tensor], Tensor]) -> None:
+    for name, table in splats.tables().items():
+        setattr(splats, name, edit(table))

@@ -1,0 +1,147 @@
+"""What a callback may touch of the module it is attached to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, cast
+
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from torch import Tensor
+from torch.optim import Optimizer
+
+from nsvq_lightning.quantize.base import Quantizer
+from nsvq_lightning.render.camera import Camera
+from nsvq_lightning.render.rasterize import Render
+from nsvq_lightning.schedule import Phase, Schedule
+from nsvq_lightning.splats import RawSplats, Splats, SplatTensors
+from nsvq_lightning.state import Stopwatch
+
+if TYPE_CHECKING:
+    from nsvq_lightning.io.compressed import CompressedScene
+
+__all__ = [
+    "SplatHost",
+    "as_host",
+    "is_trial",
+    "log_interval",
+    "next_iteration",
+    "output_folder",
+    "raw_optimizer",
+    "splat_host",
+    "sum_over_processes",
+]
+
+
+class SplatHost(Protocol):
+    """A module that trains splats; :class:`nsvq_lightning.SplatModule` is one.
+
+    Callbacks know each other only through this state, and take their decisions from ``schedule`` and the trainer's
+    step, so that the order of their list does not matter.
+    """
+
+    splats: Splats
+    """The splats; rows are edited through :mod:`nsvq_lightning.edit` only."""
+    schedule: Schedule
+    """Phases and milestones of the run."""
+    phase: Phase
+    """Phase of the current iteration; a buffer behind it."""
+    active_sh_degree: int
+    """SH degree that is rendered; a buffer behind it."""
+    opacity_weight: float
+    """λ of the loss term λ · Σ opacity."""
+    wants_screen_gradients: bool
+    """Whether the training step retains the gradient of the projected centres."""
+    evaluation_splats: SplatTensors | None
+    """What test and predict steps render instead of the module's own splats."""
+    history: list[dict[str, Any]]
+    """Evaluations so far, one plain dictionary each; checkpoints carry it."""
+    stopwatch: Stopwatch
+    """Measures the time spent training."""
+    seed: int
+    """Seed of every draw."""
+    background: str
+    """``black``, ``white`` or ``random``."""
+
+    @property
+    def quantizers(self) -> Mapping[str, Quantizer]:
+        """Quantizer by attribute; empty for a run without quantization."""
+
+    @property
+    def extent(self) -> float:
+        """Extent of the scene, scene units."""
+
+    @property
+    def train_seconds(self) -> float:
+        """Seconds spent training so far."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the splats are."""
+
+    def rows(self, attribute: str) -> Tensor:
+        """Rows ``[N, D]`` of a quantized attribute, detached."""
+
+    def hard_splats(self, phase: Phase) -> RawSplats:
+        """The splats as a file written in ``phase`` would hold them, detached."""
+
+    def render_splats(self, splats: SplatTensors, camera: Camera) -> Render:
+        """Render any splats with the module's settings."""
+
+    def compressed(self) -> CompressedScene:
+        """The scene as it is stored."""
+
+
+def splat_host(module: LightningModule) -> SplatHost:
+    """The module as a host.
+
+    Raises:
+        TypeError: It lacks something that :class:`SplatHost` names.
+    """
+    names = {name for name in (*SplatHost.__annotations__, *vars(SplatHost)) if not name.startswith("_")}
+    missing = sorted(name for name in names if not hasattr(module, name))
+    if missing:
+        raise TypeError(
+            f"{type(module).__name__} cannot host the splat callbacks, it lacks: {', '.join(missing)}; "
+            "use nsvq_lightning.SplatModule or offer the members of nsvq_lightning.host.SplatHost"
+        )
+    return as_host(module)
+
+
+def as_host(module: LightningModule) -> SplatHost:
+    """The module as a host, unchecked: what the hooks of every step use."""
+    return cast(SplatHost, module)
+
+
+def next_iteration(trainer: Trainer) -> int:
+    """1-based number of the iteration that starts (or runs) now; at the end of a step: of the next one."""
+    return trainer.global_step + 1
+
+
+def raw_optimizer(trainer: Trainer) -> Optimizer:
+    """The one optimiser, unwrapped."""
+    return trainer.optimizers[0]
+
+
+def is_trial(trainer: Trainer) -> bool:
+    """Whether this is ``fast_dev_run``, which must leave no files."""
+    return bool(getattr(trainer, "fast_dev_run", False))
+
+
+def log_interval(trainer: Trainer) -> int:
+    """Iterations between two lines of the loggers."""
+    return max(1, int(getattr(trainer, "log_every_n_steps", 50)))
+
+
+def output_folder(trainer: Trainer) -> Path:
+    """Where a run writes its files: the logger's folder, without a logger the default root folder."""
+    return Path(trainer.log_dir or trainer.default_root_dir)
+
+
+def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:
+    """Sum of a tensor over all processes; the tensor itself where there is one."""
+    if trainer.world_size == 1:
+        return tensor
+    reduced = trainer.strategy.reduce(tensor, reduce_op="sum")
+    return cast(Tensor, reduced)

@@ -1,0 +1,195 @@
+"""LightningCLI with this package's module, data, callbacks and defaults."""
+
+from __future__ import annotations
+
+import json
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NoReturn
+
+from lightning.pytorch import Callback, Trainer
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+
+import nsvq_lightning.callbacks as callbacks
+import nsvq_lightning.quantize.nsvq  # noqa: F401  short class names resolve to what is imported
+from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
+from nsvq_lightning.host import is_trial, output_folder
+from nsvq_lightning.module import SplatModule
+from nsvq_lightning.progress import SplatProgressBar
+from nsvq_lightning.trainer import SplatTrainer
+
+__all__ = ["DEFAULT_CALLBACKS", "SplatCLI", "default_loggers"]
+
+DEFAULT_CALLBACKS: dict[str, type[Callback]] = {
+    "phases": callbacks.PhaseSchedule,
+    "sh_degree": callbacks.ShDegreeSchedule,
+    "density": callbacks.DensityControl,
+    "opacity": callbacks.OpacityRegularization,
+    "codebook_init": callbacks.CodebookInit,
+    "codebook_replacement": callbacks.CodebookReplacement,
+    "freeze": callbacks.FreezeCodes,
+    "report": callbacks.MetricReport,
+    "export": callbacks.ExportScene,
+    "predictions": callbacks.RenderWriter,
+    "checkpoint": callbacks.RunCheckpoint,
+    "progress": SplatProgressBar,
+}
+"""Callback of each option group ``callbacks.<name>``. Each can be configured, exchanged for another class, or null."""
+
+TRAINER_DEFAULTS: dict[str, Any] = {
+    "max_steps": 45_000,  # the paper's run; phases and everything that depends on them follow
+    "max_epochs": -1,  # the sampler is endless: steps end the run
+    "limit_val_batches": 0,  # MetricReport evaluates, outside the training time
+    "num_sanity_val_steps": 0,
+    "use_distributed_sampler": False,  # the sampler knows its rank
+    "enable_model_summary": False,
+    "default_root_dir": "runs",
+}
+
+
+PARSER_TEXTS: dict[str, Any] = {
+    "prog": "nsvq",
+    "description": "Train 3D Gaussian splatting scenes and store them small. Two more commands have their own options: "
+    "'nsvq info FILE' describes a scene file, 'nsvq benchmark' measures this machine.",
+    "fit": {"description": "Train a scene, compress it, and measure the decoded file."},
+    "validate": {"description": "Measure the scene of a checkpoint."},
+    "test": {"description": "Write the compressed file of a checkpoint, read it back and measure it."},
+    "predict": {"description": "Render every view of a scene into a folder."},
+}
+
+
+class QuietParser(LightningArgumentParser):
+    """Says what is wrong without the usage, which has some hundred lines."""
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        """Write the message to stderr and exit with status 2."""
+        # Parsers of nested classes are made by jsonargparse and named after the script.
+        program = self.prog.replace(" [options]", "") if self.prog.startswith("nsvq") else "nsvq COMMAND"
+        hint = " (--data.root=path/to/scene)" if message.endswith("required: root") else ""
+        sys.stderr.write(f"error: {message}{hint}\nAll options: {program} --help\n")
+        self.exit(2)
+
+
+class SplatCLI(LightningCLI):
+    """``nsvq fit | validate | test | predict | export``.
+
+    The callbacks of a run are options of their own: ``--callbacks.density.max_splats=200000`` changes one number
+    without repeating a list; ``trainer.callbacks`` takes further ones.
+    """
+
+    def __init__(self, args: list[str]) -> None:
+        super().__init__(
+            SplatModule,
+            ColmapDataModule,
+            trainer_class=SplatTrainer,
+            trainer_defaults=TRAINER_DEFAULTS,
+            save_config_kwargs={"overwrite": True},
+            seed_everything_default=False,  # every draw has its own generator
+            parser_class=QuietParser,
+            parser_kwargs=PARSER_TEXTS,
+            subclass_mode_data=True,
+            auto_configure_optimizers=False,  # the module builds its groups
+            args=args,
+        )
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        """Lightning's subcommands and ours, each with the arguments that are no options."""
+        return {**LightningCLI.subcommands(), "export": {"model"}}
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Add the callbacks."""
+        for name, kind in DEFAULT_CALLBACKS.items():
+            key = f"callbacks.{name}"
+            path = f"{kind.__module__}.{kind.__qualname__}"
+            parser.add_argument(
+                f"--{key}", type=Callback | None, default={"class_path": path}, help=_first_sentence(kind)
+            )
+            parser.callback_keys.append(key)
+
+    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
+        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        # Export reads no scene: any data module that can be built without options will do.
+        data = DemoDataModule if subcommand == "export" else ColmapDataModule
+        parser.set_defaults({"data": {"class_path": f"{data.__module__}.{data.__qualname__}"}})
+        if subcommand == "validate":
+            parser.set_defaults({"trainer.limit_val_batches": 1.0})
+        if subcommand == "predict":
+            # RenderWriter has them on disk; a list of all pictures would only fill the memory.
+            parser.set_defaults({"return_predictions": False})
+        return parser
+
+    def _parse_ckpt_path(self) -> None:
+        """Take the model's settings from the checkpoint, except in ``fit``: there the user's options must win."""
+        if self.config.subcommand != "fit":
+            super()._parse_ckpt_path()
+
+    def _prepare_subcommand_kwargs(self, subcommand: str) -> dict[str, Any]:
+        kwargs = super()._prepare_subcommand_kwargs(subcommand)
+        if subcommand == "export":
+            kwargs.pop("datamodule", None)
+        return kwargs
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """The trainer with default loggers, and without the callbacks that are null."""
+        parser = self._parser(self.subcommand)
+        parser.callback_keys = [key for key in parser.callback_keys if self._get(self.config_init, key) is not None]
+        settings = self._get(self.config_init, "trainer")
+        if settings.logger in (None, True) and self.subcommand != "export":
+            kwargs["logger"] = default_loggers(settings.default_root_dir, self._run_name())
+        return super().instantiate_trainer(**kwargs)
+
+    def _run_name(self) -> str:
+        root = getattr(self.datamodule, "root", None)
+        return Path(root).resolve().name if root is not None else "scene"
+
+    def after_fit(self) -> None:
+        """Test the decoded file, and say what came out."""
+        if is_trial(self.trainer) or self.trainer.interrupted:
+            return
+        self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
+        self._print_summary()
+
+    def after_test(self) -> None:
+        """Say what came out."""
+        self._print_summary()
+
+    def _print_summary(self) -> None:
+        path = output_folder(self.trainer) / "metrics.json"
+        if self.trainer.is_global_zero and path.is_file():
+            sys.stdout.write(summary(path.parent, json.loads(path.read_text())))
+
+
+def summary(folder: Path, metrics: dict[str, Any]) -> str:
+    """What a run achieved, in a few lines."""
+    before = metrics["before_quantization"]
+    lines = [
+        f"{folder}",
+        f"  PSNR {_number(metrics['psnr'], '.2f')} dB, SSIM {_number(metrics['ssim'], '.4f')} "
+        f"on {metrics['views']} test views, rendered from the decoded file",
+        f"  {metrics['num_splats']} splats in {metrics['file_bytes']} bytes (scene.nsvq), "
+        f"{metrics['ratio']:.1f} times smaller than the plain .ply",
+        f"  {metrics['train_seconds']:.0f} s of training",
+    ]
+    if before is not None:
+        lines.insert(2, f"  before quantization: PSNR {_number(before['psnr'], '.2f')} dB")
+    return "\n".join(lines) + "\n"
+
+
+def default_loggers(root: str | None, name: str) -> list[Logger]:
+    """A CSV logger in ``root/name/version_k``, and a TensorBoard logger in the same folder where it is installed."""
+    csv = CSVLogger(root or "runs", name)
+    loggers: list[Logger] = [csv]
+    if find_spec("tensorboard") is not None:
+        loggers.append(TensorBoardLogger(root or "runs", name, version=csv.version, default_hp_metric=False))
+    return loggers
+
+
+def _number(value: float | None, form: str) -> str:
+    return "infinite" if value is None else format(value, form)
+
+
+def _first_sentence(kind: type) -> str:
+    return (kind.__doc__ or "").strip().split("\n")[0]

@@ -1,0 +1,189 @@
+"""The Lightning module: splats, codebooks, one optimiser; everything that happens at certain steps is a callback."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+from torchmetrics import Metric
+
+from nsvq_lightning.data.scene import View
+from nsvq_lightning.host import log_interval
+from nsvq_lightning.io.formats import load
+from nsvq_lightning.losses import photometric_loss
+from nsvq_lightning.metrics import eight_bit, image_metrics, psnr
+from nsvq_lightning.model import SplatModel
+from nsvq_lightning.optim import LearningRates, apply_rates, build_adam, param_groups, position_lr, set_lr
+from nsvq_lightning.quantize.nsvq import NSVQ
+from nsvq_lightning.render.camera import Camera
+from nsvq_lightning.splats import Splats
+
+__all__ = ["SplatModule"]
+
+log = logging.getLogger(__name__)
+
+
+class SplatModule(SplatModel):
+    """Trains 3D Gaussian splats and the codebooks that store them (NSVQ-GS).
+
+    The module renders what its phase trains (:class:`~nsvq_lightning.model.SplatModel`) and computes the loss; phases,
+    density control, codebooks and reports are callbacks (:mod:`nsvq_lightning.callbacks`).
+
+    Args:
+        sh_degree: Highest degree of the spherical harmonics, 0 to 3.
+        quantizer: Makes the quantizer of an attribute from (number of codes, dimension).
+        codebooks: The paper's name of the codebook sizes ("0.5k" to "16k"), or number of codes by attribute (scales,
+            quats, sh0, shN; those left out stay unquantized), or None for plain 3D Gaussian splatting.
+        background: Colour behind the splats; ``random`` draws a new one each step and tests on black.
+        dssim_weight: Share of 1 - SSIM in the loss, the rest is L1.
+        rates: Learning rates.
+        backend: Rasterizer, see :func:`nsvq_lightning.render`.
+        seed: Seed of every draw of the run except the order of the views.
+        init_from: ``.ply`` or ``.nsvq`` file to start from instead of the scene's points.
+        splats: Splats to start from, for use from Python.
+
+    Raises:
+        ValueError: A codebook is for an unknown attribute or has no code, or an argument is out of range.
+        TypeError: What ``quantizer`` makes does not follow :class:`nsvq_lightning.quantize.base.Quantizer`.
+    """
+
+    def __init__(
+        self,
+        sh_degree: int = 3,
+        quantizer: Callable[[int, int], nn.Module] = NSVQ,
+        codebooks: str | dict[str, int] | None = "16k",
+        background: Literal["black", "white", "random"] = "black",
+        dssim_weight: float = 0.2,
+        rates: LearningRates = LearningRates(),  # noqa: B008  frozen
+        backend: str = "auto",
+        seed: int = 0,
+        init_from: str | None = None,
+        splats: Splats | None = None,
+    ) -> None:
+        # A checkpoint stores the rates as a plain dictionary.
+        rates = LearningRates(**rates) if isinstance(rates, Mapping) else rates
+        start = splats if splats is not None else Splats(sh_degree)
+        super().__init__(start, quantizer, codebooks, background, dssim_weight, rates, backend, seed)
+        self.save_hyperparameters(ignore=["splats"])
+        self.init_from = init_from
+        self.view_metrics = image_metrics()
+
+    def setup(self, stage: str) -> None:
+        """Fill empty splats from ``init_from`` or the scene's points; take over the extent of the scene.
+
+        Raises:
+            ValueError: There is nothing to start from.
+        """
+        if stage != "fit":
+            return
+        scene = getattr(getattr(self.trainer, "datamodule", None), "scene", None)
+        if scene is not None and self.extent == 0.0:
+            self.state.extent = scene.extent
+        if len(self.splats) == 0:
+            self.splats = self._first_splats(scene).to(self.device)
+        if self.extent <= 0.0:
+            raise ValueError("the extent of the scene is unknown; fit with a data module that has a scene")
+
+    def _first_splats(self, scene: Any) -> Splats:
+        if self.init_from is not None:
+            loaded = load(self.init_from)
+            if loaded.sh_degree != self.splats.sh_degree:
+                raise ValueError(
+                    f"{self.init_from} has SH degree {loaded.sh_degree}, the module has {self.splats.sh_degree}; "
+                    f"set sh_degree={loaded.sh_degree}"
+                )
+            self.active_sh_degree = loaded.sh_degree
+            return loaded
+        if scene is None:
+            raise ValueError("no splats to start from: fit with a data module that has a scene, or set init_from")
+        return Splats.from_points(scene.points, scene.colors, self.splats.sh_degree)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """One Adam, one named group for each attribute and codebook."""
+        return build_adam(param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
+
+    def on_train_start(self) -> None:
+        """Take the learning rates of this run, not those of a checkpoint; start counting the training time."""
+        apply_rates(self.trainer.optimizers[0], self.rates, self.extent)
+        self.stopwatch.start()
+
+    def on_train_batch_start(self, batch: View, batch_idx: int) -> None:
+        """Set the position's learning rate of this iteration."""
+        self._micro_batch = batch_idx % self.trainer.accumulate_grad_batches
+        rate = position_lr(self.global_step + 1, self.extent, self.rates, self.schedule.position_decay_end)
+        set_lr(self.trainer.optimizers[0], "means", rate)
+
+    def training_step(self, batch: View, batch_idx: int) -> dict[str, Any] | None:
+        """Loss of one view: (1 - w)·L1 + w·(1 - SSIM) + λ·Σ opacity (paper, section 3.3).
+
+        Returns:
+            ``loss`` and the attached ``render``; None, which skips the update, when the loss is not finite.
+        """
+        rendered = self(batch.camera)
+        if self.wants_screen_gradients:
+            rendered.means2d.retain_grad()
+        image, target = rendered.image.clamp(0.0, 1.0), batch.image.float() / 255
+        loss = photometric_loss(image, target, self.dssim_weight)
+        if self.opacity_weight:
+            loss = loss + self.opacity_weight * self.splats.opacities.sigmoid().sum()
+        if (self.global_step + 1) % log_interval(self.trainer) == 0:
+            self._log_step(loss, image, target)
+        # Several processes must skip together, or their collectives would no longer match.
+        if self.trainer.world_size == 1 and not math.isfinite(loss.item()):
+            log.warning("step %d: the loss of %s is %s, no update", self.global_step + 1, batch.name, loss.item())
+            return None
+        return {"loss": loss, "render": rendered}
+
+    def _log_step(self, loss: Tensor, image: Tensor, target: Tensor) -> None:
+        quality = psnr(eight_bit(image.detach()), target).float()
+        values: dict[str, Metric | Tensor | int | float] = {
+            "train/loss": loss.detach(),
+            "train/psnr": quality,
+            "train/splats": float(len(self.splats)),
+        }
+        self.log_dict(values, batch_size=1)
+
+    def on_train_batch_end(self, outputs: Any, batch: View, batch_idx: int) -> None:
+        """Add the time of this step."""
+        self.stopwatch.lap()
+
+    def on_train_end(self) -> None:
+        """Stop counting the training time."""
+        self.stopwatch.stop()
+
+    def _evaluation_start(self) -> None:
+        if self.evaluation_splats is None:
+            self.evaluation_splats = self.hard_splats(self.phase)
+
+    def _evaluation_end(self) -> None:
+        self.evaluation_splats = None
+
+    on_validation_start = on_test_start = on_predict_start = _evaluation_start
+    on_validation_end = on_test_end = on_predict_end = _evaluation_end
+
+    def _evaluation_step(self, view: View, prefix: str) -> dict[str, Any]:
+        image = self._evaluation_image(view.camera)
+        scores = self.view_metrics(image, view.image)
+        self.log_dict({f"{prefix}/{name}": metric for name, metric in self.view_metrics.items()}, batch_size=1)
+        return {"image": image, **scores}
+
+    def _evaluation_image(self, camera: Camera) -> Tensor:
+        if self.evaluation_splats is None:
+            raise RuntimeError("evaluation steps run inside Trainer.validate, test or predict only")
+        return eight_bit(self.render_splats(self.evaluation_splats, camera).image)
+
+    def validation_step(self, batch: View, batch_idx: int) -> dict[str, Any]:
+        """Score one view: ``image [H, W, 3]`` (8-bit values in [0, 1]), ``psnr``, ``ssim``."""
+        return self._evaluation_step(batch, "val")
+
+    def test_step(self, batch: View, batch_idx: int) -> dict[str, Any]:
+        """Score one view: ``image [H, W, 3]`` (8-bit values in [0, 1]), ``psnr``, ``ssim``."""
+        return self._evaluation_step(batch, "test")
+
+    def predict_step(self, batch: View, batch_idx: int) -> dict[str, Any]:
+        """Render one view: ``name`` and ``image [H, W, 3]`` (8-bit values in [0, 1])."""
+        return {"name": batch.name, "image": self._evaluation_image(batch.camera)}

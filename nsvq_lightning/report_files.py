@@ -1,0 +1,136 @@
+"""The files of a report: ``metrics.json``, ``views.csv``, ``curve.csv``, ``curve.png``."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from nsvq_lightning.compress import formula_bytes
+from nsvq_lightning.evaluation import ViewScore
+from nsvq_lightning.host import SplatHost
+from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.container import read_header
+from nsvq_lightning.schedule import Phase, Schedule
+
+__all__ = ["summarize", "write_curve", "write_curve_csv", "write_metrics", "write_views"]
+
+PHASE_COLOURS = {Phase.WARMUP: "#dfe8f5", Phase.PRUNE: "#f8e6d0", Phase.QUANTIZE: "#dcefdc", Phase.FINETUNE: "#efe0f0"}
+
+
+def summarize(
+    path: Path,
+    scene: CompressedScene,
+    scores: Sequence[ViewScore],
+    lpips: tuple[float | None, str | None],
+    host: SplatHost,
+) -> dict[str, Any]:
+    """Everything ``metrics.json`` says; sizes in bytes, PSNR in dB, times in seconds.
+
+    Args:
+        path: The file that was decoded.
+        scene: What it holds.
+        scores: Score of each test view.
+        lpips: Mean LPIPS, or None and why.
+        host: The module, for its history and schedule.
+    """
+    file_bytes, header_bytes = path.stat().st_size, read_header(path).size
+    formula = formula_bytes(scene, header_bytes)
+    ends = _phase_ends(host.history)
+    return {
+        "psnr": _mean([score.psnr for score in scores]),
+        "ssim": _mean([score.ssim for score in scores]),
+        "lpips": lpips[0],
+        "lpips_reason": lpips[1],
+        "views": len(scores),
+        "num_splats": len(scene),
+        "file_bytes": file_bytes,
+        "plain_bytes": scene.plain_bytes,
+        "ratio": scene.plain_bytes / file_bytes,
+        "formula": {"bytes": formula, "header_bytes": header_bytes, "matches": formula == file_bytes},
+        "train_seconds": host.train_seconds,
+        "before_quantization": next((end for end in ends if end["phase"] == Phase.PRUNE.name.lower()), None),
+        "phases": ends,
+    }
+
+
+def write_metrics(path: Path, metrics: Mapping[str, Any]) -> None:
+    """Write the numbers as JSON, atomically; a PSNR that is infinite (no error at all) becomes null."""
+    text = json.dumps(_json_value(metrics), indent=2, allow_nan=False) + "\n"
+    _write_text(path, text)
+
+
+def write_views(path: Path, scores: Sequence[ViewScore]) -> None:
+    """Write one row a test view, atomically."""
+    _write_rows(path, [asdict(score) for score in scores])
+
+
+def write_curve_csv(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
+    """Write one row an evaluation, atomically."""
+    _write_rows(path, history)
+
+
+def write_curve(path: Path, history: Sequence[Mapping[str, Any]], schedule: Schedule) -> None:
+    """Draw PSNR and number of splats over the iterations, phases shaded, atomically."""
+    # Drawn without pyplot, which keeps global state and may look for a display.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    quality = figure.add_subplot()
+    count = quality.twinx()
+    iterations = [entry["iteration"] for entry in history]
+    start = 0
+    for phase, end in zip(Phase, schedule.ends, strict=True):
+        if end > start:
+            quality.axvspan(start, end, color=PHASE_COLOURS[phase], label=phase.name.lower(), linewidth=0)
+        start = end
+    quality.plot(iterations, [entry["psnr"] for entry in history], "o-", color="#1f4e9c", markersize=3)
+    count.plot(iterations, [entry["splats"] for entry in history], "-", color="#b5651d")
+    quality.set(xlabel="iteration", xlim=(0, max(schedule.total, 1)))
+    quality.set_ylabel("test PSNR, dB", color="#1f4e9c")
+    count.set_ylabel("splats", color="#b5651d")
+    count.set_ylim(bottom=0)
+    quality.legend(loc="lower right", fontsize="small")
+    picture = io.BytesIO()
+    canvas.print_png(picture)
+    with atomic_write(path) as file:
+        file.write(picture.getvalue())
+
+
+def _phase_ends(history: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The last evaluation of each phase."""
+    last = {str(entry["phase"]): dict(entry) for entry in history}
+    return [last[phase.name.lower()] for phase in Phase if phase.name.lower() in last]
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _json_value(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _json_value(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_json_value(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    _write_text(path, text.getvalue())
+
+
+def _write_text(path: Path, text: str) -> None:
+    with atomic_write(path) as file:
+        file.write(text.encode())

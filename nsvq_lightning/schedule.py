@@ -1,0 +1,167 @@
+"""The four phases of a run, and how the paper's iteration numbers turn into those of a shorter or longer one.
+
+This module is the one place that decides what scales. Every other part of the package writes the paper's numbers (of a
+run of 45 000 iterations) and asks the :class:`Schedule` for the numbers of this run:
+
+===============================  ==========================================================================
+what                             how it scales with ``total / reference_total``
+===============================  ==========================================================================
+ends of the phases               proportionally; a phase that exists in the reference never vanishes
+steps of the SH degree           proportionally
+density control: start, stop     proportionally
+density control: interval        proportionally, not below ``min_density_interval`` (its statistic is a mean over
+                                 the views of one interval, and a mean over two views is noise)
+opacity resets                   proportionally, interval not below ``min_reset_interval`` (opacities need some
+                                 hundred steps of Adam to come back)
+pruning in the prune phase       proportionally
+replacement of codes             proportionally, interval not below ``min_replacement_interval`` (a code is called
+                                 unused after a window of views)
+decay of the position's rate     proportionally (30 000 of 45 000)
+learning rates, thresholds, λ    not at all
+===============================  ==========================================================================
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+from itertools import pairwise
+
+__all__ = ["Phase", "Schedule"]
+
+POSITION_DECAY_END = 30_000
+"""The position's learning rate falls until here in the paper's run, then stays."""
+
+
+class Phase(IntEnum):
+    """Phase of a run (paper, section 4.1)."""
+
+    WARMUP = 0
+    """Plain 3D Gaussian splatting with density control."""
+    PRUNE = 1
+    """Opacity regularisation, no new splats."""
+    QUANTIZE = 2
+    """Splats and codebooks are trained together through noise substitution."""
+    FINETUNE = 3
+    """Codes are frozen; codebooks, positions and opacities are trained on."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Phases and milestones of a run of ``total`` iterations.
+
+    Iterations are 1-based: iteration 1 is the first optimiser step, ``phase_at(1)`` is ``WARMUP``. A phase covers the
+    iterations after the end of the one before, up to and including its own end. Equal ends leave a phase out.
+
+    Attributes:
+        total: Iterations of this run.
+        reference_total: Iterations of the run whose numbers the rules are written in; the paper's is 45 000.
+        warmup_end: Last iteration of the warm-up phase, in the reference run.
+        prune_end: Last iteration of the prune phase, in the reference run.
+        quantize_end: Last iteration of the quantize phase, in the reference run; fine-tuning takes the rest.
+        min_density_interval: Lower limit of the interval of density control, in iterations of this run.
+        min_reset_interval: Lower limit of the interval of opacity resets, in iterations of this run.
+        min_replacement_interval: Lower limit of the window of code replacement, in iterations of this run.
+
+    To give ends in iterations of this run, set ``reference_total`` to ``total``: then nothing scales.
+
+    Raises:
+        ValueError: The ends are not ascending within the run, or an interval is below 1.
+    """
+
+    total: int = 45_000
+    reference_total: int = 45_000
+    warmup_end: int = 15_000
+    prune_end: int = 20_000
+    quantize_end: int = 43_000
+    min_density_interval: int = 50
+    min_reset_interval: int = 300
+    min_replacement_interval: int = 50
+
+    def __post_init__(self) -> None:
+        if self.total < 1 or self.reference_total < 1:
+            raise ValueError(
+                f"a schedule needs at least one iteration, got total={self.total}, "
+                f"reference_total={self.reference_total}; set trainer.max_steps"
+            )
+        ends = (0, self.warmup_end, self.prune_end, self.quantize_end, self.reference_total)
+        if any(a > b for a, b in pairwise(ends)):
+            raise ValueError(
+                f"phase ends must satisfy 0 <= warmup_end <= prune_end <= quantize_end <= reference_total, got "
+                f"{self.warmup_end}, {self.prune_end}, {self.quantize_end}, {self.reference_total}"
+            )
+        if self.prune_end == self.quantize_end < self.reference_total:
+            raise ValueError(
+                f"fine-tuning needs a quantize phase of at least one iteration to place its codebooks in, got "
+                f"prune_end = quantize_end = {self.prune_end}; raise quantize_end or set it to reference_total"
+            )
+        for name in ("min_density_interval", "min_reset_interval", "min_replacement_interval"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1 iteration, got {getattr(self, name)}")
+
+    @cached_property
+    def scale(self) -> float:
+        """Length of this run relative to the reference run."""
+        return self.total / self.reference_total
+
+    @cached_property
+    def ends(self) -> tuple[int, int, int, int]:
+        """Last iterations of the four phases in this run; an empty phase repeats the end before it."""
+        reference = (0, self.warmup_end, self.prune_end, self.quantize_end, self.reference_total)
+        exists = [end > before for before, end in pairwise(reference)]
+        ends: list[int] = []
+        for phase, end in enumerate(reference[1:]):
+            before = ends[-1] if ends else 0
+            # Rounding must not swallow a phase: one iteration for this one, one for each that follows.
+            latest = self.total - sum(exists[phase + 1 :])
+            ends.append(min(max(round(end * self.scale), before + 1), latest) if exists[phase] else before)
+        warmup, prune, quantize, finetune = (max(end, 0) for end in ends)
+        return warmup, prune, quantize, finetune
+
+    def phase_at(self, iteration: int) -> Phase:
+        """Phase of a 1-based iteration; iterations past the end belong to the last phase that exists."""
+        ends = self.ends
+        for phase in Phase:
+            if iteration <= ends[phase]:
+                return phase
+        return max(phase for phase in Phase if ends[phase] > (ends[phase - 1] if phase else 0))
+
+    def first_of(self, phase: Phase) -> int | None:
+        """First iteration of a phase, or None when this run has no such phase."""
+        first = self.ends[phase - 1] + 1 if phase else 1
+        return first if first <= self.ends[phase] else None
+
+    def iteration(self, reference: int) -> int:
+        """The iteration of this run that stands for iteration ``reference`` of the reference run, at least 1."""
+        return max(1, round(reference * self.scale))
+
+    def interval(self, reference: int, minimum: int = 1) -> int:
+        """The interval of this run that stands for ``reference`` iterations, at least ``minimum``."""
+        return max(minimum, self.iteration(reference)) if self.scale < 1 else self.iteration(reference)
+
+    def times(self, start: int, last: int, every: int, minimum: int = 1) -> range:
+        """The iterations ``start, start + every, …, last`` of the reference run as iterations of this run."""
+        return range(self.iteration(start), self.iteration(last) + 1, self.interval(every, minimum))
+
+    def density_times(self, start: int, last: int, every: int) -> range:
+        """Iterations at which splats are cloned, split and pruned."""
+        return self.times(start, last, every, self.min_density_interval)
+
+    def reset_times(self, last: int, every: int) -> range:
+        """Iterations at which opacities are reset: the multiples of the interval up to ``last``."""
+        step = self.interval(every, self.min_reset_interval)
+        return range(step, self.iteration(last) + 1, step)
+
+    def replacement_times(self, start: int, last: int, every: int) -> range:
+        """Iterations at which inactive codes are replaced."""
+        return self.times(start, last, every, self.min_replacement_interval)
+
+    def sh_degree_at(self, iteration: int, every: int, highest: int) -> int:
+        """SH degree in use at a 1-based iteration: one more every ``every`` reference iterations."""
+        return min(highest, iteration // self.interval(every))
+
+    @property
+    def position_decay_end(self) -> int:
+        """Iteration from which the position's learning rate is constant."""
+        return self.iteration(POSITION_DECAY_END)

@@ -1,0 +1,46 @@
+"""Lightning's trainer with the subcommand ``export``."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import torch
+from lightning.pytorch import Trainer
+
+from nsvq_lightning.io.container import write_nsvq
+from nsvq_lightning.io.formats import save
+from nsvq_lightning.module import SplatModule
+
+__all__ = ["SplatTrainer"]
+
+log = logging.getLogger(__name__)
+
+
+class SplatTrainer(Trainer):
+    """:class:`lightning.pytorch.Trainer`; every public method below is a subcommand of ``nsvq``."""
+
+    def export(self, model: SplatModule, ckpt_path: str, output: str = "scene.nsvq") -> Path:
+        """Write the scene of a checkpoint as a file.
+
+        Args:
+            model: Module that the checkpoint is loaded into.
+            ckpt_path: Checkpoint of a run.
+            output: File to write; its suffix names the format: .nsvq is the compressed scene, any other format holds
+                the decoded splats.
+
+        Raises:
+            FileNotFoundError: No such checkpoint.
+        """
+        checkpoint = torch.load(ckpt_path, map_location="cpu", weights_only=True)
+        model.on_load_checkpoint(checkpoint)
+        model.load_state_dict(checkpoint["state_dict"])
+        path = Path(output)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        scene = model.compressed()
+        if path.suffix.lower() == ".nsvq":
+            write_nsvq(path, scene)
+        else:
+            save(scene.decode(), path)
+        log.info("wrote %s: %d splats, %d bytes", path, len(scene), path.stat().st_size)
+        return path

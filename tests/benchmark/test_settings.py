@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from nsvq_lightning.benchmark.settings import Settings, usable_cores
+
+
+def test_full_and_quick_runs_have_their_own_defaults() -> None:
+    full, quick = (Settings.of(quick=quick, most_threads=4) for quick in (False, True))
+    assert (full.threads, full.repeats, full.workloads) == ((1, 4), 15, ("A20k", "B100k", "C500k"))
+    assert (quick.threads, quick.repeats, quick.workloads) == ((4,), 3, ("A20k",))
+    assert quick.seconds < full.seconds
+    assert Settings.of(quick=False, most_threads=1).threads == (1,)
+
+
+def test_what_is_given_wins() -> None:
+    settings = Settings.of(
+        quick=True, most_threads=2, threads=(2, 1), repeats=9, workloads=("B100k",), scene=Path("x.ply")
+    )
+    assert (settings.threads, settings.repeats, settings.workloads) == ((2, 1), 9, ("B100k",))
+    assert settings.scene == Path("x.ply")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"threads": ()}, "at least 1"),
+        ({"threads": (1, 0)}, "at least 1, got"),
+        ({"threads": (1,), "repeats": 0}, "repeats must be at least 1, got 0"),
+        ({"threads": (1,), "seconds": math.nan}, "seconds must be finite"),
+        ({"threads": (1,), "seconds": 0.0}, "above 0"),
+        ({"threads": (1,), "workloads": ("A20k", "Z")}, "some of A20k, B100k, C500k, got Z"),
+        ({"threads": (1,), "workloads": ()}, "got none"),
+    ],
+)
+def test_values_out_of_range_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Settings(**arguments)
+
+
+def test_more_threads_than_there_are_would_be_a_lie() -> None:
+    with pytest.raises(ValueError, match="at most 2 threads can be measured here, got 3"):
+        Settings.of(quick=True, most_threads=2, threads=(1, 3))
+
+
+def test_at_least_one_core_is_usable() -> None:
+    assert usable_cores() >= 1

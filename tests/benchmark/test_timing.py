@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import gc
+import time
+
+import pytest
+import torch
+
+from nsvq_lightning.benchmark import timing
+from nsvq_lightning.benchmark.row import Timing
+from nsvq_lightning.benchmark.settings import Settings
+from nsvq_lightning.benchmark.timing import Case, measure
+
+
+@pytest.fixture(autouse=True)
+def small_product(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(timing, "SGEMM_SIDE", 16)
+
+
+def test_cases_take_turns_in_a_rotating_order_after_one_call_that_is_not_counted() -> None:
+    calls: list[str] = []
+    cases = [Case(name, lambda name=name: calls.append(name)) for name in "ab"]  # type: ignore[misc]
+    timings = measure(cases, Settings((1,), repeats=3), 1)
+    # The product goes first in the first round; then the order is turned by one place a round.
+    assert "".join(calls) == "ab" + "ab" + "ab" + "ba"
+    assert {name: len(result.samples) for name, result in timings.items()} == {"a": 3, "b": 3}
+    assert len(timings["a"].sgemm) == 3
+    assert timings["a"].sgemm == timings["b"].sgemm
+
+
+def test_times_are_milliseconds_without_the_preparation() -> None:
+    result = measure([Case("nap", lambda: time.sleep(0.02), lambda: time.sleep(0.2))], Settings((1,), repeats=2), 1)
+    assert 20 <= result["nap"].minimum < 200
+
+
+def test_slow_case_sits_out_once_its_time_is_used_up() -> None:
+    cases = [Case("slow", lambda: time.sleep(0.03)), Case("fast", lambda: None)]
+    timings = measure(cases, Settings((1,), repeats=6, seconds=0.05), 1)
+    assert len(timings["slow"].samples) == 2
+    assert len(timings["fast"].samples) == len(timings["fast"].sgemm) == 6
+
+
+def test_threads_and_collector_are_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 7)
+    counts: list[int] = []
+    monkeypatch.setattr(torch, "set_num_threads", counts.append)
+    seen: list[bool] = []
+
+    def fail() -> None:
+        seen.append(gc.isenabled())
+        raise RuntimeError("broken case")
+
+    with pytest.raises(RuntimeError, match="broken case"):
+        measure([Case("a", fail)], Settings((1,)), 3)
+    assert counts == [3, 7]
+    assert seen == [False]
+    assert gc.isenabled()
+
+
+def test_names_must_differ() -> None:
+    with pytest.raises(ValueError, match="different names"):
+        measure([Case("a", lambda: None), Case("a", lambda: None)], Settings((1,)), 1)
+
+
+def test_summary_of_known_samples() -> None:
+    known = Timing((5.0, 1.0, 2.0, 4.0, 3.0), (10.0, 30.0, 20.0))
+    assert (known.median, known.minimum, known.quartiles, known.ratio) == (3.0, 1.0, (2.0, 4.0), 0.15)
+    assert Timing((7.0,), (7.0,)).quartiles == (7.0, 7.0)
+    assert known.as_json()["samples_ms"] == [5.0, 1.0, 2.0, 4.0, 3.0]
+
+
+def test_timing_needs_samples() -> None:
+    with pytest.raises(ValueError, match="at least one sample"):
+        Timing((), (1.0,))

@@ -1,0 +1,88 @@
+"""When codes are replaced (method: 20 100..22 000 every 100, then 22 500..43 000 every 500), and perplexity by hand."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from nsvq_lightning.callbacks import CodebookReplacement, OpacityRegularization, PhaseSchedule, ShDegreeSchedule
+from nsvq_lightning.callbacks.codebooks import perplexity
+from nsvq_lightning.callbacks.latch import StepLatch
+from nsvq_lightning.schedule import Phase, Schedule
+
+
+def host(**values: Any) -> Any:
+    return SimpleNamespace(schedule=Schedule(), **values)
+
+
+def test_codes_are_replaced_at_the_papers_iterations() -> None:
+    callback = CodebookReplacement()
+    due = [i for i in range(1, 45_001) if callback.is_due(host(), i)]
+    assert due == [*range(20_100, 22_001, 100), *range(22_500, 43_001, 500)]
+
+
+def test_a_short_run_replaces_over_windows_of_several_views() -> None:
+    callback = CodebookReplacement()
+    short: Any = SimpleNamespace(schedule=Schedule(total=4500, min_replacement_interval=40))
+    due = [i for i in range(1, 4501) if callback.is_due(short, i)]
+    assert due[0] == 2010
+    assert {b - a for a, b in pairwise(due) if b < 2250} == {40}
+    assert due[-1] == 4300
+    assert all(short.schedule.phase_at(i) is Phase.QUANTIZE for i in due)
+
+
+@pytest.mark.parametrize(
+    ("usage", "expected"), [([0, 0, 0], 0.0), ([5, 0, 0], 1.0), ([3, 3, 3], 3.0), ([1, 1, 2], 2.0 * 2**0.5)]
+)
+def test_perplexity_by_hand(usage: list[int], expected: float) -> None:
+    assert perplexity(torch.tensor(usage)) == pytest.approx(expected)
+
+
+def test_the_latch_opens_once_an_iteration() -> None:
+    latch = StepLatch()
+    assert [latch.first_time(i) for i in (0, 0, 1, 1, 2)] == [True, False, True, False, True]
+
+
+@pytest.mark.parametrize("bad", [{"start": 0}, {"early_end": 100}, {"late_every": 0}])
+def test_impossible_replacement_is_refused(bad: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match="replacement needs"):
+        CodebookReplacement(**bad)
+
+
+def test_lambda_acts_in_the_prune_phase_only() -> None:
+    callback = OpacityRegularization()
+    module = host(opacity_weight=0.0)
+    weights = {}
+    for step in (0, 14_999, 15_000, 19_999, 20_000):
+        callback.on_train_batch_start(SimpleNamespace(global_step=step), module, None, 0)  # type: ignore[arg-type]
+        weights[step + 1] = module.opacity_weight
+    assert weights == {1: 0.0, 15_000: 0.0, 15_001: 1e-7, 20_000: 1e-7, 20_001: 0.0}
+
+
+def test_the_sh_degree_grows_up_to_that_of_the_splats() -> None:
+    callback = ShDegreeSchedule()
+    module = host(active_sh_degree=0, splats=SimpleNamespace(sh_degree=2))
+    degrees = {}
+    for step in (0, 998, 999, 1999, 2999, 40_000):
+        callback.on_train_batch_start(SimpleNamespace(global_step=step), module, None, 0)  # type: ignore[arg-type]
+        degrees[step + 1] = module.active_sh_degree
+    assert degrees == {1: 0, 999: 0, 1000: 1, 2000: 2, 3000: 2, 40_001: 2}
+
+
+def test_phase_schedule_says_at_once_what_is_wrong() -> None:
+    with pytest.raises(ValueError, match="phase ends must satisfy"):
+        PhaseSchedule(warmup_end=30_000)
+    with pytest.raises(ValueError, match="weight must be finite"):
+        OpacityRegularization(-1.0)
+    with pytest.raises(ValueError, match="every must be at least 1"):
+        ShDegreeSchedule(0)
+
+
+def test_ends_in_iterations_of_the_run_do_not_scale() -> None:
+    callback = PhaseSchedule(reference_total=None, warmup_end=100, prune_end=150, quantize_end=300)
+    schedule = callback.schedule(400)
+    assert (schedule.ends, schedule.scale) == ((100, 150, 300, 400), 1.0)

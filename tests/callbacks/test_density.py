@@ -1,0 +1,194 @@
+"""Density control on a host of five splats: statistics, edits, guard, cap, resets."""
+
+from __future__ import annotations
+
+import logging
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
+
+from nsvq_lightning.callbacks import DensityControl, DensityRules
+from nsvq_lightning.optim import LearningRates, build_adam, param_groups
+from nsvq_lightning.render.rasterize import Render
+from nsvq_lightning.schedule import Schedule
+from nsvq_lightning.splats import Splats
+
+EXTENT = 2.0
+SMALL, LARGE = 0.01, 0.05  # below and above 0.01 · extent
+
+
+def make_splats(sizes: list[float], opacities: list[float]) -> Splats:
+    n = len(sizes)
+    return Splats.from_tensors(
+        means=torch.arange(3.0 * n).view(n, 3),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+        scales=torch.tensor(sizes).log()[:, None].repeat(1, 3),
+        opacities=torch.tensor(opacities).logit(),
+        sh0=torch.zeros(n, 1, 3),
+        shN=torch.zeros(n, 0, 3),
+    )
+
+
+def view(gradients: list[float], seen: list[bool], width: int = 40, height: int = 20) -> Render:
+    """A render whose screen-space gradients (in normalised coordinates, along x) are given."""
+    n = len(gradients)
+    means2d = torch.zeros(n, 2, requires_grad=True)
+    means2d.grad = torch.tensor([[g / (0.5 * width), 0.0] for g in gradients])
+    image = torch.zeros(height, width, 3)
+    return Render(image, image[..., 0], torch.tensor(seen).int(), means2d, image[..., 0])
+
+
+class Stage:
+    """Host and trainer in one run of the paper's length."""
+
+    def __init__(self, splats: Splats, control: DensityControl, background: str = "black", micro: int = 1) -> None:
+        self.control = control
+        optimizer = build_adam(param_groups(splats, {}, LearningRates(), EXTENT))
+        self.host: Any = SimpleNamespace(
+            splats=splats,
+            schedule=Schedule(),
+            extent=EXTENT,
+            seed=0,
+            background=background,
+            wants_screen_gradients=True,
+        )
+        self.trainer: Any = SimpleNamespace(
+            optimizers=[optimizer], global_step=0, world_size=1, accumulate_grad_batches=micro
+        )
+
+    def end_batch(self, iteration: int, render: Render | None = None) -> None:
+        self.trainer.global_step = iteration
+        outputs = {} if render is None else {"loss": torch.tensor(0.0), "render": render}
+        self.control.on_train_batch_end(self.trainer, self.host, outputs, None, 0)
+
+    @property
+    def count(self) -> int:
+        return len(self.host.splats)
+
+
+def test_the_statistic_is_the_mean_over_the_views_that_saw_the_splat() -> None:
+    stage = Stage(make_splats([SMALL] * 3, [0.5] * 3), DensityControl())
+    stage.end_batch(1, view([4e-4, 1e-4, 0.0], [True, True, False]))
+    stage.end_batch(2, view([2e-4, 0.0, 0.0], [True, False, False]))
+    tables = stage.host.splats.tables()
+    assert tables["gradient_sum"].tolist() == pytest.approx([6e-4, 1e-4, 0.0])
+    assert tables["view_count"].tolist() == [2.0, 1.0, 0.0]
+
+
+def test_clone_split_and_prune_at_the_scheduled_iteration() -> None:
+    splats = make_splats([SMALL, LARGE, SMALL, SMALL], [0.5, 0.5, 0.004, 0.5])
+    stage = Stage(splats, DensityControl(DensityRules(min_splats=1)))
+    stage.end_batch(599, view([3e-4, 3e-4, 0.0, 1e-4], [True] * 4))
+    assert stage.count == 4
+    stage.end_batch(600, view([3e-4, 3e-4, 0.0, 1e-4], [True] * 4))
+    # 0 is there twice, 1 became two children, 2 was transparent, 3 stays.
+    means = stage.host.splats.means.detach()
+    assert stage.count == 5
+    assert means[:3].tolist() == [[0, 1, 2], [9, 10, 11], [0, 1, 2]]
+    assert stage.host.splats.scales.exp()[3:].tolist() == [[pytest.approx(LARGE / 1.6)] * 3] * 2
+    assert (means[3:] - torch.tensor([3.0, 4.0, 5.0])).abs().max() < 6 * LARGE
+    assert not any(table.any() for table in stage.host.splats.tables().values())  # the statistics start anew
+
+
+def test_gradient_accumulation_neither_repeats_an_edit_nor_weakens_the_statistic() -> None:
+    stage = Stage(make_splats([SMALL] * 2, [0.5] * 2), DensityControl(DensityRules(min_splats=1)), micro=2)
+    # Each micro-batch sees half of the gradient, as Lightning divides the loss.
+    stage.end_batch(600, view([1.1e-4, 0.0], [True, True]))
+    assert stage.count == 3
+    stage.end_batch(600, view([1.1e-4, 0.0, 1.1e-4], [True] * 3))
+    assert stage.count == 3
+
+
+def test_huge_splats_go_only_after_iteration_3000() -> None:
+    rules = DensityRules(min_splats=1)
+    for iteration, left in ((2900, 2), (3000, 2), (3100, 1)):
+        stage = Stage(make_splats([0.1 * EXTENT + 0.01, SMALL], [0.5, 0.5]), DensityControl(rules))
+        stage.end_batch(iteration, view([0.0, 0.0], [True, True]))
+        assert stage.count == left
+
+
+def test_opacities_are_reset_with_their_moments() -> None:
+    stage = Stage(make_splats([SMALL] * 3, [0.9, 0.5, 0.008]), DensityControl(DensityRules(min_splats=1)))
+    optimizer = stage.trainer.optimizers[0]
+    stage.host.splats.opacities.sum().backward()
+    optimizer.step()
+    stage.end_batch(3000, view([0.0] * 3, [True] * 3))
+    opacities = stage.host.splats.opacities
+    assert opacities.sigmoid().tolist() == pytest.approx([0.01, 0.01, 0.008], rel=0.1)
+    assert not optimizer.state[opacities]["exp_avg"].any()
+    assert float(optimizer.state[opacities]["step"]) == 1.0
+
+
+def test_a_white_background_is_reset_once_more() -> None:
+    for background, opacity in (("white", 0.01), ("black", 0.9)):
+        stage = Stage(make_splats([SMALL] * 12, [0.9] * 12), DensityControl(), background)
+        stage.end_batch(500, view([0.0] * 12, [True] * 12))
+        assert float(stage.host.splats.opacities[0].detach().sigmoid()) == pytest.approx(opacity, rel=1e-4)
+
+
+def test_the_prune_phase_prunes_and_never_grows() -> None:
+    stage = Stage(make_splats([SMALL] * 3, [0.5, 0.004, 0.5]), DensityControl(DensityRules(min_splats=1)))
+    stage.end_batch(15_500, view([1.0] * 3, [True] * 3))
+    assert stage.count == 3
+    stage.end_batch(16_000, view([1.0] * 3, [True] * 3))
+    assert stage.count == 2
+
+
+def test_pruning_everything_is_skipped_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    stage = Stage(make_splats([SMALL] * 12, [0.001] * 12), DensityControl())
+    with caplog.at_level(logging.WARNING):
+        stage.end_batch(16_000, view([0.0] * 12, [True] * 12))
+    assert stage.count == 12
+    assert "pruning 12 of 12 splats would leave fewer than min_splats=10" in caplog.text
+
+
+def test_growth_stops_at_the_cap() -> None:
+    control = DensityControl(DensityRules(min_splats=1), max_splats=5)
+    stage = Stage(make_splats([SMALL, SMALL, LARGE, LARGE], [0.5] * 4), control)
+    stage.end_batch(600, view([3e-4, 4e-4, 5e-4, 9e-4], [True] * 4))
+    assert stage.count == 5
+    # The one with the largest statistic, the last, was split.
+    assert stage.host.splats.means.detach()[:3].tolist() == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
+
+
+def test_a_non_finite_splat_is_dropped_as_soon_as_the_loss_shows_it(caplog: pytest.LogCaptureFixture) -> None:
+    stage = Stage(make_splats([SMALL] * 3, [0.5] * 3), DensityControl())
+    with torch.no_grad():
+        stage.host.splats.quats[1] = math.nan
+    stage.end_batch(7, None)  # the step was skipped: no outputs
+    assert stage.count == 2
+    assert "step 7: dropped 1 of 3 splats with non-finite values: quats in 1 rows" in caplog.text
+
+
+def test_resuming_right_after_an_edit_does_not_repeat_it() -> None:
+    control = DensityControl(DensityRules(min_splats=1))
+    stage = Stage(make_splats([SMALL] * 2, [0.5] * 2), control)
+    stage.end_batch(600, view([3e-4, 0.0], [True, True]))
+    fresh = DensityControl(DensityRules(min_splats=1))
+    fresh.load_state_dict(control.state_dict())
+    stage.control = fresh
+    stage.end_batch(600, view([3e-4, 0.0, 3e-4], [True] * 3))
+    assert stage.count == 3
+
+
+def test_ddp_is_refused_with_the_reason() -> None:
+    control, host = DensityControl(), SimpleNamespace()
+    with pytest.raises(ValueError, match="silently stops averaging"):
+        control.setup(SimpleNamespace(strategy=DDPStrategy()), host, "fit")  # type: ignore[arg-type]
+    control.setup(SimpleNamespace(strategy=SingleDeviceStrategy()), host, "fit")  # type: ignore[arg-type]
+
+    class Following(DDPStrategy):
+        follows_replaced_parameters = True
+
+    control.setup(SimpleNamespace(strategy=Following()), host, "fit")  # type: ignore[arg-type]
+
+
+def test_impossible_arguments_are_refused() -> None:
+    with pytest.raises(ValueError, match="max_splats must be at least"):
+        DensityControl(max_splats=3)
+    with pytest.raises(ValueError, match="finite_every"):
+        DensityControl(finite_every=0)

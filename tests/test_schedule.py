@@ -1,0 +1,95 @@
+"""The schedule against the paper's own numbers (section 4.1), and against proportion."""
+
+from __future__ import annotations
+
+import pytest
+
+from nsvq_lightning.schedule import Phase, Schedule
+
+
+def test_the_papers_run_has_the_papers_phases() -> None:
+    schedule = Schedule()
+    assert schedule.ends == (15_000, 20_000, 43_000, 45_000)
+    expected = {
+        1: Phase.WARMUP,
+        15_000: Phase.WARMUP,
+        15_001: Phase.PRUNE,
+        20_000: Phase.PRUNE,
+        20_001: Phase.QUANTIZE,
+        43_000: Phase.QUANTIZE,
+        43_001: Phase.FINETUNE,
+        45_000: Phase.FINETUNE,
+    }
+    assert {iteration: schedule.phase_at(iteration) for iteration in expected} == expected
+    assert [schedule.first_of(phase) for phase in Phase] == [1, 15_001, 20_001, 43_001]
+
+
+def test_the_papers_run_has_the_papers_milestones() -> None:
+    schedule = Schedule()
+    density = schedule.density_times(600, 14_900, 100)
+    assert (density[0], density[1], density[-1], len(density)) == (600, 700, 14_900, 144)
+    assert list(schedule.reset_times(12_000, 3000)) == [3000, 6000, 9000, 12_000]
+    assert list(schedule.times(16_000, 20_000, 1000)) == [16_000, 17_000, 18_000, 19_000, 20_000]
+    assert schedule.replacement_times(20_100, 22_000, 100)[-1] == 22_000
+    assert list(schedule.replacement_times(22_500, 43_000, 500))[-2:] == [42_500, 43_000]
+    assert [schedule.sh_degree_at(i, 1000, 3) for i in (1, 999, 1000, 1999, 2000, 3000, 45_000)] == [
+        0,
+        0,
+        1,
+        1,
+        2,
+        3,
+        3,
+    ]
+    assert schedule.position_decay_end == 30_000
+
+
+def test_a_shorter_run_is_the_same_run_scaled() -> None:
+    schedule = Schedule(total=4500, min_density_interval=1, min_reset_interval=1, min_replacement_interval=1)
+    assert schedule.ends == (1500, 2000, 4300, 4500)
+    assert list(schedule.density_times(600, 14_900, 100))[:2] == [60, 70]
+    assert list(schedule.reset_times(12_000, 3000)) == [300, 600, 900, 1200]
+    assert list(schedule.times(16_000, 20_000, 1000)) == [1600, 1700, 1800, 1900, 2000]
+    assert schedule.sh_degree_at(300, 1000, 3) == 3
+    assert schedule.position_decay_end == 3000
+
+
+def test_intervals_of_short_runs_have_a_lower_limit_and_paper_runs_have_none() -> None:
+    short = Schedule(total=3000, min_density_interval=40)
+    times = short.density_times(600, 14_900, 100)
+    assert times.step == 40
+    assert times[0] == 40  # 600 / 15
+    assert Schedule(min_density_interval=400).density_times(600, 14_900, 100).step == 100
+
+
+@pytest.mark.parametrize("total", range(4, 60))
+def test_no_phase_vanishes_from_a_tiny_run(total: int) -> None:
+    schedule = Schedule(total=total)
+    ends = schedule.ends
+    assert ends[-1] == total
+    assert {schedule.phase_at(i) for i in range(1, total + 1)} == set(Phase)
+    assert all(schedule.phase_at(end) is phase for phase, end in zip(Phase, ends, strict=True))
+
+
+def test_equal_ends_leave_phases_out() -> None:
+    plain = Schedule(total=3000, reference_total=30_000, prune_end=30_000, quantize_end=30_000)
+    assert plain.ends == (1500, 3000, 3000, 3000)
+    assert plain.first_of(Phase.QUANTIZE) is None
+    assert plain.first_of(Phase.FINETUNE) is None
+    assert plain.phase_at(3000) is Phase.PRUNE
+    assert plain.phase_at(3001) is Phase.PRUNE
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"total": 0}, "total=0"),
+        ({"warmup_end": 30_000}, "phase ends must satisfy"),
+        ({"quantize_end": 50_000}, "phase ends must satisfy"),
+        ({"quantize_end": 20_000}, "quantize phase of at least one iteration"),
+        ({"min_density_interval": 0}, "min_density_interval must be at least 1"),
+    ],
+)
+def test_impossible_schedules_are_refused(settings: dict[str, int], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Schedule(**settings)

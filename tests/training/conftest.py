@@ -1,0 +1,87 @@
+"""A run through all four phases that takes seconds: 9 views of 48×36, some hundred splats, codebooks of a few codes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lightning.pytorch import Callback, Trainer
+
+from nsvq_lightning.callbacks import (
+    CodebookInit,
+    CodebookReplacement,
+    DensityControl,
+    DensityRules,
+    ExportScene,
+    FreezeCodes,
+    MetricReport,
+    OpacityRegularization,
+    PhaseSchedule,
+    RunCheckpoint,
+    ShDegreeSchedule,
+)
+from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.module import SplatModule
+
+STEPS = 60
+CODES = {"scales": 24, "quats": 24, "sh0": 16, "shN": 16}
+
+
+Recipe = Callable[..., dict[str, Callback]]
+
+
+@pytest.fixture(scope="module")
+def recipe() -> Recipe:
+    """``recipe(**replaced)``: the callbacks of a full run, with intervals that fit 60 steps."""
+
+    def build(**replaced: Callback) -> dict[str, Callback]:
+        standard: dict[str, Callback] = {
+            "phases": PhaseSchedule(min_density_interval=4, min_reset_interval=11, min_replacement_interval=5),
+            "sh_degree": ShDegreeSchedule(),
+            "density": DensityControl(DensityRules(grad_threshold=5e-6)),
+            "opacity": OpacityRegularization(),
+            "codebook_init": CodebookInit(),
+            "codebook_replacement": CodebookReplacement(),
+            "freeze": FreezeCodes(),
+            "report": MetricReport(every=20),
+            "export": ExportScene(),
+        }
+        return standard | replaced
+
+    return build
+
+
+RunFactory = Callable[..., tuple[Trainer, SplatModule]]
+
+
+@pytest.fixture(scope="module")
+def run(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFactory:
+    """``run(callbacks, ckpt_path=…, module={…}, **trainer)`` fits and returns trainer and module."""
+
+    def fit(
+        callbacks: Iterable[Callback],
+        ckpt_path: Path | None = None,
+        module: dict[str, Any] | None = None,
+        **trainer_arguments: Any,
+    ) -> tuple[Trainer, SplatModule]:
+        callbacks = list(callbacks)
+        settings: dict[str, Any] = {"max_steps": STEPS, "max_epochs": -1, "limit_val_batches": 0, **trainer_arguments}
+        trainer = Trainer(
+            accelerator="cpu",
+            devices=1,
+            logger=False,
+            enable_checkpointing=any(isinstance(c, RunCheckpoint) for c in callbacks),
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            use_distributed_sampler=False,
+            default_root_dir=tmp_path_factory.mktemp("run"),
+            callbacks=callbacks,
+            **settings,
+        )
+        splat_module = SplatModule(**{"sh_degree": 1, "codebooks": CODES, **(module or {})})
+        trainer.fit(splat_module, datamodule=ColmapDataModule(str(demo_scene), factor=2), ckpt_path=ckpt_path)
+        return trainer, splat_module
+
+    return fit

@@ -1,0 +1,220 @@
+"""The command line: configs by name, traps of LightningCLI, export, what a run leaves behind."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from nsvq_lightning.cli import find_config, main, resolve_configs
+from nsvq_lightning.io.formats import load
+from nsvq_lightning.schedule import Phase
+
+CODES = ["--model.codebooks.scales=16", "--model.codebooks.sh0=8"]
+
+
+def fit(scene: Path, folder: Path, *more: str, steps: int = 20) -> list[str]:
+    return [
+        "fit",
+        f"--data.root={scene}",
+        "--data.factor=2",
+        f"--trainer.max_steps={steps}",
+        f"--trainer.default_root_dir={folder}",
+        "--trainer.accelerator=cpu",
+        "--trainer.enable_progress_bar=false",
+        "--callbacks.progress=null",
+        "--model.sh_degree=1",
+        *more,
+    ]
+
+
+@pytest.fixture(scope="module")
+def finished(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a run of 20 steps."""
+    root = tmp_path_factory.mktemp("cli")
+    assert main(fit(demo_scene, root, *CODES, "--model.quantizer=NSVQ", "--model.quantizer.kmeans_steps=3")) == 0
+    return root / demo_scene.name / "version_0"
+
+
+def test_a_run_leaves_scene_report_config_and_checkpoint(finished: Path) -> None:
+    names = {path.name for path in finished.iterdir()}
+    assert {"scene.nsvq", "scene.ply", "metrics.json", "views.csv", "curve.csv", "curve.png", "renders"} <= names
+    assert {"config.yaml", "metrics.csv", "checkpoints"} <= names
+    config = yaml.safe_load((finished / "config.yaml").read_text())
+    assert config["model"]["quantizer"]["init_args"] == {"kmeans_steps": 3}
+    assert config["model"]["codebooks"] == {"scales": 16, "sh0": 8}
+    metrics = json.loads((finished / "metrics.json").read_text())
+    assert metrics["formula"]["matches"]
+    assert [end["phase"] for end in metrics["phases"]] == [phase.name.lower() for phase in Phase]
+
+
+def test_a_second_run_gets_its_own_folder_and_prints_its_summary(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for _ in range(2):
+        assert main(fit(demo_scene, tmp_path, steps=5)) == 0
+    out = capsys.readouterr().out
+    assert "version_0" in out
+    assert "version_1" in out
+    assert "rendered from the decoded file" in out
+
+
+def test_checkpoints_of_the_command_line_are_plain_data_and_load(finished: Path) -> None:
+    path = finished / "checkpoints" / "last.ckpt"
+    stored = torch.load(path, weights_only=True)
+    assert stored["hyper_parameters"]["quantizer"]["class_path"].endswith("NSVQ")
+    from nsvq_lightning.module import SplatModule
+
+    module = SplatModule.load_from_checkpoint(path, weights_only=True)
+    assert set(module.quantizers) == {"scales", "sh0"}
+    assert getattr(module.quantizers["scales"], "kmeans_steps", None) == 3
+
+
+def test_options_win_over_the_checkpoint_in_fit(demo_scene: Path, finished: Path, tmp_path: Path) -> None:
+    checkpoint = finished / "checkpoints" / "last.ckpt"
+    more = ["--model.rates.opacities=0.0123", f"--ckpt_path={checkpoint}", "--callbacks.phases.total=20"]
+    assert main(fit(demo_scene, tmp_path, *CODES, *more, steps=22)) == 0
+    config = yaml.safe_load((tmp_path / demo_scene.name / "version_0" / "config.yaml").read_text())
+    assert config["model"]["rates"]["opacities"] == 0.0123
+    # Lightning restores the optimiser with its stored rates; ours must still be the new one.
+    stored = torch.load(tmp_path / demo_scene.name / "version_0" / "checkpoints" / "last.ckpt", weights_only=True)
+    rates = {group["name"]: group["lr"] for group in stored["optimizer_states"][0]["param_groups"]}
+    assert rates["opacities"] == 0.0123
+
+
+def test_a_checkpoint_of_another_phase_is_refused_with_the_way_out(
+    demo_scene: Path, finished: Path, tmp_path: Path
+) -> None:
+    checkpoint = finished / "checkpoints" / "last.ckpt"
+    with pytest.raises(ValueError, match=r"at iteration 20 in its finetune phase.*callbacks\.phases\.total"):
+        main(fit(demo_scene, tmp_path, *CODES, f"--ckpt_path={checkpoint}", steps=40))
+
+
+def test_test_takes_the_model_from_the_checkpoint(demo_scene: Path, finished: Path, tmp_path: Path) -> None:
+    checkpoint = finished / "checkpoints" / "last.ckpt"
+    arguments = [f"--ckpt_path={checkpoint}", f"--data.root={demo_scene}", "--data.factor=2"]
+    assert main(["test", *arguments, f"--trainer.default_root_dir={tmp_path}", "--callbacks.progress=null"]) == 0
+    folder = tmp_path / demo_scene.name / "version_0"
+    assert (folder / "scene.nsvq").read_bytes() == (finished / "scene.nsvq").read_bytes()
+    ours, theirs = (json.loads((f / "metrics.json").read_text()) for f in (folder, finished))
+    assert ours.pop("train_seconds") == pytest.approx(theirs.pop("train_seconds"), abs=0.1)
+    assert ours == theirs
+
+
+def test_export_reads_no_scene(finished: Path, tmp_path: Path) -> None:
+    checkpoint = finished / "checkpoints" / "last.ckpt"
+    for suffix in ("nsvq", "ply"):
+        output = tmp_path / f"out.{suffix}"
+        assert main(["export", f"--ckpt_path={checkpoint}", f"--output={output}"]) == 0
+        assert output.read_bytes() == (finished / f"scene.{suffix}").read_bytes()
+    assert len(load(tmp_path / "out.ply")) > 0
+
+
+def test_predict_writes_a_picture_of_every_view(demo_scene: Path, finished: Path, tmp_path: Path) -> None:
+    checkpoint = finished / "checkpoints" / "last.ckpt"
+    arguments = [f"--ckpt_path={checkpoint}", f"--data.root={demo_scene}", "--data.factor=2"]
+    folder = f"--callbacks.predictions.folder={tmp_path / 'pictures'}"
+    assert main(["predict", *arguments, folder, f"--trainer.default_root_dir={tmp_path}"]) == 0
+    photos = {path.stem for path in (demo_scene / "images").iterdir()}
+    assert {path.stem for path in (tmp_path / "pictures").iterdir()} == photos
+
+
+def test_validate_scores_the_test_views(
+    demo_scene: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    checkpoint = finished / "checkpoints" / "last.ckpt"
+    arguments = [f"--ckpt_path={checkpoint}", f"--data.root={demo_scene}", "--data.factor=2"]
+    assert main(["validate", *arguments, f"--trainer.default_root_dir={tmp_path}", "--callbacks.progress=null"]) == 0
+    assert "val/psnr" in capsys.readouterr().out
+
+
+def test_callbacks_can_be_configured_exchanged_removed_and_added(
+    capsys: pytest.CaptureFixture[str], demo_scene: Path
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(
+            [
+                *("fit", f"--data.root={demo_scene}", "--callbacks.density.rules.min_splats=7"),
+                *("--callbacks.density.max_splats=99", "--callbacks.opacity=null"),
+                *("--trainer.callbacks+=LearningRateMonitor", "--print_config"),
+            ]
+        )
+    assert stop.value.code == 0
+    config = yaml.safe_load(capsys.readouterr().out)
+    assert config["callbacks"]["density"]["init_args"]["max_splats"] == 99
+    assert config["callbacks"]["density"]["init_args"]["rules"]["min_splats"] == 7
+    assert config["callbacks"]["opacity"] is None
+    assert config["trainer"]["callbacks"][0]["class_path"].endswith("LearningRateMonitor")
+
+
+@pytest.mark.parametrize(
+    ("name", "codes"),
+    [("16k", 16_384), ("8k", 8192), ("4k", 4096), ("2k", 2048), ("1k", 1024), ("half_k", 512)],
+)
+def test_every_config_parses_and_has_the_codebooks_it_names(
+    name: str, codes: int, demo_scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from nsvq_lightning.quantize.attributes import codebook_sizes
+
+    with pytest.raises(SystemExit):
+        main(["fit", "--config", f"nsvq_{name}", f"--data.root={demo_scene}", "--print_config"])
+    config = yaml.safe_load(capsys.readouterr().out)
+    assert codebook_sizes(config["model"]["codebooks"])["scales"] == codes
+    assert config["trainer"]["max_steps"] == 45_000
+
+
+def test_plain_and_demo_configs_parse(demo_scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["fit", "--config=plain", f"--data.root={demo_scene}", "--print_config"])
+    config = yaml.safe_load(capsys.readouterr().out)
+    assert config["model"]["codebooks"] is None
+    assert config["callbacks"]["phases"]["init_args"]["warmup_end"] == 15_000
+    with pytest.raises(SystemExit):
+        main(["fit", "--config=demo.yaml", "--print_config"])
+    assert "DemoDataModule" in capsys.readouterr().out
+
+
+def test_configs_are_found_as_files_first_then_by_name(tmp_path: Path) -> None:
+    mine = tmp_path / "nsvq_4k.yaml"
+    mine.write_text("{}")
+    shipped = find_config("nsvq_4k")
+    assert shipped.endswith("configs/nsvq_4k.yaml")
+    assert find_config(str(mine)) == str(mine)
+    assert find_config("configs/nsvq_4k.yaml").endswith("configs/nsvq_4k.yaml")
+    assert find_config("no_such_config") == "no_such_config"
+    arguments = ["fit", "--config", "nsvq_4k", "--config=nsvq_4k", "-c", str(mine), "--data.root", "nsvq_4k"]
+    assert resolve_configs(arguments) == [
+        *("fit", "--config", shipped, f"--config={shipped}", "-c", str(mine), "--data.root", "nsvq_4k")
+    ]
+
+
+def test_errors_are_one_line_and_name_the_option(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["fit", "--data.root=x", "--model.shdegree=2"])
+    assert stop.value.code == 2
+    message = capsys.readouterr().err
+    assert "shdegree" in message
+    assert len(message.splitlines()) < 12
+    assert main(["fit", f"--data.root={tmp_path / 'nowhere'}", f"--trainer.default_root_dir={tmp_path}"]) == 1
+    assert "nowhere" in capsys.readouterr().err
+
+
+def test_info_starts_without_torch(finished: Path) -> None:
+    code = (
+        "import sys; from nsvq_lightning.cli import main; status = main(sys.argv[1:]); "
+        "assert 'torch' not in sys.modules, 'torch was imported'; sys.exit(status)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "info", str(finished / "scene.nsvq")],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=Path(__file__).resolve().parents[2],
+    )
+    assert done.returncode == 0, done.stderr
+    assert "splats" in done.stdout

@@ -1,0 +1,237 @@
+"""What the module renders and trains in each phase; checkpoints hold plain data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning.pytorch import Trainer
+from torch import Tensor, nn
+
+from nsvq_lightning.callbacks import PhaseSchedule
+from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.data.scene import View
+from nsvq_lightning.host import SplatHost, splat_host
+from nsvq_lightning.hyperparameters import plain
+from nsvq_lightning.io.formats import save
+from nsvq_lightning.module import SplatModule
+from nsvq_lightning.optim import LearningRates
+from nsvq_lightning.quantize.nsvq import NSVQ
+from nsvq_lightning.random import generator
+from nsvq_lightning.render.camera import Camera
+from nsvq_lightning.render.rasterize import render, visible
+from nsvq_lightning.schedule import Phase
+from nsvq_lightning.splats import ATTRIBUTES, RawSplats, Splats
+from nsvq_lightning.state import RunState, Stopwatch
+
+CODES = {"scales": 6, "quats": 5, "sh0": 4, "shN": 3}
+
+
+def make_splats(n: int = 30) -> Splats:
+    g = torch.Generator().manual_seed(0)
+
+    def rand(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g)
+
+    means = rand(n, 3) * 0.5
+    means[:5, 2] = -50.0  # behind the camera
+    return Splats.from_tensors(means, rand(n, 4), rand(n, 3) * 0.2 - 2, rand(n), rand(n, 1, 3), rand(n, 3, 3) * 0.1)
+
+
+def camera(width: int = 40, height: int = 30) -> Camera:
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 3.0
+    K = torch.tensor([[35.0, 0.0, width / 2], [0.0, 35.0, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(K, viewmat, width, height)
+
+
+@pytest.fixture
+def module() -> SplatModule:
+    built = SplatModule(sh_degree=1, codebooks=CODES, splats=make_splats())
+    built.active_sh_degree = 1
+    for name, quantizer in built.quantizers.items():
+        quantizer.fit(built.rows(name), generator=generator(0, 0, name))
+    # Steps and ranks come from a trainer; there is none here.
+    built._trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, max_steps=10)
+    return built.train()
+
+
+def test_warm_up_renders_the_raw_splats(module: SplatModule) -> None:
+    expected = render(module.splats.raw(), camera(), sh_degree=1)
+    assert torch.equal(module(camera()).image, expected.image)
+    module.active_sh_degree = 0
+    assert not torch.equal(module(camera()).image, expected.image)
+
+
+def test_quantizing_renders_the_visible_splats_with_noise_of_the_right_length(
+    module: SplatModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[RawSplats] = []
+
+    def spy(splats: RawSplats, view: Camera, **settings: Any) -> Any:
+        seen.append(splats)
+        return render(splats, view, **settings)
+
+    monkeypatch.setattr("nsvq_lightning.model.render", spy)
+    module.phase = Phase.QUANTIZE
+    module(camera())
+    rows = visible(module.splats.raw(), camera()).nonzero()[:, 0]
+    assert 0 < len(rows) <= 25
+    used = seen[0]
+    assert torch.equal(used.means, module.splats.means[rows])
+    assert torch.equal(used.opacities, module.splats.opacities[rows])
+    for name, quantizer in module.quantizers.items():
+        raw = module.rows(name)[rows]
+        hard = quantizer.decode(quantizer.encode(raw)).detach()
+        moved = (getattr(used, name).detach().reshape(len(rows), -1) - raw).norm(dim=1)
+        torch.testing.assert_close(moved, (hard - raw).norm(dim=1), rtol=1e-4, atol=1e-5)
+    module(camera())
+    assert torch.equal(seen[0].scales, seen[1].scales)  # one step, one noise
+    assert [int(quantizer.window) for quantizer in module.quantizers.values()] == [2, 2, 2, 2]
+
+
+def test_evaluation_in_the_quantize_phase_uses_hard_codes(module: SplatModule) -> None:
+    module.phase = Phase.QUANTIZE
+    module.eval()
+    expected = render(module.compressed().decode(), camera(), sh_degree=1)
+    assert torch.equal(module(camera()).image, expected.image)
+    assert all(int(quantizer.window) == 0 for quantizer in module.quantizers.values())
+    hard = module.hard_splats(Phase.QUANTIZE)
+    assert torch.equal(render(hard, camera()).image, expected.image)
+    assert torch.equal(module.hard_splats(Phase.PRUNE).scales, module.splats.scales)
+
+
+def test_fine_tuning_trains_codebooks_positions_and_opacities_only(module: SplatModule) -> None:
+    module.phase = Phase.FINETUNE
+    for name, quantizer in module.quantizers.items():
+        quantizer.freeze(quantizer.encode(module.rows(name)))
+    module(camera()).image.square().mean().backward()
+    assert {name for name in ATTRIBUTES if getattr(module.splats, name).grad is not None} == {"means", "opacities"}
+    assert all(quantizer.codebook.grad is not None for quantizer in module.quantizers.values())
+    book = module.quantizers["scales"].codebook.grad
+    assert book is not None
+    assert book.any()
+
+
+def test_random_backgrounds_change_with_the_step_and_not_in_evaluation(module: SplatModule) -> None:
+    random = SplatModule(sh_degree=1, codebooks=None, background="random", splats=make_splats())
+    random._trainer = module._trainer
+    first = random.train()(camera()).image
+    random._micro_batch = 1
+    assert not torch.equal(first, random(camera()).image)
+    assert torch.equal(random.eval()(camera()).image, module(camera()).image) is False  # degree 0 against degree 1
+    assert float(random(camera()).image[0, 0].detach().min()) >= 0.0
+    white = SplatModule(sh_degree=1, codebooks=None, background="white", splats=make_splats())
+    white._trainer = module._trainer
+    black = SplatModule(sh_degree=1, codebooks=None, splats=make_splats())
+    black._trainer = module._trainer
+    alpha = black(camera()).alpha
+    torch.testing.assert_close(white(camera()).image, black(camera()).image + (1 - alpha)[..., None])
+
+
+def test_a_loss_that_is_not_finite_skips_the_update(
+    module: SplatModule, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    view = View("a.png", 0, camera(), torch.zeros(30, 40, 3, dtype=torch.uint8))
+    assert module.training_step(view, 0) is not None
+    monkeypatch.setattr("nsvq_lightning.module.photometric_loss", lambda image, *_: image.sum() * torch.nan)
+    assert module.training_step(view, 0) is None
+    assert "the loss of a.png is nan, no update" in caplog.text
+
+
+def test_the_loss_adds_lambda_times_the_sum_of_opacities(module: SplatModule) -> None:
+    view = View("a.png", 0, camera(), torch.zeros(30, 40, 3, dtype=torch.uint8))
+    plain_step = module.training_step(view, 0)
+    module.opacity_weight = 0.01
+    weighted = module.training_step(view, 0)
+    assert plain_step is not None
+    assert weighted is not None
+    total = float(module.splats.opacities.detach().sigmoid().sum())
+    assert (weighted["loss"] - plain_step["loss"]).item() == pytest.approx(0.01 * total, rel=1e-4)
+
+
+def test_the_module_is_a_host_and_others_are_told_what_they_lack(module: SplatModule) -> None:
+    assert splat_host(module) is module
+    with pytest.raises(TypeError, match=r"lacks: .*splats"):
+        splat_host(Trainer)  # type: ignore[arg-type]
+    assert SplatHost is not None
+
+
+def test_what_is_not_a_quantizer_is_refused() -> None:
+    with pytest.raises(TypeError, match="Linear is no quantizer"):
+        SplatModule(quantizer=nn.Linear)
+    with pytest.raises(ValueError, match="unknown attributes albedo"):
+        SplatModule(codebooks={"albedo": 4})
+    with pytest.raises(ValueError, match="scales needs at least 1 code"):
+        SplatModule(codebooks={"scales": 0})
+    with pytest.raises(ValueError, match="background must be"):
+        SplatModule(background="green")  # type: ignore[arg-type]
+
+
+def test_without_higher_coefficients_there_is_no_codebook_for_them() -> None:
+    assert set(SplatModule(sh_degree=0, codebooks="1k").quantizers) == {"scales", "quats", "sh0"}
+
+
+def test_hyper_parameters_become_plain_data() -> None:
+    stored = plain({"a": 1, "rates": LearningRates(), "quantizer": NSVQ, "t": torch.zeros(1), "n": [None, {"x": 0.5}]})
+    assert stored == {"a": 1, "rates": LearningRates().__dict__, "n": [None, {"x": 0.5}]}
+
+
+def test_a_loaded_state_refreshes_the_mirrors() -> None:
+    state, other = RunState(), RunState()
+    state.phase, state.sh_degree, state.extent, state.train_seconds = Phase.PRUNE, 2, 1.5, 12.25
+    other.load_state_dict(state.state_dict())
+    assert (other.phase, other.sh_degree, other.extent, other.train_seconds) == (Phase.PRUNE, 2, 1.5, 12.25)
+
+
+def test_a_paused_stopwatch_stands_still(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("nsvq_lightning.state.time.perf_counter", lambda: now[0])
+    state = RunState()
+    watch = Stopwatch(state)
+    watch.lap()
+    watch.start()
+    now[0] = 2.0
+    with watch.paused(torch.device("cpu")):
+        now[0] = 10.0
+    now[0] = 13.0
+    watch.stop()
+    now[0] = 20.0
+    watch.lap()
+    assert state.train_seconds == 5.0
+
+
+def test_a_trained_module_cannot_be_trained_from_the_start(module: SplatModule) -> None:
+    module.phase = Phase.FINETUNE
+    with pytest.raises(ValueError, match="already trained into its finetune phase"):
+        PhaseSchedule().on_train_start(module.trainer, module)
+
+
+def test_a_run_can_start_from_a_file(demo_scene: Path, tmp_path: Path) -> None:
+    start = make_splats()
+    save(start, tmp_path / "start.ply")
+    module = SplatModule(
+        sh_degree=1,
+        codebooks=None,
+        init_from=str(tmp_path / "start.ply"),
+        rates=LearningRates(means=1e-9, means_final=1e-9),
+    )
+    trainer = Trainer(
+        accelerator="cpu",
+        max_steps=1,
+        max_epochs=-1,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        limit_val_batches=0,
+        callbacks=[PhaseSchedule()],
+        default_root_dir=tmp_path,
+    )
+    trainer.fit(module, datamodule=ColmapDataModule(str(demo_scene), factor=4))
+    torch.testing.assert_close(module.splats.means.detach(), start.means.detach(), atol=1e-6, rtol=0)
+    assert module.active_sh_degree == 1
+    wrong = SplatModule(sh_degree=2, codebooks=None, init_from=str(tmp_path / "start.ply"))
+    with pytest.raises(ValueError, match="set sh_degree=1"):
+        trainer.fit(wrong, datamodule=ColmapDataModule(str(demo_scene), factor=4))

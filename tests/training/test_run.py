@@ -1,0 +1,239 @@
+"""A whole run: phases, file, report, repeatability, resume."""
+
+from __future__ import annotations
+
+import csv
+import json
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from nsvq_lightning.callbacks import MetricReport, RunCheckpoint
+from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.io.container import read_header, read_nsvq
+from nsvq_lightning.io.formats import load
+from nsvq_lightning.module import SplatModule
+from nsvq_lightning.render.rasterize import render
+from nsvq_lightning.schedule import Phase, Schedule
+
+RunFactory = Callable[..., tuple[Trainer, SplatModule]]
+Recipe = Callable[..., dict[str, Callback]]
+
+
+class Witness(Callback):
+    """Notes the state of every step, and whether raw quantized attributes moved."""
+
+    def __init__(self) -> None:
+        self.phases: list[Phase] = []
+        self.splats: list[int] = []
+        self.opacity_weights: list[float] = []
+        self.scales: dict[int, torch.Tensor] = {}
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        assert isinstance(pl_module, SplatModule)
+        self.phases.append(pl_module.phase)
+        self.splats.append(len(pl_module.splats))
+        self.opacity_weights.append(pl_module.opacity_weight)
+        self.scales[trainer.global_step] = pl_module.splats.scales.detach().clone()
+
+
+class CheckpointAt(RunCheckpoint):
+    """Checkpoints at given iterations."""
+
+    def __init__(self, *iterations: int) -> None:
+        super().__init__(keep=True)
+        self.iterations = iterations
+
+    def is_due(self, total: int, iteration: int) -> bool:
+        return iteration in self.iterations
+
+
+@dataclass
+class Whole:
+    """A finished run that several tests look at."""
+
+    trainer: Trainer
+    module: SplatModule
+    witness: Witness
+
+    @property
+    def folder(self) -> Path:
+        return Path(self.trainer.default_root_dir)
+
+
+SCHEDULE = Schedule(total=60, min_density_interval=4, min_reset_interval=11, min_replacement_interval=5)
+
+
+@pytest.fixture(scope="module")
+def whole(run: RunFactory, recipe: Recipe) -> Whole:
+    witness = Witness()
+    trainer, module = run([*recipe(checkpoint=CheckpointAt(10, 24, 30, 58)).values(), witness])
+    return Whole(trainer, module, witness)
+
+
+def scene_bytes(trainer: Trainer) -> bytes:
+    return (Path(trainer.default_root_dir) / "scene.nsvq").read_bytes()
+
+
+def test_a_run_passes_all_phases(whole: Whole) -> None:
+    witness, module = whole.witness, whole.module
+    assert whole.trainer.global_step == 60
+    assert module.schedule == SCHEDULE
+    assert witness.phases == [SCHEDULE.phase_at(i) for i in range(1, 61)]
+    assert [w > 0 for w in witness.opacity_weights] == [phase is Phase.PRUNE for phase in witness.phases]
+    assert max(witness.splats) > witness.splats[0]  # it grew
+    assert len(set(witness.splats[SCHEDULE.ends[Phase.PRUNE] :])) == 1  # and stood still once quantized
+
+
+def test_codes_are_frozen_in_fine_tuning(whole: Whole) -> None:
+    module, frozen_at = whole.module, SCHEDULE.ends[Phase.QUANTIZE]
+    assert all(quantizer.codes.shape == (len(module.splats),) for quantizer in module.quantizers.values())
+    # The raw attributes the codes stand for no longer move, though Adam has momentum for them.
+    scales = whole.witness.scales
+    assert torch.equal(scales[frozen_at], scales[60])
+    assert not torch.equal(scales[frozen_at - 1], scales[60])
+
+
+def test_the_file_has_the_size_of_the_formula(whole: Whole) -> None:
+    # 16 N + ⌈N·Σ bits / 8⌉ + Σ 4·K·D + header; 24 and 16 codes have 5 and 4 bits.
+    path, n = whole.folder / "scene.nsvq", len(whole.module.splats)
+    codebooks = 4 * (24 * 3 + 24 * 4 + 16 * 3 + 16 * 9)
+    assert path.stat().st_size == 16 * n + (n * 18 + 7) // 8 + codebooks + read_header(path).size
+    assert len(load(whole.folder / "scene.ply")) == n
+
+
+def test_the_report_measures_the_decoded_file(whole: Whole, demo_scene: Path) -> None:
+    exported = scene_bytes(whole.trainer)
+    data = ColmapDataModule(str(demo_scene), factor=2)
+    whole.trainer.test(whole.module, datamodule=data, verbose=False)
+    assert scene_bytes(whole.trainer) == exported
+    assert whole.module.evaluation_splats is None
+    folder = whole.folder
+    metrics = json.loads((folder / "metrics.json").read_text())
+    # Oracle: decode the file here, render, round to 8 bit, PSNR by its formula.
+    splats = load(folder / "scene.nsvq")
+    expected = []
+    for index in data.scene.test:
+        view = data.scene.view(index)
+        image = (render(splats, view.camera).image.detach().clamp(0, 1) * 255).round() / 255
+        error = (image.double() - view.image.double() / 255).square().mean()
+        expected.append(-10 * np.log10(float(error)))
+    assert metrics["psnr"] == pytest.approx(np.mean(expected), abs=1e-3)
+    assert metrics["num_splats"] == len(splats)
+    assert metrics["file_bytes"] == (folder / "scene.nsvq").stat().st_size == metrics["formula"]["bytes"]
+    assert metrics["formula"]["matches"]
+    assert metrics["plain_bytes"] == (folder / "scene.ply").stat().st_size
+    assert metrics["ratio"] == pytest.approx(metrics["plain_bytes"] / metrics["file_bytes"])
+    assert (metrics["lpips"] is None) == (metrics["lpips_reason"] is not None)
+    assert [end["phase"] for end in metrics["phases"]] == ["warmup", "prune", "quantize", "finetune"]
+    assert [end["iteration"] for end in metrics["phases"]] == list(SCHEDULE.ends)
+    assert metrics["before_quantization"] == metrics["phases"][1]
+    assert 0 < metrics["phases"][0]["seconds"] <= metrics["train_seconds"]
+    # The end of the run was evaluated before the file was written: both must agree.
+    assert metrics["phases"][-1]["psnr"] == pytest.approx(metrics["psnr"], abs=1e-3)
+    rows = list(csv.DictReader((folder / "views.csv").open()))
+    assert [float(row["psnr"]) for row in rows] == pytest.approx(expected, abs=1e-3)
+    assert [row["iteration"] for row in csv.DictReader((folder / "curve.csv").open())] == ["20", "27", "40", "57", "60"]
+    assert (folder / "curve.png").stat().st_size > 1000
+    assert len(list((folder / "renders").iterdir())) == len(rows)
+    assert not [path for path in folder.rglob("*") if path.suffix == ".tmp"]
+
+
+def test_training_improves_the_picture(run: RunFactory, recipe: Recipe) -> None:
+    # Without density control: its opacity resets are no help to a run of 60 steps.
+    _, module = run(recipe(report=MetricReport(every=1), density=Callback()).values())
+    quality = [entry["psnr"] for entry in module.history]
+    assert quality[26] > quality[0] + 1.0  # end of the prune phase
+
+
+def test_the_same_seed_gives_the_same_bytes_whatever_the_order_of_callbacks(
+    whole: Whole, run: RunFactory, recipe: Recipe
+) -> None:
+    shuffled = list(recipe().values())
+    random.Random(3).shuffle(shuffled)
+    again, module = run(shuffled)
+    assert scene_bytes(again) == scene_bytes(whole.trainer)
+    assert measured(module) == measured(whole.module)
+    backwards, module = run(list(recipe().values())[::-1])
+    assert scene_bytes(backwards) == scene_bytes(whole.trainer)
+    assert measured(module) == measured(whole.module)
+    other, _ = run(recipe().values(), module={"seed": 1})
+    assert scene_bytes(other) != scene_bytes(whole.trainer)
+
+
+def measured(module: SplatModule) -> list[tuple[int, int, float]]:
+    return [(entry["iteration"], entry["splats"], entry["psnr"]) for entry in module.history]
+
+
+@pytest.mark.parametrize("interrupted_at", [10, 24, 30, 58])
+def test_a_resumed_run_is_the_run_not_interrupted(
+    whole: Whole, run: RunFactory, recipe: Recipe, interrupted_at: int
+) -> None:
+    path = whole.folder / "checkpoints" / f"step-{interrupted_at}.ckpt"
+    resumed, module = run(recipe(checkpoint=RunCheckpoint(every=0)).values(), ckpt_path=path)
+    assert resumed.global_step == 60
+    assert scene_bytes(resumed) == scene_bytes(whole.trainer)
+    assert measured(module) == measured(whole.module)
+    stored = torch.load(path, weights_only=True)  # no code in a checkpoint
+    assert 0.0 < float(stored["state_dict"]["state._train_seconds"]) < module.train_seconds
+
+
+def test_a_checkpoint_is_complete_without_its_trainer(whole: Whole) -> None:
+    path = whole.folder / "checkpoints" / "last.ckpt"
+    loaded = SplatModule.load_from_checkpoint(path, weights_only=True)
+    assert (loaded.phase, loaded.active_sh_degree, loaded.extent) == (Phase.FINETUNE, 1, whole.module.extent)
+    assert loaded.schedule == whole.module.schedule
+    assert measured(loaded) == measured(whole.module)
+    ours, theirs = loaded.compressed(), read_nsvq(whole.folder / "scene.nsvq")
+    assert np.array_equal(ours.means, theirs.means)
+    assert all(np.array_equal(ours.codes[name], theirs.codes[name]) for name in theirs.codes)
+    assert dict(ours.config) == dict(theirs.config)
+
+
+def test_gradient_accumulation_acts_once_a_step(
+    run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
+) -> None:
+    witness = Witness()
+    caplog.set_level("DEBUG", logger="nsvq_lightning")
+    trainer, _ = run([*recipe().values(), witness], accumulate_grad_batches=3)
+    assert trainer.global_step == 60
+    assert len(witness.phases) == 180
+    grown = [r for r in caplog.messages if " splats, now " in r]
+    assert len(grown) == len(SCHEDULE.density_times(600, 14_900, 100))
+    placed = [r for r in caplog.messages if "codebooks for" in r]
+    assert len(placed) == 1
+    # Within a step the splats stand still: rows of the three micro-batches match.
+    assert all(len(set(witness.splats[i : i + 3])) == 1 for i in range(2, 180 - 3, 3))
+
+
+def test_a_run_without_codebooks_is_plain_splatting(run: RunFactory, recipe: Recipe, demo_scene: Path) -> None:
+    trainer, module = run(recipe().values(), module={"codebooks": None})
+    trainer.test(module, datamodule=ColmapDataModule(str(demo_scene), factor=2), verbose=False)
+    folder = Path(trainer.default_root_dir)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["formula"]["matches"]
+    decoded = load(folder / "scene.nsvq")
+    assert all(torch.equal(getattr(decoded, n), p.detach()) for n, p in module.splats.attributes().items())
+
+
+@pytest.mark.parametrize("codebooks", [{"scales": 8}, {"quats": 5, "shN": 3}])
+def test_any_subset_of_attributes_can_be_quantized(run: RunFactory, recipe: Recipe, codebooks: dict[str, int]) -> None:
+    trainer, _ = run(recipe().values(), module={"codebooks": codebooks}, max_steps=20)
+    stored = read_nsvq(Path(trainer.default_root_dir) / "scene.nsvq")
+    assert {name: len(book) for name, book in stored.codebooks.items()} == codebooks
+    assert set(stored.raw) == {"scales", "quats", "sh0", "shN"} - set(codebooks)
+
+
+def test_more_codes_than_splats_are_no_problem(run: RunFactory, recipe: Recipe) -> None:
+    trainer, module = run(recipe(density=Callback()).values(), module={"codebooks": "0.5k"}, max_steps=20)
+    stored = read_nsvq(Path(trainer.default_root_dir) / "scene.nsvq")
+    assert all(len(book) <= len(module.splats) for book in stored.codebooks.values())
