@@ -13,7 +13,7 @@ from torch import Tensor
 from nsvq_lightning.edit import append_rows, drop_non_finite, keep_rows, replace_attribute, reset_moments
 from nsvq_lightning.host import SplatHost, as_host, next_iteration, raw_optimizer, sum_over_processes
 from nsvq_lightning.random import generator
-from nsvq_lightning.render.rasterize import Render
+from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.schedule import Phase
 from nsvq_lightning.splats import RawSplats
 

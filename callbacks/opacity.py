@@ -16,10 +16,11 @@ __all__ = ["OpacityRegularization"]
 class OpacityRegularization(Callback):
     """Adds λ · Σ opacity to the loss during the prune phase, so that needless splats fade and are pruned.
 
-    It is a sum over the splats (paper, section 3.4), so its strength grows with their number.
+    It is a sum over the splats (paper, section 3.4), so its strength grows with their number. A shorter run has fewer
+    iterations to fade a splat in, and a proportionally larger λ (:meth:`nsvq_lightning.schedule.Schedule.strength`).
 
     Args:
-        weight: λ.
+        weight: λ of the reference run.
 
     Raises:
         ValueError: λ is negative or not finite.
@@ -34,4 +35,4 @@ class OpacityRegularization(Callback):
         """Switch the term on and off."""
         host = as_host(pl_module)
         pruning = host.schedule.phase_at(next_iteration(trainer)) is Phase.PRUNE
-        host.opacity_weight = self.weight if pruning else 0.0
+        host.opacity_weight = host.schedule.strength(self.weight) if pruning else 0.0

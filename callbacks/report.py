@@ -19,7 +19,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.container import read_nsvq
 from nsvq_lightning.metrics import build_lpips, eight_bit
 from nsvq_lightning.pictures import comparison, file_stem, write_png
-from nsvq_lightning.render.camera import Camera
+from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.report_files import summarize, write_curve, write_curve_csv, write_metrics, write_views
 from nsvq_lightning.splats import RawSplats
 

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 _HOME = {
-    "Camera": "nsvq_lightning.render.camera",
+    "Camera": "nsvq_lightning.rendering.camera",
     "ColmapDataModule": "nsvq_lightning.data.datamodule",
-    "Render": "nsvq_lightning.render.rasterize",
+    "Render": "nsvq_lightning.rendering.rasterize",
     "SplatModule": "nsvq_lightning.module",
     "Splats": "nsvq_lightning.splats",
     "load": "nsvq_lightning.io.formats",
-    "render": "nsvq_lightning.render.rasterize",
+    "render": "nsvq_lightning.rendering.rasterize",
     "save": "nsvq_lightning.io.formats",
 }
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from nsvq_lightning.data.datamodule import ColmapDataModule
     from nsvq_lightning.io.formats import load, save
     from nsvq_lightning.module import SplatModule
-    from nsvq_lightning.render.camera import Camera
-    from nsvq_lightning.render.rasterize import Render, render
+    from nsvq_lightning.rendering.camera import Camera
+    from nsvq_lightning.rendering.rasterize import Render, render
     from nsvq_lightning.splats import Splats
 
 __all__ = ["Camera", "ColmapDataModule", "Render", "SplatModule", "Splats", "load", "render", "save"]
@@ -35,7 +35,6 @@ __all__ = ["Camera", "ColmapDataModule", "Render", "SplatModule", "Splats", "loa
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    # `render` and the sub-package of that name must both work: the function wins as attribute.
     value = getattr(importlib.import_module(_HOME[name]), name)
     globals()[name] = value
     return value

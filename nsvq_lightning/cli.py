@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -12,7 +13,7 @@ from pathlib import Path
 
 __all__ = ["find_config", "main", "resolve_configs"]
 
-OWN_COMMANDS = {"info": "nsvq_lightning.info", "benchmark": "nsvq_lightning.benchmark"}
+OWN_COMMANDS = {"info": "nsvq_lightning.info", "benchmark": "nsvq_lightning.benchmark.cli"}
 """Commands without a trainer: modules with a ``main(argv)``, which must not pay for Lightning's start."""
 
 NOT_ACTIONABLE = (
@@ -42,6 +43,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run_lightning(arguments: list[str]) -> int:
+    # Waiting OpenMP threads otherwise spin: as soon as anything else runs on the machine, the threads that have work
+    # wait for those that only spin, and a step takes several times as long. Must be set before torch loads OpenMP.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     for message in NOT_ACTIONABLE:
         warnings.filterwarnings("ignore", f".*{message}.*")
     from nsvq_lightning.data.model_files import SceneError

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.metrics import image_metrics
-from nsvq_lightning.render.camera import Camera
+from nsvq_lightning.rendering.camera import Camera
 
 __all__ = ["Quality", "ViewScore", "evaluate"]
 

@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from nsvq_lightning.quantize.base import Quantizer
-from nsvq_lightning.render.camera import Camera
-from nsvq_lightning.render.rasterize import Render
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.schedule import Phase, Schedule
 from nsvq_lightning.splats import RawSplats, Splats, SplatTensors
 from nsvq_lightning.state import Stopwatch

@@ -33,15 +33,15 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
         Scalar, 1 for equal images (Wang et al. 2004, eq. 13; beyond the border the images count as 0).
     """
     if _is_fusible(image, target) and not (torch.is_grad_enabled() and image.requires_grad):
-        from nsvq_lightning.render.cpu.dssim import l1_dssim
+        from nsvq_lightning.rendering.cpu.dssim import l1_dssim
 
         return image.new_tensor(1 - l1_dssim(image.contiguous(), target.contiguous(), 1.0)[0])
-    taps = ssim_window().to(image)
-    planes = [image, target, image * image, target * target, image * target]
-    stacked = torch.cat([plane.movedim(-1, 0) for plane in planes])[:, None]
-    stacked = functional.conv2d(stacked, taps.view(1, 1, -1, 1), padding=(SSIM_RADIUS, 0))
-    stacked = functional.conv2d(stacked, taps.view(1, 1, 1, -1), padding=(0, SSIM_RADIUS))
-    mean_x, mean_y, square_x, square_y, product = stacked.squeeze(1).chunk(5)
+    planes = torch.cat([image, target, image * image, target * target, image * target], -1).movedim(-1, 0)[None]
+    channels = planes.shape[1]
+    taps = ssim_window().to(image).expand(channels, 1, -1)
+    planes = functional.conv2d(planes, taps[..., None], padding=(SSIM_RADIUS, 0), groups=channels)
+    planes = functional.conv2d(planes, taps[:, :, None], padding=(0, SSIM_RADIUS), groups=channels)
+    mean_x, mean_y, square_x, square_y, product = planes[0].chunk(5)
     variance_x, variance_y = square_x - mean_x**2, square_y - mean_y**2
     covariance = product - mean_x * mean_y
     luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
@@ -79,7 +79,7 @@ def _is_fusible(image: Tensor, target: Tensor) -> bool:
 class _FusedLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, dssim_weight: float) -> Tensor:
-        from nsvq_lightning.render.cpu.dssim import l1_dssim
+        from nsvq_lightning.rendering.cpu.dssim import l1_dssim
 
         loss, gradient = l1_dssim(image.detach().contiguous(), target.contiguous(), dssim_weight)
         ctx.save_for_backward(gradient)

@@ -18,8 +18,8 @@ from nsvq_lightning.optim import LearningRates
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.quantized import attribute_rows, build_quantizers, decoded, noisy_rows
 from nsvq_lightning.random import generator
-from nsvq_lightning.render.camera import Camera
-from nsvq_lightning.render.rasterize import Render, render, visible
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.rasterize import Render, render, visible
 from nsvq_lightning.schedule import Phase, Schedule
 from nsvq_lightning.splats import RawSplats, Splats, SplatTensors, sh_degree_of
 from nsvq_lightning.state import RunState, Stopwatch

@@ -19,7 +19,7 @@ from nsvq_lightning.metrics import eight_bit, image_metrics, psnr
 from nsvq_lightning.model import SplatModel
 from nsvq_lightning.optim import LearningRates, apply_rates, build_adam, param_groups, position_lr, set_lr
 from nsvq_lightning.quantize.nsvq import NSVQ
-from nsvq_lightning.render.camera import Camera
+from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats import Splats
 
 __all__ = ["SplatModule"]

@@ -17,7 +17,8 @@ pruning in the prune phase       proportionally
 replacement of codes             proportionally, interval not below ``min_replacement_interval`` (a code is called
                                  unused after a window of views)
 decay of the position's rate     proportionally (30 000 of 45 000)
-learning rates, thresholds, λ    not at all
+λ of the opacities               inversely: what it takes from an opacity in a whole phase stays the same
+learning rates, thresholds       not at all
 ===============================  ==========================================================================
 """
 
@@ -160,6 +161,14 @@ class Schedule:
     def sh_degree_at(self, iteration: int, every: int, highest: int) -> int:
         """SH degree in use at a 1-based iteration: one more every ``every`` reference iterations."""
         return min(highest, iteration // self.interval(every))
+
+    def strength(self, reference: float) -> float:
+        """The weight of a loss term whose effect adds up over a phase, for one of ``reference`` in the reference run.
+
+        Measured with 4500 iterations: with λ = 1e-7 unchanged the prune phase removed 6 % of the splats of a scene that
+        the tenfold λ brought to half, at the same test PSNR (25.43 and 25.44 dB).
+        """
+        return reference / self.scale
 
     @property
     def position_decay_end(self) -> int:

@@ -51,7 +51,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
 def test_the_words_are_those_of_the_front_end() -> None:
     from nsvq_lightning.lightning_cli import SplatCLI
 
-    assert set(lightning_script.COMMANDS) == {*SplatCLI.subcommands(), "info"}
+    assert set(lightning_script.COMMANDS) == {*SplatCLI.subcommands(), "info", "benchmark"}
 
 
 @pytest.mark.parametrize("arguments", [["fit", "--config", "a.yaml"], ["info", "x.ply"], ["validate"], ["--help"], []])

@@ -93,3 +93,8 @@ def test_equal_ends_leave_phases_out() -> None:
 def test_impossible_schedules_are_refused(settings: dict[str, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Schedule(**settings)
+
+
+def test_terms_that_add_up_are_stronger_in_a_shorter_run() -> None:
+    assert Schedule().strength(1e-7) == 1e-7
+    assert Schedule(total=4500).strength(1e-7) == pytest.approx(1e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,7 @@ def draw_suite(path: Path, rows: Sequence[Row]) -> None:
         _draw_panel(panel, [row for row in rows if row.operation == operation])
         panel.set_title(f"{rows[0].suite}: {operation}", fontsize="medium")
     picture = io.BytesIO()
-    canvas.print_png(picture)
+    canvas.print_figure(picture, format="png", bbox_inches="tight")
     with atomic_write(path) as file:
         file.write(picture.getvalue())
 
@@ -65,6 +66,9 @@ def _draw_panel(panel: Any, rows: Sequence[Row]) -> None:
     positive = [_drawn(row) for row in rows if _drawn(row) > 0]
     smallest, largest = min(positive, default=1.0) / 3, 3 * max(positive, default=1.0)
     panel.set_xscale("log")
+    panel.set_xlim(*_decades([time for row in rows for time in row.timing.quartiles]))
+    panel.xaxis.set_major_formatter("{x:g}")
+    panel.xaxis.set_minor_formatter("")
     if len(positive) == len(rows):
         panel.set_yscale("log")
         panel.set_ylim(smallest, largest)
@@ -77,8 +81,14 @@ def _draw_panel(panel: Any, rows: Sequence[Row]) -> None:
     by_colour = [panel.plot([], [], "s", color=colours[method], label=method)[0] for method in methods]
     by_marker = [panel.plot([], [], markers[name], color="0.4", label=name)[0] for name in workloads]
     first_key = panel.legend(handles=by_colour, loc="upper left", bbox_to_anchor=(0.0, -0.12), **keys)
-    panel.add_artist(first_key)
+    panel.add_artist(first_key).set_clip_on(False)  # or the picture would be cut off below the second one
     panel.legend(handles=by_marker, loc="upper left", bbox_to_anchor=(0.35, -0.12), **keys)
+
+
+def _decades(times: Sequence[float]) -> tuple[float, float]:
+    """Limits at whole powers of ten, so that a logarithmic axis has two numbers at least."""
+    low, high = (math.log10(max(time, 1e-6)) for time in (min(times), max(times)))
+    return 10.0 ** math.floor(low), 10.0 ** max(math.ceil(high), math.floor(low) + 1)
 
 
 def _distinct(rows: Sequence[Row], field: str) -> list[str]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.sizes import SIZES
 from nsvq_lightning.io.formats import load
-from nsvq_lightning.render.camera import Camera
+from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats import RawSplats
 
 __all__ = ["Workload", "scene_workload", "synthetic_workload", "workloads"]

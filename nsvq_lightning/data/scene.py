@@ -16,7 +16,7 @@ from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, read_model
 from nsvq_lightning.data.images import ImageSource, ImageStore, image_size
 from nsvq_lightning.data.model_files import SceneError
 from nsvq_lightning.data.undistort import Pinhole, Undistortion, rectify
-from nsvq_lightning.render.camera import Camera
+from nsvq_lightning.rendering.camera import Camera
 
 __all__ = ["Factor", "Scene", "SceneError", "View", "load_scene"]
 

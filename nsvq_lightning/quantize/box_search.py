@@ -17,8 +17,20 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.quantize.boxes import NO_CODE, Boxes
 from nsvq_lightning.quantize.kernels import lane_min
-from nsvq_lightning.render.cpu.jit import inline, kernel, thread_count
-from nsvq_lightning.render.cpu.lanes import fma, get, load, lowest_bit, mask_bits, put, select, splat, store, vmax, vmin
+from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
+from nsvq_lightning.rendering.cpu.lanes import (
+    fma,
+    get,
+    load,
+    lowest_bit,
+    mask_bits,
+    put,
+    select,
+    splat,
+    store,
+    vmax,
+    vmin,
+)
 
 __all__ = ["MAX_DIM", "box_search"]
 

@@ -9,7 +9,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from nsvq_lightning.quantize.kernels import aligned_empty
-from nsvq_lightning.render.cpu.jit import inline, kernel, thread_count
+from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
 
 __all__ = ["NO_CODE", "Boxes", "build_boxes"]
 

@@ -12,7 +12,7 @@ from numba.core.typing.templates import Signature, signature
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from nsvq_lightning.render.cpu.lanes import WIDTH, Lanes
+from nsvq_lightning.rendering.cpu.lanes import WIDTH, Lanes
 
 __all__ = ["aligned_empty", "lane_min"]
 

@@ -18,8 +18,8 @@ from numba import prange
 from numpy.typing import NDArray
 
 from nsvq_lightning.quantize.kernels import aligned_empty, lane_min
-from nsvq_lightning.render.cpu.jit import inline, kernel, thread_count
-from nsvq_lightning.render.cpu.lanes import fma, fnma, get, load, select, splat, store, vmax, vmin
+from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
+from nsvq_lightning.rendering.cpu.lanes import fma, fnma, get, load, select, splat, store, vmax, vmin
 
 __all__ = ["LIST", "CentredCodes", "centre_codes", "score_search", "true_distance"]
 

@@ -15,8 +15,8 @@ from numba import prange
 from numpy.typing import NDArray
 
 from nsvq_lightning.quantize.noise import fill_normal
-from nsvq_lightning.render.cpu.jit import inline, kernel, thread_count
-from nsvq_lightning.render.cpu.lanes import fma, get, lane_sum, load, put, select, splat, store, vsqrt
+from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
+from nsvq_lightning.rendering.cpu.lanes import fma, get, lane_sum, load, put, select, splat, store, vsqrt
 
 __all__ = ["substitute", "substitute_backward"]
 

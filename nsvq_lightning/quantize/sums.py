@@ -9,7 +9,7 @@ from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nsvq_lightning.render.cpu.jit import kernel, thread_count
+from nsvq_lightning.rendering.cpu.jit import kernel, thread_count
 
 __all__ = ["lookup", "sum_by_code"]
 

@@ -20,8 +20,8 @@ from nsvq_lightning.quantize.boxes import build_boxes
 from nsvq_lightning.quantize.kernels import aligned_empty, lane_min
 from nsvq_lightning.quantize.nearest import check_rows, nearest
 from nsvq_lightning.quantize.scores import LIST, centre_codes, score_search, true_distance
-from nsvq_lightning.render.cpu.jit import inline, kernel, thread_count
-from nsvq_lightning.render.cpu.lanes import fma, get, lane_sum, lane_sums, load, lowest_bit, mask_bits, put, splat
+from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
+from nsvq_lightning.rendering.cpu.lanes import fma, get, lane_sum, lane_sums, load, lowest_bit, mask_bits, put, splat
 
 __all__ = ["NearestTracker"]
 

@@ -98,7 +98,7 @@ def test_picture_shows_one_panel_an_operation(tmp_path: Path, rows: list[Row]) -
     draw_suite(path, rows)
     picture = cv2.imread(str(path))
     panels = len({row.operation for row in rows})
-    assert picture.shape[1] == 100 + 600 * panels
+    assert picture.shape[1] / picture.shape[0] > 1.1 * panels
     assert (picture != 255).any()
 
 

@@ -12,7 +12,7 @@ from nsvq_lightning import save
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.sizes import SIZES
 from nsvq_lightning.benchmark.workloads import scene_workload, synthetic_workload, workloads
-from nsvq_lightning.render.rasterize import render
+from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats import RawSplats, Splats
 
 

@@ -13,7 +13,7 @@ from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 
 from nsvq_lightning.callbacks import DensityControl, DensityRules
 from nsvq_lightning.optim import LearningRates, build_adam, param_groups
-from nsvq_lightning.render.rasterize import Render
+from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.schedule import Schedule
 from nsvq_lightning.splats import Splats
 

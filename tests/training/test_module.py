@@ -20,8 +20,8 @@ from nsvq_lightning.module import SplatModule
 from nsvq_lightning.optim import LearningRates
 from nsvq_lightning.quantize.nsvq import NSVQ
 from nsvq_lightning.random import generator
-from nsvq_lightning.render.camera import Camera
-from nsvq_lightning.render.rasterize import render, visible
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.rasterize import render, visible
 from nsvq_lightning.schedule import Phase
 from nsvq_lightning.splats import ATTRIBUTES, RawSplats, Splats
 from nsvq_lightning.state import RunState, Stopwatch

@@ -20,7 +20,7 @@ from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io.container import read_header, read_nsvq
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.module import SplatModule
-from nsvq_lightning.render.rasterize import render
+from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.schedule import Phase, Schedule
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]

@@ -20,7 +20,7 @@ from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.timing import Case, measure, use_threads
 from nsvq_lightning.benchmark.workloads import Workload, workloads
-from nsvq_lightning.render.rasterize import BACKENDS, render, resolve_backend
+from nsvq_lightning.rendering.rasterize import BACKENDS, render, resolve_backend
 from nsvq_lightning.splats import RawSplats
 
 __all__ = ["image_errors", "run"]

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nsvq_lightning.render.camera import Camera
-from nsvq_lightning.render.constants import FRUSTUM_MARGIN
-from nsvq_lightning.render.cpu.binning import DIGITS, count_tiles, fill_tiles, sort_by_depth
-from nsvq_lightning.render.cpu.blend import (
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.constants import FRUSTUM_MARGIN
+from nsvq_lightning.rendering.cpu.binning import DIGITS, count_tiles, fill_tiles, sort_by_depth
+from nsvq_lightning.rendering.cpu.blend import (
     BACKWARD_SCRATCH,
     BATCH,
     FORWARD_SCRATCH,
@@ -21,10 +21,10 @@ from nsvq_lightning.render.cpu.blend import (
     pixel_grid,
     total_slots,
 )
-from nsvq_lightning.render.cpu.jit import thread_count
-from nsvq_lightning.render.cpu.projection import finish_records, project_backward, project_splats
-from nsvq_lightning.render.cpu.records import CAMERA, GROUP_TILES, RECORD, group_grid
-from nsvq_lightning.render.cpu.workspace import Array, Workspace, recycled
+from nsvq_lightning.rendering.cpu.jit import thread_count
+from nsvq_lightning.rendering.cpu.projection import finish_records, project_backward, project_splats
+from nsvq_lightning.rendering.cpu.records import CAMERA, GROUP_TILES, RECORD, group_grid
+from nsvq_lightning.rendering.cpu.workspace import Array, Workspace, recycled
 from nsvq_lightning.splats import SplatTensors
 
 __all__ = ["render_cpu", "visible_cpu"]

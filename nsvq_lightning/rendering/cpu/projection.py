@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from nsvq_lightning.render import constants, sh
-from nsvq_lightning.render.cpu.jit import inline, kernel
-from nsvq_lightning.render.cpu.lanes import (
+from nsvq_lightning.rendering import constants, sh
+from nsvq_lightning.rendering.cpu.jit import inline, kernel
+from nsvq_lightning.rendering.cpu.lanes import (
     exp2_clamped,
     fma,
     fnma,
@@ -40,7 +40,7 @@ from nsvq_lightning.render.cpu.lanes import (
     vmin,
     vsqrt,
 )
-from nsvq_lightning.render.cpu.records import (
+from nsvq_lightning.rendering.cpu.records import (
     CX,
     CY,
     DEPTH,

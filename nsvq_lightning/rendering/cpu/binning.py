@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from nsvq_lightning.render.cpu.jit import inline, kernel
-from nsvq_lightning.render.cpu.lanes import get, prefetch, put
-from nsvq_lightning.render.cpu.records import EXTENT, GROUP_SHIFT, GROUP_TILES, ORIGIN, RECORD
+from nsvq_lightning.rendering.cpu.jit import inline, kernel
+from nsvq_lightning.rendering.cpu.lanes import get, prefetch, put
+from nsvq_lightning.rendering.cpu.records import EXTENT, GROUP_SHIFT, GROUP_TILES, ORIGIN, RECORD
 
 DIGIT_BITS = 11
 DIGITS = 1 << DIGIT_BITS

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from nsvq_lightning.render.camera import Camera
+from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats import RawSplats
 
 

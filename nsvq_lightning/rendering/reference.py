@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from nsvq_lightning.render.camera import Camera
-from nsvq_lightning.render.constants import (
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
     BLUR,
@@ -21,7 +21,7 @@ from nsvq_lightning.render.constants import (
     NEAR,
     TRANSMITTANCE_MIN,
 )
-from nsvq_lightning.render.sh import sh_colors
+from nsvq_lightning.rendering.sh import sh_colors
 from nsvq_lightning.splats import RawSplats, SplatTensors
 
 __all__ = ["Projection", "project", "render_reference", "rotation_matrices", "visible_rows"]

@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from nsvq_lightning.render import constants
-from nsvq_lightning.render.cpu.jit import inline, kernel
-from nsvq_lightning.render.cpu.lanes import (
+from nsvq_lightning.rendering import constants
+from nsvq_lightning.rendering.cpu.jit import inline, kernel
+from nsvq_lightning.rendering.cpu.lanes import (
     any_lane,
     column_bits,
     divide_fast,
@@ -39,7 +39,7 @@ from nsvq_lightning.render.cpu.lanes import (
     vmax,
     vmin,
 )
-from nsvq_lightning.render.cpu.records import (
+from nsvq_lightning.rendering.cpu.records import (
     BLUE,
     DEPTH,
     EXTENT,

@@ -9,8 +9,8 @@ import numba
 import pytest
 import torch
 
-from nsvq_lightning.render.camera import Camera
-from nsvq_lightning.render.rasterize import Render, render, resolve_backend, visible
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.rasterize import Render, render, resolve_backend, visible
 from nsvq_lightning.splats import ATTRIBUTES, RawSplats, Splats
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from nsvq_lightning.render.camera import Camera
-from nsvq_lightning.render.reference import render_reference, visible_rows
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.reference import render_reference, visible_rows
 from nsvq_lightning.splats import SplatTensors, sh_degree_of
 
 __all__ = ["BACKENDS", "Render", "render", "resolve_backend", "visible"]
@@ -89,7 +89,7 @@ def visible(splats: SplatTensors, camera: Camera, *, backend: str = "auto") -> T
         backend: One of :data:`BACKENDS`.
     """
     if resolve_backend(backend, splats.means) == "cpu":
-        from nsvq_lightning.render.cpu.rasterizer import visible_cpu
+        from nsvq_lightning.rendering.cpu.rasterizer import visible_cpu
 
         return visible_cpu(splats, camera)
     mask = torch.zeros(splats.means.shape[0], dtype=torch.bool, device=splats.means.device)
@@ -119,6 +119,6 @@ def resolve_backend(backend: str, like: Tensor) -> str:
 def _rasterizer(backend: str) -> Callable[[SplatTensors, Camera, int, Tensor], _Outputs]:
     if backend == "reference":
         return render_reference
-    module = importlib.import_module("nsvq_lightning.render.cpu.rasterizer")
+    module = importlib.import_module("nsvq_lightning.rendering.cpu.rasterizer")
     rasterizer: Callable[[SplatTensors, Camera, int, Tensor], _Outputs] = module.render_cpu
     return rasterizer

@@ -15,10 +15,10 @@ from numba import prange
 from torch import Tensor
 
 from nsvq_lightning.losses import SSIM_C1, SSIM_C2, SSIM_RADIUS, ssim_window
-from nsvq_lightning.render.cpu.jit import inline, kernel, thread_count
-from nsvq_lightning.render.cpu.lanes import fma, fnma, lane_sum, load, select, splat, store, vfabs
-from nsvq_lightning.render.cpu.records import F
-from nsvq_lightning.render.cpu.workspace import Workspace
+from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
+from nsvq_lightning.rendering.cpu.lanes import fma, fnma, lane_sum, load, select, splat, store, vfabs
+from nsvq_lightning.rendering.cpu.records import F
+from nsvq_lightning.rendering.cpu.workspace import Workspace
 
 __all__ = ["l1_dssim"]
 
