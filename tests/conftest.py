@@ -1,5 +1,10 @@
 from __future__ import annotations
 
+import os
+
+# Before torch loads OpenMP: threads that wait by spinning slow everything down where cores are shared.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 from collections.abc import Callable
 from pathlib import Path
 
