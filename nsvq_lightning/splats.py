@@ -19,9 +19,6 @@ ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh0."""
 
-LOG_SCALE_LIMIT = 20.0
-"""Raw log-scales are kept within ±20 (2e-9 to 5e8 scene units), where exp and its square stay finite in float32."""
-
 
 class SplatTensors(Protocol):
     """Anything with the six raw attributes; :func:`nsvq_lightning.render` takes it."""
