@@ -87,7 +87,9 @@ class DensityControl(Callback):
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         """Ask for screen-space gradients while they are needed."""
         host = as_host(pl_module)
-        host.wants_screen_gradients = next_iteration(trainer) <= host.schedule.iteration(self.rules.last)
+        iteration = next_iteration(trainer)
+        growing = host.schedule.phase_at(iteration) is Phase.WARMUP
+        host.wants_screen_gradients = growing and iteration <= host.schedule.iteration(self.rules.last)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
