@@ -62,9 +62,10 @@ class MetricReport(Callback):
 
     def is_due(self, host: SplatHost, iteration: int) -> bool:
         """Whether the scene is evaluated after this iteration."""
-        total = host.schedule.total
-        every = max(1, total // 20) if self.every is None else self.every
-        return iteration > 0 and (iteration in host.schedule.ends or bool(every and iteration % every == 0))
+        every = max(1, host.schedule.total // 20) if self.every is None else self.every
+        # By default between the round numbers: opacities are reset at those, and just then a picture says nothing.
+        offset = every // 2 if self.every is None else 0
+        return iteration > 0 and (iteration in host.schedule.ends or bool(every and iteration % every == offset))
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         """Evaluate the last iteration, now that every callback has finished with it."""
