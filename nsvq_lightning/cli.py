@@ -22,6 +22,7 @@ NOT_ACTIONABLE = (
     "dataloader.*no length",
     "LeafSpec",
     "Checkpoint directory .* exists and is not empty",
+    "`tensorboardX` has been removed",
 )
 """Parts of warnings of Lightning and torch that a user of this command can do nothing about."""
 

@@ -128,7 +128,7 @@ class DemoDataModule(ColmapDataModule):
 
     def __init__(
         self,
-        root: str = "runs/demo_scene",
+        root: str = "scenes/demo",
         views: int = 40,
         width: int = 320,
         height: int = 240,
