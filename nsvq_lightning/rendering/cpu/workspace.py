@@ -51,11 +51,16 @@ class Workspace:
         return self.array(name, rows * columns, dtype).reshape(rows, columns)
 
 
-_RECYCLED: dict[tuple[int, ...], list[Array]] = {}
-_SPARE = 4
-"""Buffers of one shape that are kept when nobody holds them."""
-_REFERENCES_OF_IDLE = 3
-"""References to an idle buffer while it is looked at: the list's, the loop's and getrefcount's own."""
+_BUFFERS: list[Array] = []
+_SLACK = 4
+"""A buffer up to this many times as large as asked for is good enough."""
+_PAGE = 1024
+"""Elements of a memory page."""
+
+
+def _is_idle(index: int) -> bool:
+    """Whether nobody but the list and this question refers to a buffer."""
+    return sys.getrefcount(_BUFFERS[index]) == 2
 
 
 def recycled(shape: tuple[int, ...]) -> Tensor:
@@ -64,16 +69,16 @@ def recycled(shape: tuple[int, ...]) -> Tensor:
     Images and the gradients of large scenes come and go at every step; taking them from the system each time would cost
     more in page faults than computing them.
     """
-    if shape not in _RECYCLED:
-        # The number of splats changes at densification: the buffers of old shapes are of no more use.
-        for old in [old for old in _RECYCLED if old[1:] == shape[1:]]:
-            del _RECYCLED[old]
-        _RECYCLED[shape] = []
-    buffers = _RECYCLED[shape]
-    for buffer in buffers:
-        if sys.getrefcount(buffer) == _REFERENCES_OF_IDLE:
-            return torch.from_numpy(buffer)
-    fresh = torch.empty(max(1, math.prod(shape)), dtype=torch.float32).numpy()[: math.prod(shape)].reshape(shape)
-    if len(buffers) < _SPARE:
-        buffers.append(fresh)
-    return torch.from_numpy(fresh)
+    size = math.prod(shape)
+    best = -1
+    for i in range(len(_BUFFERS)):
+        if size <= _BUFFERS[i].size <= _SLACK * size + _PAGE and _is_idle(i):
+            best = i if best < 0 or _BUFFERS[i].size < _BUFFERS[best].size else best
+    if best < 0:
+        # The number of splats grows: what is a little too small now will not be asked for again.
+        outgrown = [i for i in range(len(_BUFFERS)) if size / 2 <= _BUFFERS[i].size < size and _is_idle(i)]
+        for i in reversed(outgrown):
+            del _BUFFERS[i]
+        _BUFFERS.append(torch.empty(size + size // 8 + _PAGE, dtype=torch.float32).numpy())
+    # The tensor keeps the view alive, the view its buffer.
+    return torch.from_numpy(_BUFFERS[best][:size].reshape(shape))

@@ -1,0 +1,76 @@
+"""Rows out of a table and back into one, in one pass over the memory each."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numba import prange
+from torch import Tensor
+
+from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
+from nsvq_lightning.rendering.cpu.lanes import get, put
+from nsvq_lightning.rendering.cpu.workspace import recycled
+
+__all__ = ["gather_rows", "spread_rows"]
+
+
+@inline
+def _copy(source, start, target, place, count):
+    for k in range(count):
+        put(target, place + k, get(source, start + k))
+
+
+@inline
+def _clear(target, first, last):
+    for k in range(first, last):
+        put(target, k, np.float32(0))
+
+
+@kernel
+def _gather(threads, columns, source, rows, target):
+    count = rows.shape[0]
+    for thread in prange(threads):
+        for i in range(count * thread // threads, count * (thread + 1) // threads):
+            _copy(source, columns * get(rows, i), target, columns * i, columns)
+
+
+@kernel
+def _spread(threads, columns, source, rows, target):
+    count, total = rows.shape[0], target.shape[0]
+    for thread in prange(threads):
+        first, last = count * thread // threads, count * (thread + 1) // threads
+        # Every thread clears what it passes by, the last one up to the end.
+        done = columns * (get(rows, first - 1) + 1) if first > 0 else 0
+        for i in range(first, last):
+            place = columns * get(rows, i)
+            _clear(target, done, place)
+            _copy(source, columns * i, target, place, columns)
+            done = place + columns
+        if thread == threads - 1:
+            _clear(target, done, total)
+
+
+def gather_rows(table: Tensor, rows: Tensor) -> Tensor:
+    """The rows ``rows [V]`` of a float32 table ``[N, ...]`` on the CPU: ``[V, ...]``."""
+    out = torch.empty(rows.shape[0], *table.shape[1:])
+    _gather(thread_count(), _columns(table), _flat(table), rows.numpy(), _flat(out))
+    return out
+
+
+def spread_rows(values: Tensor, rows: Tensor, count: int) -> Tensor:
+    """A table ``[count, ...]`` of zeros but for ``values [V, ...]`` at the ascending ``rows [V]``."""
+    table = recycled((count, *values.shape[1:]))
+    _spread(thread_count(), _columns(values), _flat(values), rows.numpy(), _flat(table))
+    return table
+
+
+def _columns(table: Tensor) -> int:
+    columns = 1
+    for size in table.shape[1:]:
+        columns *= size
+    return columns
+
+
+def _flat(tensor: Tensor) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
+    flat: np.ndarray[tuple[int], np.dtype[np.float32]] = tensor.detach().contiguous().numpy().reshape(-1)
+    return flat
