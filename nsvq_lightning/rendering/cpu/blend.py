@@ -334,11 +334,12 @@ def blend(
 
 @inline
 def start_block(
-    block, left, top, width, height, image, depth, transmittance, g_image, g_alpha, g_depth, with_depth, grid, state
-):
+    block, left, top, width, height, image, depth, transmittance, g_image, g_alpha, g_depth, with_alpha, with_depth,
+    grid, state,
+):  # fmt: skip
     """Backward state of a block: transmittance 1, and ``rest`` = g · everything that this pixel received.
 
-    Alpha is 1 - T, so its gradient enters as -g_alpha·T at the far end.
+    Alpha is 1 - T, so its gradient enters as -g_alpha·T at the far end. Gradients that are not asked for are not read.
     """
     s = BLOCK_STATE * block
     x0, y0 = left + (block & 3) * BLOCK_SIDE, top + (block >> 2) * BLOCK_SIDE
@@ -349,7 +350,8 @@ def start_block(
         red, green, blue = load_rgb_block(g_image, 3 * pixel, 3 * width)
         r, g, b = load_rgb_block(image, 3 * pixel, 3 * width)
         rest = fma(red, r, fma(green, g, blue * b))
-        rest = fnma(load_block(g_alpha, pixel, width), load_block(transmittance, pixel, width), rest)
+        if with_alpha:
+            rest = fnma(load_block(g_alpha, pixel, width), load_block(transmittance, pixel, width), rest)
         if with_depth:
             far = load_block(g_depth, pixel, width)
             store(state, s + B_DEPTH, far)
@@ -368,7 +370,9 @@ def start_block(
         x, y = x0 + (lane & 3), y0 + (lane >> 2)
         if x < width and y < height:
             pixel, o = y * width + x, s + lane
-            rest = -get(g_alpha, pixel) * get(transmittance, pixel)
+            rest = F(0)
+            if with_alpha:
+                rest -= get(g_alpha, pixel) * get(transmittance, pixel)
             for channel in range(3):
                 gradient = get(g_image, 3 * pixel + channel)
                 put(state, o + B_RED + 16 * channel, gradient)
@@ -474,6 +478,7 @@ def blend_backward(
     g_image,
     g_alpha,
     g_depth,
+    with_alpha,
     with_depth,
     sums,
     slots,
@@ -501,7 +506,7 @@ def blend_backward(
                 for block in range(BLOCKS):
                     start_block(
                         block, left, top, width, height, image, depth, transmittance, g_image, g_alpha, g_depth,
-                        with_depth, grid, state,
+                        with_alpha, with_depth, grid, state,
                     )  # fmt: skip
                 tile_backward(
                     records, integers, entries, begin, end, left, top, group % group_columns, group // group_columns,

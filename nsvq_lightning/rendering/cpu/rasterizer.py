@@ -132,12 +132,18 @@ class _Project(torch.autograd.Function):
         ctx.save_for_backward(*attributes)
         frame.finish(_flat(sh0), _flat(shN), ctx.stride, degree, _flat(means2d), _flat(radii))
         ctx.mark_non_differentiable(radii)
+        ctx.set_materialize_grads(False)
         return means2d, means.new_zeros(()), radii
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, g_means2d: Tensor, g_token: Tensor, g_radii: Tensor) -> tuple[Any, ...]:
+    def backward(ctx: Any, g_means2d: Tensor | None, g_token: Tensor | None, g_radii: Tensor | None) -> tuple[Any, ...]:
         frame: _Frame = ctx.frame
+        if g_token is None:
+            # Only the centres were differentiated: no blend has left its sums.
+            frame.sums = frame.work.array("sums", RECORD * frame.slots)
+            frame.sums.fill(0)
+        g_means2d = torch.zeros(frame.n, 2) if g_means2d is None else g_means2d
         *_, sh0, shN = ctx.saved_tensors
         gradients = [recycled(tuple(tensor.shape)) for tensor in ctx.saved_tensors]
         project_backward(
@@ -177,18 +183,19 @@ class _Blend(torch.autograd.Function):
     def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, g_depth: Tensor | None) -> tuple[Any, ...]:
         frame: _Frame = ctx.frame
         image, transmittance, depth = ctx.saved_tensors
-        nothing = torch.zeros_like(transmittance) if g_alpha is None or g_depth is None else transmittance
-        with_depth = g_depth is not None
+        # Arguments that are not read stand in for gradients that do not exist.
+        with_alpha, with_depth = g_alpha is not None, g_depth is not None
         g_image = torch.zeros_like(image) if g_image is None else g_image
-        g_alpha = nothing if g_alpha is None else g_alpha
-        g_depth = nothing if g_depth is None else g_depth
+        g_alpha = transmittance if g_alpha is None else g_alpha
+        g_depth = depth if g_depth is None else g_depth
         work = frame.work
         frame.sums = work.array("sums", RECORD * frame.slots)
         g_means2d = torch.zeros(frame.n, 2)
         blend_backward(
             frame.threads, frame.records, frame.integers, frame.entries, frame.offsets, frame.ends,
             frame.group_columns, frame.width, frame.height, _GRID, frame.touched,
-            *(_flat(tensor) for tensor in (image, transmittance, depth, g_image, g_alpha, g_depth)), with_depth,
+            *(_flat(tensor) for tensor in (image, transmittance, depth, g_image, g_alpha, g_depth)), with_alpha,
+            with_depth,
             frame.sums, frame.slots, work.rows("blend_backward", frame.threads, BACKWARD_SCRATCH),
             np.zeros(1, np.int64),
         )  # fmt: skip
