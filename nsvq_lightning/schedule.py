@@ -10,7 +10,10 @@ ends of the phases               proportionally; a phase that exists in the refe
 steps of the SH degree           proportionally
 density control: start, stop     proportionally
 density control: interval        proportionally, not below ``min_density_interval`` (its statistic is a mean over
-                                 the views of one interval, and a mean over two views is noise)
+                                 the views of one interval, and a mean over two views is noise). Test PSNR after
+                                 2000 of 4500 iterations with 50 / 100: 29.98 dB with 105 k splats / 30.26 dB with
+                                 73 k where SfM left 13 k points, 25.44 dB with 162 k / 23.06 dB with 81 k where it
+                                 left 5.5 k (25: 25.44 dB with 209 k): fewer times starve a sparse start, so 50
 opacity resets                   proportionally, interval not below ``min_reset_interval`` (opacities need some
                                  hundred steps of Adam to come back)
 pruning in the prune phase       proportionally
