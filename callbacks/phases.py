@@ -107,8 +107,9 @@ class PhaseSchedule(Callback):
             )
         raise ValueError(
             f"the checkpoint is at iteration {step} in its {host.phase.name.lower()} phase, but in a run of "
-            f"{host.schedule.total} iterations that is in the {expected.name.lower()} phase; keep the "
-            "length it was trained for (PhaseSchedule.total, --callbacks.phases.total); trainer.max_steps may be larger"
+            f"{host.schedule.total} iterations that is in the {expected.name.lower()} phase; pass "
+            "the trainer.max_steps it was started with, or that number as PhaseSchedule.total "
+            "(--callbacks.phases.total) and a larger trainer.max_steps to train on in its last phase"
         )
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:

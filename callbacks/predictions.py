@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ from nsvq_lightning.host import output_folder
 from nsvq_lightning.pictures import file_stem, write_png
 
 __all__ = ["RenderWriter"]
+
+log = logging.getLogger(__name__)
 
 
 class RenderWriter(Callback):
@@ -33,6 +36,13 @@ class RenderWriter(Callback):
         dataloader_idx: int = 0,
     ) -> None:
         """Write one picture."""
-        folder = output_folder(trainer) / "predictions" if self.folder is None else Path(self.folder)
+        folder = self._target(trainer)
         folder.mkdir(parents=True, exist_ok=True)
         write_png(folder / f"{file_stem(outputs['name'])}.png", outputs["image"])
+
+    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say where the pictures are."""
+        log.info("rendered views are in %s", self._target(trainer))
+
+    def _target(self, trainer: Trainer) -> Path:
+        return output_folder(trainer) / "predictions" if self.folder is None else Path(self.folder)

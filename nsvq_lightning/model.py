@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any, cast
@@ -25,6 +26,8 @@ from nsvq_lightning.splats import RawSplats, Splats, SplatTensors, sh_degree_of
 from nsvq_lightning.state import RunState, Stopwatch
 
 __all__ = ["SplatModel"]
+
+log = logging.getLogger(__name__)
 
 
 class SplatModel(LightningModule):
@@ -132,8 +135,19 @@ class SplatModel(LightningModule):
         return self._render(splats, camera, self._background())
 
     def compressed(self) -> CompressedScene:
-        """The scene as it is stored: frozen or nearest codes, codebooks, positions, opacities and the settings."""
-        return compress(self.splats.raw(), self.quantizers, self._settings())
+        """The scene as it is stored: frozen or nearest codes, codebooks, positions, opacities and the settings.
+
+        Before the quantize phase there are no codebooks yet, and everything is stored as it is.
+
+        Raises:
+            ValueError: There are no splats.
+        """
+        if len(self.splats) == 0:
+            raise ValueError("there are no splats to store or to measure: pass the checkpoint of a run (--ckpt_path)")
+        quantizers = self.quantizers if self.phase >= Phase.QUANTIZE else {}
+        if self.quantizers and not quantizers:
+            log.warning("the %s phase has no codebooks yet: the scene is stored unquantized", self.phase.name.lower())
+        return compress(self.splats.raw(), quantizers, self._settings(quantizers))
 
     def forward(self, camera: Camera) -> Render:
         """Render what the current phase trains, or outside training what a file would hold."""
@@ -174,14 +188,25 @@ class SplatModel(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take over history, and outside a fit (which has its own) the schedule."""
         self.history = list(checkpoint.get("history", []))
+        if "schedule" not in checkpoint:
+            return
+        stored = Schedule(**checkpoint["schedule"])
         fitting = self._trainer is not None and self._trainer.state.fn == "fit"
-        if "schedule" in checkpoint and not fitting:
-            self.schedule = Schedule(**checkpoint["schedule"])
+        if not fitting:
+            self.schedule = stored
+        elif stored != self.schedule:
+            log.warning(
+                "the checkpoint is of a run of %d iterations, this one has %d: phases, density control and learning "
+                "rates follow the new length; pass --trainer.max_steps=%d to continue that run as it was",
+                stored.total,
+                self.schedule.total,
+                stored.total,
+            )
 
-    def _settings(self) -> dict[str, Any]:
+    def _settings(self, quantizers: Mapping[str, Quantizer]) -> dict[str, Any]:
         """What is stored in the file about the run: nothing that differs between two runs of one seed."""
-        sizes = {name: int(q.codebook.shape[0]) for name, q in self.quantizers.items()}
-        quantizer = {name: type(q).__name__ for name, q in self.quantizers.items()}
+        sizes = {name: int(q.codebook.shape[0]) for name, q in quantizers.items()}
+        quantizer = {name: type(q).__name__ for name, q in quantizers.items()}
         return {
             "version": __version__,
             "codebooks": sizes,

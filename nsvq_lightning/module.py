@@ -78,6 +78,8 @@ class SplatModule(SplatModel):
         Raises:
             ValueError: There is nothing to start from.
         """
+        # An evaluation that was interrupted may have left its splats.
+        self.evaluation_splats = None
         if stage != "fit":
             return
         scene = getattr(getattr(self.trainer, "datamodule", None), "scene", None)
@@ -156,6 +158,8 @@ class SplatModule(SplatModel):
         self.stopwatch.stop()
 
     def _evaluation_start(self) -> None:
+        if len(self.splats) == 0:
+            raise ValueError("there are no splats to render: pass the checkpoint of a run (--ckpt_path)")
         if self.evaluation_splats is None:
             self.evaluation_splats = self.hard_splats(self.phase)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+import threading
+
 import torch
 
 from nsvq_lightning.rendering.cpu.workspace import Workspace, recycled
@@ -68,3 +71,26 @@ def test_a_workspace_is_lent_to_one_at_a_time() -> None:
     assert Workspace.borrow() is first
     second.give_back()
     first.give_back()
+
+
+def test_threads_do_not_get_the_same_memory() -> None:
+    wrong: list[int] = []
+
+    def use(number: int) -> None:
+        for _ in range(300):
+            tensor = recycled((1000 + number, 7))
+            tensor.fill_(number)
+            if float(tensor.sum()) != number * tensor.numel():
+                wrong.append(number)
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        threads = [threading.Thread(target=use, args=(number,)) for number in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(interval)
+    assert not wrong

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+import threading
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,10 @@ class Workspace:
     @staticmethod
     def borrow() -> Workspace:
         """An idle workspace, or a new one."""
-        return _IDLE.pop() if _IDLE else Workspace()
+        try:
+            return _IDLE.pop()
+        except IndexError:
+            return Workspace()
 
     def give_back(self) -> None:
         """Offer the workspace to the next render."""
@@ -52,6 +56,7 @@ class Workspace:
 
 
 _BUFFERS: list[Array] = []
+_LOCK = threading.Lock()
 _SLACK = 4
 """A buffer up to this many times as large as asked for is good enough."""
 _PAGE = 1024
@@ -70,15 +75,16 @@ def recycled(shape: tuple[int, ...]) -> Tensor:
     more in page faults than computing them.
     """
     size = math.prod(shape)
-    best = -1
-    for i in range(len(_BUFFERS)):
-        if size <= _BUFFERS[i].size <= _SLACK * size + _PAGE and _is_idle(i):
-            best = i if best < 0 or _BUFFERS[i].size < _BUFFERS[best].size else best
-    if best < 0:
-        # The number of splats grows: what is a little too small now will not be asked for again.
-        outgrown = [i for i in range(len(_BUFFERS)) if size / 2 <= _BUFFERS[i].size < size and _is_idle(i)]
-        for i in reversed(outgrown):
-            del _BUFFERS[i]
-        _BUFFERS.append(torch.empty(size + size // 8 + _PAGE, dtype=torch.float32).numpy())
-    # The tensor keeps the view alive, the view its buffer.
-    return torch.from_numpy(_BUFFERS[best][:size].reshape(shape))
+    with _LOCK:
+        best = -1
+        for i in range(len(_BUFFERS)):
+            if size <= _BUFFERS[i].size <= _SLACK * size + _PAGE and _is_idle(i):
+                best = i if best < 0 or _BUFFERS[i].size < _BUFFERS[best].size else best
+        if best < 0:
+            # The number of splats grows: what is a little too small now will not be asked for again.
+            outgrown = [i for i in range(len(_BUFFERS)) if size / 2 <= _BUFFERS[i].size < size and _is_idle(i)]
+            for i in reversed(outgrown):
+                del _BUFFERS[i]
+            _BUFFERS.append(torch.empty(size + size // 8 + _PAGE, dtype=torch.float32).numpy())
+        # The tensor keeps the view alive, the view its buffer.
+        return torch.from_numpy(_BUFFERS[best][:size].reshape(shape))

@@ -1,0 +1,33 @@
+"""What is stored belongs to the phase that a run is in."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+import torch
+
+from nsvq_lightning.module import SplatModule
+from nsvq_lightning.splats import ATTRIBUTES, Splats
+
+
+def splats(count: int = 40) -> Splats:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(count, 3, generator=generator)
+    return Splats.from_points(points, torch.rand(count, 3, generator=generator))
+
+
+def test_before_the_codebooks_everything_is_stored_as_it_is(caplog: pytest.LogCaptureFixture) -> None:
+    module = SplatModule(codebooks="0.5k", splats=splats())
+    with caplog.at_level(logging.WARNING):
+        stored = module.compressed()
+    assert "unquantized" in caplog.text
+    assert not stored.codes
+    decoded = stored.decode()
+    for name in ATTRIBUTES:
+        assert torch.equal(getattr(decoded, name), getattr(module.splats, name)), name
+
+
+def test_nothing_to_store_names_the_checkpoint() -> None:
+    with pytest.raises(ValueError, match="--ckpt_path"):
+        SplatModule().compressed()
