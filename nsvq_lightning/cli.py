@@ -16,6 +16,9 @@ __all__ = ["find_config", "main", "resolve_configs"]
 OWN_COMMANDS = {"info": "nsvq_lightning.info", "benchmark": "nsvq_lightning.benchmark.cli"}
 """Commands without a trainer: modules with a ``main(argv)``, which must not pay for Lightning's start."""
 
+TRACEBACK = "NSVQ_TRACEBACK"
+"""Environment variable that makes errors show their traceback."""
+
 NOT_ACTIONABLE = (
     "does not have many workers",  # views come from a cache in memory; workers would each hold a copy
     "args parameter is intended",  # we pass the arguments after looking configs up
@@ -49,17 +52,25 @@ def _run_lightning(arguments: list[str]) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     for message in NOT_ACTIONABLE:
         warnings.filterwarnings("ignore", f".*{message}.*")
-    from nsvq_lightning.data.model_files import SceneError
-    from nsvq_lightning.io.errors import FormatError
     from nsvq_lightning.lightning_cli import SplatCLI
 
     _quiet_lightning()
     try:
         SplatCLI(arguments)
-    except (SceneError, FormatError) as error:
-        sys.stderr.write(f"error: {error}\n")
+    except (ValueError, FileNotFoundError) as error:
+        if os.environ.get(TRACEBACK) or not (isinstance(error, FileNotFoundError) or _is_ours(error)):
+            raise
+        sys.stderr.write(f"error: {error}\n({TRACEBACK}=1 shows where)\n")
         return 1
     return 0
+
+
+def _is_ours(error: BaseException) -> bool:
+    """Whether this package raised the error: its message then says what to do, and a traceback would only hide it."""
+    frame = error.__traceback__
+    while frame is not None and frame.tb_next is not None:
+        frame = frame.tb_next
+    return frame is not None and Path(frame.tb_frame.f_code.co_filename).is_relative_to(Path(__file__).parent)
 
 
 def _quiet_lightning() -> None:
