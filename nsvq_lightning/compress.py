@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nsvq_lightning.io.arrays import finite_rows
 from nsvq_lightning.io.compressed import QUANTIZABLE, CompressedScene
 from nsvq_lightning.io.container import write_nsvq
 from nsvq_lightning.io.formats import save
@@ -19,9 +18,7 @@ from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.quantized import attribute_rows, codes_of
 from nsvq_lightning.splats import RawSplats, sh_degree_of
 
-__all__ = ["compress", "export_scene", "finite_scene", "formula_bytes"]
-
-log = logging.getLogger(__name__)
+__all__ = ["compress", "export_scene", "formula_bytes"]
 
 EXPORT_FORMATS = ("nsvq", "ply")
 """Formats that :func:`export_scene` writes: the compressed scene, and its decoded splats for any viewer."""
@@ -38,7 +35,7 @@ def compress(splats: RawSplats, quantizers: Mapping[str, Quantizer], config: Map
         quantizers: Quantizer by attribute; empty stores everything as it is.
         config: Settings of the run, JSON values; the same run must give the same ones.
     """
-    finite = finite_scene(splats)
+    finite = finite_rows({name: _numpy(tensor) for name, tensor in splats._asdict().items()})
     codes = {name: _numpy(codes_of(splats, name, quantizer)) for name, quantizer in quantizers.items()}
     return CompressedScene(
         means=_numpy(splats.means)[finite],
@@ -49,20 +46,6 @@ def compress(splats: RawSplats, quantizers: Mapping[str, Quantizer], config: Map
         sh_degree=sh_degree_of(splats.shN),
         config=dict(config),
     )
-
-
-def finite_scene(splats: RawSplats) -> NDArray[np.bool_]:
-    """Which splats ``[N]`` are finite in every attribute; the others are reported in a warning."""
-    finite = np.ones(splats.means.shape[0], dtype=bool)
-    found = []
-    for name, tensor in zip(splats._fields, splats, strict=True):
-        good = np.isfinite(_numpy(tensor)).reshape(finite.shape[0], -1).all(1)
-        if not good.all():
-            found.append(f"{name} in {int((~good).sum())} rows")
-            finite &= good
-    if found:
-        log.warning("%d splats with non-finite values are not stored: %s", int((~finite).sum()), ", ".join(found))
-    return finite
 
 
 def export_scene(scene: CompressedScene, folder: Path, formats: tuple[str, ...] = EXPORT_FORMATS) -> dict[str, Path]:

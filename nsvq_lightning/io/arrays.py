@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from nsvq_lightning.splats import Splats, SplatTensors
 
-__all__ = ["SplatArrays", "check_floats", "shN_degree", "sh_coefficients"]
+__all__ = ["SplatArrays", "check_floats", "finite_rows", "shN_degree", "sh_coefficients"]
 
 logger = logging.getLogger(__name__)
 
@@ -121,15 +122,23 @@ class SplatArrays:
         return shN_degree(self.shN.shape[1])
 
     def finite(self) -> SplatArrays:
-        """The splats without NaN or infinite values; a warning names the attributes of what is dropped."""
+        """The splats without NaN or infinite values, see :func:`finite_rows`."""
         attributes: dict[str, NDArray[np.float32]] = vars(self)
-        bad = {
-            name: ~np.isfinite(array).reshape(len(self), -1).all(1) for name, array in attributes.items() if len(self)
-        }
-        culprits = {name: int(rows.sum()) for name, rows in bad.items() if rows.any()}
-        if not culprits:
-            return self
-        keep = ~np.logical_or.reduce(list(bad.values()))
-        counts = ", ".join(f"{name} {count}" for name, count in culprits.items())
-        logger.warning("dropped %d of %d splats with non-finite values (%s)", int((~keep).sum()), len(self), counts)
-        return SplatArrays(**{name: array[keep] for name, array in attributes.items()})
+        keep = finite_rows(attributes)
+        return self if keep.all() else SplatArrays(**{name: array[keep] for name, array in attributes.items()})
+
+
+def finite_rows(attributes: Mapping[str, NDArray[np.float32]]) -> NDArray[np.bool_]:
+    """Which rows ``[N]`` of the arrays ``[N, ...]`` are finite in all; a warning names the attributes of the others."""
+    count = len(next(iter(attributes.values())))
+    keep = np.ones(count, dtype=bool)
+    culprits = []
+    for name, array in attributes.items():
+        good = np.isfinite(array).all(tuple(range(1, array.ndim)))
+        if not good.all():
+            culprits.append(f"{name} {int((~good).sum())}")
+            keep &= good
+    if culprits:
+        dropped = count - int(keep.sum())
+        logger.warning("dropped %d of %d splats with non-finite values (%s)", dropped, count, ", ".join(culprits))
+    return keep

@@ -365,13 +365,13 @@ def _interleave_step(step: int) -> tuple[list[int], list[int]]:
 @_function(Lanes, 1)
 def lane_sums(context, builder, sig, values):
     """``lane_sums((v0, v1, …))``: lane i of the result is the sum of the lanes of vector i, 0 beyond the last."""
-    vectors: list[Any] = list(cgutils.unpack_tuple(builder, values[0], len(sig.args[0])))
+    vectors = list(cgutils.unpack_tuple(builder, values[0], len(sig.args[0])))
     vectors += [None] * (WIDTH - len(vectors))
     zero = _constant(0.0)
     step = 1
     while len(vectors) > 1:
         low, high = _interleave_step(step)
-        merged: list[Any] = []
+        merged = []
         for first, second in zip(vectors[0::2], vectors[1::2], strict=True):
             if first is None and second is None:
                 merged.append(None)
