@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -88,11 +89,48 @@ def test_options_win_over_the_checkpoint_in_fit(demo_scene: Path, finished: Path
 
 
 def test_a_checkpoint_of_another_phase_is_refused_with_the_way_out(
-    demo_scene: Path, finished: Path, tmp_path: Path
+    demo_scene: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     checkpoint = finished / "checkpoints" / "last.ckpt"
-    with pytest.raises(ValueError, match=r"at iteration 20 in its finetune phase.*callbacks\.phases\.total"):
-        main(fit(demo_scene, tmp_path, *CODES, f"--ckpt_path={checkpoint}", steps=40))
+    assert main(fit(demo_scene, tmp_path, *CODES, f"--ckpt_path={checkpoint}", steps=40)) == 1
+    assert re.search(
+        r"^error: .*at iteration 20 in its finetune phase.*callbacks\.phases\.total",
+        capsys.readouterr().err,
+        re.MULTILINE,
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["export", "--ckpt_path=no.ckpt"], "no.ckpt"),
+        (["fit", "--model.codebooks=3k"], "choose one of 0.5k"),
+        (["fit", "--trainer.max_steps=0"], "set trainer.max_steps"),
+        (["test"], "--ckpt_path"),
+        (["predict"], "--ckpt_path"),
+    ],
+)
+def test_errors_of_the_user_are_one_line(
+    arguments: list[str],
+    message: str,
+    demo_scene: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if arguments[0] != "export":
+        arguments = [*arguments, f"--data.root={demo_scene}"]
+    assert main(arguments) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert "Traceback" not in error
+
+
+def test_an_error_can_show_its_traceback(demo_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NSVQ_TRACEBACK", "1")
+    with pytest.raises(ValueError, match="choose one of"):
+        main(["fit", "--model.codebooks=3k", f"--data.root={demo_scene}"])
 
 
 def test_test_takes_the_model_from_the_checkpoint(demo_scene: Path, finished: Path, tmp_path: Path) -> None:
