@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from numba import prange
@@ -9,6 +11,7 @@ from torch import Tensor
 
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
 from nsvq_lightning.rendering.cpu.lanes import get, put
+from nsvq_lightning.rendering.cpu.projection import clear
 from nsvq_lightning.rendering.cpu.workspace import recycled
 
 __all__ = ["gather_rows", "spread_rows"]
@@ -18,12 +21,6 @@ __all__ = ["gather_rows", "spread_rows"]
 def _copy(source, start, target, place, count):
     for k in range(count):
         put(target, place + k, get(source, start + k))
-
-
-@inline
-def _clear(target, first, last):
-    for k in range(first, last):
-        put(target, k, np.float32(0))
 
 
 @kernel
@@ -43,11 +40,11 @@ def _spread(threads, columns, source, rows, target):
         done = columns * (get(rows, first - 1) + 1) if first > 0 else 0
         for i in range(first, last):
             place = columns * get(rows, i)
-            _clear(target, done, place)
+            clear(target, done, place)
             _copy(source, columns * i, target, place, columns)
             done = place + columns
         if thread == threads - 1:
-            _clear(target, done, total)
+            clear(target, done, total)
 
 
 def gather_rows(table: Tensor, rows: Tensor) -> Tensor:
@@ -65,10 +62,7 @@ def spread_rows(values: Tensor, rows: Tensor, count: int) -> Tensor:
 
 
 def _columns(table: Tensor) -> int:
-    columns = 1
-    for size in table.shape[1:]:
-        columns *= size
-    return columns
+    return math.prod(table.shape[1:])
 
 
 def _flat(tensor: Tensor) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
