@@ -1,8 +1,10 @@
 """Front-to-back blending of sorted splats and its backward pass, a 4x4 block of pixels a vector.
 
 Forward: a tile takes its splats in batches; an exact test tells which of its 16 blocks each splat can reach, then
-each block runs through its own splats with transmittance and colour in registers. The blocks that a splat really
-changed are kept as a 16-bit mask for the backward pass, which goes through the splats once more from front to back:
+each block runs through its own splats, four at a time, with transmittance and colour in registers. Nothing branches
+on a single pixel: one that is closed goes on losing transmittance, and a splat counts only where the transmittance
+after it would still be open. The blocks that a splat was blended into are kept as a 16-bit mask for the backward pass,
+which goes through the splats once more from front to back:
 with d = g·colour and ``rest`` = what all splats from here on (and the background) add to g·image, dL/dα = (T·d - rest
 after this splat/(1 - α)), so neither the last contributor nor any atomic is needed.
 """
@@ -36,6 +38,7 @@ from nsvq_lightning.rendering.cpu.lanes import (
     store,
     store_block,
     store_rgb_block,
+    trailing_zeros,
     vmax,
     vmin,
 )
@@ -68,18 +71,21 @@ from nsvq_lightning.rendering.cpu.records import (
 ALPHA_MAX = F(constants.ALPHA_MAX)
 TRANSMITTANCE_MIN = F(constants.TRANSMITTANCE_MIN)
 BATCH = 128
+TINY = F(1e-20)
+"""Where the transmittance of closed pixels is held: far below the threshold, far above denormal numbers."""
 AHEAD = 24
 """How many entries ahead a record is asked for; its slot, whose number stands in the record, a little later."""
 SLOT_AHEAD = 10
 BLOCKS = 16
 BLOCK_SIDE = 4
 
-# Planes of the per-thread scratch of the forward pass, one vector a block each.
-T, T_STOPPED, R_SUM, G_SUM, B_SUM, Z_SUM = (256 * plane for plane in range(6))
-FORWARD_SCRATCH = 6 * 256 + BATCH * RECORD
+# Planes of the per-thread scratch of the forward pass, one vector a block each: T falls on when a pixel is closed,
+# T_LEFT is what its image keeps.
+T, T_LEFT, R_SUM, G_SUM, B_SUM, Z_SUM = (256 * plane for plane in range(6))
+FORWARD_SCRATCH = 6 * 256 + (BATCH + 1) * RECORD
 # Vectors a block owns in the scratch of the backward pass.
-B_T, B_REST, B_RED, B_GREEN, B_BLUE, B_DEPTH, B_STOP, B_X, B_Y = (16 * part for part in range(9))
-BLOCK_STATE = 16 * 9
+B_T, B_REST, B_RED, B_GREEN, B_BLUE, B_DEPTH, B_X, B_Y = (16 * part for part in range(8))
+BLOCK_STATE = 16 * 8
 BACKWARD_SCRATCH = BLOCKS * BLOCK_STATE
 TWO_LN2 = F(2 * np.log(2.0))
 
@@ -93,10 +99,16 @@ def pixel_grid() -> np.ndarray[tuple[int], np.dtype[np.float32]]:
 
 
 @inline
-def exponent(a, b, c, peak, dx, dy):
+def offsets_at(a, b, c, x, y):
+    """Constant terms of the factors u = A·x + B·y + u0 and v = C·y + v0 of the exponent of a splat at (x, y)."""
+    return -(a * x + b * y), -(c * y)
+
+
+@inline
+def exponent(a, b, c, u0, v0, peak, x, y):
     """log2 α and the two factors of the exponent."""
-    u = fma(b, dy, a * dx)
-    v = c * dy
+    u = fma(a, x, fma(b, y, u0))
+    v = fma(c, y, v0)
     return fnma(u, u, fnma(v, v, peak)), u, v
 
 
@@ -107,15 +119,15 @@ def highest_exponent(a, b, c, slope_x, slope_y, left, right, top, bottom):
     dx, dy = vmax(left, vmin(right, zero)), vmax(top, vmin(bottom, zero))
     along_y = vmax(top, vmin(bottom, slope_x * dx))
     along_x = vmax(left, vmin(right, slope_y * dy))
-    first, _, _ = exponent(a, b, c, zero, dx, along_y)
-    second, _, _ = exponent(a, b, c, zero, along_x, dy)
+    first, _, _ = exponent(a, b, c, zero, zero, zero, dx, along_y)
+    second, _, _ = exponent(a, b, c, zero, zero, zero, along_x, dy)
     return vmax(first, second)
 
 
 @inline
-def reachable_blocks(batch, o, grid):
+def reachable_blocks(batch, o, x, y, grid):
     """Mask of the blocks of a tile in which a splat can reach α = 1/255."""
-    left, top = load(grid, 512) - splat(get(batch, o + X)), load(grid, 528) - splat(get(batch, o + Y))
+    left, top = load(grid, 512) - splat(x), load(grid, 528) - splat(y)
     side = splat(F(BLOCK_SIDE - 1))
     peak = highest_exponent(
         splat(get(batch, o + A)),
@@ -132,62 +144,102 @@ def reachable_blocks(batch, o, grid):
 
 
 @inline
-def blend_block(block, count, masks, batch, grid, state, touched, first):
+def alpha_at(batch, r, x, y):
+    """α of one splat of a batch on a block of pixels, 0 below 1/255; a batch holds (u0, v0) in place of the centre."""
+    power, _, _ = exponent(
+        splat(get(batch, r + A)),
+        splat(get(batch, r + B)),
+        splat(get(batch, r + C)),
+        splat(get(batch, r + X)),
+        splat(get(batch, r + Y)),
+        splat(get(batch, r + LOG2_OPACITY)),
+        x,
+        y,
+    )
+    return select(power >= splat(LOG2_ALPHA_MIN), vmin(exp2(power), splat(ALPHA_MAX)), splat(F(0)))
+
+
+@inline
+def accumulate(batch, r, weight, sums):
+    """Add colour and depth of one splat."""
+    red, green, blue, depth = sums
+    return (
+        fma(weight, splat(get(batch, r + RED)), red),
+        fma(weight, splat(get(batch, r + GREEN)), green),
+        fma(weight, splat(get(batch, r + BLUE)), blue),
+        fma(weight, splat(get(batch, r + DEPTH)), depth),
+    )
+
+
+@inline
+def next_splat(low, high, base):
+    """Take the lowest bit of a queue of 128; without one the position is 128."""
+    if low == 0:
+        low, high, base = high, np.int64(0), np.int64(64)
+    return base + trailing_zeros(low), low & (low - 1), high, base
+
+
+@inline
+def blend_one(batch, r, alpha, t, after, left, sums):
+    """Add one splat where it leaves the pixel open; returns the transmittance left and the sums."""
+    red, green, blue, depth = sums
+    open_ = after >= splat(TRANSMITTANCE_MIN)
+    weight = select(open_, alpha * t, splat(F(0)))
+    sums = (
+        fma(weight, splat(get(batch, r + RED)), red),
+        fma(weight, splat(get(batch, r + GREEN)), green),
+        fma(weight, splat(get(batch, r + BLUE)), blue),
+        fma(weight, splat(get(batch, r + DEPTH)), depth),
+    )
+    return select(open_, after, left), sums
+
+
+@inline
+def blend_block(block, count, batch, grid, state, touched, first):
     """Blend a batch into one block; returns whether a pixel of it is still open."""
-    zero, open_, never = splat(F(0)), splat(TRANSMITTANCE_MIN), splat(F(-1))
-    lowest, highest = splat(LOG2_ALPHA_MIN), splat(ALPHA_MAX)
     o = 16 * block
-    t = load(state, T + o)
-    red, green, blue = load(state, R_SUM + o), load(state, G_SUM + o), load(state, B_SUM + o)
-    depth = load(state, Z_SUM + o)
+    t, left = load(state, T + o), load(state, T_LEFT + o)
+    sums = load(state, R_SUM + o), load(state, G_SUM + o), load(state, B_SUM + o), load(state, Z_SUM + o)
     x, y = load(grid, o), load(grid, 256 + o)
-    live = t > zero
-    limit = select(live, open_, never)
     bit = 1 << block
-    half = 0
-    while half < count:
-        queue = column_bits(masks, half, block)
-        while queue != 0:
-            j = half + lowest_bit(queue)
-            queue &= queue - 1
-            r = RECORD * j
-            dx, dy = x - splat(get(batch, r + X)), y - splat(get(batch, r + Y))
-            power, _, _ = exponent(
-                splat(get(batch, r + A)),
-                splat(get(batch, r + B)),
-                splat(get(batch, r + C)),
-                splat(get(batch, r + LOG2_OPACITY)),
-                dx,
-                dy,
-            )
-            hit = live & (power >= lowest)
-            alpha = select(hit, vmin(exp2(power), highest), zero)
-            after = fnma(alpha, t, t)
-            stopped = after < limit
-            # Where a pixel stops the backward pass has to come by, too.
-            put(touched, first + j, get(touched, first + j) | (np.int64(any_lane(hit)) << block))
-            if any_lane(stopped):
-                store(state, T_STOPPED + o, select(stopped, t, load(state, T_STOPPED + o)))
-                live = live & ~stopped
-                alpha = select(stopped, zero, alpha)
-                after = select(stopped, zero, after)
-                limit = select(stopped, never, limit)
-                if not any_lane(live):
-                    bit = 0
-                    queue = 0
-                    half = count
-            weight = alpha * t
-            red = fma(weight, splat(get(batch, r + RED)), red)
-            green = fma(weight, splat(get(batch, r + GREEN)), green)
-            blue = fma(weight, splat(get(batch, r + BLUE)), blue)
-            depth = fma(weight, splat(get(batch, r + DEPTH)), depth)
-            t = after
-        half += 64
+    low = column_bits(touched, first, block)
+    high = np.int64(0)
+    if count < 64:
+        low &= (1 << count) - 1
+    elif count > 64:
+        high = column_bits(touched, first + 64, block)
+        if count < 128:
+            high &= (1 << (count - 64)) - 1
+    base = np.int64(0)
+    while low | high != 0:
+        j0, low, high, base = next_splat(low, high, base)
+        j1, low, high, base = next_splat(low, high, base)
+        j2, low, high, base = next_splat(low, high, base)
+        j3, low, high, base = next_splat(low, high, base)
+        r0, r1, r2, r3 = RECORD * j0, RECORD * j1, RECORD * j2, RECORD * j3
+        a0, a1 = alpha_at(batch, r0, x, y), alpha_at(batch, r1, x, y)
+        a2, a3 = alpha_at(batch, r2, x, y), alpha_at(batch, r3, x, y)
+        t1 = fnma(a0, t, t)
+        t2 = fnma(a1, t1, t1)
+        t3 = fnma(a2, t2, t2)
+        t4 = fnma(a3, t3, t3)
+        left, sums = blend_one(batch, r0, a0, t, t1, left, sums)
+        left, sums = blend_one(batch, r1, a1, t1, t2, left, sums)
+        left, sums = blend_one(batch, r2, a2, t2, t3, left, sums)
+        left, sums = blend_one(batch, r3, a3, t3, t4, left, sums)
+        if not any_lane(t4 >= splat(TRANSMITTANCE_MIN)):
+            for j in range(j3 + 1, count):
+                put(touched, first + j, get(touched, first + j) & ~bit)
+            bit = 0
+            low, high = np.int64(0), np.int64(0)
+        # Pixels that are closed fall on; keep them clear of denormals.
+        t = vmax(t4, splat(TINY))
     store(state, T + o, t)
-    store(state, R_SUM + o, red)
-    store(state, G_SUM + o, green)
-    store(state, B_SUM + o, blue)
-    store(state, Z_SUM + o, depth)
+    store(state, T_LEFT + o, left)
+    store(state, R_SUM + o, sums[0])
+    store(state, G_SUM + o, sums[1])
+    store(state, B_SUM + o, sums[2])
+    store(state, Z_SUM + o, sums[3])
     return bit
 
 
@@ -196,8 +248,7 @@ def write_block(block, left, top, width, height, background, state, image, trans
     """Add the background and write one block, pixel by pixel where it sticks out of the image."""
     o = 16 * block
     x0, y0 = left + (block & 3) * BLOCK_SIDE, top + (block >> 2) * BLOCK_SIDE
-    # A pixel's transmittance is in one of the two planes, 0 in the other.
-    t = load(state, T + o) + load(state, T_STOPPED + o)
+    t = load(state, T_LEFT + o)
     red = fma(t, splat(get(background, 0)), load(state, R_SUM + o))
     green = fma(t, splat(get(background, 1)), load(state, G_SUM + o))
     blue = fma(t, splat(get(background, 2)), load(state, B_SUM + o))
@@ -207,7 +258,7 @@ def write_block(block, left, top, width, height, background, state, image, trans
         store_block(transmittance, pixel, width, t)
         store_block(depth, pixel, width, load(state, Z_SUM + o))
         return
-    store(state, T + o, t)
+    store(state, T_LEFT + o, t)
     store(state, R_SUM + o, red)
     store(state, G_SUM + o, green)
     store(state, B_SUM + o, blue)
@@ -215,7 +266,7 @@ def write_block(block, left, top, width, height, background, state, image, trans
         x, y = x0 + (lane & 3), y0 + (lane >> 2)
         if x < width and y < height:
             pixel, s = y * width + x, o + lane
-            put(transmittance, pixel, get(state, T + s))
+            put(transmittance, pixel, get(state, T_LEFT + s))
             put(depth, pixel, get(state, Z_SUM + s))
             put(image, 3 * pixel, get(state, R_SUM + s))
             put(image, 3 * pixel + 1, get(state, G_SUM + s))
@@ -239,7 +290,6 @@ def blend_tile(
     transmittance,
     depth,
     state,
-    masks,
 ):
     """Blend one tile; returns the end of the part of its list that was looked at."""
     zero, one = splat(F(0)), splat(F(1))
@@ -248,11 +298,15 @@ def blend_tile(
     for block in range(BLOCKS):
         inside = (load(grid, 16 * block) < columns) & (load(grid, 256 + 16 * block) < rows)
         store(state, T + 16 * block, select(inside, one, zero))
-        for plane in range(1, 6):
+        store(state, T_LEFT + 16 * block, select(inside, one, zero))
+        for plane in range(2, 6):
             store(state, 256 * plane + 16 * block, zero)
         if any_lane(inside):
             alive |= 1 << block
     batch = state[6 * 256 :]
+    # What fills up a group of four.
+    store(batch, BATCH * RECORD, zero)
+    put(batch, BATCH * RECORD + LOG2_OPACITY, F(-100))
     fx, fy = F(left), F(top)
     for i in range(begin, min(end, begin + AHEAD)):
         prefetch(records, RECORD * np.int64(get(entries, i)))
@@ -266,18 +320,17 @@ def blend_tile(
             r = RECORD * np.int64(get(entries, i + j))
             o = RECORD * j
             store(batch, o, load(records, r))
-            put(batch, o + X, get(records, r + X) - fx)
-            put(batch, o + Y, get(records, r + Y) - fy)
-            mask = reachable_blocks(batch, o, grid) & alive
-            put(masks, j, mask)
-            put(touched, i + j, 0)
+            x, y = get(records, r + X) - fx, get(records, r + Y) - fy
+            mask = reachable_blocks(batch, o, x, y, grid) & alive
+            u0, v0 = offsets_at(get(records, r + A), get(records, r + B), get(records, r + C), x, y)
+            put(batch, o + X, u0)
+            put(batch, o + Y, v0)
+            put(touched, i + j, mask)
             reached |= mask
-        for j in range(count, (count + 63) & ~63):
-            put(masks, j, 0)
         while reached != 0:
             block = lowest_bit(reached)
             reached &= reached - 1
-            if blend_block(block, count, masks, batch, grid, state, touched, i) == 0:
+            if blend_block(block, count, batch, grid, state, touched, i) == 0:
                 alive &= ~(1 << block)
         i += count
     for block in range(BLOCKS):
@@ -312,7 +365,6 @@ def blend(
     transmittance,
     depth,
     scratch,
-    mask_scratch,
     counter,
 ):
     """Blend all tiles, handed out dynamically; a pixel depends on its own tile only."""
@@ -326,7 +378,7 @@ def blend(
             if left < width and top < height:
                 ends[tile] = blend_tile(
                     records, entries, np.int64(offsets[tile]), np.int64(offsets[tile + 1]), left, top, width, height,
-                    background, grid, touched, image, transmittance, depth, scratch[thread], mask_scratch[thread],
+                    background, grid, touched, image, transmittance, depth, scratch[thread],
                 )  # fmt: skip
             else:
                 ends[tile] = offsets[tile]
@@ -361,11 +413,9 @@ def start_block(
         store(state, s + B_RED, red)
         store(state, s + B_GREEN, green)
         store(state, s + B_BLUE, blue)
-        store(state, s + B_STOP, splat(TRANSMITTANCE_MIN))
         return
     for part in range(0, B_X, 16):
         store(state, s + part, splat(F(0)))
-    store(state, s + B_STOP, splat(F(-1)))
     for lane in range(16):
         x, y = x0 + (lane & 3), y0 + (lane >> 2)
         if x < width and y < height:
@@ -382,7 +432,6 @@ def start_block(
                 rest += get(g_depth, pixel) * get(depth, pixel)
             put(state, o + B_REST, rest)
             put(state, o + B_T, F(1))
-            put(state, o + B_STOP, TRANSMITTANCE_MIN)
 
 
 @inline
@@ -399,11 +448,12 @@ def slot_of(integers, row, group_x, group_y):
 @inline
 def splat_backward(records, row, blocks, left, top, with_depth, state):
     """Sums of one splat over the blocks it changed in a tile (the fields of a slot); moves the blocks' state on."""
-    zero, one, never = splat(F(0)), splat(F(1)), splat(F(-1))
+    zero, one = splat(F(0)), splat(F(1))
     lowest, highest = splat(LOG2_ALPHA_MIN), splat(ALPHA_MAX)
     r = RECORD * row
-    centre_x, centre_y = splat(get(records, r + X) - F(left)), splat(get(records, r + Y) - F(top))
-    a, b, c = splat(get(records, r + A)), splat(get(records, r + B)), splat(get(records, r + C))
+    fa, fb, fc = get(records, r + A), get(records, r + B), get(records, r + C)
+    u0, v0 = offsets_at(fa, fb, fc, get(records, r + X) - F(left), get(records, r + Y) - F(top))
+    a, b, c, u0, v0 = splat(fa), splat(fb), splat(fc), splat(u0), splat(v0)
     peak = splat(get(records, r + LOG2_OPACITY))
     red, green, blue = splat(get(records, r + RED)), splat(get(records, r + GREEN)), splat(get(records, r + BLUE))
     z = splat(get(records, r + DEPTH))
@@ -411,7 +461,7 @@ def splat_backward(records, row, blocks, left, top, with_depth, state):
     while blocks != 0:
         s = BLOCK_STATE * lowest_bit(blocks)
         blocks &= blocks - 1
-        power, u, v = exponent(a, b, c, peak, load(state, s + B_X) - centre_x, load(state, s + B_Y) - centre_y)
+        power, u, v = exponent(a, b, c, u0, v0, peak, load(state, s + B_X), load(state, s + B_Y))
         raw = exp2(power)
         alpha = select(power >= lowest, vmin(raw, highest), zero)
         g_r, g_g, g_b = load(state, s + B_RED), load(state, s + B_GREEN), load(state, s + B_BLUE)
@@ -420,17 +470,12 @@ def splat_backward(records, row, blocks, left, top, with_depth, state):
             d = fma(load(state, s + B_DEPTH), z, d)
         t, rest = load(state, s + B_T), load(state, s + B_REST)
         after = fnma(alpha, t, t)
-        stopped = after < load(state, s + B_STOP)
-        if any_lane(stopped):
-            alpha = select(stopped, zero, alpha)
-            after = select(stopped, zero, after)
-            rest = select(stopped, zero, rest)
-            store(state, s + B_STOP, select(stopped, never, load(state, s + B_STOP)))
+        open_ = after >= splat(TRANSMITTANCE_MIN)
         td = t * d
-        store(state, s + B_REST, fnma(alpha, td, rest))
-        store(state, s + B_T, after)
-        weight = alpha * t
-        h = select(raw <= highest, divide_fast(alpha, one - alpha) * (td - rest), zero)
+        weight = select(open_, alpha * t, zero)
+        store(state, s + B_REST, fnma(weight, d, rest))
+        store(state, s + B_T, vmax(after, splat(TINY)))
+        h = select(open_ & (raw <= highest), divide_fast(alpha, one - alpha) * (td - rest), zero)
         s_r, s_g, s_b = fma(weight, g_r, s_r), fma(weight, g_g, s_g), fma(weight, g_b, s_b)
         hu, hv = h * u, h * v
         s_h, s_u, s_v = s_h + h, s_u + hu, s_v + hv

@@ -324,6 +324,12 @@ def lowest_bit(context, builder, sig, values):
     return builder.cttz(values[0], _i1(1))
 
 
+@_function(types.int64, 1)
+def trailing_zeros(context, builder, sig, values):
+    """Position of the lowest set bit of an integer; 64 for 0."""
+    return builder.cttz(values[0], _i1(0))
+
+
 @_function(types.int64, 3)
 def column_bits(context, builder, sig, values):
     """``column_bits(uint16_array, offset, k)``: bit k of 64 consecutive elements as one 64-bit integer."""

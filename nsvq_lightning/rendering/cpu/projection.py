@@ -25,6 +25,7 @@ from nsvq_lightning.rendering.cpu.lanes import (
     log2,
     lowest_bit,
     mask_bits,
+    prefetch,
     put,
     scatter_rows1,
     scatter_rows3,
@@ -41,6 +42,7 @@ from nsvq_lightning.rendering.cpu.lanes import (
     vsqrt,
 )
 from nsvq_lightning.rendering.cpu.records import (
+    BLUE,
     CX,
     CY,
     DEPTH,
@@ -48,6 +50,7 @@ from nsvq_lightning.rendering.cpu.records import (
     FACTOR_SCALE,
     FX,
     FY,
+    GREEN,
     GROUP_SHIFT,
     HEIGHT,
     HIGH_X,
@@ -96,6 +99,8 @@ C0, C1 = F(sh.C0), F(sh.C1)
 C2A, C2B, C2C = (F(value) for value in sh.C2)
 C3A, C3B, C3C, C3D, C3E = (F(value) for value in sh.C3)
 
+AHEAD = 32
+"""How many splats ahead the rows of a list are asked for."""
 SH_ROW = 45
 """Floats of a row of degree-3 coefficients, which is read by whole vectors."""
 
@@ -235,6 +240,16 @@ def unit_direction(camera, means):
     z = means[2] - splat(get(camera, POSITION + 2))
     inverse = splat(F(1)) / vsqrt(vmax(dot3(x, y, z, x, y, z), splat(F(1e-20))))
     return (x * inverse, y * inverse, z * inverse), inverse
+
+
+@inline
+def prefetch_sh(array, ids, start, end, stride, used):
+    """Ask for the SH rows of 16 splats of the list ahead of their turn, ``used`` floats of each."""
+    if start < end:
+        for lane in range(16):
+            row = stride * np.int64(get(ids, start + lane))
+            for k in range(0, used, 16):
+                prefetch(array, row + k)
 
 
 @inline
@@ -388,6 +403,7 @@ def color_range(camera, means, sh0, shN, stride, degree, ids, first, last, recor
     zero = splat(F(0))
     coefficients = 3 * ((degree + 1) * (degree + 1) - 1)
     for start in range(first, last, 16):
+        prefetch_sh(shN, ids, start + AHEAD, last, stride, coefficients)
         mean = gather_rows3(means, ids, start)
         direction, _ = unit_direction(camera, mean)
         if degree > 0:
@@ -560,7 +576,7 @@ def scatter_sh(gradient, columns, ids, start, stride, count):
 
 
 @inline
-def color_backward(camera, degree, stride, mean, sh0, shN, ids, start, rgb, g_sh0, g_shN, scratch):
+def color_backward(camera, degree, stride, mean, shN, ids, start, rgb, g_sh0, g_shN, scratch):
     """Gradients of the SH coefficients; returns that of the mean through the viewing direction."""
     zero = splat(F(0))
     d, inverse = unit_direction(camera, mean)
@@ -568,8 +584,6 @@ def color_backward(camera, degree, stride, mean, sh0, shN, ids, start, rgb, g_sh
     columns, gradient, e = scratch[:768], scratch[768:1536], scratch[1536:]
     if degree > 0:
         gather_sh(shN, ids, start, stride, coefficients, columns)
-    r, g, b = color(degree, d, gather_rows3(sh0, ids, start), columns)
-    rgb = (select(r > zero, rgb[0], zero), select(g > zero, rgb[1], zero), select(b > zero, rgb[2], zero))
     k = splat(C0)
     scatter_rows3(g_sh0, ids, start, (k * rgb[0], k * rgb[1], k * rgb[2]))
     if degree == 0:
@@ -693,6 +707,7 @@ def project_backward(
     """
     blocks = (count + 15) // 16
     n = logits.shape[0]
+    coefficients = 3 * ((degree + 1) * (degree + 1) - 1)
     for thread in prange(threads):
         work = scratch[thread]
         slot = work[2048:].view(np.int32)
@@ -707,6 +722,12 @@ def project_backward(
         if thread == threads - 1:
             clear_rows(row, n, stride, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN)
         for start in range(16 * (blocks * thread // threads), 16 * (blocks * (thread + 1) // threads), 16):
+            prefetch_sh(shN, ids, start + AHEAD, end, stride, coefficients)
+            prefetch_sh(g_shN, ids, start + AHEAD, end, stride, stride)
+            if start + AHEAD < end:
+                for lane in range(16):
+                    row = RECORD * np.int64(get(ids, start + AHEAD + lane))
+                    prefetch(sums, RECORD * np.int64(get(integers, row + SLOT)))
             for lane in range(16):
                 row = np.int64(get(ids, start + lane))
                 put(slot, lane, get(integers, RECORD * row + SLOT))
@@ -718,8 +739,14 @@ def project_backward(
             mean = gather_rows3(means, ids, start)
             quat, scale = gather_rows4(quats, ids, start), gather_rows3(scales, ids, start)
             g_mean, g_quat, g_scale = geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y)
-            rgb = (total[SUM_RED], total[SUM_GREEN], total[SUM_BLUE])
-            gx, gy, gz = color_backward(camera, degree, stride, mean, sh0, shN, ids, start, rgb, g_sh0, g_shN, work)
+            zero = splat(F(0))
+            # A colour below 0 was cut off.
+            rgb = (
+                select(record[RED] > zero, total[SUM_RED], zero),
+                select(record[GREEN] > zero, total[SUM_GREEN], zero),
+                select(record[BLUE] > zero, total[SUM_BLUE], zero),
+            )
+            gx, gy, gz = color_backward(camera, degree, stride, mean, shN, ids, start, rgb, g_sh0, g_shN, work)
             scatter_rows3(g_means, ids, start, (g_mean[0] + gx, g_mean[1] + gy, g_mean[2] + gz))
             scatter_rows4(g_quats, ids, start, g_quat)
             scatter_rows3(g_scales, ids, start, g_scale)

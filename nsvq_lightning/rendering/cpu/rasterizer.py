@@ -165,13 +165,12 @@ class _Blend(torch.autograd.Function):
         image, transmittance, depth, alpha = (recycled((*shape, *last)) for last in ((3,), (), (), ()))
         frame.bin()
         work = frame.work
-        frame.touched = work.array("touched", frame.entries.size, np.uint16)
+        frame.touched = work.array("touched", frame.entries.size + BATCH, np.uint16)
         frame.ends = work.array("ends", frame.tiles, np.int64)
         blend(
             frame.threads, frame.records, frame.entries, frame.offsets, frame.group_columns, frame.width, frame.height,
             _flat(background), _GRID, frame.touched, frame.ends, _flat(image), _flat(transmittance), _flat(depth),
-            work.rows("blend", frame.threads, FORWARD_SCRATCH),
-            work.rows("masks", frame.threads, BATCH + 64, np.uint16), np.zeros(1, np.int64),
+            work.rows("blend", frame.threads, FORWARD_SCRATCH), np.zeros(1, np.int64),
         )  # fmt: skip
         ctx.frame = frame
         ctx.set_materialize_grads(False)
