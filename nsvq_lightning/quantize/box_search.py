@@ -103,38 +103,41 @@ def _nearest_node(dim, nodes, x, row):  # type: ignore[no-untyped-def]
 
 @inline
 def _recall(dim, codebook, x, rows, first, last, state, count):  # type: ignore[no-untyped-def]
-    """Start every query of a block from its last code; False where one has none at a finite distance."""
-    best, label, guess, _, _ = state
+    """Start queries from their last codes; lists those without one at a finite distance and returns their number."""
+    best, label, guess, unknown, _ = state
+    missing = 0
     for i in range(count):
         code = np.int64(get(last, get(rows, first + i)))
-        if code < 0:
-            return False
         total = splat(np.float32(0.0))
         for j in range(dim):
-            difference = splat(get(codebook, code * dim + j)) - splat(get(x, i * dim + j))
+            difference = splat(get(codebook, max(code, 0) * dim + j)) - splat(get(x, i * dim + j))
             total = fma(difference, difference, total)
         distance = lane_min(total)
-        if not distance < np.float32(np.inf):
-            return False
         put(best, i, distance)
         put(label, i, np.int32(code))
         put(guess, i, -1)
-    return True
+        put(unknown, missing, i)
+        if code < 0 or not distance < np.float32(np.inf):
+            missing += 1
+    return missing
 
 
 @inline
 def _guess(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
-    """For each query the best code of one near leaf: three passes without unpredictable branches."""
+    """For each of the listed queries the best code of one near leaf: three passes without unpredictable branches."""
     codes, labels, leaves, nodes = tree
-    best, label, guess, _, scratch = state
-    for i in range(count):
+    best, label, guess, unknown, scratch = state
+    for k in range(count):
+        i = get(unknown, k)
         put(guess, i, _nearest_node(dim, nodes, x, i * dim))
-    for i in range(count):
+    for k in range(count):
+        i = get(unknown, k)
         node = get(guess, i)
         distances = _box_distances(dim, leaves, node * 32 * dim, x, i * dim)
         lane = lowest_bit(mask_bits(distances <= splat(lane_min(distances))))
         put(guess, i, node * 16 + lane)
-    for i in range(count):
+    for k in range(count):
+        i = get(unknown, k)
         leaf = get(guess, i)
         limit = lane_min(_code_distances(dim, codes, leaf, x, i * dim))
         nearest, code = _visit_leaf(dim, codes, labels, leaf, x, i * dim, limit, scratch, np.float32(np.inf), NO_CODE)
@@ -197,8 +200,8 @@ def _search_kernel(dim: int) -> Any:
             for i in range(count):
                 for j in range(dim):
                     put(queries, i * dim + j, get(x, get(rows, first + i) * dim + j))
-            if not _recall(dim, codebook, queries, rows, first, last, state, count):
-                _guess(dim, tree, queries, count, state)
+            missing = _recall(dim, codebook, queries, rows, first, last, state, count)
+            _guess(dim, tree, queries, missing, state)
             _visit_near(dim, tree, queries, count, state)
             for i in range(count):
                 code = get(label, i) if get(label, i) != NO_CODE else np.int32(0)

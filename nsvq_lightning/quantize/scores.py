@@ -2,10 +2,10 @@
 
 With rows and codes centred on the mean of the codes, ‖x − c‖² = ‖x‖² + 2 s(c) with the score s(c) = ‖c‖²/2 − x·c, one
 fused multiply-add a number. A row keeps its few best scores, sorted; most blocks of codes hold no better one, which one
-branch tells for six rows. All codes that can be nearest after rounding are among the best, unless even the last of these
-is as near as rounding (many equal codes; then all codes are compared by true distances). What else this yields is a
-short list of the nearest codes and a distance below which there is no other code, which lets :mod:`tracking` skip most
-searches.
+branch tells for six rows. All codes that can be nearest after rounding are among the best, unless even the last of
+these is as near as rounding (many equal codes; then all codes are compared by true distances). What else this yields is
+a short list of the nearest codes and a distance below which there is no other code, which lets :mod:`tracking` skip
+most searches.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def _lay_out(codebook, centre, blocks, halves):  # type: ignore[no-untyped-def]
         for lane in range(32):
             code, total = block * 32 + lane, np.float64(np.inf)
             if code < count:
-                total = 0.0
+                total = np.float64(0.0)
                 for j in range(dim):
                     value = codebook[code, j] - centre[j]
                     blocks[block, j, lane] = value

@@ -97,7 +97,7 @@ def train(scene: Path, factor: Any, points: int, steps: int, folder: Path) -> Wi
 def check(witness: Witness, steps: int) -> None:
     assert dict(witness.steps) == dict.fromkeys(("scales", "quats", "sh0", "shN"), steps)
     for name, rows in witness.rows.items():
-        assert witness.ties[name] <= 1e-4 * rows, name
+        assert witness.ties[name] <= 1e-3 * rows, name
         # Otherwise a tracker that never looks again would pass, too.
         assert witness.moves[name] > steps, name
 
