@@ -6,10 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from numba import prange
 from torch import Tensor
 
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.quantize.sums import sum_by_code
+from nsvq_lightning.rendering.cpu.jit import kernel, thread_count
 
 __all__ = ["distinct_rows", "kmeans"]
 
@@ -100,17 +102,21 @@ def distinct_rows(x: Tensor) -> Tensor:
     take longer than k-means itself.
     """
     rows = (x.detach().cpu() + 0.0).contiguous().numpy()  # + 0.0 makes -0 and 0 the same bits
-    bits = rows.view(np.uint32 if rows.itemsize == 4 else np.uint64).astype(np.uint64, copy=False)
-    _, first, inverse = np.unique(_hash(bits), return_index=True, return_inverse=True)
+    hashes = np.empty(len(rows), np.uint64)
+    thread_count()
+    _hash_rows(rows.view(np.uint32), hashes)
+    _, first, inverse = np.unique(hashes, return_index=True, return_inverse=True)
     if not np.array_equal(rows[first][inverse], rows):
         _, first = np.unique(rows, axis=0, return_index=True)
     return torch.from_numpy(np.sort(first)).to(x.device)
 
 
-def _hash(bits: np.ndarray) -> np.ndarray:
+@kernel
+def _hash_rows(bits, hashes):  # type: ignore[no-untyped-def]
     """One 64-bit number a row of integers ``[N, D]``, by multiplication and xor-shift."""
-    value = np.full(bits.shape[0], 0x9E3779B97F4A7C15, np.uint64)
-    for column in bits.T:
-        value = (value ^ column) * np.uint64(0xBF58476D1CE4E5B9)
-        value ^= value >> np.uint64(29)
-    return value
+    for i in prange(bits.shape[0]):
+        value = np.uint64(0x9E3779B97F4A7C15)
+        for j in range(bits.shape[1]):
+            value = (value ^ np.uint64(bits[i, j])) * np.uint64(0xBF58476D1CE4E5B9)
+            value ^= value >> np.uint64(29)
+        hashes[i] = value

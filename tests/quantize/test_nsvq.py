@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -50,6 +51,28 @@ def test_gradients_equal_autograd_of_the_formula(dim: int, dtype: torch.dtype) -
         torch.testing.assert_close(found.double(), expected, rtol=tolerance, atol=tolerance)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dim", DIMS)
+@pytest.mark.parametrize("chosen", [[0, 3, 4, 522], [7], list(range(523)), list(range(1, 500, 2)), []])
+def test_rows_of_a_table_are_those_rows_and_the_others_get_no_gradient(
+    dim: int, dtype: torch.dtype, chosen: list[int]
+) -> None:
+    x, codebook, codes = problem(dim, dtype)
+    rows = torch.tensor(chosen, dtype=torch.int64)
+    weight = torch.randn(len(chosen), dim, generator=generator(2), dtype=dtype)
+    results = []
+    for table, which in ((x, rows), (x.detach()[rows].requires_grad_(), None)):
+        codebook.grad = None
+        x_q = noise_substitution(table, codebook, codes[rows], generator(1), which)
+        x_q.backward(weight)
+        results.append((x_q.detach(), table.grad, codebook.grad))
+    (x_q, grad, book), (expected_q, expected_grad, expected_book) = results
+    assert grad is not None
+    assert torch.equal(x_q, expected_q)
+    assert torch.equal(grad, torch.zeros_like(x).index_copy_(0, rows, expected_grad))
+    assert torch.equal(book, expected_book)
+
+
 @pytest.mark.parametrize("dim", [3, 45])
 def test_kernel_gradient_equals_the_plain_formulation(dim: int) -> None:
     """Same directions in both: the float32 kernel against the closed form in float64."""
@@ -57,10 +80,11 @@ def test_kernel_gradient_equals_the_plain_formulation(dim: int) -> None:
 
     x, codebook, codes = (tensor.detach() for tensor in problem(dim))
     grad = torch.randn(x.shape, generator=generator(2))
-    unit = substitute(7, torch.zeros_like(x).numpy(), torch.eye(dim)[:1].numpy(), torch.zeros_like(codes).numpy())
-    arrays = x.numpy(), codebook.numpy(), codes.numpy()
+    rows = np.arange(len(x))
+    unit = substitute(7, torch.zeros_like(x).numpy(), rows, torch.eye(dim)[:1].numpy(), np.zeros_like(rows))
+    arrays = x.numpy(), rows, codebook.numpy(), codes.numpy()
     out = substitute(7, *arrays)
-    grad_x, grad_codebook = substitute_backward(7, grad.numpy(), *arrays)
+    grad_x, grad_codebook = substitute_backward(grad.numpy(), *arrays, out)
     v, r = torch.from_numpy(unit).double(), x.double() - codebook[codes].double()
     length = r.norm(dim=1, keepdim=True)
     radial = (grad.double() * v).sum(1, keepdim=True) * r / length
@@ -163,7 +187,7 @@ def test_module_in_its_three_states() -> None:
     quantizer.train()
     quantizer.freeze(codes.flip(0))
     rows = torch.tensor([4, 2, 500])
-    x_q, frozen = quantizer(x[rows], rows=rows)
+    x_q, frozen = quantizer(x, rows=rows)
     assert torch.equal(frozen, codes.flip(0)[rows])
     assert torch.equal(x_q, quantizer.codebook[frozen])
     with pytest.raises(ValueError, match="rows"):
