@@ -77,7 +77,7 @@ SKIPS = {
         ),
         Skip("metrics", "the PSNR of a training view", "it is not logged in this step"),
         # photos
-        Skip("undistortion", "resampling a photo", "its camera has no distortion"),
+        Skip("undistortion", "resampling a photo", "its camera is a pinhole"),
         Skip("resizing", "resampling a photo", "it has its size already"),
     )
 }
