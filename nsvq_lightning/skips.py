@@ -1,0 +1,120 @@
+"""Work that a scene, a view or a phase may not need, and the switches that skip it.
+
+Most switches are on and leave every bit of the result as it is; those that change a result say how in ``changes`` and
+are off. They exist to be measured and tested one by one:
+
+* in Python: ``with switched(blocks=False): ...``
+* on the command line: ``nsvq fit --skips.blocks=false``, in a config ``skips: {blocks: false}``
+
+Switches hold for the whole process, so set them before work starts, not while another thread renders.
+
+Things that look alike and have no switch, because switching them off would only call a function that returns its
+argument: the sum over processes where there is one process, and gradients of what nothing depends on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+__all__ = ["SKIPS", "Skip", "is_on", "switch", "switched"]
+
+
+@dataclass(frozen=True)
+class Skip:
+    """One switch.
+
+    Attributes:
+        name: Its name.
+        work: What is not done while it is on.
+        when: In which case it is not needed.
+        changes: What a result loses by it; None when all bits stay the same.
+        default: Whether it is on.
+    """
+
+    name: str
+    work: str
+    when: str
+    changes: str | None = None
+    default: bool = True
+
+    @property
+    def exact(self) -> bool:
+        """Whether all results are the same bits with and without."""
+        return self.changes is None
+
+    @property
+    def summary(self) -> str:
+        """One line for the help of a command."""
+        return f"skip {self.work}: {self.when} ({self.changes or 'same bits'})"
+
+
+SKIPS = {
+    skip.name: skip
+    for skip in (
+        # rendering
+        Skip("blocks", "4x4 blocks of pixels", "a splat cannot reach them"),
+        Skip("saturated", "blocks of pixels", "all their pixels are opaque"),
+        Skip("culled", "colours and records of splats", "they are out of view"),
+        Skip("sh_bands", "SH bands in the renderer", "they are above the active degree"),
+        Skip("depth", "the depth image", "nobody asked for it"),
+        Skip("first_render", "a render that finds the visible splats", "the projection alone tells them"),
+        # quantization
+        Skip("visible_search", "the nearest code of a splat", "it is not visible in this step"),
+        Skip("frozen_search", "the nearest code of a splat", "its codes are frozen"),
+        Skip("distance_bounds", "the nearest code of a splat", "bounds prove that it is the last one"),
+        Skip("few_rows", "the quantization of an attribute", "it has no more distinct rows than codes"),
+        Skip("unused_codes", "storing a codebook row", "no splat uses it"),
+        # training step
+        Skip("adam_bands", "SH bands in the optimiser", "they never had a gradient"),
+        Skip(
+            "adam_rows",
+            "splats in the optimiser",
+            "they have no gradient in this step",
+            # 1500 iterations of nsvq_4k on 43 photos that each see 3 of 4 splats: 28.12 dB without, 27.43 dB with, in
+            # the same time. It would pay where a view sees few splats and memory is slow.
+            changes="momentum no longer moves them on, which costs 0.7 dB in a short run",
+            default=False,
+        ),
+        Skip("metrics", "the PSNR of a training view", "it is not logged in this step"),
+        # photos
+        Skip("undistortion", "resampling a photo", "its camera is a pinhole"),
+        Skip("resizing", "resampling a photo", "it has its size already"),
+    )
+}
+"""All switches by name."""
+
+_ON = {name: skip.default for name, skip in SKIPS.items()}
+
+
+def is_on(name: str) -> bool:
+    """Whether the work of the switch ``name`` is skipped."""
+    return _ON[name]
+
+
+def switch(**switches: bool) -> None:
+    """Set switches by name.
+
+    Raises:
+        ValueError: There is no such switch.
+    """
+    unknown = sorted(set(switches) - set(SKIPS))
+    if unknown:
+        raise ValueError(f"unknown switches {', '.join(unknown)}; there are {', '.join(SKIPS)}")
+    _ON.update(switches)
+
+
+@contextmanager
+def switched(**switches: bool) -> Iterator[None]:
+    """Set switches by name for the body of a ``with`` statement; afterwards all are as before.
+
+    Raises:
+        ValueError: There is no such switch.
+    """
+    before = dict(_ON)
+    try:
+        switch(**switches)
+        yield
+    finally:
+        _ON.update(before)
