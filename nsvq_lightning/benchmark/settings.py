@@ -45,7 +45,7 @@ class Settings:
     threads: tuple[int, ...]
     quick: bool = False
     repeats: int = 15
-    seconds: float = 10.0
+    seconds: float = 5.0
     workloads: tuple[str, ...] = tuple(SIZES)
     scene: Path | None = None
     init_from: Path | None = None

@@ -37,7 +37,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(timing, "SGEMM_SIDE", 64)
-    monkeypatch.setattr(render, "ORACLE_WORK", {True: 2e6})
+    monkeypatch.setattr(render, "ORACLE_PAIRS", {True: 3e5})
     monkeypatch.setattr(nearest, "ROWS", {True: 200})
     monkeypatch.setattr(loss, "SIZE", (40, 48))
     monkeypatch.setattr(optimizer, "SPLATS", {True: (100,)})
@@ -116,6 +116,15 @@ def test_less_accuracy_costs_what_the_rows_say(scene: Path) -> None:
     assert by_degree == sorted(by_degree)
     assert by_degree[1] > 100 * by_degree[0]
     assert rows["cpu, quarter size"]["mean error"] > rows["cpu, half size"]["mean error"] > 100 * by_degree[0]
+
+
+def test_crop_is_the_largest_that_the_oracle_can_do() -> None:
+    workload = synthetic_workload("A20k")
+    pairs = {crop.camera.height: render._pairs(crop) for crop in (workload.crop(36, 24), workload.crop(48, 32))}
+    assert pairs[24] < pairs[32]
+    for most, size in ((pairs[24], (36, 24)), (pairs[32] - 1, (36, 24)), (0, (24, 16)), (1e30, (400, 300))):
+        camera = render._crop(workload, most).camera
+        assert (camera.width, camera.height) == size
 
 
 def test_smaller_picture_of_one_colour_is_that_colour() -> None:

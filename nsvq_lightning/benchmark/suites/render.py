@@ -3,15 +3,15 @@
 The oracle has everything: all SH bands, every pixel. So the error of a lower SH degree is that of the colours it leaves
 out, and the error of a smaller picture, blown up to the full size, that of the detail it does not have.
 
-Errors are measured on a crop in the middle of the view, whose pixels see the same splats as in the whole view: the
-oracle would take minutes for the whole. Where two splats are equally deep, or α is 1/255, to rounding, float32 decides
+Where the oracle would take minutes for the whole view, errors are measured on a crop in its middle, whose pixels see
+the same splats. Where two splats are equally deep, or α is 1/255, to rounding, float32 decides
 by chance and the pixel's error jumps by orders of magnitude. Such pixels are counted, and left out of the other
 errors: they say nothing about the quality of the arithmetic.
 """
 
 from __future__ import annotations
 
-import math
+from bisect import bisect_right
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -26,14 +26,18 @@ from nsvq_lightning.benchmark.timing import Case, measure, use_threads
 from nsvq_lightning.benchmark.workloads import Workload, workloads
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import BACKENDS, render, resolve_backend
+from nsvq_lightning.rendering.reference import TILE
 from nsvq_lightning.splats import RawSplats, sh_degree_of
 
 __all__ = ["Accuracy", "Method", "accuracies", "image_errors", "run"]
 
 REFERENCE = "reference"
 FORWARD, BOTH = "forward", "forward + backward"
-ORACLE_WORK = {True: 1.2e8, False: 6e8}
-"""Splats times pixels that the oracle is given, quick and full: a second, and up to half a minute on one core."""
+ORACLE_PAIRS = {True: 4e6, False: 8e7}
+"""Pairs of a splat and a pixel of the tiles it touches that the oracle is given, quick and full: half a minute on one
+core at most."""
+CROP_STEP = 8
+"""Pixels by which the height of a crop grows."""
 REFERENCE_SPLATS = 20_000
 """Plain torch is timed up to this many splats; beyond, one image takes it most of a minute."""
 FLIPPED = 1e-3
@@ -109,7 +113,7 @@ def _smaller(camera: Camera, shrink: int) -> Camera:
 
 def _rows(workload: Workload, settings: Settings) -> list[Row]:
     small = len(workload.splats.means) <= REFERENCE_SPLATS
-    crop = workload.crop(*_crop_size(workload, settings.quick))
+    crop = _crop(workload, ORACLE_PAIRS[settings.quick])
     asked = accuracies(sh_degree_of(workload.splats.shN))
     fast = [Method(name, accuracy) for name in _fast_backends(workload.splats.means) for accuracy in asked]
     plain = Method(REFERENCE)
@@ -119,7 +123,9 @@ def _rows(workload: Workload, settings: Settings) -> list[Row]:
         jobs.append((crop, [fast[0], plain]))
     with use_threads(max(settings.threads)):
         errors = _errors(crop, list(dict.fromkeys(method for _, methods in jobs for method in methods)))
-    note = f"errors on the middle {crop.camera.width}x{crop.camera.height} pixels"
+    size = f"{crop.camera.width}x{crop.camera.height}"
+    whole = crop.camera.height == workload.camera.height
+    note = "errors on all pixels" if whole else f"errors on the middle {size} pixels"
     rows = []
     for threads in settings.threads:
         for where, methods in jobs:
@@ -153,25 +159,43 @@ def _case(workload: Workload, method: Method, operation: str) -> Case:
     return Case(f"{method} {operation}", forward if operation == FORWARD else both)
 
 
-def _crop_size(workload: Workload, quick: bool) -> tuple[int, int]:
-    """Width and height in pixels, 3:2, that keep the oracle within its work."""
-    pixels = ORACLE_WORK[quick] / len(workload.splats.means)
-    height = max(16, 8 * int(math.sqrt(pixels / 1.5) / 8))
-    return min(3 * height // 2, workload.camera.width), min(height, workload.camera.height)
+def _crop(workload: Workload, most_pairs: float) -> Workload:
+    """The largest middle of the view, 3:2 or all of it, that is not too much for the oracle."""
+    tallest = -(-workload.camera.height // CROP_STEP)
+
+    def of(steps: int) -> Workload:
+        height = min(CROP_STEP * steps, workload.camera.height)
+        whole = height == workload.camera.height
+        return workload.crop(workload.camera.width if whole else min(3 * height // 2, workload.camera.width), height)
+
+    too_tall = bisect_right(range(2, tallest + 1), most_pairs, key=lambda steps: _pairs(of(steps)))
+    return of(min(2, tallest) if too_tall == 0 else 1 + too_tall)
+
+
+@torch.no_grad()
+def _pairs(workload: Workload) -> float:
+    """About how many pairs of a splat and a pixel the oracle blends: the pixels of all tiles a splat touches."""
+    seen = render(workload.splats, workload.camera)
+    centres, radii = seen.means2d[seen.radii > 0], seen.radii[seen.radii > 0, None]
+    last = torch.tensor([workload.camera.width, workload.camera.height]) - 1
+    first_tile = ((centres - radii).clamp_min(0) / TILE).floor()
+    tiles = (torch.minimum(centres + radii, last) / TILE).floor() - first_tile + 1
+    return float(tiles.clamp_min(0).prod(1).sum()) * TILE**2
 
 
 def _errors(crop: Workload, methods: list[Method]) -> dict[tuple[Method, str], dict[str, float]]:
     """Errors by method and operation; pixels are left out by what the back-end does with everything asked for."""
     truth = _trace(crop, Method(REFERENCE), torch.float64)
-    usual = {name: _usual(_trace(crop, Method(name), torch.float32).image, truth.image) for name, _ in methods}
+    usual, expected = {}, {}
+    for name in dict.fromkeys(method.backend for method in methods):
+        usual[name] = _usual(_trace(crop, Method(name), torch.float32).image, truth.image)
+        expected[name] = _gradients(truth, crop.image_gradient.double() * usual[name][..., None])
     errors = {}
     for method in methods:
         result, counted = _trace(crop, method, torch.float32), usual[method.backend]
         errors[method, FORWARD] = image_errors(result.image, truth.image, counted)
-        weights = crop.image_gradient * counted[..., None]
-        gradients = _gradients(result, weights)
-        expected = _gradients(truth, weights.double())
-        by_name = {name: relative_l2(gradients[name], expected[name]) for name in expected}
+        gradients = _gradients(result, crop.image_gradient * counted[..., None])
+        by_name = {name: relative_l2(gradients[name], g) for name, g in expected[method.backend].items()}
         errors[method, BOTH] = worst_first("gradient error", by_name)
     return errors
 
