@@ -19,11 +19,11 @@ from nsvq_lightning.splats import RawSplats
 
 from .density_rules import (
     DensityRules,
+    add_view,
     clone_mask,
     limit_growth,
     lower_opacities,
     prune_mask,
-    screen_gradient,
     split,
     split_mask,
 )
@@ -113,12 +113,17 @@ class DensityControl(Callback):
     def _observe(self, trainer: Trainer, host: SplatHost, render: Render) -> None:
         """Add one view (of each process) to the statistics."""
         assert render.means2d.grad is not None
+        sums, views = host.splats.add_table(GRADIENTS), host.splats.add_table(VIEWS)
         height, width = render.alpha.shape
         # Gradient accumulation divides the loss by the number of micro-batches; each is a view of its own here.
-        norm = screen_gradient(render.means2d.grad, width, height) * trainer.accumulate_grad_batches
-        seen = (render.radii > 0).float()
-        host.splats.add_table(GRADIENTS).add_(sum_over_processes(trainer, norm * seen))
-        host.splats.add_table(VIEWS).add_(sum_over_processes(trainer, seen))
+        size = width * trainer.accumulate_grad_batches, height * trainer.accumulate_grad_batches
+        if trainer.world_size == 1:
+            add_view(sums, views, render.means2d.grad, render.radii, *size)
+            return
+        norms, seen = torch.zeros_like(sums), torch.zeros_like(views)
+        add_view(norms, seen, render.means2d.grad, render.radii, *size)
+        sums.add_(sum_over_processes(trainer, norms))
+        views.add_(sum_over_processes(trainer, seen))
 
     def _warmup_step(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
         rules, schedule = self.rules, host.schedule

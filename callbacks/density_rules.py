@@ -12,6 +12,7 @@ from nsvq_lightning.splats import RawSplats
 
 __all__ = [
     "DensityRules",
+    "add_view",
     "clone_mask",
     "limit_growth",
     "lower_opacities",
@@ -98,6 +99,27 @@ def screen_gradient(grad: Tensor, width: int, height: int) -> Tensor:
         height: Image height in pixels.
     """
     return torch.hypot(grad[:, 0] * (0.5 * width), grad[:, 1] * (0.5 * height))
+
+
+def add_view(sums: Tensor, views: Tensor, grad: Tensor, radii: Tensor, width: int, height: int) -> None:
+    """Add :func:`screen_gradient` of one view to ``sums [N]`` and 1 to ``views [N]``, where a splat was seen.
+
+    Args:
+        sums: Sum of the norms, changed in place.
+        views: Number of views, changed in place.
+        grad: Gradient of the loss ``[N, 2]`` by the centre in pixels.
+        radii: Radius on the screen ``[N]`` in pixels, 0 for splats that were not seen.
+        width: Image width in pixels.
+        height: Image height in pixels.
+    """
+    if grad.device.type == "cpu" and grad.dtype == torch.float32:
+        from nsvq_lightning.rendering.cpu.statistics import add_view as add_view_cpu
+
+        add_view_cpu(sums, views, grad, radii, (0.5 * width, 0.5 * height))
+        return
+    seen = (radii > 0).to(sums)
+    sums.add_(screen_gradient(grad, width, height) * seen)
+    views.add_(seen)
 
 
 def largest_scale(scales: Tensor) -> Tensor:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from nsvq_lightning.optim import find_group
 from nsvq_lightning.splats import ATTRIBUTES, Splats
 
 __all__ = ["append_rows", "drop_non_finite", "finite_rows", "keep_rows", "replace_attribute", "reset_moments"]
@@ -88,7 +88,7 @@ def replace_attribute(splats: Splats, optimizer: Optimizer, name: str, values: T
 
 def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -> None:
     """Set the Adam moments of the group ``name`` to zero, of all rows or of ``rows`` (indices or a mask)."""
-    state = optimizer.state.get(_group(optimizer, name)["params"][0], {})
+    state = optimizer.state.get(find_group(optimizer, name)["params"][0], {})
     for key in MOMENTS:
         if key in state:
             if rows is None:
@@ -138,19 +138,11 @@ def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> int:
     return dropped
 
 
-def _group(optimizer: Optimizer, name: str) -> dict[str, Any]:
-    for group in optimizer.param_groups:
-        if group.get("name") == name:
-            return group
-    names = ", ".join(str(group.get("name")) for group in optimizer.param_groups)
-    raise ValueError(f"the optimiser has no parameter group {name!r}, only: {names}")
-
-
 def _rebind(
     splats: Splats, optimizer: Optimizer, name: str, values: Tensor, edit_moment: Callable[[Tensor], Tensor]
 ) -> None:
     """Bind ``values`` as the new parameter ``name`` everywhere the old one was known."""
-    group = _group(optimizer, name)
+    group = find_group(optimizer, name)
     old = group["params"][0]
     new = nn.Parameter(values.contiguous(), requires_grad=old.requires_grad)
     state = optimizer.state.pop(old, None)

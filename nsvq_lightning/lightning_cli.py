@@ -18,6 +18,7 @@ from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
 from nsvq_lightning.host import is_trial, output_folder
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.progress import SplatProgressBar
+from nsvq_lightning.skips import SKIPS, switch, switched
 from nsvq_lightning.trainer import SplatTrainer
 
 __all__ = ["DEFAULT_CALLBACKS", "SplatCLI", "default_loggers"]
@@ -76,23 +77,25 @@ class SplatCLI(LightningCLI):
     """``nsvq fit | validate | test | predict | export``.
 
     The callbacks of a run are options of their own: ``--callbacks.density.max_splats=200000`` changes one number
-    without repeating a list; ``trainer.callbacks`` takes further ones.
+    without repeating a list; ``trainer.callbacks`` takes further ones. So are the switches of
+    :mod:`nsvq_lightning.skips`: ``--skips.adam_rows=true``.
     """
 
     def __init__(self, args: list[str]) -> None:
-        super().__init__(
-            SplatModule,
-            ColmapDataModule,
-            trainer_class=SplatTrainer,
-            trainer_defaults=TRAINER_DEFAULTS,
-            save_config_kwargs={"overwrite": True},
-            seed_everything_default=False,  # every draw has its own generator
-            parser_class=QuietParser,
-            parser_kwargs=PARSER_TEXTS,
-            subclass_mode_data=True,
-            auto_configure_optimizers=False,  # the module builds its groups
-            args=args,
-        )
+        with switched():  # they hold for this command only
+            super().__init__(
+                SplatModule,
+                ColmapDataModule,
+                trainer_class=SplatTrainer,
+                trainer_defaults=TRAINER_DEFAULTS,
+                save_config_kwargs={"overwrite": True},
+                seed_everything_default=False,  # every draw has its own generator
+                parser_class=QuietParser,
+                parser_kwargs=PARSER_TEXTS,
+                subclass_mode_data=True,
+                auto_configure_optimizers=False,  # the module builds its groups
+                args=args,
+            )
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
@@ -100,7 +103,9 @@ class SplatCLI(LightningCLI):
         return {**LightningCLI.subcommands(), "export": {"model"}}
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """Add the callbacks."""
+        """Add the callbacks and the switches."""
+        for skip in SKIPS.values():
+            parser.add_argument(f"--skips.{skip.name}", type=bool, default=skip.default, help=skip.summary)
         for name, kind in DEFAULT_CALLBACKS.items():
             key = f"callbacks.{name}"
             path = f"{kind.__module__}.{kind.__qualname__}"
@@ -120,6 +125,10 @@ class SplatCLI(LightningCLI):
             # RenderWriter has them on disk; a list of all pictures would only fill the memory.
             parser.set_defaults({"return_predictions": False})
         return parser
+
+    def before_instantiate_classes(self) -> None:
+        """Set the switches."""
+        switch(**self._get(self.config, "skips").as_dict())
 
     def _parse_ckpt_path(self) -> None:
         """Take the model's settings from the checkpoint, except in ``fit``: there the user's options must win."""

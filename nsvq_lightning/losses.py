@@ -50,13 +50,13 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 
 
 def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2) -> Tensor:
-    """(1 - λ)·mean |image - target| + λ·(1 - SSIM), differentiable in ``image``.
+    """(1 - λ)·mean |image - target| + λ·(1 - SSIM), differentiable in ``image``, which is clamped to [0, 1] first.
 
-    float32 images on the CPU take one fused sweep for loss and gradient; everything else is plain torch.
+    float32 images on the CPU take one fused sweep for clamping, loss and gradient; everything else is plain torch.
 
     Args:
-        image: Rendered ``[H, W, 3]``, clamped to [0, 1].
-        target: Photo ``[H, W, 3]`` in [0, 1].
+        image: Rendered ``[H, W, 3]``; values outside [0, 1] get no gradient.
+        target: Photo ``[H, W, 3]``, uint8 or in [0, 1].
         dssim_weight: λ in [0, 1].
 
     Raises:
@@ -67,13 +67,15 @@ def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2) -
     if _is_fusible(image, target):
         loss: Tensor = _FusedLoss.apply(image, target, dssim_weight)  # type: ignore[no-untyped-call]
         return loss
+    image = image.clamp(0.0, 1.0)
+    target = target.to(image.dtype) / 255 if target.dtype == torch.uint8 else target
     return (1 - dssim_weight) * (image - target).abs().mean() + dssim_weight * (1 - ssim(image, target))
 
 
 def _is_fusible(image: Tensor, target: Tensor) -> bool:
-    """Whether the fused sweep can take the images: float32 on the CPU, and rows of at least one vector."""
-    fits = image.device.type == "cpu" and image.dtype == target.dtype == torch.float32 and 3 * image.shape[1] >= 16
-    return fits and not target.requires_grad
+    """Whether the fused sweep can take the images: on the CPU, float32, and rows of at least one vector."""
+    fits = image.device.type == "cpu" and image.dtype == torch.float32 and 3 * image.shape[1] >= 16
+    return fits and target.dtype in (torch.float32, torch.uint8) and not target.requires_grad
 
 
 class _FusedLoss(torch.autograd.Function):
@@ -88,4 +90,5 @@ class _FusedLoss(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, scale: Tensor) -> tuple[Tensor, None, None]:
         (gradient,) = ctx.saved_tensors
-        return gradient * scale, None, None
+        # One view a step leaves the loss as it is, and a pass over the image is worth sparing.
+        return gradient if scale == 1 else gradient * scale, None, None

@@ -22,6 +22,7 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, render, visible
 from nsvq_lightning.schedule import Phase, Schedule
+from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats import RawSplats, Splats, SplatTensors, sh_degree_of
 from nsvq_lightning.state import RunState, Stopwatch
 
@@ -163,9 +164,17 @@ class SplatModel(LightningModule):
         if self.phase < Phase.QUANTIZE or not self.codebooks:
             return raw
         if self.phase is Phase.QUANTIZE and self.training:
-            rows = visible(raw, camera, backend=self.backend).nonzero()[:, 0]
-            return noisy_rows(raw, rows, self.quantizers, lambda name: self._generator("noise", name))
+            return noisy_rows(
+                raw, self._visible_rows(raw, camera), self.quantizers, lambda name: self._generator("noise", name)
+            )
         return decoded(raw, self.quantizers)
+
+    @torch.no_grad()
+    def _visible_rows(self, raw: RawSplats, camera: Camera) -> Tensor:
+        """Rows of the splats that can change the image, ascending."""
+        skip = is_on("first_render")
+        mask = visible(raw, camera, backend=self.backend) if skip else self._render(raw, camera, None).radii > 0
+        return mask.nonzero()[:, 0]
 
     def _background(self) -> Tensor | None:
         return torch.ones(3, device=self.device) if self.background == "white" else None

@@ -17,9 +17,19 @@ from nsvq_lightning.io.formats import load
 from nsvq_lightning.losses import photometric_loss
 from nsvq_lightning.metrics import eight_bit, image_metrics, psnr
 from nsvq_lightning.model import SplatModel
-from nsvq_lightning.optim import LearningRates, apply_rates, build_adam, param_groups, position_lr, set_lr
+from nsvq_lightning.optim import (
+    LearningRates,
+    apply_rates,
+    build_adam,
+    param_groups,
+    position_lr,
+    set_columns,
+    set_lr,
+)
 from nsvq_lightning.quantize.nsvq import NSVQ
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.schedule import Phase
+from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats import Splats
 
 __all__ = ["SplatModule"]
@@ -114,10 +124,14 @@ class SplatModule(SplatModel):
         self.stopwatch.start()
 
     def on_train_batch_start(self, batch: View, batch_idx: int) -> None:
-        """Set the position's learning rate of this iteration."""
+        """Set the position's learning rate of this iteration, and how many SH coefficients it can change."""
         self._micro_batch = batch_idx % self.trainer.accumulate_grad_batches
+        optimizer = self.trainer.optimizers[0]
         rate = position_lr(self.global_step + 1, self.extent, self.rates, self.schedule.position_decay_end)
-        set_lr(self.trainer.optimizers[0], "means", rate)
+        set_lr(optimizer, "means", rate)
+        # Noise substitution scales a whole row, so from there on every coefficient has a gradient.
+        degree = self.active_sh_degree if self.phase < Phase.QUANTIZE else self.splats.sh_degree
+        set_columns(optimizer, "shN", 3 * ((degree + 1) ** 2 - 1))
 
     def training_step(self, batch: View, batch_idx: int) -> dict[str, Any] | None:
         """Loss of one view: (1 - w)·L1 + w·(1 - SSIM) + λ·Σ opacity (paper, section 3.3).
@@ -128,12 +142,11 @@ class SplatModule(SplatModel):
         rendered = self(batch.camera)
         if self.wants_screen_gradients:
             rendered.means2d.retain_grad()
-        image, target = rendered.image.clamp(0.0, 1.0), batch.image.float() / 255
-        loss = photometric_loss(image, target, self.dssim_weight)
+        loss = photometric_loss(rendered.image, batch.image, self.dssim_weight)
         if self.opacity_weight:
             loss = loss + self.opacity_weight * self.splats.opacities.sigmoid().sum()
-        if (self.global_step + 1) % log_interval(self.trainer) == 0:
-            self._log_step(loss, image, target)
+        if (self.global_step + 1) % log_interval(self.trainer) == 0 or not is_on("metrics"):
+            self._log_step(loss, rendered.image, batch.image)
         # Several processes must skip together, or their collectives would no longer match.
         if self.trainer.world_size == 1 and not math.isfinite(loss.item()):
             log.warning("step %d: the loss of %s is %s, no update", self.global_step + 1, batch.name, loss.item())
@@ -141,7 +154,7 @@ class SplatModule(SplatModel):
         return {"loss": loss, "render": rendered}
 
     def _log_step(self, loss: Tensor, image: Tensor, target: Tensor) -> None:
-        quality = psnr(eight_bit(image.detach()), target).float()
+        quality = psnr(eight_bit(image.detach()), eight_bit(target)).float()
         values: dict[str, Metric | Tensor | int | float] = {
             "train/loss": loss.detach(),
             "train/psnr": quality,

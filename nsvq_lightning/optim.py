@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats import Splats
 
 __all__ = [
     "LearningRates",
+    "SplatAdam",
     "apply_rates",
     "build_adam",
     "codebook_group",
+    "find_group",
     "group_lr",
     "param_groups",
     "position_lr",
+    "set_columns",
     "set_lr",
 ]
 
@@ -27,7 +31,7 @@ EPS = 1e-15
 """Adam's epsilon of 3D Gaussian splatting: gradients of a splat are far below PyTorch's default of 1e-8."""
 
 FUSED_DEVICES = frozenset({"cpu", "cuda"})
-"""Device types on which the fused Adam is used: the same bits for any number of threads, 2.7 times as fast on a CPU."""
+"""Device types on which torch has a fused Adam."""
 
 CODEBOOK_PREFIX = "codebook_"
 """A codebook's parameter group is named after its attribute with this in front."""
@@ -121,17 +125,104 @@ def apply_rates(optimizer: torch.optim.Optimizer, rates: LearningRates, extent: 
         group["lr"] = group_lr(group["name"], rates, extent)
 
 
+class SplatAdam(torch.optim.Adam):
+    """:class:`torch.optim.Adam` for contiguous float32 parameters on the CPU, in one pass over the memory.
+
+    The same bits for any number of threads; the state is that of torch's, so checkpoints fit both. A group may name
+    ``columns`` (:func:`set_columns`): the leading numbers of a row that can have a gradient or ever had one; Adam
+    leaves the others as they are, so they are not looked at (switch ``adam_bands``). With the switch ``adam_rows``
+    splats without a gradient keep weights and moments; the count of steps, which corrects the bias, goes on for all.
+
+    Args:
+        groups: Parameter groups with their learning rates.
+        eps: Added to the root of the second moment.
+    """
+
+    def __init__(self, groups: list[dict[str, Any]], eps: float = EPS) -> None:
+        super().__init__(groups, eps=eps)
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
+        """Call ``closure``, if any, and update what has a gradient then.
+
+        Returns:
+            What ``closure`` returned.
+        """
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    self._update(group, parameter, parameter.grad)
+        return loss
+
+    def _update(self, group: dict[str, Any], parameter: Tensor, gradient: Tensor) -> None:
+        from nsvq_lightning.rendering.cpu.adam import adam_step
+
+        state = self.state[parameter]
+        if not state:
+            state["step"] = torch.zeros(())
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        state["step"] += 1
+        adam_step(
+            parameter,
+            gradient.contiguous(),
+            state["exp_avg"],
+            state["exp_avg_sq"],
+            step=int(state["step"]),
+            lr=group["lr"],
+            betas=group["betas"],
+            eps=group["eps"],
+            columns=group.get("columns") if is_on("adam_bands") else None,
+            rows_with_gradient=is_on("adam_rows") and not group.get("name", "").startswith(CODEBOOK_PREFIX),
+        )
+
+
 def build_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
-    """Adam of the paper over ``groups``: default betas, epsilon 1e-15, no weight decay; fused where there is such."""
+    """Adam of the paper over ``groups``: default betas, epsilon 1e-15, no weight decay.
+
+    Returns:
+        :class:`SplatAdam` where it can take the parameters, else torch's, fused where there is such.
+
+    Raises:
+        ValueError: ``adam_rows`` is on, and only torch's can take the parameters.
+    """
     parameters: list[Tensor] = [parameter for group in groups for parameter in group["params"]]
+    if all(p.device.type == "cpu" and p.dtype == torch.float32 and p.is_contiguous() for p in parameters):
+        return SplatAdam(groups)
+    if is_on("adam_rows"):
+        raise ValueError("the switch adam_rows needs float32 parameters on the CPU; train there, or leave it off")
     fused = all(p.device.type in FUSED_DEVICES and p.is_floating_point() for p in parameters)
     return torch.optim.Adam(groups, eps=EPS, fused=True if fused else None)
 
 
+def set_columns(optimizer: torch.optim.Optimizer, name: str, columns: int) -> None:
+    """Say that from now on the leading ``columns`` numbers of a row of the group ``name`` can have a gradient.
+
+    Groups start without a limit. The first call at the start of a training sets one, later ones only raise it: moments
+    that were set once need their decay. The optimiser's state carries it.
+    """
+    group = find_group(optimizer, name)
+    fresh = not optimizer.state.get(group["params"][0])
+    if fresh or "columns" in group:
+        group["columns"] = max(columns, group.get("columns", 0))
+
+
 def set_lr(optimizer: torch.optim.Optimizer, name: str, rate: float) -> None:
     """Set the learning rate of the group ``name``."""
+    find_group(optimizer, name)["lr"] = rate
+
+
+def find_group(optimizer: torch.optim.Optimizer, name: str) -> dict[str, Any]:
+    """The parameter group ``name``.
+
+    Raises:
+        ValueError: There is none.
+    """
     for group in optimizer.param_groups:
-        if group["name"] == name:
-            group["lr"] = rate
-            return
-    raise ValueError(f"the optimiser has no parameter group {name!r}")
+        if group.get("name") == name:
+            return group
+    names = ", ".join(str(group.get("name")) for group in optimizer.param_groups)
+    raise ValueError(f"the optimiser has no parameter group {name!r}, only: {names}")

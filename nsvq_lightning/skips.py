@@ -71,13 +71,13 @@ SKIPS = {
         Skip(
             "adam_rows",
             "splats in the optimiser",
-            "they are not visible in this step",
-            changes="their momentum does not move them on, and decays only in steps that see them",
+            "they have no gradient in this step",
+            changes="their momentum does not move them on, and decays only in steps with a gradient",
             default=False,
         ),
         Skip("metrics", "the PSNR of a training view", "it is not logged in this step"),
         # photos
-        Skip("undistortion", "resampling a photo", "its camera has no distortion"),
+        Skip("undistortion", "resampling a photo", "its camera is a pinhole"),
         Skip("resizing", "resampling a photo", "it has its size already"),
     )
 }

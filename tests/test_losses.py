@@ -16,6 +16,11 @@ def pair(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
     return image, (image + 0.2 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1)
 
 
+def plain_loss(image: torch.Tensor, target: torch.Tensor, weight: float) -> torch.Tensor:
+    image = image.clamp(0, 1)
+    return (1 - weight) * (image - target).abs().mean() + weight * (1 - ssim(image, target))
+
+
 def test_ssim_is_scikit_images_on_a_zero_padded_image() -> None:
     image, target = pair(40, 50)
     padded = [np.pad(x.double().numpy(), ((5, 5), (5, 5), (0, 0))) for x in (image, target)]
@@ -34,11 +39,17 @@ def test_ssim_is_scikit_images_on_a_zero_padded_image() -> None:
 
 @pytest.mark.parametrize(("height", "width"), [(64, 70), (1, 6), (3, 20), (12, 33), (30, 6), (200, 7), (9, 5)])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
-def test_fused_loss_and_gradient(height: int, width: int, weight: float) -> None:
+@pytest.mark.parametrize("kind", ["float", "bytes", "beyond"])
+def test_fused_loss_and_gradient(height: int, width: int, weight: float, kind: str) -> None:
     image, target = pair(height, width)
+    if kind == "beyond":
+        image = 1.5 * image - 0.25
+        image[0, 0] = torch.tensor([0.0, 1.0, 0.5])  # at the limits there still is a gradient
+    if kind == "bytes":
+        target = (255 * target).round().to(torch.uint8)
     fused, oracle = image.clone().requires_grad_(), image.double().requires_grad_()
     loss = photometric_loss(fused, target, weight)
-    expected = photometric_loss(oracle, target.double(), weight)
+    expected = plain_loss(oracle, target.double() / (255 if kind == "bytes" else 1), weight)
     (3 * loss).backward()
     (3 * expected).backward()
     assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-6, abs=2e-7)
@@ -67,6 +78,20 @@ def test_bits_do_not_depend_on_the_number_of_threads() -> None:
 def test_equal_images_have_no_loss() -> None:
     image, _ = pair(20, 20)
     assert float(photometric_loss(image, image)) == pytest.approx(0, abs=1e-6)
+
+
+def test_a_loss_that_is_no_number_stays_none() -> None:
+    image, target = pair(20, 20)
+    image[3, 4, 1] = torch.nan
+    assert not torch.isfinite(photometric_loss(image, target))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bytes_are_the_same_photo(dtype: torch.dtype) -> None:
+    image, target = pair(20, 20)
+    photo = (255 * target).round().to(torch.uint8)
+    image = image.to(dtype)
+    assert torch.equal(photometric_loss(image, photo), photometric_loss(image, photo.to(dtype) / 255))
 
 
 def test_shapes_must_agree() -> None:

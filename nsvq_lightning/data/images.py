@@ -17,6 +17,7 @@ from torch import Tensor
 
 from nsvq_lightning.data.model_files import SceneError
 from nsvq_lightning.data.undistort import Pinhole, Undistortion
+from nsvq_lightning.skips import is_on
 
 __all__ = ["ImageSource", "ImageStore", "image_size", "read_image"]
 
@@ -101,7 +102,7 @@ class ImageSource:
             raise _undecodable(self.path, f"decoded to {width}x{height}, its head says {self.size[0]}x{self.size[1]}")
         if self.undistortion is not None:
             image = self.undistortion(image)
-        if image.shape[:2] != (self.pinhole.height, self.pinhole.width):
+        if image.shape[:2] != (self.pinhole.height, self.pinhole.width) or not is_on("resizing"):
             image = cv2.resize(image, (self.pinhole.width, self.pinhole.height), interpolation=cv2.INTER_AREA)
         return torch.from_numpy(np.ascontiguousarray(image))
 

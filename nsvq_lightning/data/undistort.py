@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.data.colmap import import_pycolmap
 from nsvq_lightning.data.model_files import SceneError
+from nsvq_lightning.skips import is_on
 
 __all__ = ["Pinhole", "Undistortion", "rectify"]
 
@@ -147,7 +148,9 @@ def rectify(camera: Any, width: int, height: int, keep_maps: bool = True) -> tup
     Raises:
         SceneError: The camera cannot be turned into a pinhole camera.
     """
-    if camera.model_name in _PINHOLE or (camera.model_name in _POLYNOMIAL and camera.is_undistorted()):
+    # A polynomial of zeros is a pinhole too, but COLMAP's undistorter would crop its picture by a pixel.
+    skip = camera.model_name in _POLYNOMIAL and camera.is_undistorted()
+    if skip or (camera.model_name in _PINHOLE and is_on("undistortion")):
         pinhole = Pinhole(camera.calibration_matrix(), camera.width, camera.height)
         return pinhole.resized(width, height), None
     undistortion = Undistortion(camera, width, height, keep_maps)

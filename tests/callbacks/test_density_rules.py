@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.callbacks.density_rules import (
     DensityRules,
+    add_view,
     clone_mask,
     limit_growth,
     lower_opacities,
@@ -36,6 +37,18 @@ def test_the_statistic_is_in_normalised_device_coordinates() -> None:
     norm = screen_gradient(torch.tensor([[3e-6, 0.0], [0.0, 4e-6], [3e-6, 4e-6]]), width=800, height=600)
     expected = [3e-6 * 400, 4e-6 * 300, math.hypot(3e-6 * 400, 4e-6 * 300)]
     assert norm.tolist() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_only_splats_that_were_seen_enter_the_statistic(dtype: torch.dtype) -> None:
+    draw = torch.Generator().manual_seed(0)
+    grad, start = torch.randn(57, 2, generator=draw).to(dtype), torch.rand(57, generator=draw).to(dtype)
+    radii = torch.randint(0, 3, (57,), generator=draw, dtype=torch.int32)
+    sums, views = start.clone(), torch.full((57,), 2.0, dtype=dtype)
+    add_view(sums, views, grad, radii, width=80, height=60)
+    seen = radii > 0
+    torch.testing.assert_close(sums, torch.where(seen, start + screen_gradient(grad, 80, 60), start))
+    assert torch.equal(views, torch.where(seen, 3.0, 2.0).to(dtype))
 
 
 def test_small_splats_are_cloned_and_large_ones_split() -> None:

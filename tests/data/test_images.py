@@ -14,6 +14,7 @@ from torch import Tensor
 from nsvq_lightning.data.images import ImageSource, ImageStore, image_size, read_image
 from nsvq_lightning.data.model_files import SceneError
 from nsvq_lightning.data.undistort import Pinhole
+from nsvq_lightning.skips import switched
 
 RGB = np.random.default_rng(0).integers(0, 256, (6, 9, 3), dtype=np.uint8)
 
@@ -80,6 +81,14 @@ def test_downscaling_averages_areas(tmp_path: Path) -> None:
     expected = image.reshape(4, 2, 6, 2, 3).astype(float).mean(axis=(1, 3))
     assert np.abs(source.load().numpy() - expected).max() <= 0.5
     assert source.nbytes == source.load().nbytes
+
+
+def test_resizing_a_picture_to_its_own_size_would_change_no_bit(tmp_path: Path) -> None:
+    PIL.Image.fromarray(RGB).save(tmp_path / "a.png")
+    source = ImageSource(tmp_path / "a.png", (9, 6), None, Pinhole(np.eye(3), 9, 6))
+    with switched(resizing=False):
+        resized = source.load()
+    assert torch.equal(resized, source.load())
 
 
 def test_picture_that_changed_its_size_since_loading(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from nsvq_lightning.data.colmap import import_pycolmap, read_model
 from nsvq_lightning.data.model_files import SceneError
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.data.undistort import Pinhole, rectify
+from nsvq_lightning.skips import switched
 
 SceneFactory = Callable[..., Path]
 
@@ -72,6 +73,19 @@ def test_cameras_without_distortion_pass_straight_through(model: str, params: tu
     assert undistortion is None
     assert pinhole.K.tolist() == [[300, 0, 205], [0, 300, 148], [0, 0, 1]]
     assert (pinhole.width, pinhole.height) == (400, 300)
+
+
+@pytest.mark.parametrize(
+    ("model", "params"), [("PINHOLE", (300.0, 310.0, 205.3, 148.7)), ("SIMPLE_PINHOLE", (300.0, 205.0, 148.0))]
+)
+def test_undistorting_a_pinhole_picture_would_change_no_bit(model: str, params: tuple[float, ...]) -> None:
+    camera, image = _camera(model, params), _picture(400, 300)
+    skipped, _ = rectify(camera, 400, 300)
+    with switched(undistortion=False):
+        pinhole, undistortion = rectify(camera, 400, 300)
+    assert undistortion is not None
+    assert np.array_equal(pinhole.K, skipped.K)
+    assert np.array_equal(undistortion(image), image)
 
 
 def test_fisheye_without_coefficients_is_still_undistorted() -> None:

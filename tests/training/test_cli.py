@@ -14,7 +14,9 @@ import yaml
 
 from nsvq_lightning.cli import find_config, main, resolve_configs
 from nsvq_lightning.io.formats import load
+from nsvq_lightning.module import SplatModule
 from nsvq_lightning.schedule import Phase
+from nsvq_lightning.skips import is_on
 
 CODES = ["--model.codebooks.scales=16", "--model.codebooks.sh0=8"]
 
@@ -52,6 +54,20 @@ def test_a_run_leaves_scene_report_config_and_checkpoint(finished: Path) -> None
     metrics = json.loads((finished / "metrics.json").read_text())
     assert metrics["formula"]["matches"]
     assert [end["phase"] for end in metrics["phases"]] == [phase.name.lower() for phase in Phase]
+
+
+def test_switches_are_options_that_hold_for_one_command(
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[bool, bool]] = []
+
+    def look(module: SplatModule) -> None:
+        seen.append((is_on("adam_rows"), is_on("metrics")))
+
+    monkeypatch.setattr(SplatModule, "on_train_end", look)
+    assert main(fit(demo_scene, tmp_path, "--model.codebooks=null", "--skips.adam_rows=true", steps=2)) == 0
+    assert seen == [(True, True)]
+    assert not is_on("adam_rows")
 
 
 def test_a_second_run_gets_its_own_folder_and_prints_its_summary(

@@ -1,8 +1,9 @@
 """L1 and D-SSIM with their gradient in one sweep down an image.
 
-Each row is met once: vertical blur of the five moment planes, horizontal blur, SSIM and its three derivative planes,
-horizontal blur of those into a ring of eleven rows, and, five rows later, their vertical blur, which is the gradient
-(the blur is its own adjoint). Nothing but a few rows is ever in memory.
+Each row is met once: it is clamped and brought to [0, 1] on entering a ring of eleven rows; five rows later follow the
+vertical blur of the four moment planes, their horizontal blur, SSIM and its three derivative planes and the horizontal
+blur of those into a second ring; after another five rows their vertical blur, which is the gradient (the blur is its
+own adjoint). Nothing but these rows is ever in memory.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from torch import Tensor
 
 from nsvq_lightning.losses import SSIM_C1, SSIM_C2, SSIM_RADIUS, ssim_window
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
-from nsvq_lightning.rendering.cpu.lanes import fma, fnma, lane_sum, load, select, splat, store, vfabs
+from nsvq_lightning.rendering.cpu.lanes import fma, fnma, get, lane_sum, load, put, select, splat, store, vfabs
 from nsvq_lightning.rendering.cpu.records import F
-from nsvq_lightning.rendering.cpu.workspace import Workspace
+from nsvq_lightning.rendering.cpu.workspace import Workspace, recycled
 
 __all__ = ["l1_dssim"]
 
@@ -27,9 +28,42 @@ C1, C2 = F(SSIM_C1), F(SSIM_C2)
 PAD = 16
 """Zeros beside every row, at least 3·radius floats, so that the horizontal blur needs no border case."""
 RING = 2 * SSIM_RADIUS + 1
-MOMENTS = 5
+IMAGES = 2
+MOMENTS = 4
 DERIVATIVES = 3
 LANE_NUMBERS = np.arange(16, dtype=np.float32)
+
+
+@inline
+def row_of(y, planes, pitch):
+    """Offset of row y in a ring of rows with some planes each."""
+    return (y + RING) % RING * planes * pitch
+
+
+@inline
+def clear_row(ring, o, count):
+    """Write zeros over some floats."""
+    zero = splat(F(0))
+    for x in range(0, count, 16):
+        store(ring, o + x, zero)
+
+
+@inline
+def take_row(image, target, white, images, y, height, length, pitch):
+    """Bring row y of both images into their ring: the image clamped, the target divided by ``white``."""
+    o = row_of(y, IMAGES, pitch)
+    if y < 0 or y >= height:
+        clear_row(images, o, IMAGES * pitch)
+    else:
+        zero, one = splat(F(0)), splat(F(1))
+        for x_ in range(0, length, 16):
+            # The last vector of a row overlaps the one before instead of running over.
+            x = min(x_, length - 16)
+            p = load(image, y * length + x)
+            # Not a minimum and a maximum: a NaN must stay one.
+            store(images, o + x, select(p < zero, zero, select(p > one, one, p)))
+        for x in range(length):
+            put(images, o + pitch + x, F(get(target, y * length + x)) / white)
 
 
 @inline
@@ -44,53 +78,37 @@ def blur_along(row, o):
 
 
 @inline
-def add_row(image, target, o, weight, sums):
-    """Add one row's moments (p, q, p², q², pq) times a tap."""
-    p, q = load(image, o), load(target, o)
-    wp, wq = weight * p, weight * q
-    return sums[0] + wp, sums[1] + wq, fma(wp, p, sums[2]), fma(wq, q, sums[3]), fma(wp, q, sums[4])
-
-
-@inline
-def add_pair(image, target, above, below, weight, sums):
-    """Add the moments of two rows that share a tap."""
-    p, q, r, s = load(image, above), load(target, above), load(image, below), load(target, below)
+def add_pair(images, y, distance, x, pitch, weight, sums):
+    """Add the moments (p, q, p² + q², p·q) of the rows at a distance above and below row y, which share a tap."""
+    above = row_of(y - distance, IMAGES, pitch) + x
+    below = row_of(y + distance, IMAGES, pitch) + x
+    p, q = load(images, above), load(images, above + pitch)
+    r, s = load(images, below), load(images, below + pitch)
     return (
         fma(weight, p + r, sums[0]),
         fma(weight, q + s, sums[1]),
-        fma(weight, fma(p, p, r * r), sums[2]),
-        fma(weight, fma(q, q, s * s), sums[3]),
-        fma(weight, fma(p, q, r * s), sums[4]),
+        fma(weight, fma(p, p, r * r) + fma(q, q, s * s), sums[2]),
+        fma(weight, fma(p, q, r * s), sums[3]),
     )
 
 
 @inline
-def moments_of_row(image, target, y, height, length, pitch, moments):
-    """Vertical blur of the five moment planes at row y; rows outside the image count as zeros."""
-    zero = splat(F(0))
-    inner = y >= SSIM_RADIUS and y < height - SSIM_RADIUS
+def moments_of_row(images, y, length, pitch, moments):
+    """Vertical blur of the four moment planes at row y."""
     for x_ in range(0, length, 16):
-        # The last vector of a row overlaps the one before instead of running over.
         x = min(x_, length - 16)
-        sums = (zero, zero, zero, zero, zero)
-        if inner:
-            o = y * length + x
-            sums = add_row(image, target, o, splat(G0), sums)
-            sums = add_pair(image, target, o - length, o + length, splat(G1), sums)
-            sums = add_pair(image, target, o - 2 * length, o + 2 * length, splat(G2), sums)
-            sums = add_pair(image, target, o - 3 * length, o + 3 * length, splat(G3), sums)
-            sums = add_pair(image, target, o - 4 * length, o + 4 * length, splat(G4), sums)
-            sums = add_pair(image, target, o - 5 * length, o + 5 * length, splat(G5), sums)
-        else:
-            taps = (G0, G1, G2, G3, G4, G5)
-            for k in range(max(-SSIM_RADIUS, -y), min(SSIM_RADIUS + 1, height - y)):
-                sums = add_row(image, target, (y + k) * length + x, splat(taps[abs(k)]), sums)
-        o = PAD + x
-        store(moments, o, sums[0])
-        store(moments, pitch + o, sums[1])
-        store(moments, 2 * pitch + o, sums[2])
-        store(moments, 3 * pitch + o, sums[3])
-        store(moments, 4 * pitch + o, sums[4])
+        o = row_of(y, IMAGES, pitch) + x
+        p, q, tap = load(images, o), load(images, o + pitch), splat(G0)
+        sums = (tap * p, tap * q, tap * fma(p, p, q * q), tap * (p * q))
+        sums = add_pair(images, y, 1, x, pitch, splat(G1), sums)
+        sums = add_pair(images, y, 2, x, pitch, splat(G2), sums)
+        sums = add_pair(images, y, 3, x, pitch, splat(G3), sums)
+        sums = add_pair(images, y, 4, x, pitch, splat(G4), sums)
+        sums = add_pair(images, y, 5, x, pitch, splat(G5), sums)
+        store(moments, PAD + x, sums[0])
+        store(moments, pitch + PAD + x, sums[1])
+        store(moments, 2 * pitch + PAD + x, sums[2])
+        store(moments, 3 * pitch + PAD + x, sums[3])
 
 
 @inline
@@ -103,13 +121,14 @@ def similarity_of_row(moments, derivatives, length, pitch, lanes):
         x = min(x_, length - 16)
         o = PAD + x
         m1, m2 = blur_along(moments, o), blur_along(moments, pitch + o)
-        m11, m22, m12 = m1 * m1, m2 * m2, m1 * m2
-        v1 = blur_along(moments, 2 * pitch + o) - m11
-        v2 = blur_along(moments, 3 * pitch + o) - m22
-        v12 = blur_along(moments, 4 * pitch + o) - m12
-        a, d = fma(two, m12, c1), fma(two, v12, c2)
-        e, f = one / (m11 + m22 + c1), one / (v1 + v2 + c2)
-        ef = e * f
+        m12 = m1 * m2
+        squares = fma(m1, m1, m2 * m2)
+        variances = blur_along(moments, 2 * pitch + o) - squares
+        covariance = blur_along(moments, 3 * pitch + o) - m12
+        a, d = fma(two, m12, c1), fma(two, covariance, c2)
+        e, f = squares + c1, variances + c2
+        ef = one / (e * f)
+        e, f = f * ef, e * ef
         similarity = a * d * ef
         by_product = two * a * ef
         by_square = -(similarity * f)
@@ -122,65 +141,61 @@ def similarity_of_row(moments, derivatives, length, pitch, lanes):
 
 
 @inline
-def blur_across(ring, y, plane, o, pitch):
-    """Eleven taps down the ring, centred on row y, of one derivative plane."""
-    p = plane * pitch + o
-    s = DERIVATIVES * pitch
-    total = splat(G0) * load(ring, (y + RING) % RING * s + p)
-    total = fma(splat(G1), load(ring, (y + RING - 1) % RING * s + p) + load(ring, (y + 1) % RING * s + p), total)
-    total = fma(splat(G2), load(ring, (y + RING - 2) % RING * s + p) + load(ring, (y + 2) % RING * s + p), total)
-    total = fma(splat(G3), load(ring, (y + RING - 3) % RING * s + p) + load(ring, (y + 3) % RING * s + p), total)
-    total = fma(splat(G4), load(ring, (y + RING - 4) % RING * s + p) + load(ring, (y + 4) % RING * s + p), total)
-    return fma(splat(G5), load(ring, (y + RING - 5) % RING * s + p) + load(ring, (y + 5) % RING * s + p), total)
+def pair_sum(ring, y, distance, o, pitch):
+    """Sum of the rows at a distance above and below row y."""
+    above, below = row_of(y - distance, DERIVATIVES, pitch), row_of(y + distance, DERIVATIVES, pitch)
+    return load(ring, above + o) + load(ring, below + o)
 
 
 @inline
-def gradient_of_row(image, target, gradient, ring, y, length, pitch, l1_step, ssim_step, lanes):
-    """Gradient of the loss at row y; returns the row's sum of absolute differences."""
-    zero, two = splat(F(0)), splat(F(2))
+def blur_across(ring, y, plane, x, pitch):
+    """Eleven taps down the ring, centred on row y, of one derivative plane."""
+    o = plane * pitch + x
+    total = splat(G0) * load(ring, row_of(y, DERIVATIVES, pitch) + o)
+    total = fma(splat(G1), pair_sum(ring, y, 1, o, pitch), total)
+    total = fma(splat(G2), pair_sum(ring, y, 2, o, pitch), total)
+    total = fma(splat(G3), pair_sum(ring, y, 3, o, pitch), total)
+    total = fma(splat(G4), pair_sum(ring, y, 4, o, pitch), total)
+    return fma(splat(G5), pair_sum(ring, y, 5, o, pitch), total)
+
+
+@inline
+def gradient_of_row(image, gradient, images, ring, y, length, pitch, l1_step, ssim_step, lanes):
+    """Gradient of the loss at row y, 0 where the image was clamped; returns the row's sum of absolute differences."""
+    zero, one, two = splat(F(0)), splat(F(1)), splat(F(2))
     step, scale = splat(l1_step), splat(ssim_step)
     total = zero
     lane = load(lanes, 0)
     for x_ in range(0, length, 16):
         x = min(x_, length - 16)
-        o = y * length + x
-        p, q = load(image, o), load(target, o)
+        o = row_of(y, IMAGES, pitch) + x
+        p, q = load(images, o), load(images, o + pitch)
         g = blur_across(ring, y, 0, PAD + x, pitch)
         g = fma(two * p, blur_across(ring, y, 1, PAD + x, pitch), g)
         g = fma(q, blur_across(ring, y, 2, PAD + x, pitch), g)
         sign = select(p > q, step, select(p < q, -step, zero))
-        store(gradient, o, fnma(scale, g, sign))
+        raw = load(image, y * length + x)
+        inside = (raw >= zero) & (raw <= one)
+        store(gradient, y * length + x, select(inside, fnma(scale, g, sign), zero))
         total = total + select(lane >= splat(F(x_ - x)), vfabs(p - q), zero)
     return lane_sum(total)
 
 
 @inline
 def sweep(
-    image,
-    target,
-    gradient,
-    first,
-    last,
-    height,
-    length,
-    pitch,
-    l1_step,
-    ssim_step,
-    moments,
-    derivatives,
-    ring,
-    lanes,
-    sums,
-):
+    image, target, white, gradient, first, last, height, length, pitch, l1_step, ssim_step, images, moments,
+    derivatives, ring, lanes, sums,
+):  # fmt: skip
     """Do some rows; their sums of SSIM and of absolute differences go to ``sums[2·y]`` and ``sums[2·y + 1]``."""
-    zero = splat(F(0))
+    for y in range(first - 2 * SSIM_RADIUS, first):
+        take_row(image, target, white, images, y, height, length, pitch)
     for y in range(first - SSIM_RADIUS, last + SSIM_RADIUS):
-        slot = (y + RING) % RING * DERIVATIVES * pitch
+        take_row(image, target, white, images, y + SSIM_RADIUS, height, length, pitch)
+        slot = row_of(y, DERIVATIVES, pitch)
         if y < 0 or y >= height:
-            for x in range(0, DERIVATIVES * pitch, 16):
-                store(ring, slot + x, zero)
+            clear_row(ring, slot, DERIVATIVES * pitch)
         else:
-            moments_of_row(image, target, y, height, length, pitch, moments)
+            moments_of_row(images, y, length, pitch, moments)
             similarity = similarity_of_row(moments, derivatives, length, pitch, lanes)
             if y >= first and y < last:
                 sums[2 * y] = similarity
@@ -191,42 +206,48 @@ def sweep(
         done = y - SSIM_RADIUS
         if done >= first:
             sums[2 * done + 1] = gradient_of_row(
-                image, target, gradient, ring, done, length, pitch, l1_step, ssim_step, lanes
+                image, gradient, images, ring, done, length, pitch, l1_step, ssim_step, lanes
             )
 
 
 @kernel
 def sweep_image(
-    threads, image, target, gradient, height, length, pitch, l1_step, ssim_step, moments, derivatives, ring, lanes, sums
-):
+    threads, image, target, white, gradient, height, length, pitch, l1_step, ssim_step, images, moments, derivatives,
+    ring, lanes, sums,
+):  # fmt: skip
     """Every thread sweeps a band of rows; a row's result does not depend on the band it is in."""
     for thread in prange(threads):
         sweep(
-            image, target, gradient, height * thread // threads, height * (thread + 1) // threads, height, length,
-            pitch, l1_step, ssim_step, moments[thread], derivatives[thread], ring[thread], lanes, sums,
+            image, target, white, gradient, height * thread // threads, height * (thread + 1) // threads, height,
+            length, pitch, l1_step, ssim_step, images[thread], moments[thread], derivatives[thread], ring[thread],
+            lanes, sums,
         )  # fmt: skip
 
 
 def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float) -> tuple[float, Tensor]:
-    """Loss and its gradient by ``image``; both images contiguous float32 ``[H, W, 3]`` on the CPU, W at least 6."""
+    """Loss and its gradient by ``image``, which counts as clamped to [0, 1]; W at least 6.
+
+    Args:
+        image: Contiguous float32 ``[H, W, 3]`` on the CPU.
+        target: Contiguous ``[H, W, 3]``, float32 in [0, 1] or uint8.
+        dssim_weight: Share of 1 - SSIM.
+    """
     height, width = image.shape[:2]
     length = 3 * width
     pitch = (length + 2 * PAD + 15) // 16 * 16
     threads = max(1, min(thread_count(), height // RING))
-    gradient = torch.empty_like(image)
+    gradient = recycled(tuple(image.shape))
     work = Workspace.borrow()
-    rows: dict[str, Any] = {
-        name: work.rows(name, threads, planes * pitch)
-        for name, planes in (("moments", MOMENTS), ("derivatives", DERIVATIVES), ("ring", RING * DERIVATIVES))
-    }
+    planes = {"images": RING * IMAGES, "moments": MOMENTS, "derivatives": DERIVATIVES, "ring": RING * DERIVATIVES}
+    rows: dict[str, Any] = {name: work.rows(name, threads, count * pitch) for name, count in planes.items()}
     for padded in (rows["moments"], rows["derivatives"]):
         padded.fill(0)
     sums = work.array("row_sums", 2 * height, np.float64)
     count = length * height
+    white = F(255 if target.dtype == torch.uint8 else 1)
     sweep_image(
-        threads, image.numpy().reshape(-1), target.numpy().reshape(-1), gradient.numpy().reshape(-1), height, length,
-        pitch, F((1 - dssim_weight) / count), F(dssim_weight / count), rows["moments"], rows["derivatives"],
-        rows["ring"], LANE_NUMBERS, sums,
+        threads, image.numpy().reshape(-1), target.numpy().reshape(-1), white, gradient.numpy().reshape(-1), height,
+        length, pitch, F((1 - dssim_weight) / count), F(dssim_weight / count), *rows.values(), LANE_NUMBERS, sums,
     )  # fmt: skip
     similarity, difference = sums[0::2].sum() / count, sums[1::2].sum() / count
     work.give_back()

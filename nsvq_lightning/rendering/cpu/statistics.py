@@ -1,0 +1,39 @@
+"""Screen-space statistics of density control in one pass over the splats."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+from torch import Tensor
+
+from nsvq_lightning.rendering.cpu.jit import kernel, thread_count
+from nsvq_lightning.rendering.cpu.lanes import get, put
+from nsvq_lightning.rendering.cpu.records import F
+
+__all__ = ["add_view"]
+
+
+@kernel
+def _add(threads, gradients, radii, x_factor, y_factor, sums, views):
+    count = radii.shape[0]
+    for thread in prange(threads):
+        for i in range(count * thread // threads, count * (thread + 1) // threads):
+            if get(radii, i) > 0:
+                x, y = x_factor * get(gradients, 2 * i), y_factor * get(gradients, 2 * i + 1)
+                put(sums, i, get(sums, i) + np.sqrt(x * x + y * y))
+                put(views, i, get(views, i) + F(1))
+
+
+def add_view(sums: Tensor, views: Tensor, gradients: Tensor, radii: Tensor, factors: tuple[float, float]) -> None:
+    """Add the norms of one view's screen-space gradients, and count it, where a splat was seen; in place.
+
+    Args:
+        sums: Sum of the norms ``[N]`` float32.
+        views: Number of views ``[N]`` float32.
+        gradients: Gradient by the projected centres ``[N, 2]`` float32, per pixel.
+        radii: Radius on the screen ``[N]`` int32, 0 for splats that were not seen.
+        factors: What the two components count times.
+    """
+    tensors = (gradients.contiguous().view(-1), radii), (sums, views)
+    inputs, outputs = ([tensor.numpy() for tensor in group] for group in tensors)
+    _add(thread_count(), *inputs, F(factors[0]), F(factors[1]), *outputs)
