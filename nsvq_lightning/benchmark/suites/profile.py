@@ -48,16 +48,16 @@ PARTS = (
     ("projection backward", ("*.project_backward",)),
     ("loss", ("nsvq_lightning.losses.*", "*.cpu.dssim.*")),
     ("rows of visible splats", ("*.cpu.rows.*", "nsvq_lightning.subset.*")),
+    ("Adam", ("*.optimizer_step", "nsvq_lightning.optim.*", "*.cpu.adam.*")),
+    ("density statistics", ("*.DensityControl._observe", "*.screen_gradient", "*.add_table", "*.cpu.statistics.*")),
     ("rasterizer, its Python", ("nsvq_lightning.rendering.*",)),
     ("quantizer: noise backward", ("*.substitute_backward", "*.substitution._sum*", "*Substitution.backward")),
     ("quantizer: noise", ("*.substitution.*", "*.quantize.noise.*", "*.quantize.nsvq.*")),
     ("quantizer: count", ("*.CodebookQuantizer.count",)),
     ("quantizer: decode", ("*.quantize.sums.*", "*.CodebookQuantizer.decode", "nsvq_lightning.quantized.*")),
     ("quantizer: search", ("nsvq_lightning.quantize.*",)),
-    ("density statistics", ("*.DensityControl._observe", "*.screen_gradient", "*.add_table")),
     ("other callbacks", ("nsvq_lightning.callbacks.*",)),
     ("autograd's own", ("*Strategy.backward",)),
-    ("Adam", ("*.optimizer_step", "nsvq_lightning.optim.*")),
     ("module, its Python and torch", ("nsvq_lightning.*",)),
 )
 """Parts by the names that belong to them; the first pattern that fits counts. What fits none is left to Lightning."""
