@@ -118,7 +118,7 @@ def _profile(subject: Trainee, phase: Phase, quick: bool) -> Profile:
             # The step in which the timing began has seen it in part only.
             if warm + 1 < step.iteration <= last:
                 steps.append((step.milliseconds, own))
-            if step.iteration % PRODUCT_EVERY == 0:
+            if step.iteration <= last and step.iteration % PRODUCT_EVERY == 0:
                 products.append(milliseconds(product))
             if step.iteration == last:
                 timing.close()
@@ -214,8 +214,14 @@ class _Nothing(LightningModule):
 
 
 def _empty_loop(subject: Trainee, quick: bool) -> float:
-    """Median step of a module that does nothing, ms: Lightning's hooks, data, loggers and bookkeeping."""
-    clock = StepClock(lambda *_: None)
+    """Median step of a module that does nothing without its data, ms: Lightning's hooks, loggers and bookkeeping."""
+    recorder = Recorder()
+    times: list[float] = []
+
+    def between(_: Any, __: View, step: Step) -> None:
+        data = parts_of(recorder.take()).get("data", Own())
+        times.append(step.milliseconds - 1000 * data.seconds)
+
     steps = WARM_STEPS[quick] + STEPS[quick]
-    fit(_Nothing(), subject.data(), [clock], steps)
-    return median(step.milliseconds for step in clock.steps[WARM_STEPS[quick] :])
+    fit(_Nothing(), subject.data(), [StepClock(between)], steps, RecordingProfiler(recorder))
+    return median(times[WARM_STEPS[quick] :])
