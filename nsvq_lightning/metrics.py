@@ -7,6 +7,7 @@ per image.
 from __future__ import annotations
 
 import logging
+import math
 from typing import Any
 
 import torch
@@ -24,19 +25,21 @@ def eight_bit(image: Tensor) -> Tensor:
     """A float image ``[H, W, 3]`` clamped to [0, 1] and rounded to multiples of 1/255; uint8 is only rescaled."""
     if image.dtype == torch.uint8:
         return image.float() / 255
-    return (image.clamp(0.0, 1.0) * 255).round() / 255
+    return image.clamp(0.0, 1.0).mul_(255).round_().div_(255)
 
 
 def psnr(image: Tensor, target: Tensor) -> Tensor:
     """Peak signal-to-noise ratio in dB from the squared error pooled over pixels and RGB.
 
-    PSNR = -10 · log10(mean((image - target)²)), computed in float64; equal images give infinity.
+    PSNR = -10 · log10(mean((image - target)²)), summed in float64; equal images give infinity.
 
     Args:
         image: ``[H, W, 3]`` in [0, 1].
         target: ``[H, W, 3]`` in [0, 1].
     """
-    return -10.0 * torch.log10((image.double() - target.double()).square().mean())
+    # A norm adds up in float64 without a copy of the images in it.
+    error = torch.linalg.vector_norm(image - target, dtype=torch.float64)
+    return -20.0 * torch.log10(error / math.sqrt(image.numel()))
 
 
 class _MeanOverImages(Metric):

@@ -72,7 +72,9 @@ SKIPS = {
             "adam_rows",
             "splats in the optimiser",
             "they have no gradient in this step",
-            changes="their momentum does not move them on, and decays only in steps with a gradient",
+            # 1500 iterations of nsvq_4k on 43 photos that each see 3 of 4 splats: 28.12 dB without, 27.43 dB with, in
+            # the same time. It would pay where a view sees few splats and memory is slow.
+            changes="momentum no longer moves them on, which costs 0.7 dB in a short run",
             default=False,
         ),
         Skip("metrics", "the PSNR of a training view", "it is not logged in this step"),
