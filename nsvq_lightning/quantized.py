@@ -89,11 +89,14 @@ def noisy_rows(
     Returns:
         ``V`` splats; gradients reach the chosen rows and the codebooks.
     """
-    subset: dict[str, Any] = {name: take_rows(tensor, rows) for name, tensor in splats._asdict().items()}
-    for name, quantizer in quantizers.items():
+    subset: dict[str, Any] = {}
+    for name, tensor in splats._asdict().items():
+        if name not in quantizers:
+            subset[name] = take_rows(tensor, rows)
+            continue
         attribute = QUANTIZED[name]
         # The module's call, not its forward: hooks of user-made quantizers must run.
-        call: Callable[..., tuple[Tensor, Tensor]] = quantizer  # type: ignore[assignment]
-        quantized, _ = call(attribute.rows(subset[name]), noise(name), rows)
-        subset[name] = attribute.unrows(quantized, subset[name])
+        call: Callable[..., tuple[Tensor, Tensor]] = quantizers[name]  # type: ignore[assignment]
+        quantized, _ = call(attribute.rows(tensor), noise(name), rows)
+        subset[name] = attribute.unrows(quantized, tensor)
     return RawSplats(**subset)

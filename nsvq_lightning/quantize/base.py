@@ -33,10 +33,10 @@ class Quantizer(Protocol):
     def forward(
         self, x: Tensor, generator: torch.Generator | None = None, rows: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Quantize ``x [V, D]`` for training: differentiable ``x_q [V, D]`` and codes ``[V]``; counts the usage.
+        """Quantize rows of ``x [N, D]`` in training: differentiable ``x_q [V, D]``, codes ``[V]``; counts the usage.
 
-        ``rows [V]`` are the numbers of these rows among all N where only some are given: frozen codes are looked up by
-        them, and a search may start from what it knows about them.
+        ``rows [V]`` int64, ascending and all different, says which; without it all rows are quantized. Gathering them
+        (:func:`nsvq_lightning.subset.take_rows`) is left to the quantizer, which may do it on the way.
         """
 
     def encode(self, x: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.quantize.replacement import choose_replacements, inactive_codes
-from nsvq_lightning.quantize.sums import lookup
+from nsvq_lightning.quantize.sums import count_hits, lookup
 from nsvq_lightning.quantize.tracking import NearestTracker
 from nsvq_lightning.random import generator as seeded
 
@@ -37,6 +37,8 @@ class CodebookQuantizer(nn.Module, ABC):
         window: Iterations in the window, scalar int64.
         codes: Frozen codes ``[N]`` int64, empty until :meth:`freeze`.
         fitted: Whether the codebook has been placed, scalar bool.
+        tracks: Whether a search in :meth:`forward` starts from the codes of earlier steps (:mod:`tracking`), True at
+            first. It changes the time, never a result.
 
     Raises:
         ValueError: An argument is out of range.
@@ -54,6 +56,7 @@ class CodebookQuantizer(nn.Module, ABC):
             if value < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
         self.kmeans_steps = kmeans_steps
+        self.tracks = True
         self._tracker = NearestTracker()
         self.codebook = nn.Parameter(torch.zeros(num_codes, dim))
         self.register_buffer("usage", torch.zeros(num_codes, dtype=torch.int64))
@@ -62,8 +65,11 @@ class CodebookQuantizer(nn.Module, ABC):
         self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
 
     @abstractmethod
-    def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator) -> Tensor:
-        """Differentiable stand-in ``[N, D]`` for the codes ``[N]`` of the rows ``x [N, D]`` in training."""
+    def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator, rows: Tensor | None) -> Tensor:
+        """Differentiable stand-in ``[V, D]`` in training for rows ``[V]`` of ``x [N, D]`` with codes ``[V]``.
+
+        ``rows`` is ascending; without it all rows of ``x`` are meant, in their order.
+        """
 
     @property
     def num_codes(self) -> int:
@@ -117,10 +123,9 @@ class CodebookQuantizer(nn.Module, ABC):
         """Quantize rows; in training this counts the codes that are hit.
 
         Args:
-            x: Rows ``[V, D]``.
+            x: Rows of the scene ``[N, D]``.
             generator: Source of the noise, needed in training.
-            rows: Numbers ``[V]`` int64 of these rows among the N rows of the scene: frozen codes need them where they
-                are only some of them, and they let the search use what it knows from earlier steps.
+            rows: Which rows to quantize, ``[V]`` int64, ascending, all different; all of them by default.
 
         Returns:
             ``x_q [V, D]``, differentiable, and the codes ``[V]`` int64.
@@ -131,7 +136,10 @@ class CodebookQuantizer(nn.Module, ABC):
         if self.frozen:
             codes = self._frozen_codes(x.shape[0], rows)
             return self.decode(codes), codes
-        codes = self._tracker.search(x, self.codebook, rows)
+        if self.tracks:
+            codes = self._tracker.search(x, self.codebook, rows)
+        else:
+            codes = self.encode(x if rows is None else x.detach().index_select(0, rows))
         if not self.training:
             return self.decode(codes), codes
         if generator is None:
@@ -139,7 +147,7 @@ class CodebookQuantizer(nn.Module, ABC):
                 "a quantizer in training needs a generator: pass nsvq_lightning.random.generator(seed, step)"
             )
         self.count(codes)
-        return self.approximate(x, codes, generator), codes
+        return self.approximate(x, codes, generator, rows), codes
 
     def encode(self, x: Tensor) -> Tensor:
         """Nearest codes ``[N]`` int64 of ``x [N, D]``."""
@@ -152,9 +160,7 @@ class CodebookQuantizer(nn.Module, ABC):
     @torch.no_grad()
     def count(self, codes: Tensor) -> None:
         """Count one iteration in which ``codes [N]`` were hit."""
-        hit = torch.zeros_like(self.usage)
-        hit[codes] = 1
-        self.usage += hit
+        count_hits(codes, self.usage)
         self.window += 1
 
     def reset_usage(self) -> None:
@@ -218,13 +224,11 @@ class CodebookQuantizer(nn.Module, ABC):
         self.codes = codes.detach().clone().to(self.codebook.device)
 
     def _frozen_codes(self, count: int, rows: Tensor | None) -> Tensor:
-        if rows is not None:
-            return self.codes[rows]
         if count != self.codes.shape[0]:
             raise ValueError(
-                f"codes are frozen for {self.codes.shape[0]} rows, got {count}; pass their numbers as `rows`"
+                f"codes are frozen for {self.codes.shape[0]} rows, got {count}; pass all of them, and `rows` to choose"
             )
-        return self.codes
+        return self.codes if rows is None else self.codes[rows]
 
     def _resize(self, num_codes: int) -> None:
         if num_codes != self.num_codes:

@@ -82,5 +82,5 @@ def nearest(x: Tensor, codebook: Tensor) -> Tensor:
 
 def _search(x: NDArray[np.float32], codebook: NDArray[np.float32]) -> NDArray[np.int64]:
     if x.shape[1] <= MAX_DIM:
-        return box_search(x, build_boxes(codebook))
+        return box_search(x, codebook, build_boxes(codebook))
     return score_search(x, centre_codes(codebook))[0]

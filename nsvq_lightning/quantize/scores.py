@@ -1,11 +1,11 @@
 """Exact nearest code in many dimensions: dot products on 16-lane vectors, settled by true distances where they tie.
 
 With rows and codes centred on the mean of the codes, ‖x − c‖² = ‖x‖² + 2 s(c) with the score s(c) = ‖c‖²/2 − x·c, one
-fused multiply-add a number. Codes are spread over 32 classes (code mod 32, the lanes of two vectors), and the best and
-second best score of every class is kept. All codes that can be nearest after rounding are then class bests, unless some
-second best is as near as rounding too (equal codes in one class; then all codes are compared by true distances). What
-else this yields is a short list of the nearest codes and a distance below which there is no other code, which lets
-:mod:`tracking` skip most searches.
+fused multiply-add a number. A row keeps its few best scores, sorted; most blocks of codes hold no better one, which one
+branch tells for six rows. All codes that can be nearest after rounding are among the best, unless even the last of these
+is as near as rounding (many equal codes; then all codes are compared by true distances). What else this yields is a
+short list of the nearest codes and a distance below which there is no other code, which lets :mod:`tracking` skip most
+searches.
 """
 
 from __future__ import annotations
@@ -19,20 +19,22 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.quantize.kernels import aligned_empty, lane_min
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
-from nsvq_lightning.rendering.cpu.lanes import fma, fnma, get, load, select, splat, store, vmax, vmin
+from nsvq_lightning.rendering.cpu.lanes import fma, fnma, get, load, lowest_bit, mask_bits, put, splat, store, vmin
 
 __all__ = ["LIST", "CentredCodes", "centre_codes", "score_search", "true_distance"]
 
 LIST = 8
 """Codes in the list of a row."""
+_BEST = LIST + 1
+"""Scores that a row keeps: those of a list, and the least of a code outside it."""
+_FEW = 4
+"""Scores that a row keeps where no list is asked for."""
 _GROUP = 6
 """Rows scored together."""
 _TILE = 8 * _GROUP
 """Rows that pass over the codes while a chunk of these stays in the first-level cache."""
 _CHUNK = 4
 """Blocks of 32 codes in a chunk."""
-_STATE = 96
-"""Floats a row keeps: best score, second best score and block of the best, for 32 classes."""
 
 
 class CentredCodes(NamedTuple):
@@ -53,19 +55,40 @@ class CentredCodes(NamedTuple):
     longest: float
 
 
+@kernel
+def _lay_out(codebook, centre, blocks, halves):  # type: ignore[no-untyped-def]
+    """Write blocks of centred codes and half their squared norms; a code that is not finite becomes 0 and infinite."""
+    count, dim = codebook.shape
+    for block in prange(blocks.shape[0]):
+        for lane in range(32):
+            code, total = block * 32 + lane, np.float64(np.inf)
+            if code < count:
+                total = 0.0
+                for j in range(dim):
+                    value = codebook[code, j] - centre[j]
+                    blocks[block, j, lane] = value
+                    total += np.float64(value) * np.float64(value)
+            if total < np.inf:
+                halves[code] = 0.5 * total
+                continue
+            halves[code] = np.inf
+            for j in range(dim):
+                blocks[block, j, lane] = 0
+
+
 def centre_codes(codebook: NDArray[np.float32]) -> CentredCodes:
     """Centre the codes ``[K, D]`` and lay them out in blocks of 32."""
     count, dim = codebook.shape
-    finite = np.isfinite(codebook).all(1)
-    centre = codebook[finite].mean(0, dtype=np.float64).astype(np.float32) if finite.any() else codebook[0] * 0
-    size = -(-count // 32) * 32
-    centred, halves = np.zeros((size, dim), np.float32), np.full(size, np.inf, np.float32)
-    centred[:count][finite] = codebook[finite] - centre
-    squared = np.einsum("kd,kd->k", centred[:count], centred[:count], dtype=np.float64)
-    halves[:count][finite] = 0.5 * squared[finite]
-    blocks = aligned_empty((size // 32, dim, 32))
-    blocks[:] = centred.reshape(-1, 32, dim).transpose(0, 2, 1)
-    return CentredCodes(codebook, centre, blocks, halves, float(np.sqrt(squared.max())))
+    with np.errstate(invalid="ignore"):
+        centre = codebook.mean(0, dtype=np.float64).astype(np.float32)
+    if not np.isfinite(centre).all():
+        finite = np.isfinite(codebook).all(1)
+        centre = codebook[finite].mean(0, dtype=np.float64).astype(np.float32) if finite.any() else codebook[0] * 0
+    blocks, halves = aligned_empty((-(-count // 32), dim, 32)), np.empty(-(-count // 32) * 32, np.float32)
+    thread_count()
+    _lay_out(codebook, centre, blocks, halves)
+    longest = float(halves[np.isfinite(halves)].max(initial=0.0))
+    return CentredCodes(codebook, centre, blocks, halves, float(np.sqrt(2.0 * longest)))
 
 
 @inline
@@ -79,24 +102,36 @@ def true_distance(dim, x, row, codebook, code):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _keep_class(state, at, score, number):  # type: ignore[no-untyped-def]
-    best, second, block_of = load(state, at), load(state, at + 32), load(state, at + 64)
-    store(state, at + 64, select(score < best, number, block_of))
-    store(state, at + 32, vmin(vmax(score, best), second))
-    store(state, at, vmin(score, best))
+def _insert(scores, codes, at, kept, score, code):  # type: ignore[no-untyped-def]
+    """Put a score into the sorted ones of a row; the last one falls out."""
+    place = at + kept - 1
+    while place > at and get(scores, place - 1) > score:
+        put(scores, place, get(scores, place - 1))
+        put(codes, place, get(codes, place - 1))
+        place -= 1
+    put(scores, place, score)
+    put(codes, place, code)
 
 
 @inline
-def _keep(state, row, block, low, high):  # type: ignore[no-untyped-def]
-    """Update best, second best and block of the best of a row's 32 classes."""
-    number = splat(np.float32(block))
-    _keep_class(state, row * _STATE, low, number)
-    _keep_class(state, row * _STATE + 16, high, number)
+def _keep(scores, codes, limits, slack, kept, first, block, found):  # type: ignore[no-untyped-def]
+    """Insert what is below the limits of 6 rows from their scores ``found`` of a block."""
+    for i in range(_GROUP):
+        limit = splat(get(limits, first + i))
+        below = mask_bits(load(found, 32 * i) < limit) | (mask_bits(load(found, 32 * i + 16) < limit) << 16)
+        while below != 0:
+            lane = lowest_bit(below)
+            below &= below - 1
+            score, at = get(found, 32 * i + lane), (first + i) * _BEST
+            if score < get(limits, first + i):
+                _insert(scores, codes, at, kept, score, np.int32(block * 32 + lane))
+                put(limits, first + i, min(get(scores, at + kept - 1), get(scores, at) + get(slack, first + i)))
 
 
 @inline
-def _score_block(dim, blocks, halves, block, rows, first, state):  # type: ignore[no-untyped-def]
+def _score_block(dim, blocks, halves, block, rows, first, kept, state):  # type: ignore[no-untyped-def]
     """Scores of 6 rows against 32 codes: 12 sums that hide each other's latency."""
+    scores, codes, limits, slack, found = state
     a0 = a1 = a2 = a3 = a4 = a5 = load(halves, block * 32)
     b0 = b1 = b2 = b3 = b4 = b5 = load(halves, block * 32 + 16)
     at, row = block * dim * 32, first * dim
@@ -114,42 +149,55 @@ def _score_block(dim, blocks, halves, block, rows, first, state):  # type: ignor
         a4, b4 = fnma(value, low, a4), fnma(value, high, b4)
         value = splat(get(rows, row + 5 * dim + j))
         a5, b5 = fnma(value, low, a5), fnma(value, high, b5)
-    _keep(state, first, block, a0, b0)
-    _keep(state, first + 1, block, a1, b1)
-    _keep(state, first + 2, block, a2, b2)
-    _keep(state, first + 3, block, a3, b3)
-    _keep(state, first + 4, block, a4, b4)
-    _keep(state, first + 5, block, a5, b5)
+    below = (
+        (vmin(a0, b0) < splat(get(limits, first)))
+        | (vmin(a1, b1) < splat(get(limits, first + 1)))
+        | (vmin(a2, b2) < splat(get(limits, first + 2)))
+        | (vmin(a3, b3) < splat(get(limits, first + 3)))
+        | (vmin(a4, b4) < splat(get(limits, first + 4)))
+        | (vmin(a5, b5) < splat(get(limits, first + 5)))
+    )
+    if mask_bits(below) != 0:
+        store(found, 0, a0)
+        store(found, 16, b0)
+        store(found, 32, a1)
+        store(found, 48, b1)
+        store(found, 64, a2)
+        store(found, 80, b2)
+        store(found, 96, a3)
+        store(found, 112, b3)
+        store(found, 128, a4)
+        store(found, 144, b4)
+        store(found, 160, a5)
+        store(found, 176, b5)
+        _keep(scores, codes, limits, slack, kept, first, block, found)
 
 
 @inline
-def _score_tile(dim, blocks, halves, rows, count, state):  # type: ignore[no-untyped-def]
-    infinite, zero = splat(np.float32(np.inf)), splat(np.float32(0.0))
-    for k in range(0, count * _STATE, _STATE):
-        for part in range(0, 64, 16):
-            store(state, k + part, infinite)
-        store(state, k + 64, zero)
-        store(state, k + 80, zero)
+def _score_tile(dim, blocks, halves, rows, count, kept, state):  # type: ignore[no-untyped-def]
+    scores, codes, limits, _, _ = state
+    for i in range(count * _BEST):
+        put(scores, i, np.float32(np.inf))
+        put(codes, i, np.int32(0))
+    for i in range(count):
+        put(limits, i, np.float32(np.inf))
     total = halves.shape[0] // 32
     for chunk in range(0, total, _CHUNK):
         for first in range(0, count, _GROUP):
             for block in range(chunk, min(total, chunk + _CHUNK)):
-                _score_block(dim, blocks, halves, block, rows, first, state)
+                _score_block(dim, blocks, halves, block, rows, first, kept, state)
 
 
 @inline
-def _settle(dim, x, row, codebook, state, at, limit):  # type: ignore[no-untyped-def]
-    """Nearest code by true distance among the class bests with a score up to ``limit``; -1 if there is none."""
-    found, code, distance = 0, np.int64(-1), np.float32(np.inf)
-    for lane in range(32):
-        if get(state, at + lane) <= limit:
-            found, code = found + 1, np.int64(get(state, at + 64 + lane)) * 32 + lane
-    if found < 2:
+def _settle(dim, x, row, codebook, scores, codes, at, kept, limit):  # type: ignore[no-untyped-def]
+    """Nearest code by true distance among those with a score up to ``limit``."""
+    code = np.int64(get(codes, at))
+    if get(scores, at + 1) > limit:
         return code
-    code = np.int64(-1)
-    for lane in range(32):
-        if get(state, at + lane) <= limit:
-            candidate = np.int64(get(state, at + 64 + lane)) * 32 + lane
+    distance = np.float32(np.inf)
+    for place in range(at, at + kept):
+        if get(scores, place) <= limit:
+            candidate = np.int64(get(codes, place))
             candidate_distance = true_distance(dim, x, row, codebook, candidate)
             if candidate_distance < distance or (candidate_distance == distance and candidate < code):
                 code, distance = candidate, candidate_distance
@@ -166,60 +214,48 @@ def _compare_all(dim, x, row, codebook):  # type: ignore[no-untyped-def]
     return code
 
 
-@inline
-def _write_list(state, at, others, lists, start, scores):  # type: ignore[no-untyped-def]
-    """Write the nearest class bests, nearest first; returns the score below which there is no code outside the list."""
-    size = 0
-    for lane in range(32):
-        score = get(state, at + lane)
-        if score >= others:
-            continue
-        if size == LIST:
-            if score >= scores[LIST - 1]:
-                others = score
-                continue
-            others, size = scores[LIST - 1], LIST - 1
-        place = size
-        while place > 0 and scores[place - 1] > score:
-            scores[place], lists[start + place] = scores[place - 1], lists[start + place - 1]
-            place -= 1
-        scores[place] = score
-        lists[start + place] = np.int32(get(state, at + 64 + lane)) * 32 + lane
-        size += 1
-    return others
-
-
 @cache
 def _search_kernel(dim: int) -> Any:
     """The search for one dimension, a constant for the compiler."""
 
-    def search(x, codebook, centre, blocks, halves, longest, result, lists, limits):  # type: ignore[no-untyped-def]
+    def search(x, codebook, centre, blocks, halves, longest, result, lists, distances):  # type: ignore[no-untyped-def]
         count = result.shape[0]
+        with_lists = lists.shape[0] > 0
+        kept = _BEST if with_lists else _FEW
         rounding = np.float32(2.0 * (dim + 8) * 2.0**-24)
         for tile in prange((count + _TILE - 1) // _TILE):
-            rows, state = np.empty(_TILE * dim, np.float32), np.empty(_TILE * _STATE, np.float32)
-            squared, scores = np.zeros(_TILE, np.float32), np.empty(LIST, np.float32)
+            rows, squared = np.empty(_TILE * dim, np.float32), np.zeros(_TILE, np.float32)
+            scores, codes = np.empty(_TILE * _BEST, np.float32), np.empty(_TILE * _BEST, np.int32)
+            limits, slack = np.empty(_TILE, np.float32), np.empty(_TILE, np.float32)
+            state = scores, codes, limits, slack, np.empty(32 * _GROUP, np.float32)
             start, valid = tile * _TILE, min(_TILE, count - tile * _TILE)
             for i in range(_TILE):
                 for j in range(dim):
                     value = x[(start + min(i, valid - 1)) * dim + j] - centre[j]
                     rows[i * dim + j] = value
                     squared[i] += value * value
-            _score_tile(dim, blocks, halves, rows, (valid + _GROUP - 1) // _GROUP * _GROUP, state)
+                reach = np.sqrt(squared[i]) + longest
+                # Without a list only what may be nearest after rounding is kept.
+                slack[i] = np.float32(np.inf) if with_lists else np.float32(2.0) * rounding * reach * reach
+            _score_tile(dim, blocks, halves, rows, (valid + _GROUP - 1) // _GROUP * _GROUP, kept, state)
             for i in range(valid):
-                at, row = i * _STATE, start + i
-                best, others = state[at], state[at + 32]
-                for lane in range(1, 32):
-                    best, others = min(best, state[at + lane]), min(others, state[at + 32 + lane])
+                at, row = i * _BEST, start + i
                 reach = np.sqrt(squared[i]) + longest
                 margin = rounding * reach * reach
-                code = -1
-                if others > best + margin:
-                    code = _settle(dim, x, row, codebook, state, at, best + margin)
-                result[row] = code if code >= 0 else _compare_all(dim, x, row, codebook)
-                if lists.shape[0] > 0:
-                    others = _write_list(state, at, others, lists, row * LIST, scores)
-                    limits[row] = np.sqrt(max(np.float32(0.0), squared[i] + np.float32(2.0) * (others - margin)))
+                limit, others = scores[at] + margin, scores[at + kept - 1]
+                if others > limit:
+                    result[row] = _settle(dim, x, row, codebook, scores, codes, at, kept, limit)
+                else:
+                    result[row] = _compare_all(dim, x, row, codebook)
+                if with_lists:
+                    for k in range(LIST):
+                        lists[row * LIST + k] = codes[at + k] if scores[at + k] < np.float32(np.inf) else codes[at]
+                    distances[row] = np.sqrt(max(np.float32(0.0), squared[i] + np.float32(2.0) * (others - margin)))
+                    second = scores[at + 1]
+                    lone = np.float32(0.0)
+                    if second > limit:
+                        lone = np.sqrt(max(np.float32(0.0), squared[i] + np.float32(2.0) * (second - margin)))
+                    distances[count + row] = lone
 
     return kernel(search)
 
@@ -235,13 +271,14 @@ def score_search(
         with_lists: Whether to return what the search knows beside the nearest code.
 
     Returns:
-        Codes ``[N]``; a list of near codes ``[N, LIST]``, filled up with K; and the distance ``[N]`` below which there
-        is no code outside the list. The last two are empty unless asked for.
+        Codes ``[N]``; a list of the nearest codes ``[N, LIST]`` int32, filled up with the first where there are fewer;
+        and distances ``[2, N]``: below the first there is no code outside the list, below the second none but the
+        nearest. The last two are empty unless asked for.
     """
     count, dim = x.shape
     result = np.empty(count, np.int64)
-    lists = np.full((count if with_lists else 0, LIST), codes.codebook.shape[0], np.int32)
-    limits = np.empty(count if with_lists else 0, np.float32)
+    lists = np.empty((count if with_lists else 0, LIST), np.int32)
+    distances = np.empty((2, count if with_lists else 0), np.float32)
     thread_count()
     _search_kernel(dim)(
         x.ravel(),
@@ -252,6 +289,6 @@ def score_search(
         np.float32(codes.longest),
         result,
         lists.ravel(),
-        limits,
+        distances.ravel(),
     )
-    return result, lists, limits
+    return result, lists, distances

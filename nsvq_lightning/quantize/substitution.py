@@ -1,8 +1,12 @@
-"""Noise substitution on the CPU: residual, noise and result of a row in one pass, its gradients in another.
+"""Noise substitution on the CPU: gather, residual, noise and result of a row in one pass, its gradients in another.
 
-Short rows are handled 16 at a time, one row a lane. Rows of 16 and more numbers are handled one at a time, in vectors
-along the row of which the last two may overlap. The backward pass draws the noise again: that is faster than to write
-it to memory and to read it back.
+Rows are read out of the whole table, and their gradient is written back into one. Short rows are handled 16 at a time,
+one row a lane. Rows of 16 and more numbers are handled one at a time, in vectors along the row of which the last two
+may overlap. The backward pass takes the direction of the noise from the result, not from a second draw: with x̃ - x =
+‖r‖ v̂ the radial term (g·v̂) r/‖r‖ is (g·(x̃ - x)) r/‖r‖².
+
+The sums of a code go over the rows in their order. A part of the rows has sums of its own, which are added in the order
+of the parts; where the parts lie depends on the sizes alone, so the bits do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -17,37 +21,29 @@ from numpy.typing import NDArray
 from nsvq_lightning.quantize.noise import fill_normal
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
 from nsvq_lightning.rendering.cpu.lanes import fma, get, lane_sum, load, put, select, splat, store, vsqrt
+from nsvq_lightning.rendering.cpu.projection import clear
+from nsvq_lightning.rendering.cpu.workspace import recycled
 
 __all__ = ["substitute", "substitute_backward"]
 
 _ROWS = 256
-"""Rows a unit of parallel work takes; the noise of a row depends on its number alone."""
+"""Rows a unit of parallel work takes; the noise of a row depends on its position alone."""
+_LEAST_PARTS, _MOST_PARTS = 4, 64
+"""Parts that the rows are summed in: enough for the threads, few enough that their sums are little work."""
+
+_TINY = np.finfo(np.float32).tiny
 
 Floats = NDArray[np.float32]
-Codes = NDArray[np.int64]
+Integers = NDArray[np.int64]
 
 
 @inline
-def _copy_in(dim, source, row, count, group):  # type: ignore[no-untyped-def]
-    """Rows to vectors, one row a lane."""
+def _copy_in(dim, source, rows, first, count, group):  # type: ignore[no-untyped-def]
+    """Chosen rows to vectors, one row a lane."""
     for lane in range(count):
+        start = get(rows, first + lane) * dim
         for j in range(dim):
-            put(group, j * 16 + lane, get(source, (row + lane) * dim + j))
-
-
-@inline
-def _copy_out(dim, group, target, row, count):  # type: ignore[no-untyped-def]
-    for lane in range(count):
-        for j in range(dim):
-            put(target, (row + lane) * dim + j, get(group, j * 16 + lane))
-
-
-@inline
-def _copy_codes(dim, codebook, codes, row, count, group):  # type: ignore[no-untyped-def]
-    for lane in range(count):
-        code = get(codes, row + lane)
-        for j in range(dim):
-            put(group, j * 16 + lane, get(codebook, code * dim + j))
+            put(group, j * 16 + lane, get(source, start + j))
 
 
 @inline
@@ -69,10 +65,9 @@ def _residuals_squared(dim, rows, chosen):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _inverse_roots(squared):  # type: ignore[no-untyped-def]
-    """1/√s, and 0 where s is 0: a vector without length has no direction."""
-    zero = splat(np.float32(0.0))
-    return select(squared > zero, splat(np.float32(1.0)) / vsqrt(squared), zero)
+def _inverses(squared):  # type: ignore[no-untyped-def]
+    """1/s, and 0 where s is 0 (or its inverse too large): a vector without length has no direction."""
+    return select(squared > splat(_TINY), splat(np.float32(1.0)) / squared, splat(np.float32(0.0)))
 
 
 @inline
@@ -83,6 +78,18 @@ def _dot(dim, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
         total = fma(load(a, at_a + j), load(b, at_b + j), total)
     if dim % 16:
         total = fma(load(a, at_a + dim - 16) * load(keep, 0), load(b, at_b + dim - 16), total)
+    return lane_sum(total)
+
+
+@inline
+def _dot_difference(dim, g, at_g, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
+    """Product of a long row with the difference of two."""
+    total = splat(np.float32(0.0))
+    for j in range(0, dim // 16 * 16, 16):
+        total = fma(load(g, at_g + j), load(a, at_a + j) - load(b, at_b + j), total)
+    if dim % 16:
+        difference = load(a, at_a + dim - 16) - load(b, at_b + dim - 16)
+        total = fma(load(g, at_g + dim - 16) * load(keep, 0), difference, total)
     return lane_sum(total)
 
 
@@ -99,101 +106,126 @@ def _residual_squared(dim, x, at, codebook, code, keep):  # type: ignore[no-unty
 
 
 @inline
-def _inverse_root(squared):  # type: ignore[no-untyped-def]
-    return np.float32(1.0) / np.sqrt(squared) if squared > np.float32(0.0) else np.float32(0.0)
+def _inverse(squared):  # type: ignore[no-untyped-def]
+    return np.float32(1.0) / squared if squared > _TINY else np.float32(0.0)
 
 
 def _short_forward(dim: int) -> Any:
-    def forward(seed, x, codebook, codes, out):  # type: ignore[no-untyped-def]
+    def forward(seed, x, rows, codebook, codes, out):  # type: ignore[no-untyped-def]
         count = codes.shape[0]
         for block in prange((count + _ROWS - 1) // _ROWS):
             noise, radius, angle = np.empty(_ROWS * dim, np.float32), np.empty(16, np.float32), np.empty(16, np.float32)
-            rows, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
+            values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
             fill_normal(seed, block * _ROWS // 16 * dim, _ROWS // 16 * dim, noise, radius, angle)
-            for row in range(block * _ROWS, min(count, (block + 1) * _ROWS), 16):
-                valid = min(16, count - row)
-                _copy_in(dim, x, row, valid, rows)
-                _copy_codes(dim, codebook, codes, row, valid, chosen)
-                group = noise[(row - block * _ROWS) * dim :]
-                length = vsqrt(_residuals_squared(dim, rows, chosen))
-                inverse = _inverse_roots(_dots(dim, group, group))
+            for first in range(block * _ROWS, min(count, (block + 1) * _ROWS), 16):
+                valid = min(16, count - first)
+                _copy_in(dim, x, rows, first, valid, values)
+                _copy_in(dim, codebook, codes, first, valid, chosen)
+                at = (first - block * _ROWS) * dim
+                squared = splat(np.float32(0.0))
                 for j in range(dim):
-                    store(rows, 16 * j, fma(length, load(group, 16 * j) * inverse, load(rows, 16 * j)))
-                _copy_out(dim, rows, out, row, valid)
+                    squared = fma(load(noise, at + 16 * j), load(noise, at + 16 * j), squared)
+                length = vsqrt(_residuals_squared(dim, values, chosen) * _inverses(squared))
+                for j in range(dim):
+                    store(values, 16 * j, fma(length, load(noise, at + 16 * j), load(values, 16 * j)))
+                for lane in range(valid):
+                    for j in range(dim):
+                        put(out, (first + lane) * dim + j, get(values, j * 16 + lane))
 
     return kernel(forward)
-
-
-def _short_backward(dim: int) -> Any:
-    def backward(seed, grad, x, codebook, codes, grad_x, factor):  # type: ignore[no-untyped-def]
-        count = codes.shape[0]
-        for block in prange((count + _ROWS - 1) // _ROWS):
-            noise, radius, angle = np.empty(_ROWS * dim, np.float32), np.empty(16, np.float32), np.empty(16, np.float32)
-            rows, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
-            slope, along = np.zeros(16 * dim, np.float32), np.empty(16, np.float32)
-            fill_normal(seed, block * _ROWS // 16 * dim, _ROWS // 16 * dim, noise, radius, angle)
-            for row in range(block * _ROWS, min(count, (block + 1) * _ROWS), 16):
-                valid = min(16, count - row)
-                _copy_in(dim, x, row, valid, rows)
-                _copy_codes(dim, codebook, codes, row, valid, chosen)
-                _copy_in(dim, grad, row, valid, slope)
-                group = noise[(row - block * _ROWS) * dim :]
-                scale = _dots(dim, slope, group) * _inverse_roots(_dots(dim, group, group))
-                scale = scale * _inverse_roots(_residuals_squared(dim, rows, chosen))
-                store(along, 0, scale)
-                for j in range(dim):
-                    residual = load(rows, 16 * j) - load(chosen, 16 * j)
-                    store(slope, 16 * j, fma(scale, residual, load(slope, 16 * j)))
-                _copy_out(dim, slope, grad_x, row, valid)
-                for lane in range(valid):
-                    factor[row + lane] = along[lane]
-
-    return kernel(backward)
 
 
 def _long_forward(dim: int) -> Any:
     vectors = -(-dim // 16)
 
-    def forward(seed, x, codebook, codes, out):  # type: ignore[no-untyped-def]
+    def forward(seed, x, rows, codebook, codes, out):  # type: ignore[no-untyped-def]
         count = codes.shape[0]
         for block in prange((count + _ROWS - 1) // _ROWS):
             radius, angle, keep = np.empty(16, np.float32), np.empty(16, np.float32), np.ones(16, np.float32)
             keep[: vectors * 16 - dim] = 0
-            size = _ROWS * vectors
-            noise = np.empty(size * 16, np.float32)
-            fill_normal(seed, block * size, size, noise, radius, angle)
-            for row in range(block * _ROWS, min(count, (block + 1) * _ROWS)):
-                at, code, start = row * dim, get(codes, row) * dim, (row - block * _ROWS) * vectors * 16
-                length = splat(np.sqrt(_residual_squared(dim, x, at, codebook, code, keep)))
-                inverse = splat(_inverse_root(_dot(dim, noise, start, noise, start, keep)))
+            noise = np.empty(2 * vectors * 16, np.float32)
+            for i in range(block * _ROWS, min(count, (block + 1) * _ROWS)):
+                start = i % 2 * vectors * 16
+                if start == 0:
+                    fill_normal(seed, i * vectors, 2 * vectors, noise, radius, angle)
+                at, code = get(rows, i) * dim, get(codes, i) * dim
+                squared = _residual_squared(dim, x, at, codebook, code, keep)
+                length = splat(np.sqrt(squared * _inverse(_dot(dim, noise, start, noise, start, keep))))
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
-                    store(out, at + place, fma(length, load(noise, start + place) * inverse, load(x, at + place)))
+                    store(out, i * dim + place, fma(length, load(noise, start + place), load(x, at + place)))
 
     return kernel(forward)
+
+
+@inline
+def _clear_between(rows, i, dim, table):  # type: ignore[no-untyped-def]
+    """Clear the rows of ``table`` between the chosen rows ``i - 1`` and ``i``."""
+    clear(table, (get(rows, i - 1) + 1) * dim if i > 0 else 0, get(rows, i) * dim)
+
+
+def _short_backward(dim: int) -> Any:
+    def backward(grad, x, rows, codebook, codes, out, grad_x, sums):  # type: ignore[no-untyped-def]
+        count, parts = codes.shape[0], sums.shape[0]
+        for part in prange(parts):
+            values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
+            moved, slope = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
+            total = sums[part]
+            clear(total, 0, total.shape[0])
+            stop = count * (part + 1) // parts
+            for first in range(count * part // parts, stop, 16):
+                valid = min(16, stop - first)
+                _copy_in(dim, x, rows, first, valid, values)
+                _copy_in(dim, codebook, codes, first, valid, chosen)
+                for lane in range(valid):
+                    for j in range(dim):
+                        put(moved, j * 16 + lane, get(out, (first + lane) * dim + j))
+                        put(slope, j * 16 + lane, get(grad, (first + lane) * dim + j))
+                for j in range(dim):
+                    store(moved, 16 * j, load(moved, 16 * j) - load(values, 16 * j))
+                scale = _dots(dim, slope, moved) * _inverses(_residuals_squared(dim, values, chosen))
+                for j in range(dim):
+                    radial = scale * (load(values, 16 * j) - load(chosen, 16 * j))
+                    store(chosen, 16 * j, radial)
+                    store(slope, 16 * j, load(slope, 16 * j) + radial)
+                for lane in range(valid):
+                    i = first + lane
+                    _clear_between(rows, i, dim, grad_x)
+                    at, code = get(rows, i) * dim, get(codes, i) * dim
+                    for j in range(dim):
+                        put(grad_x, at + j, get(slope, j * 16 + lane))
+                        put(total, code + j, get(total, code + j) - get(chosen, j * 16 + lane))
+            if part == parts - 1:
+                clear(grad_x, (get(rows, count - 1) + 1) * dim, grad_x.shape[0])
+
+    return kernel(backward)
 
 
 def _long_backward(dim: int) -> Any:
     vectors = -(-dim // 16)
 
-    def backward(seed, grad, x, codebook, codes, grad_x, factor):  # type: ignore[no-untyped-def]
-        count = codes.shape[0]
-        for block in prange((count + _ROWS - 1) // _ROWS):
-            radius, angle, keep = np.empty(16, np.float32), np.empty(16, np.float32), np.ones(16, np.float32)
+    def backward(grad, x, rows, codebook, codes, out, grad_x, sums):  # type: ignore[no-untyped-def]
+        count, parts = codes.shape[0], sums.shape[0]
+        for part in prange(parts):
+            keep = np.ones(16, np.float32)
             keep[: vectors * 16 - dim] = 0
-            size = _ROWS * vectors
-            noise = np.empty(size * 16, np.float32)
-            fill_normal(seed, block * size, size, noise, radius, angle)
-            for row in range(block * _ROWS, min(count, (block + 1) * _ROWS)):
-                at, code, start = row * dim, get(codes, row) * dim, (row - block * _ROWS) * vectors * 16
-                scale = _dot(dim, grad, at, noise, start, keep)
-                scale *= _inverse_root(_dot(dim, noise, start, noise, start, keep))
-                scale *= _inverse_root(_residual_squared(dim, x, at, codebook, code, keep))
-                put(factor, row, scale)
+            total = sums[part]
+            clear(total, 0, total.shape[0])
+            for i in range(count * part // parts, count * (part + 1) // parts):
+                at, code = get(rows, i) * dim, get(codes, i) * dim
+                scale = _dot_difference(dim, grad, i * dim, out, i * dim, x, at, keep)
+                scale *= _inverse(_residual_squared(dim, x, at, codebook, code, keep))
+                _clear_between(rows, i, dim, grad_x)
+                # The last two vectors overlap, so a sum is read before it is written.
+                last = load(total, code + dim - 16)
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
-                    residual = load(x, at + place) - load(codebook, code + place)
-                    store(grad_x, at + place, fma(splat(scale), residual, load(grad, at + place)))
+                    radial = splat(scale) * (load(x, at + place) - load(codebook, code + place))
+                    store(grad_x, at + place, load(grad, i * dim + place) + radial)
+                    before = last if j == vectors - 1 else load(total, code + place)
+                    store(total, code + place, before - radial)
+            if part == parts - 1:
+                clear(grad_x, (get(rows, count - 1) + 1) * dim, grad_x.shape[0])
 
     return kernel(backward)
 
@@ -205,37 +237,49 @@ def _kernels(dim: int) -> tuple[Any, Any]:
 
 
 @kernel
-def _sum_residuals(x, codebook, codes, factor, sums, parts):  # type: ignore[no-untyped-def]
-    """Subtract factor · (x − c) from the sum of its code; a part owns a range of codes, so rows add in their order."""
-    for part in prange(parts):
-        first, last = part * sums.shape[0] // parts, (part + 1) * sums.shape[0] // parts
-        for i in range(codes.shape[0]):
-            code = codes[i]
-            if first <= code < last:
-                for j in range(x.shape[1]):
-                    sums[code, j] -= factor[i] * (x[i, j] - codebook[code, j])
+def _add_parts(sums, total):  # type: ignore[no-untyped-def]
+    """Add the sums of the parts in their order."""
+    parts, size = sums.shape
+    for block in prange((size + 1023) // 1024):
+        for i in range(block * 1024, min(size, (block + 1) * 1024)):
+            value = sums[0, i]
+            for part in range(1, parts):
+                value += sums[part, i]
+            total[i] = value
 
 
-def substitute(seed: int, x: Floats, codebook: Floats, codes: Codes) -> Floats:
-    """``x + ‖x − c‖·v̂`` with random directions v̂, ``[N, D]``.
+def substitute(seed: int, x: Floats, rows: Integers, codebook: Floats, codes: Integers) -> Floats:
+    """``x + ‖x − c‖·v̂`` with random directions v̂ for some rows of a table, ``[V, D]``.
 
     Args:
-        seed: 63 random bits; a direction is a function of them and of the row's number.
-        x: Rows ``[N, D]``.
+        seed: 63 random bits; a direction is a function of them and of the position in ``rows``.
+        x: Table ``[N, D]``.
+        rows: Which rows of it, ``[V]``.
         codebook: Codes ``[K, D]``.
-        codes: Code of each row, ``[N]``.
+        codes: Code of each chosen row, ``[V]``.
     """
-    out = np.empty_like(x)
+    out = recycled((len(rows), x.shape[1])).numpy()
     thread_count()
-    _kernels(x.shape[1])[0](seed, x.ravel(), codebook.ravel(), codes, out.ravel())
+    _kernels(x.shape[1])[0](seed, x.ravel(), rows, codebook.ravel(), codes, out.ravel())
     return out
 
 
-def substitute_backward(seed: int, grad: Floats, x: Floats, codebook: Floats, codes: Codes) -> tuple[Floats, Floats]:
-    """Gradients of ``x [N, D]`` and ``codebook [K, D]`` from that of the result, ``grad [N, D]``."""
-    grad_x, grad_codebook, factor = np.empty_like(x), np.zeros_like(codebook), np.empty(len(x), np.float32)
-    threads = thread_count()
-    flat = (array.ravel() for array in (grad, x, codebook))
-    _kernels(x.shape[1])[1](seed, *flat, codes, grad_x.ravel(), factor)
-    _sum_residuals(x, codebook, codes, factor, grad_codebook, threads)
+def substitute_backward(
+    grad: Floats, x: Floats, rows: Integers, codebook: Floats, codes: Integers, out: Floats
+) -> tuple[Floats, Floats]:
+    """Gradients of ``x [N, D]`` and ``codebook [K, D]`` from that of the result, ``grad [V, D]``.
+
+    ``out [V, D]`` is the result of :func:`substitute`; ``rows [V]`` must be ascending and all different here.
+    """
+    grad_x, grad_codebook = recycled(x.shape).numpy(), recycled(codebook.shape).numpy()
+    parts = max(_LEAST_PARTS, min(_MOST_PARTS, len(rows) // (4 * len(codebook))))
+    sums = recycled((parts, codebook.size)).numpy()
+    thread_count()
+    if len(rows) == 0:
+        grad_x.fill(0)
+        grad_codebook.fill(0)
+        return grad_x, grad_codebook
+    flat = grad.ravel(), x.ravel(), rows, codebook.ravel(), codes, out.ravel()
+    _kernels(x.shape[1])[1](*flat, grad_x.ravel(), sums)
+    _add_parts(sums, grad_codebook.ravel())
     return grad_x, grad_codebook

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from numba import prange
 from torch import Tensor
@@ -11,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.rendering.cpu.jit import kernel, thread_count
 
-__all__ = ["lookup", "sum_by_code"]
+__all__ = ["count_hits", "lookup", "sum_by_code"]
 
 
 @kernel
@@ -51,6 +53,25 @@ def _sum_segments(values: Tensor, codes: Tensor, num_codes: int) -> Tensor:
     order = torch.argsort(codes, stable=True)
     lengths = torch.bincount(codes, minlength=num_codes)
     return torch.segment_reduce(values[order], "sum", lengths=lengths, axis=0, unsafe=True, initial=0)
+
+
+@partial(kernel, parallel=False)
+def _count_hits(codes, usage):  # type: ignore[no-untyped-def]
+    hit = np.zeros(usage.shape[0], np.uint8)
+    for i in range(codes.shape[0]):
+        hit[codes[i]] = 1
+    for code in range(usage.shape[0]):
+        usage[code] += hit[code]
+
+
+def count_hits(codes: Tensor, usage: Tensor) -> None:
+    """Add 1 to ``usage [K]`` (int64, in place) for every code that is among ``codes [N]``, however often."""
+    if usage.device.type == "cpu":
+        _count_hits(codes.contiguous().numpy(), usage.numpy())
+    else:
+        hit = torch.zeros_like(usage)
+        hit[codes] = 1
+        usage += hit
 
 
 def lookup(codebook: Tensor, codes: Tensor) -> Tensor:

@@ -1,13 +1,18 @@
 """Searches that remember: the same codes as :func:`nearest`, bit for bit, mostly without a search.
 
-From one training step to the next rows and codes move little. In many dimensions the tracker keeps for every row the
-codes that were near when it was last searched, where the row was then, and the distance R below which there was no
-other code. With d the distance to the nearest of the list now, m how far the row has moved and Δ how far any code can
-have moved, d + m + Δ < R proves that the nearest code is in the list (the triangle inequality, as in Hamerly's
-k-means). In few dimensions a search is cheap, and what is kept is the order in which codes were put into boxes.
+From one training step to the next rows and codes move little. In many dimensions the tracker keeps for every row its
+last code, the codes that were near when it was last searched, where the row was then, and two distances: R1 below which
+there was no code but the nearest, R below which there was none outside the list. With d the distance to the last code
+now, m how far the row has moved and Δ how far any code can have moved, d + m + Δ < R1 proves that the code has not
+changed; with d the distance to the nearest of the list, d + m + Δ < R proves that this is the nearest of all (the
+triangle inequality, as in Hamerly's k-means). In few dimensions what is kept is the last code, from which the search
+starts, and the order in which codes were put into boxes.
 """
 
 from __future__ import annotations
+
+from functools import cache, partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,13 +20,24 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nsvq_lightning.quantize.box_search import MAX_DIM, box_search
+from nsvq_lightning.quantize.box_search import MAX_DIM, UNKNOWN, box_search
 from nsvq_lightning.quantize.boxes import build_boxes
-from nsvq_lightning.quantize.kernels import aligned_empty, lane_min
+from nsvq_lightning.quantize.kernels import lane_min
 from nsvq_lightning.quantize.nearest import check_rows, nearest
 from nsvq_lightning.quantize.scores import LIST, centre_codes, score_search, true_distance
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
-from nsvq_lightning.rendering.cpu.lanes import fma, get, lane_sum, lane_sums, load, lowest_bit, mask_bits, put, splat
+from nsvq_lightning.rendering.cpu.lanes import (
+    fma,
+    get,
+    lane_sum,
+    lane_sums,
+    load,
+    lowest_bit,
+    mask_bits,
+    put,
+    splat,
+    store,
+)
 
 __all__ = ["NearestTracker"]
 
@@ -39,60 +55,61 @@ Floats = NDArray[np.float32]
 
 
 @inline
-def _distance(vectors, row, padded, code):  # type: ignore[no-untyped-def]
+def _squares(dim, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
+    """Squared differences of two rows, to be summed. ``keep`` leaves out where the last two vectors overlap."""
     total = splat(np.float32(0.0))
-    for j in range(vectors):
-        difference = load(row, 16 * j) - load(padded, code * 16 * vectors + 16 * j)
+    if dim < 16:
+        for j in range(dim):
+            difference = splat(get(a, at_a + j) - get(b, at_b + j)) * load(keep, 0)
+            total = fma(difference, difference, total)
+        return total
+    for j in range(0, dim // 16 * 16, 16):
+        difference = load(a, at_a + j) - load(b, at_b + j)
+        total = fma(difference, difference, total)
+    if dim % 16:
+        difference = (load(a, at_a + dim - 16) - load(b, at_b + dim - 16)) * load(keep, 0)
         total = fma(difference, difference, total)
     return total
 
 
-@inline
-def _member(vectors, row, padded, lists, at, place):  # type: ignore[no-untyped-def]
-    return _distance(vectors, row, padded, np.int64(get(lists, at + place)))
-
-
-@kernel
-def _check_lists(x, codebook, padded, rows, lists, anchors, limits, drift, result):  # type: ignore[no-untyped-def]
-    """Nearest codes of the rows whose list provably holds it, -1 for the others."""
-    dim = x.shape[0] // rows.shape[0]
-    vectors = (dim + 15) // 16
-    for block in prange((rows.shape[0] + _BLOCK - 1) // _BLOCK):
-        here, unused = np.zeros(16 * vectors, np.float32), np.zeros(16, np.float32)
-        unused[LIST:] = np.inf
-        for i in range(block * _BLOCK, min(rows.shape[0], (block + 1) * _BLOCK)):
-            row = rows[i]
-            for j in range(dim):
-                put(here, j, get(x, i * dim + j))
-            moved = np.sqrt(lane_sum(_distance(vectors, here, anchors, row)))
-            at = row * LIST
-            sums = (
-                _member(vectors, here, padded, lists, at, 0),
-                _member(vectors, here, padded, lists, at, 1),
-                _member(vectors, here, padded, lists, at, 2),
-                _member(vectors, here, padded, lists, at, 3),
-                _member(vectors, here, padded, lists, at, 4),
-                _member(vectors, here, padded, lists, at, 5),
-                _member(vectors, here, padded, lists, at, 6),
-                _member(vectors, here, padded, lists, at, 7),
-            )
-            squared = lane_sums(sums) + load(unused, 0)
-            best = lane_min(squared)
-            result[i] = -1
-            if (np.float64(np.sqrt(best)) + moved) * _ROUNDING < limits[row] - drift:
-                near = mask_bits(squared <= splat(best * np.float32(_ROUNDING)))
-                result[i] = _settle(dim, x, i, codebook, lists, at, near)
+def _overlap(dim: int) -> Floats:
+    """The lanes in which the last vector of a row has numbers that the one before has not; one for short rows."""
+    keep = np.zeros(16, np.float32)
+    keep[-(dim % 16) if dim > 16 else -1 :] = 1
+    return keep
 
 
 @inline
-def _settle(dim, x, row, codebook, lists, at, near):  # type: ignore[no-untyped-def]
+def _member(dim, x, at, codebook, lists, place, keep):  # type: ignore[no-untyped-def]
+    return _squares(dim, x, at, codebook, np.int64(get(lists, place)) * dim, keep)
+
+
+@inline
+def _list_squared(dim, x, at, codebook, lists, start, keep):  # type: ignore[no-untyped-def]
+    """Squared distances to the codes of a list, one a lane; the other lanes hold 0."""
+    return lane_sums(
+        (
+            _member(dim, x, at, codebook, lists, start, keep),
+            _member(dim, x, at, codebook, lists, start + 1, keep),
+            _member(dim, x, at, codebook, lists, start + 2, keep),
+            _member(dim, x, at, codebook, lists, start + 3, keep),
+            _member(dim, x, at, codebook, lists, start + 4, keep),
+            _member(dim, x, at, codebook, lists, start + 5, keep),
+            _member(dim, x, at, codebook, lists, start + 6, keep),
+            _member(dim, x, at, codebook, lists, start + 7, keep),
+        )
+    )
+
+
+@inline
+def _settle(dim, x, row, codebook, lists, start, near):  # type: ignore[no-untyped-def]
     """Nearest by true distance among the members of a list whose bits are set."""
-    code = np.int64(get(lists, at + lowest_bit(near)))
+    code = np.int64(get(lists, start + lowest_bit(near)))
     if near & (near - 1) == 0:
         return code
     distance = np.float32(np.inf)
     while near != 0:
-        candidate = np.int64(get(lists, at + lowest_bit(near)))
+        candidate = np.int64(get(lists, start + lowest_bit(near)))
         near &= near - 1
         candidate_distance = true_distance(dim, x, row, codebook, candidate)
         if candidate_distance < distance or (candidate_distance == distance and candidate < code):
@@ -100,20 +117,80 @@ def _settle(dim, x, row, codebook, lists, at, near):  # type: ignore[no-untyped-
     return code
 
 
-def _padded(values: Floats, rows: int, fill: float) -> Floats:
-    """``values [N, D]`` as ``[rows, D']`` with D' a multiple of 16; ``fill`` in added rows, 0 in added columns."""
-    count, dim = values.shape
-    out = aligned_empty((rows, -(-dim // 16) * 16))
-    out[:, dim:] = 0
-    out[:count, :dim] = values
-    out[count:, :dim] = fill
-    return out
+@inline
+def _second_smallest(squared, near, scratch):  # type: ignore[no-untyped-def]
+    """Smallest lane but for the lowest one whose bit is set."""
+    store(scratch, 0, squared)
+    put(scratch, lowest_bit(near), np.float32(np.inf))
+    return lane_min(load(scratch, 0))
+
+
+@cache
+def _check_kernel(dim: int) -> Any:
+    """The check for one dimension, a constant for the compiler."""
+
+    def check(x, rows, codebook, memory, keep, travelled, drift, result):  # type: ignore[no-untyped-def]
+        last, lists, anchors, lone, limits = memory
+        way = travelled + drift
+        for block in prange((rows.shape[0] + _BLOCK - 1) // _BLOCK):
+            unused, scratch = np.zeros(16, np.float32), np.empty(16, np.float32)
+            unused[LIST:] = np.inf
+            for i in range(block * _BLOCK, min(rows.shape[0], (block + 1) * _BLOCK)):
+                row = get(rows, i)
+                at, start, code = row * dim, row * LIST, np.int64(get(last, row))
+                put(result, i, np.int64(-1))
+                if code < 0:
+                    continue
+                moved = np.float64(np.sqrt(lane_sum(_squares(dim, x, at, anchors, at, keep)))) * _ROUNDING
+                distance = np.sqrt(lane_sum(_squares(dim, x, at, codebook, code * dim, keep)))
+                if np.float64(distance) * _ROUNDING + moved < get(lone, row) - way:
+                    put(result, i, code)
+                    continue
+                squared = _list_squared(dim, x, at, codebook, lists, start, keep) + load(unused, 0)
+                best = lane_min(squared)
+                distance = np.sqrt(best)
+                if np.float64(distance) * _ROUNDING + moved < get(limits, row) - way:
+                    near = mask_bits(squared <= splat(best * np.float32(_ROUNDING)))
+                    code = _settle(dim, x, row, codebook, lists, start, near)
+                    put(result, i, code)
+                    put(last, row, np.int32(code))
+                    second = np.float64(np.sqrt(_second_smallest(squared, near, scratch)))
+                    if near & (near - 1) == 0 and second - distance > moved:
+                        # From here on the gap to the second code is worth more than the way so far.
+                        for j in range(dim):
+                            put(anchors, at + j, get(x, at + j))
+                        limit = get(limits, row) - moved
+                        put(limits, row, limit)
+                        put(lone, row, min(limit, second / _ROUNDING - drift + travelled))
+
+    return kernel(check)
+
+
+@kernel
+def _row_distances(a, b, squares):  # type: ignore[no-untyped-def]
+    """Squared distances of the rows of two tables."""
+    for i in prange(a.shape[0]):
+        total = np.float32(0.0)
+        for j in range(a.shape[1]):
+            difference = a[i, j] - b[i, j]
+            total += difference * difference
+        squares[i] = total
+
+
+@partial(kernel, parallel=False)
+def _ascending(rows, count):  # type: ignore[no-untyped-def]
+    """Whether row numbers are ascending, all different and in [0, count)."""
+    right = rows.shape[0] == 0 or (rows[0] >= 0 and rows[-1] < count)
+    for i in range(1, rows.shape[0]):
+        right &= rows[i - 1] < rows[i]
+    return right
 
 
 class NearestTracker:
     """Nearest codes of the same rows, step after step.
 
-    What it remembers costs memory (232 bytes a row for D = 45) and never changes a result, so no checkpoint needs it.
+    What it remembers costs memory (232 bytes a row for D = 45, 4 for D up to 8) and never changes a result, so no
+    checkpoint needs it.
     """
 
     def __init__(self) -> None:
@@ -124,93 +201,90 @@ class NearestTracker:
         self._steps = 0
         self._order: NDArray[np.int32] | None = None
         self._snapshot: Floats | None = None
+        self._codebook_shape = (0, 0)
         self._travelled = 0.0
+        self._last = np.zeros(0, np.int32)
         self._lists = np.zeros((0, LIST), np.int32)
         self._anchors = np.zeros((0, 0), np.float32)
-        self._limits = np.zeros(0)  # float64: ways add up over a whole run
+        # In float64, because ways add up over a whole run.
+        self._lone, self._limits = np.zeros(0), np.zeros(0)
 
     def search(self, x: Tensor, codebook: Tensor, rows: Tensor | None = None) -> Tensor:
-        """Nearest codes, the result of :func:`nearest`.
+        """Nearest codes, the result of :func:`nearest` for the chosen rows.
 
         Args:
-            x: Rows ``[V, D]``.
+            x: Rows ``[N, D]``.
             codebook: Codes ``[K, D]``.
-            rows: Numbers ``[V]`` int64 of these rows among all rows; without them nothing is remembered about rows.
+            rows: Which rows to search, ``[V]`` int64, ascending, all different; all of them by default.
 
         Returns:
             Codes ``[V]`` int64.
 
         Raises:
-            ValueError: The shapes do not fit together.
+            ValueError: The shapes do not fit together, or rows are not ascending numbers of rows.
             TypeError: The dtypes differ or are not floating point.
         """
         check_rows(x, codebook)
+        if rows is not None and rows.dim() != 1:
+            raise ValueError(f"rows must have shape [V], got {list(rows.shape)}")
         if x.device.type != "cpu" or x.dtype != torch.float32:
-            return nearest(x, codebook)
+            return nearest(x if rows is None else x.index_select(0, rows), codebook)
         values, codes = x.detach().contiguous().numpy(), codebook.detach().contiguous().numpy()
-        if x.shape[1] <= MAX_DIM:
-            return torch.from_numpy(self._search_boxes(values, codes))
-        if rows is None or len(rows) == 0:
-            return nearest(x, codebook)
-        if rows.shape != x.shape[:1] or int(rows.min()) < 0:
-            raise ValueError(f"rows must be {x.shape[0]} numbers from 0 on, got shape {list(rows.shape)}")
-        return torch.from_numpy(self._search_lists(values, codes, rows.contiguous().numpy()))
+        chosen = np.arange(len(values)) if rows is None else rows.contiguous().numpy()
+        if not _ascending(chosen, len(values)):
+            raise ValueError(f"rows must be ascending numbers in [0, {len(values)}), all different")
+        if self._codebook_shape != codes.shape:
+            self.forget()
+            self._codebook_shape = codes.shape
+        self._grow(len(values))
+        search = self._search_boxes if codes.shape[1] <= MAX_DIM else self._search_lists
+        return torch.from_numpy(search(values, codes, chosen))
 
-    def _search_boxes(self, x: Floats, codebook: Floats) -> NDArray[np.int64]:
-        if self._order is None or len(self._order) != len(codebook) or self._steps % _BOX_STEPS == 0:
-            self._order = None
-        self._steps += 1
-        boxes = build_boxes(codebook, self._order)
+    def _search_boxes(self, x: Floats, codebook: Floats, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        boxes = build_boxes(codebook, self._order if self._steps % _BOX_STEPS else None)
         self._order = boxes.order
-        return box_search(x, boxes)
+        self._steps += 1
+        return box_search(x, codebook, boxes, rows, self._last)
 
     def _search_lists(self, x: Floats, codebook: Floats, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         drift = self._drift(codebook)
-        self._grow(int(rows.max()) + 1, x.shape[1])
-        result = np.empty(len(x), np.int64)
-        padded = _padded(codebook, len(codebook) + 1, np.inf)  # lists are filled up with code K, infinitely far
+        result = np.empty(len(rows), np.int64)
+        memory = self._last, self._lists.ravel(), self._anchors.ravel(), self._lone, self._limits
+        dim = x.shape[1]
         thread_count()
-        _check_lists(
-            x.ravel(),
-            codebook.ravel(),
-            padded.ravel(),
-            rows,
-            self._lists.ravel(),
-            self._anchors.ravel(),
-            self._limits,
-            self._travelled + drift,
-            result,
-        )
+        _check_kernel(dim)(x.ravel(), rows, codebook.ravel(), memory, _overlap(dim), self._travelled, drift, result)
         unsure = np.flatnonzero(result < 0)
         if len(unsure):
             where = rows[unsure]
-            found = score_search(x[unsure], centre_codes(codebook), with_lists=True)
-            result[unsure], self._lists[where], limits = found
-            self._anchors[where, : x.shape[1]] = x[unsure]
-            self._limits[where] = limits / _ROUNDING - drift + self._travelled
+            found, lists, distances = score_search(x[where], centre_codes(codebook), with_lists=True)
+            self._last[where] = result[unsure] = found
+            self._lists[where], self._anchors[where] = lists, x[where]
+            self._limits[where], self._lone[where] = distances / _ROUNDING - drift + self._travelled
         return result
 
     def _drift(self, codebook: Floats) -> float:
         """Farthest way of a code since the snapshot; takes a new snapshot when it is time."""
-        if self._snapshot is None or self._snapshot.shape != codebook.shape:
-            self.forget()
+        if self._snapshot is None:
             self._snapshot = codebook.copy()
-        difference = codebook - self._snapshot
-        drift = float(np.sqrt(np.einsum("kd,kd->k", difference, difference).max())) * _ROUNDING
+        squares = np.empty(len(codebook), np.float32)
+        thread_count()
+        _row_distances(codebook, self._snapshot, squares)
+        drift = float(np.sqrt(squares.max())) * _ROUNDING
         self._steps += 1
         if self._steps % _SNAPSHOT_STEPS == 0:
             self._travelled += drift
             self._snapshot, drift = codebook.copy(), 0.0
         return drift
 
-    def _grow(self, count: int, dim: int) -> None:
-        old = len(self._limits)
+    def _grow(self, count: int) -> None:
+        """Room for ``count`` rows."""
+        old = len(self._last)
         if count <= old:
             return
-        count = max(count, old + old // 2)
-        lists, self._lists = self._lists, np.zeros((count, LIST), np.int32)
-        anchors, self._anchors = self._anchors, np.zeros((count, -(-dim // 16) * 16), np.float32)
-        limits, self._limits = self._limits, np.full(count, -np.inf)
-        self._lists[:old], self._limits[:old] = lists, limits
-        if old:
-            self._anchors[:old] = anchors
+        with_lists, dim = self._codebook_shape[1] > MAX_DIM, self._codebook_shape[1]
+        self._last = np.append(self._last, np.full(count - old, UNKNOWN))
+        if with_lists:
+            more = count - old
+            self._lists = np.append(self._lists, np.zeros((more, LIST), np.int32), 0)
+            self._anchors = np.append(self._anchors.reshape(old, dim), np.zeros((more, dim), np.float32), 0)
+            self._lone, self._limits = (np.append(held, np.full(more, -np.inf)) for held in (self._lone, self._limits))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -57,10 +58,11 @@ def test_kernel_gradient_equals_the_plain_formulation(dim: int) -> None:
 
     x, codebook, codes = (tensor.detach() for tensor in problem(dim))
     grad = torch.randn(x.shape, generator=generator(2))
-    unit = substitute(7, torch.zeros_like(x).numpy(), torch.eye(dim)[:1].numpy(), torch.zeros_like(codes).numpy())
-    arrays = x.numpy(), codebook.numpy(), codes.numpy()
+    rows = np.arange(len(x))
+    unit = substitute(7, torch.zeros_like(x).numpy(), rows, torch.eye(dim)[:1].numpy(), np.zeros_like(rows))
+    arrays = x.numpy(), rows, codebook.numpy(), codes.numpy()
     out = substitute(7, *arrays)
-    grad_x, grad_codebook = substitute_backward(7, grad.numpy(), *arrays)
+    grad_x, grad_codebook = substitute_backward(grad.numpy(), *arrays, out)
     v, r = torch.from_numpy(unit).double(), x.double() - codebook[codes].double()
     length = r.norm(dim=1, keepdim=True)
     radial = (grad.double() * v).sum(1, keepdim=True) * r / length
@@ -163,7 +165,7 @@ def test_module_in_its_three_states() -> None:
     quantizer.train()
     quantizer.freeze(codes.flip(0))
     rows = torch.tensor([4, 2, 500])
-    x_q, frozen = quantizer(x[rows], rows=rows)
+    x_q, frozen = quantizer(x, rows=rows)
     assert torch.equal(frozen, codes.flip(0)[rows])
     assert torch.equal(x_q, quantizer.codebook[frozen])
     with pytest.raises(ValueError, match="rows"):

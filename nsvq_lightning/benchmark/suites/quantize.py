@@ -33,8 +33,8 @@ class Attribute(NamedTuple):
 
     Attributes:
         quantizer: Fitted and in training mode.
-        x: Rows of the visible splats ``[V, D]``, which move from step to step.
-        rows: Their numbers among all splats ``[V]``.
+        x: Rows of all splats ``[N, D]``, which move from step to step.
+        rows: The visible ones ``[V]``.
         upstream: Gradient of the quantized rows ``[V, D]``.
         rate: Learning rate: how far Adam moves a number in a step.
     """
@@ -47,7 +47,7 @@ class Attribute(NamedTuple):
 
 
 Results = dict[str, tuple[Tensor, Tensor, Tensor]]
-"""Quantized rows ``[V, D]``, their gradient by the rows, and codes ``[V]`` by attribute."""
+"""Quantized rows ``[V, D]``, their gradient by the rows ``[N, D]``, and codes ``[V]`` by attribute."""
 
 
 def run(settings: Settings) -> list[Row]:
@@ -58,7 +58,7 @@ def run(settings: Settings) -> list[Row]:
         attributes = prepare(source.splats, setting)
         errors = {"NSVQ": step_errors(attributes, step(attributes, 0))}
         errors["plain torch"] = step_errors(attributes, plain_step(attributes, 0))
-    seen = max((len(attribute.x) for attribute in attributes.values()), default=0)
+    seen = max((len(attribute.rows) for attribute in attributes.values()), default=0)
     workload = f"{source.name}, {seen} visible splats, {setting} codebooks"
     note = f"codes checked on at most {CHECKED_ROWS} rows an attribute"
     clock = iter(range(1, 1 << 62))
@@ -89,8 +89,8 @@ def prepare(splats: RawSplats, setting: str) -> dict[str, Attribute]:
         quantizer = cast(CodebookQuantizer, module)
         every = QUANTIZED[name].rows(getattr(scene, name).detach())
         quantizer.fit(every, generator=generator(0, 0, "fit", name))
-        x = every[chosen].clone().requires_grad_()
-        upstream = 1e-6 * torch.randn(x.shape, generator=generator(0, 0, "upstream", name))
+        x = every.clone().requires_grad_()
+        upstream = 1e-6 * torch.randn(count, x.shape[1], generator=generator(0, 0, "upstream", name))
         prepared[name] = Attribute(quantizer.train(), x, chosen, upstream, getattr(LearningRates(), name))
     return prepared
 
@@ -117,7 +117,8 @@ def step(attributes: Mapping[str, Attribute], iteration: int) -> Results:
 def plain_step(attributes: Mapping[str, Attribute], iteration: int) -> Results:
     """The same in a few lines of torch: all distances, noise by ``randn``, gradients by autograd."""
     results: Results = {}
-    for name, (quantizer, x, _, upstream, _) in attributes.items():
+    for name, (quantizer, table, rows, upstream, _) in attributes.items():
+        x = table[rows]
         codebook: nn.Parameter = quantizer.codebook
         with torch.no_grad():
             parts = torch.split(x, max(1, CHUNK // len(codebook)))
@@ -125,7 +126,7 @@ def plain_step(attributes: Mapping[str, Attribute], iteration: int) -> Results:
         noise = torch.randn(x.shape, generator=generator(0, iteration, "noise", name))
         length = torch.linalg.vector_norm(x - codebook[codes], dim=1, keepdim=True)
         quantized = x + length * noise / noise.norm(dim=1, keepdim=True)
-        gradient, _ = torch.autograd.grad(quantized, (x, codebook), upstream)
+        gradient, _ = torch.autograd.grad(quantized, (table, codebook), upstream)
         results[name] = quantized.detach(), gradient, codes
     return results
 
@@ -138,8 +139,8 @@ def step_errors(attributes: Mapping[str, Attribute], results: Results) -> dict[s
     """
     lengths, gradients, wrong = [], [], 0
     for name, (quantized, gradient, codes) in results.items():
-        quantizer, x, _, upstream, _ = attributes[name]
-        x, upstream = x.detach().double(), upstream.double()
+        quantizer, table, rows, upstream, _ = attributes[name]
+        x, upstream, gradient = table.detach()[rows].double(), upstream.double(), gradient[rows]
         codebook = quantizer.codebook.detach().double()
         residual, offset = x - codebook[codes], quantized.double() - x
         away, moved = residual.norm(dim=1, keepdim=True), offset.norm(dim=1, keepdim=True)

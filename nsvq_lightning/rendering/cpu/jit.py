@@ -32,13 +32,13 @@ def inline(function: Callable[..., Any]) -> Any:
     return numba.njit(forceinline=True, **_OPTIONS)(function)
 
 
-def kernel(function: Callable[..., Any]) -> Any:
-    """Compile a parallel kernel once a machine and keep it on disk.
+def kernel(function: Callable[..., Any], parallel: bool = True) -> Any:
+    """Compile a kernel once a machine and keep it on disk. To wake the threads costs more than some need in all.
 
     Numba looks only at a kernel's own file to tell whether a stored one is stale; here every file of the back-end
     counts, because kernels contain the code of their helpers.
     """
-    dispatcher = numba.njit(parallel=True, cache=True, **_OPTIONS)(function)
+    dispatcher = numba.njit(parallel=parallel, cache=True, **_OPTIONS)(function)
     files = getattr(dispatcher._cache, "_cache_file", None)
     if files is not None and hasattr(files, "_source_stamp"):
         files._source_stamp = (files._source_stamp, _STAMP)
