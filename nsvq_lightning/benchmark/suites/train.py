@@ -42,7 +42,7 @@ ROUNDS = {True: 1, False: 2}
 """Runs of every setting; their order turns, their steps are counted together."""
 EVALUATIONS = 16
 """Points on the way of a run at which its test views are compared, besides the ends of the phases."""
-PRODUCT_EVERY = {True: 8, False: 50}
+PRODUCT_EVERY = {True: 8, False: 10}
 """Steps between two matrix products."""
 WARM_STEPS, STEPS = {True: 4, False: 10}, {True: 10, False: 60}
 """Steps that are not counted, and those that are, where a step is compared with its render."""
