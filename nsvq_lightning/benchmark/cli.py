@@ -5,21 +5,33 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from nsvq_lightning.benchmark.registry import ALL, SUITES, load_suite, suite_names
-from nsvq_lightning.benchmark.report import as_json, as_markdown
+from nsvq_lightning.benchmark.report import as_json, as_markdown, fill_in, suite_tables
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.sizes import SIZES
 from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.skips import SKIPS
 
 __all__ = ["main"]
 
 log = logging.getLogger(__name__)
+
+EXAMPLES = """
+
+examples:
+  nsvq benchmark all --quick
+  nsvq benchmark render --output results
+  nsvq benchmark train --scene path/to/colmap/folder --switches all
+  nsvq benchmark profile --scene path/to/colmap/folder --init-from scene.ply
+"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,23 +44,41 @@ def main(argv: Sequence[str] | None = None) -> int:
         0, or 1 after a one-line error if the scene cannot be read or the results not be written. Wrong arguments end
         the process with status 2.
     """
+    # Read when torch is loaded. As in ``nsvq fit``, waiting threads sleep; torch's profiler keeps its diary to itself.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    os.environ.setdefault("KINETO_LOG_LEVEL", "99")
     parser = _parser()
     options = parser.parse_args(argv)
     try:
-        settings = _settings(options)
+        suites, settings = suite_names(options.suite), _settings(options)
     except ValueError as error:
         parser.error(str(error))
     logging.basicConfig(format="%(message)s")
     log.setLevel(logging.INFO)
     try:
+        document = _read_document(options.document, suites, parser)
         if settings.scene is not None:
-            _check_scene(settings.scene)
-        _run(suite_names(options.suite), settings, options.output, options.json)
+            _check_scene(settings)
+        results = _measure(suites, settings)
+        _write(results, options.output, options.document, document)
     except FormatError as error:
         return _fail(str(error))
     except OSError as error:
         return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    sys.stdout.write(results.json() if options.json else results.markdown())
     return 0
+
+
+def _read_document(path: Path | None, suites: Sequence[str], parser: argparse.ArgumentParser) -> str | None:
+    """The document that will be filled in; what it lacks is said before anything is measured."""
+    if path is None:
+        return None
+    document = path.read_text(encoding="utf-8")
+    try:
+        fill_in(document, dict.fromkeys(suites, ""))
+    except ValueError as error:
+        parser.error(f"{path}: {error}")
+    return document
 
 
 def _fail(message: str) -> int:
@@ -60,21 +90,38 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="nsvq benchmark",
         description="Measure run time against error: each part beside its plain counterpart and a float64 oracle.",
-        epilog="suites: " + "; ".join(f"{name}: {about}" for name, about in SUITES.items()),
+        epilog="suites:\n" + "\n".join(f"  {name:10} {suite.about}" for name, suite in SUITES.items()) + EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("suite", choices=[*SUITES, ALL], metavar="SUITE", help=f"{', '.join(SUITES)} or {ALL}")
-    parser.add_argument("--quick", action="store_true", help="small workloads, few repeats: all within a minute")
-    parser.add_argument("--repeats", type=int, metavar="N", help="timed calls of each case (15; quick 3)")
-    parser.add_argument("--threads", type=_integers, metavar="N,N", help="thread counts (1 and all; quick all)")
-    parser.add_argument(
+    parser.add_argument("suite", metavar="SUITE", help=f"one, some with commas between them, or {ALL}")
+    what = parser.add_argument_group("what is measured")
+    what.add_argument(
         "--workloads",
         type=_names,
         metavar="NAME,NAME",
         help=f"synthetic scenes of render and codec ({','.join(SIZES)}; quick A20k)",
     )
-    parser.add_argument("--scene", type=Path, metavar="FILE", help="scene file (.ply, .nsvq) instead of synthetic ones")
-    parser.add_argument("--output", type=Path, metavar="FOLDER", help="write benchmark.json, benchmark.md, SUITE.png")
-    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    what.add_argument(
+        "--scene", type=Path, metavar="PATH", help="scene file (.ply, .nsvq) or COLMAP folder instead of synthetic ones"
+    )
+    what.add_argument(
+        "--init-from",
+        type=Path,
+        metavar="FILE",
+        help="scene file whose splats are used with the photos of the COLMAP folder, instead of its points",
+    )
+    what.add_argument("--steps", type=int, metavar="N", help="iterations of each run of train (1000; quick 40)")
+    what.add_argument(
+        "--switches", type=_switches, metavar="NAME,NAME", help="switches that train turns round one by one, or all"
+    )
+    effort = parser.add_argument_group("how much")
+    effort.add_argument("--quick", action="store_true", help="small workloads, few repeats: all within a minute")
+    effort.add_argument("--repeats", type=int, metavar="N", help="timed calls of each case (15; quick 3)")
+    effort.add_argument("--threads", type=_integers, metavar="N,N", help="thread counts (1 and all; quick all)")
+    results = parser.add_argument_group("results")
+    results.add_argument("--output", type=Path, metavar="FOLDER", help="write benchmark.json, benchmark.md, SUITE.png")
+    results.add_argument("--document", type=Path, metavar="FILE", help="fill the tables in where the file has a place")
+    results.add_argument("--json", action="store_true", help="print JSON instead of tables")
     return parser
 
 
@@ -89,6 +136,10 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
 
 
+def _switches(text: str) -> tuple[str, ...]:
+    return tuple(SKIPS) if text == ALL else _names(text)
+
+
 def _settings(options: argparse.Namespace) -> Settings:
     # Imported here so that --help and wrong arguments answer at once.
     import numba
@@ -100,20 +151,41 @@ def _settings(options: argparse.Namespace) -> Settings:
         repeats=options.repeats,
         workloads=options.workloads,
         scene=options.scene,
+        init_from=options.init_from,
+        steps=options.steps,
+        switches=options.switches,
     )
 
 
-def _check_scene(path: Path) -> None:
+def _check_scene(settings: Settings) -> None:
     """Read the scene once before anything is measured: a wrong file is an error of the user, later it would be ours."""
-    from nsvq_lightning.benchmark.workloads import scene_workload
+    from nsvq_lightning.benchmark.workloads import workloads
 
     try:
-        scene_workload(path)
+        workloads(settings)
     except ValueError as error:
         raise FormatError(str(error)) from error
 
 
-def _run(suites: Sequence[str], settings: Settings, output: Path | None, print_json: bool) -> None:
+class _Results(NamedTuple):
+    """What was measured, where, and how much of it."""
+
+    machine: Mapping[str, Any]
+    settings: Settings
+    rows: Sequence[Row]
+
+    def json(self) -> str:
+        return json.dumps(as_json(*self), indent=2, ensure_ascii=False) + "\n"
+
+    def markdown(self) -> str:
+        return as_markdown(*self)
+
+    def by_suite(self) -> dict[str, list[Row]]:
+        names = dict.fromkeys(row.suite for row in self.rows)
+        return {name: [row for row in self.rows if row.suite == name] for name in names}
+
+
+def _measure(suites: Sequence[str], settings: Settings) -> _Results:
     from nsvq_lightning.benchmark.machine import describe_machine
 
     machine = describe_machine()
@@ -121,21 +193,28 @@ def _run(suites: Sequence[str], settings: Settings, output: Path | None, print_j
     for name in suites:
         start = time.perf_counter()
         rows += load_suite(name)(settings)
-        log.info("%s (%s): %.1f s", name, SUITES[name], time.perf_counter() - start)
-    results = json.dumps(as_json(machine, settings, rows), indent=2, ensure_ascii=False) + "\n"
-    tables = as_markdown(machine, settings, rows)
-    if output is not None:
-        _write(output, results, tables, rows)
-    sys.stdout.write(results if print_json else tables)
+        log.info("%s (%s): %.1f s", name, SUITES[name].about, time.perf_counter() - start)
+    return _Results(machine, settings, rows)
 
 
-def _write(folder: Path, results: str, tables: str, rows: Sequence[Row]) -> None:
+def _write(results: _Results, folder: Path | None, target: Path | None, document: str | None) -> None:
+    """Write the folder, and fill the tables in the document."""
     from nsvq_lightning.benchmark.plot import draw_suite
+
+    by_suite = results.by_suite()
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_text(folder / "benchmark.json", results.json())
+        _write_text(folder / "benchmark.md", results.markdown())
+        for name, rows in by_suite.items():
+            draw_suite(folder / f"{name}.png", rows, SUITES[name])
+    if target is not None and document is not None:
+        tables = {name: suite_tables(results.machine, results.settings, rows) for name, rows in by_suite.items()}
+        _write_text(target, fill_in(document, tables))
+
+
+def _write_text(path: Path, text: str) -> None:
     from nsvq_lightning.io.atomic import atomic_write
 
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, text in (("benchmark.json", results), ("benchmark.md", tables)):
-        with atomic_write(folder / name) as file:
-            file.write(text.encode())
-    for suite in dict.fromkeys(row.suite for row in rows):
-        draw_suite(folder / f"{suite}.png", [row for row in rows if row.suite == suite])
+    with atomic_write(path) as file:
+        file.write(text.encode())

@@ -1,30 +1,40 @@
-"""Pictures of error against milliseconds."""
+"""Pictures of the results: error against run time, a value over the course of a run, and shares of a step."""
 
 from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from nsvq_lightning.benchmark.registry import Suite
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.io.atomic import atomic_write
 
 __all__ = ["draw_suite"]
 
 MARKERS = "os^Dvph*X<>"
+COLUMNS = 2
+PANEL = (6.4, 4.2)
+"""Inches across and down."""
+LEGEND_LINE = 0.19
+SHARE = "share %"
 
 
-def draw_suite(path: Path, rows: Sequence[Row]) -> None:
-    """Draw one suite: a panel for each operation, a colour for each method, a marker for each workload.
+def draw_suite(path: Path, rows: Sequence[Row], suite: Suite) -> None:
+    """Draw the rows of one suite.
 
-    The time is logarithmic; so is the error, with a linear strip at the bottom where one is 0. Whiskers are the
-    quartiles of the time. Markers are filled for the largest number of threads.
+    ``errors``: a panel for each operation and value, a colour for each method, a marker for each workload. The time is
+    logarithmic; so is the value, with a linear strip at the bottom where one is 0. Whiskers are the quartiles of the
+    time. Markers are filled for the largest number of threads. Rows with a course are lines over seconds instead.
+
+    ``shares``: a panel for each operation, a bar for each method.
 
     Args:
         path: PNG file, replaced atomically.
-        rows: Rows of one suite, each with at least one value; the first is drawn.
+        rows: Rows of one suite, of which one has a value at least.
+        suite: How it is drawn.
 
     Raises:
         ValueError: There is no row with a value.
@@ -32,28 +42,87 @@ def draw_suite(path: Path, rows: Sequence[Row]) -> None:
     rows = [row for row in rows if row.values]
     if not rows:
         raise ValueError(f"cannot draw {path}: no row has a value to draw against the time")
-    # Drawn without pyplot, which keeps global state and may look for a display.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    operations = list(dict.fromkeys(row.operation for row in rows))
-    lines = max(len(_distinct(rows, "method")), len(_distinct(rows, "workload")))
-    figure = Figure(figsize=(1.0 + 6.0 * len(operations), 4.2 + 0.17 * lines), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    panels = figure.subplots(1, len(operations), squeeze=False)[0]
-    for panel, operation in zip(panels, operations, strict=True):
-        _draw_panel(panel, [row for row in rows if row.operation == operation])
-        panel.set_title(f"{rows[0].suite}: {operation}", fontsize="medium")
+    if suite.picture == "shares":
+        figure = _figure([(rows, operation, SHARE) for operation in _distinct(rows, "operation")], _draw_bars)
+    else:
+        panels = _values(rows, suite.drawn)
+        operations = {operation for _, operation, _ in panels}
+        rows = [row for row in rows if row.operation in operations]
+        figure = _figure([(rows, *panel[1:]) for panel in panels], _draw_values)
+        _draw_keys(figure, rows)
     picture = io.BytesIO()
-    canvas.print_figure(picture, format="png", bbox_inches="tight")
+    figure.canvas.print_figure(picture, format="png", bbox_inches="tight")
     with atomic_write(path) as file:
         file.write(picture.getvalue())
 
 
-def _draw_panel(panel: Any, rows: Sequence[Row]) -> None:
+Panel = tuple[Sequence[Row], str, str]
+"""All rows, the operation that is drawn, and the value."""
+
+
+def _values(rows: Sequence[Row], drawn: Sequence[str]) -> list[Panel]:
+    """The panels: what is to be drawn where the rows of an operation have it, else their first value."""
+    panels: list[Panel] = []
+    for operation in _distinct(rows, "operation"):
+        values = [row.values for row in rows if row.operation == operation]
+        wanted = [name for name in drawn if any(name in row for row in values)]
+        panels += [(rows, operation, name) for name in (wanted if drawn else [next(iter(values[0]))])]
+    return panels or [(rows, rows[0].operation, next(iter(rows[0].values)))]
+
+
+def _figure(panels: Sequence[Panel], draw: Callable[[Any, Sequence[Row], Panel], None]) -> Any:
+    # Drawn without pyplot, which keeps global state and may look for a display.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    across = min(COLUMNS, len(panels))
+    down = -(-len(panels) // across)
+    rows = panels[0][0]
+    keys = max(len(_distinct(rows, "method")), len(_distinct(rows, "workload"))) if draw is _draw_values else 0
+    figure = Figure(figsize=(PANEL[0] * across, PANEL[1] * down + LEGEND_LINE * keys), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(down, across, squeeze=False).ravel()
+    for axis in axes[len(panels) :]:
+        axis.set_axis_off()
+    for axis, panel in zip(axes, panels, strict=False):
+        axis.set_title(f"{rows[0].suite}: {panel[1]}", fontsize="medium")
+        draw(axis, [row for row in rows if row.operation == panel[1]], panel)
+    return figure
+
+
+def _styles(rows: Sequence[Row]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Colour of each method and marker of each workload, the same in all panels."""
+    from matplotlib import colormaps
+
     methods, workloads = _distinct(rows, "method"), _distinct(rows, "workload")
-    colours = {method: f"C{index % 10}" for index, method in enumerate(methods)}
-    markers = {workload: MARKERS[index % len(MARKERS)] for index, workload in enumerate(workloads)}
+    palette = colormaps["tab10" if len(methods) <= 10 else "tab20"]
+    colours = {method: palette(index % palette.N) for index, method in enumerate(methods)}
+    return colours, {workload: MARKERS[index % len(MARKERS)] for index, workload in enumerate(workloads)}
+
+
+def _draw_values(axis: Any, rows: Sequence[Row], panel: Panel) -> None:
+    everything, _, value = panel
+    styles = _styles(everything)
+    rows = [row for row in rows if value in row.values]
+    if any(row.course for row in rows):
+        _draw_courses(axis, rows, value, styles)
+    else:
+        _draw_points(axis, rows, value, styles)
+    axis.grid(alpha=0.3, which="major")
+
+
+def _draw_courses(axis: Any, rows: Sequence[Row], value: str, styles: tuple[dict[str, Any], dict[str, str]]) -> None:
+    colours, markers = styles
+    for row in rows:
+        seconds, values = zip(*row.course, strict=True)
+        axis.plot(seconds, values, f"{markers[row.workload]}-", color=colours[row.method], markersize=4, linewidth=1)
+    axis.set_xscale("log")
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.set(xlabel="seconds", ylabel=value)
+
+
+def _draw_points(axis: Any, rows: Sequence[Row], value: str, styles: tuple[dict[str, Any], dict[str, str]]) -> None:
+    colours, markers = styles
     most = max(row.threads for row in rows)
     for row in rows:
         median, (first, third) = row.timing.median, row.timing.quartiles
@@ -62,38 +131,58 @@ def _draw_panel(panel: Any, rows: Sequence[Row]) -> None:
         whiskers = [[max(0.0, median - first)], [max(0.0, third - median)]]
         face = colour if row.threads == most else "none"
         style = {"fmt": markers[row.workload], "color": colour, "markerfacecolor": face, "elinewidth": 0.8}
-        panel.errorbar([median], [_drawn(row)], xerr=whiskers, **style)
-    positive = [_drawn(row) for row in rows if _drawn(row) > 0]
-    smallest, largest = min(positive, default=1.0) / 3, 3 * max(positive, default=1.0)
-    panel.set_xscale("log")
-    panel.set_xlim(*_decades([time for row in rows for time in row.timing.quartiles]))
-    panel.xaxis.set_major_formatter("{x:g}")
-    panel.xaxis.set_minor_formatter("")
-    if len(positive) == len(rows):
-        panel.set_yscale("log")
-        panel.set_ylim(smallest, largest)
+        axis.errorbar([median], [row.values[value]], xerr=whiskers, **style)
+    values = [row.values[value] for row in rows]
+    low, high = _decades([number for number in values if number > 0] or [1.0])
+    axis.set_xscale("log")
+    axis.set_xlim(*_decades([time for row in rows for time in row.timing.quartiles]))
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.xaxis.set_minor_formatter("")
+    if min(values) > 0:
+        axis.set_yscale("log")
+        axis.set_ylim(low, high)
     else:
-        panel.set_yscale("symlog", linthresh=smallest, linscale=0.5)
-        panel.set_ylim(-smallest / 3, largest)
-    panel.set(xlabel="ms", ylabel=next(iter(rows[0].values)))
-    panel.grid(alpha=0.3, which="major")
-    keys = {"fontsize": 7, "frameon": False, "bbox_transform": panel.transAxes}
-    by_colour = [panel.plot([], [], "s", color=colours[method], label=method)[0] for method in methods]
-    by_marker = [panel.plot([], [], markers[name], color="0.4", label=name)[0] for name in workloads]
-    first_key = panel.legend(handles=by_colour, loc="upper left", bbox_to_anchor=(0.0, -0.12), **keys)
-    panel.add_artist(first_key).set_clip_on(False)  # or the picture would be cut off below the second one
-    panel.legend(handles=by_marker, loc="upper left", bbox_to_anchor=(0.35, -0.12), **keys)
+        axis.set_yscale("symlog", linthresh=low, linscale=0.5)
+        axis.set_ylim(-low / 3, high)
+    axis.set(xlabel="ms", ylabel=value)
 
 
-def _decades(times: Sequence[float]) -> tuple[float, float]:
+def _draw_keys(figure: Any, rows: Sequence[Row]) -> None:
+    """What colours, markers and hollow markers mean, below the panels."""
+    from matplotlib.lines import Line2D
+
+    colours, markers = _styles(rows)
+    threads = sorted({row.threads for row in rows})
+    by_colour = [Line2D([], [], marker="s", linestyle="", color=colour, label=name) for name, colour in colours.items()]
+    by_marker = [Line2D([], [], marker=mark, linestyle="", color="0.4", label=name) for name, mark in markers.items()]
+    if len(threads) > 1:
+        hollow = f"hollow: {', '.join(map(str, threads[:-1]))} instead of {threads[-1]} threads"
+        by_marker.append(Line2D([], [], marker="o", linestyle="", color="0.4", markerfacecolor="none", label=hollow))
+    figure.legend(handles=by_colour, loc="outside lower left", fontsize=8, frameon=False)
+    figure.legend(handles=by_marker, loc="outside lower right", fontsize=8, frameon=False)
+
+
+def _draw_bars(axis: Any, rows: Sequence[Row], panel: Panel) -> None:
+    """One bar a row below the first, which is the whole of them."""
+    whole, *parts = rows
+    axis.set_title(f"{whole.suite}: {panel[1]}, {whole.timing.median:.3g} ms", fontsize="medium")
+    names = [row.method for row in parts]
+    shares = [row.values[SHARE] for row in parts]
+    axis.barh(names, shares, color="C0")
+    axis.invert_yaxis()
+    for place, (share, row) in enumerate(zip(shares, parts, strict=True)):
+        axis.text(share, place, f" {share:.1f} %, {row.timing.median:.2g} ms", va="center", fontsize=8)
+    axis.set_xlim(0, 1.35 * max(shares, default=1.0))
+    axis.tick_params(axis="y", labelsize=8)
+    axis.set(xlabel="share of the step, %")
+
+
+def _decades(values: Sequence[float]) -> tuple[float, float]:
     """Limits at whole powers of ten, so that a logarithmic axis has two numbers at least."""
-    low, high = (math.log10(max(time, 1e-6)) for time in (min(times), max(times)))
-    return 10.0 ** math.floor(low), 10.0 ** max(math.ceil(high), math.floor(low) + 1)
+    low, high = (math.log10(max(value, 1e-30)) for value in (min(values), max(values)))
+    bottom = math.floor(low - 0.05)
+    return 10.0**bottom, 10.0 ** max(math.ceil(high + 0.05), bottom + 1)
 
 
 def _distinct(rows: Sequence[Row], field: str) -> list[str]:
     return list(dict.fromkeys(str(getattr(row, field)) for row in rows))
-
-
-def _drawn(row: Row) -> float:
-    return next(iter(row.values.values()))

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
 
-__all__ = ["as_json", "as_markdown"]
+__all__ = ["as_json", "as_markdown", "fill_in", "suite_tables"]
+
+
+END = "<!-- end -->"
 
 
 def as_json(machine: Mapping[str, Any], settings: Settings, rows: Sequence[Row]) -> dict[str, Any]:
@@ -20,22 +24,62 @@ def as_json(machine: Mapping[str, Any], settings: Settings, rows: Sequence[Row])
         settings: How much was measured.
         rows: Results.
     """
-    scene = None if settings.scene is None else str(settings.scene)
-    chosen = {**asdict(settings), "scene": scene, "threads": list(settings.threads)}
-    chosen["workloads"] = list(settings.workloads)
+    chosen = {name: _plain(value) for name, value in asdict(settings).items()}
     return {"machine": dict(machine), "settings": chosen, "rows": [row.as_json() for row in rows]}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return list(value)
+    return str(value) if isinstance(value, Path) else value
 
 
 def as_markdown(machine: Mapping[str, Any], settings: Settings, rows: Sequence[Row]) -> str:
     """The machine, then one table for every operation of every suite."""
     parts = ["# nsvq benchmark", *_machine_lines(machine, settings)]
     for suite in dict.fromkeys(row.suite for row in rows):
-        parts.append(f"## {suite}")
-        of_suite = [row for row in rows if row.suite == suite]
-        for operation in dict.fromkeys(row.operation for row in of_suite):
-            chosen = [row for row in of_suite if row.operation == operation]
-            parts += [f"### {operation}", _table(*_columns(chosen)), *_notes(chosen)]
+        parts += [f"## {suite}", *_operations([row for row in rows if row.suite == suite], "###")]
     return "\n\n".join(parts) + "\n"
+
+
+def suite_tables(machine: Mapping[str, Any], settings: Settings, rows: Sequence[Row]) -> str:
+    """The tables of one suite, for a document: first them, then what they were measured on."""
+    return "\n\n".join([*_operations(rows, "####"), *_machine_lines(machine, settings)])
+
+
+def fill_in(document: str, tables: Mapping[str, str]) -> str:
+    """Put tables between the lines ``<!-- results: SUITE -->`` and ``<!-- end -->`` of a document.
+
+    Args:
+        document: Markdown.
+        tables: Text by name of the suite; other places stay as they are.
+
+    Raises:
+        ValueError: There is no place for a suite.
+    """
+    for suite, text in tables.items():
+        start = f"<!-- results: {suite} -->\n"
+        before, found, rest = document.partition(start)
+        _, closed, after = rest.partition(END)
+        if not found or not closed:
+            raise ValueError(f"there is no place for {suite}: it needs the lines {start.strip()!r} and {END!r}")
+        document = f"{before}{start}\n{text}\n\n{END}{after}"
+    return document
+
+
+def _operations(rows: Sequence[Row], heading: str) -> Iterator[str]:
+    for operation in dict.fromkeys(row.operation for row in rows):
+        chosen = [row for row in rows if row.operation == operation]
+        # What is the same in all rows is said once.
+        common = [name for name in ("workload", "threads") if len({getattr(row, name) for row in chosen}) == 1]
+        said = {"workload": chosen[0].workload, "threads": _counted(chosen[0].threads, "thread")}
+        yield f"{heading} {operation}" + "".join(f", {said[name]}" for name in common)
+        yield _table(*_columns(chosen, common))
+        yield from _notes(chosen)
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 def _machine_lines(machine: Mapping[str, Any], settings: Settings) -> Iterator[str]:
@@ -54,17 +98,18 @@ def _machine_lines(machine: Mapping[str, Any], settings: Settings) -> Iterator[s
     )
 
 
-def _columns(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
-    """Head and cells; values that no row of the table has get no column."""
+def _columns(rows: Sequence[Row], common: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+    """Head and cells without those that are ``common``; values that no row of the table has get no column."""
     names = list(dict.fromkeys(name for row in rows for name in row.values))
-    head = ["workload", "method", "threads", "ms", "quartiles", "min", "n", "sgemm", *names]
+    own = [name for name in ("workload", "method", "threads") if name not in common]
+    head = [*own, "ms", "quartiles", "min", "n", "sgemm", *names]
     cells = []
     for row in rows:
         timing = row.timing
         quartiles = "–".join(map(number, timing.quartiles))
         times = [number(timing.median), quartiles, number(timing.minimum), str(len(timing.samples))]
         values = [number(row.values[name]) if name in row.values else "" for name in names]
-        cells.append([row.workload, row.method, str(row.threads), *times, number(timing.ratio), *values])
+        cells.append([*(str(getattr(row, name)) for name in own), *times, number(timing.ratio), *values])
     return head, cells
 
 
@@ -82,14 +127,15 @@ def number(value: float) -> str:
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table that also reads well as plain text; the first two columns are words."""
+    """A Markdown table that also reads well as plain text; words stand left, numbers right."""
     lines = [list(head), *map(list, rows)]
     widths = [max(3, *map(len, column)) for column in zip(*lines, strict=True)]
-    rule = ["-" * width if column < 2 else "-" * (width - 1) + ":" for column, width in enumerate(widths)]
+    words = [name in ("workload", "method") for name in head]
+    rule = ["-" * width if word else "-" * (width - 1) + ":" for word, width in zip(words, widths, strict=True)]
     padded = [
         [
-            cell.ljust(width) if column < 2 else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
+            cell.ljust(width) if word else cell.rjust(width)
+            for word, cell, width in zip(words, line, widths, strict=True)
         ]
         for line in lines
     ]

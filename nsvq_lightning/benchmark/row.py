@@ -77,6 +77,7 @@ class Row:
         timing: How long it took.
         values: Errors and sizes by name, the unit in the name where there is one; the first is drawn against the time.
         note: How the errors were measured, where that is not on the workload itself.
+        course: Seconds and the first value on the way to the end, for what takes its time; drawn as a line.
     """
 
     suite: str
@@ -87,6 +88,7 @@ class Row:
     timing: Timing
     values: Mapping[str, float] = field(default_factory=dict)
     note: str = ""
+    course: tuple[tuple[float, float], ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """The row as JSON values."""
@@ -99,4 +101,5 @@ class Row:
             **self.timing.as_json(),
             "values": dict(self.values),
             "note": self.note,
+            "course": [list(point) for point in self.course],
         }

@@ -14,7 +14,7 @@ from nsvq_lightning.benchmark.row import Timing
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.random import generator
 
-__all__ = ["Case", "measure", "use_threads"]
+__all__ = ["Case", "measure", "milliseconds", "sgemm", "use_threads"]
 
 SGEMM_SIDE = 2048
 
@@ -54,18 +54,18 @@ def measure(cases: Sequence[Case], settings: Settings, threads: int) -> dict[str
     names = [case.name for case in cases]
     if len(set(names)) != len(names):
         raise ValueError(f"cases need different names, got {names}")
-    sgemm = _sgemm()
-    players = [sgemm, *cases]
+    product = sgemm()
+    players = [product, *cases]
     samples: dict[str, list[float]] = {case.name: [] for case in players}
     with use_threads(threads), _no_collection():
         for case in players:
-            _milliseconds(case)
+            milliseconds(case)
         for turn in range(settings.repeats):
             shift = turn % len(players)
             for case in players[shift:] + players[:shift]:
-                if case is sgemm or sum(samples[case.name]) < 1000 * settings.seconds:
-                    samples[case.name].append(_milliseconds(case))
-    return {name: Timing(tuple(samples[name]), tuple(samples[sgemm.name])) for name in names}
+                if case is product or sum(samples[case.name]) < 1000 * settings.seconds:
+                    samples[case.name].append(milliseconds(case))
+    return {name: Timing(tuple(samples[name]), tuple(samples[product.name])) for name in names}
 
 
 @contextmanager
@@ -92,7 +92,8 @@ def _no_collection() -> Iterator[None]:
             gc.enable()
 
 
-def _milliseconds(case: Case) -> float:
+def milliseconds(case: Case) -> float:
+    """Time one call, its preparation left out."""
     if case.prepare is not None:
         case.prepare()
     _finish()
@@ -108,7 +109,8 @@ def _finish() -> None:
         torch.cuda.synchronize()
 
 
-def _sgemm() -> Case:
+def sgemm() -> Case:
+    """The matrix product that all times are compared with."""
     draw = generator(0, 0, "sgemm")
     left, right = (torch.randn(SGEMM_SIDE, SGEMM_SIDE, generator=draw) for _ in range(2))
     out = torch.empty_like(left)

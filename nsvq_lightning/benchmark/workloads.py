@@ -13,11 +13,12 @@ from torch import Tensor
 
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.sizes import SIZES
+from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.splats import RawSplats
+from nsvq_lightning.splats import RawSplats, Splats
 
-__all__ = ["Workload", "scene_workload", "synthetic_workload", "workloads"]
+__all__ = ["Workload", "folder_workload", "scene_workload", "single_workload", "synthetic_workload", "workloads"]
 
 Floats = NDArray[np.float64]
 
@@ -68,10 +69,29 @@ class Workload:
 
 
 def workloads(settings: Settings) -> list[Workload]:
-    """The scenes that the settings name."""
-    if settings.scene is not None:
-        return [scene_workload(settings.scene)]
-    return [synthetic_workload(name) for name in settings.workloads]
+    """The scene that the user gives, or the synthetic scenes that the settings name.
+
+    Raises:
+        ValueError: As :func:`scene_workload`.
+        SceneError: The COLMAP folder cannot be used.
+    """
+    if settings.scene is None:
+        return [synthetic_workload(name) for name in settings.workloads]
+    if settings.scene.is_dir():
+        return [folder_workload(settings.scene, settings.init_from)]
+    return [scene_workload(settings.scene)]
+
+
+def single_workload(settings: Settings, full: str) -> Workload:
+    """The scene that the user gives, or one synthetic scene: ``full``, in a quick run the smallest.
+
+    Raises:
+        ValueError: As :func:`workloads`.
+        SceneError: As :func:`workloads`.
+    """
+    if settings.scene is None:
+        return synthetic_workload(next(iter(SIZES)) if settings.quick else full)
+    return workloads(settings)[0]
 
 
 def synthetic_workload(name: str, seed: int = SEED) -> Workload:
@@ -112,17 +132,41 @@ def scene_workload(path: Path) -> Workload:
         ValueError: The file has an unknown suffix or no finite splat.
         FormatError: It is damaged.
     """
-    loaded = [tensor.detach() for tensor in load(path).raw()]
-    rows = [tensor.reshape(len(tensor), tensor.shape[1:].numel()) for tensor in loaded]
-    finite = torch.isfinite(torch.cat(rows, 1)).all(1)
-    splats = RawSplats(*(tensor[finite] for tensor in loaded))
-    if len(splats.means) == 0:
-        raise ValueError(f"{path} holds no splat with finite numbers; there is nothing to measure")
+    splats = _finite_splats(path)
     means = splats.means.double()
     centre = means.median(0).values
     reach = float(np.quantile((means - centre).norm(dim=1).numpy(), 0.8))
     camera = _camera(800, 533, centre.numpy(), 2 * max(reach, 1e-3))
     return Workload(path.name, splats, camera, torch.tensor(BACKGROUND), _image_gradient(camera, SEED))
+
+
+def folder_workload(root: Path, init_from: Path | None = None) -> Workload:
+    """A COLMAP folder's first train view, of the splats in a scene file or of those that its points become.
+
+    Raises:
+        ValueError: The file has an unknown suffix or no finite splat.
+        FormatError: It is damaged.
+        SceneError: The folder cannot be used.
+    """
+    scene = load_scene(root)
+    camera = scene.cameras[scene.train[0]]
+    if init_from is not None:
+        splats = _finite_splats(init_from)
+    else:
+        raw = Splats.from_points(scene.points, scene.colors, sh_degree=3).raw()
+        splats = RawSplats(*(tensor.detach() for tensor in raw))
+    name = root.resolve().name if init_from is None else f"{root.resolve().name} {init_from.name}"
+    return Workload(name, splats, camera, torch.tensor(BACKGROUND), _image_gradient(camera, SEED))
+
+
+def _finite_splats(path: Path) -> RawSplats:
+    """The splats of a file without those that have a number that is not finite."""
+    loaded = [tensor.detach() for tensor in load(path).raw()]
+    rows = [tensor.reshape(len(tensor), tensor.shape[1:].numel()) for tensor in loaded]
+    finite = torch.isfinite(torch.cat(rows, 1)).all(1)
+    if not bool(finite.any()):
+        raise ValueError(f"{path} holds no splat with finite numbers; there is nothing to measure")
+    return RawSplats(*(tensor[finite] for tensor in loaded))
 
 
 def _tensor(values: Floats) -> Tensor:

@@ -10,6 +10,8 @@ import pytest
 from nsvq_lightning import cli as front_end
 from nsvq_lightning import lightning_script
 from nsvq_lightning.benchmark import cli, timing
+from nsvq_lightning.benchmark.registry import SUITES
+from nsvq_lightning.benchmark.report import fill_in
 from nsvq_lightning.benchmark.suites import loss
 
 SMALL = ["loss", "--quick", "--repeats", "1", "--threads", "1"]
@@ -25,7 +27,7 @@ def test_tables_go_to_the_output(capsys: pytest.CaptureFixture[str]) -> None:
     assert front_end.main(["benchmark", *SMALL]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith("# nsvq benchmark\n")
-    assert "| 48x40 " in printed
+    assert "### forward + backward, 48x40, 1 thread\n" in printed
 
 
 def test_json_goes_to_the_output_and_everything_to_the_folder(
@@ -44,7 +46,9 @@ def test_json_goes_to_the_output_and_everything_to_the_folder(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["lose"], "invalid choice: 'lose'"),
+        (["lose"], "unknown benchmark suite 'lose'; choose from render"),
+        (["loss", "--switches", "blocks,blokcs"], "got blokcs"),
+        (["loss", "--init-from", "scene.ply"], "needs a COLMAP folder"),
         (["loss", "--threads", "1,two"], "got '1,two'"),
         (["loss", "--threads", "4096"], "at most"),
         (["loss", "--repeats", "0"], "repeats must be at least 1, got 0"),
@@ -56,6 +60,26 @@ def test_wrong_arguments_are_explained(arguments: list[str], message: str, capsy
         cli.main(arguments)
     assert stopped.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_document_gets_the_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    document = tmp_path / "page.md"
+    document.write_text("before\n<!-- results: loss -->\n<!-- end -->\nafter\n")
+    assert cli.main([*SMALL, "--document", str(document)]) == 0
+    text = document.read_text()
+    assert text.startswith("before\n<!-- results: loss -->\n\n#### forward + backward, 48x40, 1 thread\n")
+    assert text.endswith("\n<!-- end -->\nafter\n")
+    assert "| fused " in text
+    document.write_text("no place")
+    with pytest.raises(SystemExit):
+        cli.main([*SMALL, "--document", str(document)])
+    assert "there is no place for loss" in capsys.readouterr().err
+    assert document.read_text() == "no place"
+
+
+def test_every_suite_has_its_place_in_the_documentation() -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "benchmark.md").read_text()
+    assert fill_in(page, dict.fromkeys(SUITES, "x")).count("\n\nx\n\n") == len(SUITES)
 
 
 @pytest.mark.parametrize(("name", "message"), [("none.ply", "No such file"), ("bad.ply", "bad.ply"), ("x.md", ".md")])

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,8 @@ import pytest
 
 from nsvq_lightning.benchmark.machine import describe_machine
 from nsvq_lightning.benchmark.plot import draw_suite
-from nsvq_lightning.benchmark.report import as_json, as_markdown, number
+from nsvq_lightning.benchmark.registry import Suite
+from nsvq_lightning.benchmark.report import as_json, as_markdown, fill_in, number, suite_tables
 from nsvq_lightning.benchmark.row import Row, Timing
 from nsvq_lightning.benchmark.settings import Settings
 
@@ -57,13 +59,34 @@ def test_tables_name_the_machine_and_every_operation() -> None:
     assert "python 3.11.0, torch 2.0" in text
     assert "Rounds: 15; threads: 1, 2; quick." in text
     assert text.count("## nearest\n") == 1
-    assert text.count("### search\n") == text.count("### other\n") == 1
+    assert text.count("### search, W, 1 thread\n") == text.count("### other, W, 1 thread\n") == 1
     lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
-    assert lines[0] == ["workload", "method", "threads", "ms", "quartiles", "min", "n", "sgemm", "wrong"]
-    assert lines[2] == ["W", "fast", "1", "2", "1.5–2.5", "1", "3", "0.2", "0"]
-    assert lines[3] == ["W", "slow", "1", "600", "450–750", "300", "3", "60", "1e-06"]
+    assert lines[0] == ["method", "ms", "quartiles", "min", "n", "sgemm", "wrong"]
+    assert lines[2] == ["fast", "2", "1.5–2.5", "1", "3", "0.2", "0"]
+    assert lines[3] == ["slow", "600", "450–750", "300", "3", "60", "1e-06"]
     assert lines[4][-2:] == ["wrong", "extra"]
     assert text.endswith("\n\nOnly half.\n")
+
+
+def test_workload_and_threads_are_columns_where_they_differ() -> None:
+    other = [dataclasses.replace(ROWS[0], workload="V"), dataclasses.replace(ROWS[0], threads=2), ROWS[0]]
+    text = suite_tables(MACHINE, Settings((1, 2)), other)
+    assert text.startswith("#### search\n\n| workload | method | threads |")
+    assert "Abacus 1" in text
+    one_workload = suite_tables(MACHINE, Settings((1, 2)), other[1:])
+    assert one_workload.startswith("#### search, W\n\n| method | threads |")
+
+
+def test_tables_are_put_where_a_document_has_a_place() -> None:
+    document = "a\n<!-- results: loss -->\nold\n<!-- end -->\nb\n<!-- results: codec -->\n<!-- end -->\n"
+    once = fill_in(document, {"loss": "new"})
+    assert once == document.replace("old\n", "\nnew\n\n")
+    assert fill_in(once, {"loss": "new"}) == once
+    assert "<!-- results: codec -->\n\nx\n\n<!-- end -->\n" in fill_in(once, {"codec": "x"})
+    with pytest.raises(ValueError, match="no place for nearest: it needs the lines"):
+        fill_in(document, {"nearest": "x"})
+    with pytest.raises(ValueError, match="no place for loss"):
+        fill_in("<!-- results: loss -->\n", {"loss": "x"})
 
 
 def test_lines_of_a_table_are_equally_long() -> None:
@@ -92,16 +115,51 @@ def test_this_machine_can_be_described() -> None:
     assert machine["versions"].keys() == {"nsvq-lightning", "python", "numpy", "torch", "numba", "llvmlite"}
 
 
-@pytest.mark.parametrize("rows", [ROWS, ROWS[:1], ROWS[1:2]], ids=["all", "only zero errors", "no zero error"])
-def test_picture_shows_one_panel_an_operation(tmp_path: Path, rows: list[Row]) -> None:
-    path = tmp_path / "nearest.png"
-    draw_suite(path, rows)
+ERRORS = Suite("", drawn=("wrong", "extra"))
+
+
+def _size(path: Path) -> tuple[int, int]:
     picture = cv2.imread(str(path))
-    panels = len({row.operation for row in rows})
-    assert picture.shape[1] / picture.shape[0] > 1.1 * panels
     assert (picture != 255).any()
+    return picture.shape[1], picture.shape[0]
+
+
+@pytest.mark.parametrize("rows", [ROWS[:2], ROWS[:1], ROWS[1:2]], ids=["all", "only zero errors", "no zero error"])
+def test_picture_has_a_panel_for_each_operation_and_value(tmp_path: Path, rows: list[Row]) -> None:
+    draw_suite(tmp_path / "one.png", rows, ERRORS)
+    draw_suite(tmp_path / "three.png", [*rows, ROWS[2]], ERRORS)
+    one, three = _size(tmp_path / "one.png"), _size(tmp_path / "three.png")
+    # Panels stand in two columns.
+    assert 1.8 < three[0] / one[0] < 2.2
+    assert 1.6 < three[1] / one[1] < 2.2
+
+
+def test_first_value_is_drawn_where_the_suite_names_none(tmp_path: Path) -> None:
+    draw_suite(tmp_path / "named.png", ROWS[2:], Suite("", drawn=("wrong",)))
+    draw_suite(tmp_path / "first.png", ROWS[2:], Suite(""))
+    assert (tmp_path / "named.png").read_bytes() == (tmp_path / "first.png").read_bytes()
+
+
+def test_courses_are_drawn_alone_and_differ_from_points(tmp_path: Path) -> None:
+    run = dataclasses.replace(ROWS[0], course=((0.1, 12.0), (1.0, 20.0), (2.0, 21.0)))
+    draw_suite(tmp_path / "run.png", [run], ERRORS)
+    draw_suite(
+        tmp_path / "both.png", [run, dataclasses.replace(ROWS[0], operation="step", values={"other": 1})], ERRORS
+    )
+    draw_suite(tmp_path / "point.png", [ROWS[0]], ERRORS)
+    assert (tmp_path / "run.png").read_bytes() == (tmp_path / "both.png").read_bytes()
+    assert (tmp_path / "run.png").read_bytes() != (tmp_path / "point.png").read_bytes()
+
+
+def test_shares_are_bars_as_long_as_they_are_large(tmp_path: Path) -> None:
+    rows = [_row(name, ms, 0.0, **{"share %": ms}) for name, ms in (("whole", 100.0), ("a", 80.0), ("b", 20.0))]
+    draw_suite(tmp_path / "bars.png", rows, Suite("", picture="shares"))
+    picture = cv2.imread(str(tmp_path / "bars.png")).astype(int)
+    blue = (picture[..., 0] > 150) & (picture[..., 2] < 60)
+    lengths = sorted(set(blue.sum(1)) - {0})
+    assert lengths[-1] / lengths[0] == pytest.approx(4, rel=0.05)
 
 
 def test_picture_needs_something_to_draw(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no row has a value"):
-        draw_suite(tmp_path / "x.png", [Row("s", "w", "m", "o", 1, Timing((1.0,), (1.0,)))])
+        draw_suite(tmp_path / "x.png", [Row("s", "w", "m", "o", 1, Timing((1.0,), (1.0,)))], ERRORS)

@@ -14,15 +14,17 @@ def test_full_and_quick_runs_have_their_own_defaults() -> None:
     assert (full.threads, full.repeats, full.workloads) == ((1, 4), 15, ("A20k", "B100k", "C500k"))
     assert (quick.threads, quick.repeats, quick.workloads) == ((4,), 3, ("A20k",))
     assert quick.seconds < full.seconds
+    assert quick.steps < full.steps
     assert Settings.of(quick=False, most_threads=1).threads == (1,)
 
 
 def test_what_is_given_wins() -> None:
     settings = Settings.of(
-        quick=True, most_threads=2, threads=(2, 1), repeats=9, workloads=("B100k",), scene=Path("x.ply")
+        quick=True, most_threads=2, threads=(2, 1), repeats=9, workloads=("B100k",), scene=Path("x.ply"), steps=None
     )
     assert (settings.threads, settings.repeats, settings.workloads) == ((2, 1), 9, ("B100k",))
     assert settings.scene == Path("x.ply")
+    assert settings.steps == Settings.of(quick=True, most_threads=2).steps
 
 
 @pytest.mark.parametrize(
@@ -35,6 +37,10 @@ def test_what_is_given_wins() -> None:
         ({"threads": (1,), "seconds": 0.0}, "above 0"),
         ({"threads": (1,), "workloads": ("A20k", "Z")}, "some of A20k, B100k, C500k, got Z"),
         ({"threads": (1,), "workloads": ()}, "got none"),
+        ({"threads": (1,), "steps": 3}, "steps must be at least 4, one for each phase, got 3"),
+        ({"threads": (1,), "switches": ("blocks", "blokcs")}, "some of blocks, .*, got blokcs"),
+        ({"threads": (1,), "init_from": Path("x.ply")}, "needs a COLMAP folder"),
+        ({"threads": (1,), "init_from": Path("x.ply"), "scene": Path("y.ply")}, "needs a COLMAP folder"),
     ],
 )
 def test_values_out_of_range_are_refused(arguments: dict[str, Any], message: str) -> None:

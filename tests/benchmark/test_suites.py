@@ -15,12 +15,15 @@ from nsvq_lightning.benchmark.errors import relative_l2, worst_first
 from nsvq_lightning.benchmark.registry import SUITES, load_suite, suite_names
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
-from nsvq_lightning.benchmark.suites import codec, loss, nearest, optimizer, quantize, render
+from nsvq_lightning.benchmark.stopwatches import Own
+from nsvq_lightning.benchmark.suites import codec, kmeans, loss, nearest, optimizer, profile, quantize, render, train
 from nsvq_lightning.benchmark.workloads import synthetic_workload
 from nsvq_lightning.io.arrays import SplatArrays
 from nsvq_lightning.splats import RawSplats
 
-TINY = Settings((1,), quick=True, repeats=2, seconds=0.01, workloads=("A20k",))
+TINY = Settings((1,), quick=True, repeats=2, seconds=0.01, workloads=("A20k",), steps=8)
+BY_STEP = ("train", "profile")
+"""Suites that time steps instead of repeated calls."""
 
 
 @pytest.fixture(scope="module")
@@ -34,13 +37,18 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(timing, "SGEMM_SIDE", 64)
-    monkeypatch.setattr(render, "ORACLE_WORK", {True: 2e6})
+    monkeypatch.setattr(render, "ORACLE_PAIRS", {True: 3e5})
     monkeypatch.setattr(nearest, "ROWS", {True: 200})
     monkeypatch.setattr(loss, "SIZE", (40, 48))
     monkeypatch.setattr(optimizer, "SPLATS", {True: (100,)})
     monkeypatch.setattr(optimizer, "CHECKED_SPLATS", 200)
     monkeypatch.setattr(quantize, "CHECKED_ROWS", 500)
-    monkeypatch.setattr(quantize, "CHECKED_CODES", 20)
+    monkeypatch.setattr(kmeans, "CHECKED_ROWS", 500)
+    monkeypatch.setattr(kmeans, "CHECKED_CODES", 20)
+    monkeypatch.setattr(train, "DEMO", {True: {"views": 9, "width": 48, "height": 36}})
+    for module in (train, profile):
+        monkeypatch.setattr(module, "WARM_STEPS", {True: 2})
+        monkeypatch.setattr(module, "STEPS", {True: 4})
 
 
 def _run(name: str, scene: Path) -> list[Row]:
@@ -51,8 +59,9 @@ def test_every_suite_is_a_file_and_every_file_a_suite() -> None:
     assert {module.name for module in pkgutil.iter_modules(suites.__path__)} == set(SUITES)
     assert suite_names("all") == tuple(SUITES)
     assert suite_names("loss") == ("loss",)
-    with pytest.raises(ValueError, match=r"'lose'; choose one of render, .* or all"):
-        suite_names("lose")
+    assert suite_names("train,loss,train") == ("train", "loss")
+    with pytest.raises(ValueError, match=r"'lose'; choose from render, .* or all"):
+        suite_names("train,lose")
 
 
 @pytest.mark.parametrize("name", SUITES)
@@ -64,8 +73,10 @@ def test_rows_are_complete(name: str, scene: Path) -> None:
     for row in rows:
         assert row.values
         assert all(value == value and value >= 0 for value in row.values.values())
-        assert 1 <= len(row.timing.samples) <= TINY.repeats
-        assert len(row.timing.sgemm) == TINY.repeats
+        assert row.timing.ratio > 0 or row.method == profile.UNEXPLAINED
+        if name not in BY_STEP:
+            assert 1 <= len(row.timing.samples) <= TINY.repeats
+            assert len(row.timing.sgemm) == TINY.repeats
 
 
 def test_rasterizer_is_as_exact_as_plain_torch(scene: Path) -> None:
@@ -95,7 +106,117 @@ def test_loss_and_optimizer_and_quantizer_are_right(scene: Path) -> None:
     step = next(row.values for row in quantizer if row.method == "NSVQ")
     assert step["gradient error"] < 1e-4
     assert step["length error"] < 1e-5
-    assert max(row.values["distortion error"] for row in quantizer if row.method == "kmeans") < 1e-4
+
+
+def test_less_accuracy_costs_what_the_rows_say(scene: Path) -> None:
+    rows = {row.method: row.values for row in _run("render", scene) if row.operation == "forward"}
+    methods = [f"cpu{accuracy.label}" for accuracy in render.accuracies(3)]
+    assert methods == ["cpu", "cpu, SH 2", "cpu, SH 1", "cpu, SH 0", "cpu, half size", "cpu, quarter size"]
+    by_degree = [rows[method]["mean error"] for method in methods[:4]]
+    assert by_degree == sorted(by_degree)
+    assert by_degree[1] > 100 * by_degree[0]
+    assert rows["cpu, quarter size"]["mean error"] > rows["cpu, half size"]["mean error"] > 100 * by_degree[0]
+
+
+def test_crop_is_the_largest_that_the_oracle_can_do() -> None:
+    workload = synthetic_workload("A20k")
+    pairs = {crop.camera.height: render._pairs(crop) for crop in (workload.crop(36, 24), workload.crop(48, 32))}
+    assert pairs[24] < pairs[32]
+    for most, size in ((pairs[24], (36, 24)), (pairs[32] - 1, (36, 24)), (0, (24, 16)), (1e30, (400, 300))):
+        camera = render._crop(workload, most).camera
+        assert (camera.width, camera.height) == size
+
+
+def test_smaller_picture_of_one_colour_is_that_colour() -> None:
+    workload = synthetic_workload("A20k").crop(50, 33)
+    workload = dataclasses.replace(workload, background=torch.tensor([0.1, 0.5, 0.9]))
+    nothing = RawSplats(*(tensor[:0] for tensor in workload.splats))
+    image = render.Method("cpu", render.Accuracy(shrink=4)).picture(nothing, workload)
+    torch.testing.assert_close(image, workload.background.expand(33, 50, 3))
+
+
+def test_every_lloyd_step_brings_the_codes_nearer(scene: Path) -> None:
+    rows = _run("kmeans", scene)
+    by_method = {method: [row for row in rows if row.method == method] for method in ("1 Lloyd step", "10 Lloyd steps")}
+    assert len(by_method["1 Lloyd step"]) == len(by_method["10 Lloyd steps"]) == 5
+    for once, often in zip(*by_method.values(), strict=True):
+        assert once.workload == often.workload
+        assert 0 < often.values["distortion"] < once.values["distortion"] < 1
+        assert often.values["rounding error"] < 1e-4
+    *each, whole = by_method["10 Lloyd steps"]
+    assert whole.timing.samples[0] == pytest.approx(sum(row.timing.samples[0] for row in each))
+
+
+def test_distortion_is_a_share_of_the_variance() -> None:
+    rows = torch.tensor([[0.0, 1.0], [2.0, 1.0], [10.0, 1.0], [12.0, 1.0]])
+    # Squared distances of 1 to the centres of the pairs; variance (36 + 16 + 16 + 36) / 4.
+    assert kmeans.distortion(rows, torch.tensor([[1.0, 1.0], [11.0, 1.0]])) == pytest.approx(1 / 26)
+    assert kmeans.distortion(rows, rows) == 0
+    assert kmeans.distortion(rows[:1], rows[1:2]) == 4
+
+
+def test_runs_with_and_without_a_switch(scene: Path) -> None:
+    switched = dataclasses.replace(TINY, scene=scene, switches=("sh_bands", "adam_rows"))
+    rows = {row.method: row for row in train.run(switched)}
+    shipped, exact = rows["as shipped"], rows["no skip of sh_bands"]
+    assert shipped.values["other numbers"] == exact.values["other numbers"] == 0
+    assert shipped.values["PSNR dB"] == exact.values["PSNR dB"] > 5
+    assert shipped.values["times as shipped"] == 1
+    assert {"warmup ms", "prune ms", "quantize ms", "finetune ms"} < shipped.values.keys()
+    assert [point[0] for point in shipped.course] == sorted(point[0] for point in shipped.course)
+    assert shipped.course[-1][1] == shipped.values["PSNR dB"]
+    assert len(shipped.timing.samples) == TINY.steps
+    step, render_alone = rows["training step, Lightning included"], rows["render forward + backward"]
+    assert render_alone.values["times its render"] == 1
+    assert step.values["times its render"] == pytest.approx(step.timing.median / render_alone.timing.median)
+
+
+def test_settings_of_runs() -> None:
+    names = [setting.name for setting in train.settings_of(Settings((1, 2), switches=("sh_bands", "adam_rows")))]
+    assert names == ["as shipped", "1 thread", "no skip of sh_bands", "skip adam_rows"]
+    plain = train.settings_of(Settings((2,)))
+    assert [setting.options["codebooks"] for setting in plain] == ["1k", None]
+
+
+def test_different_numbers_are_counted_by_their_bits() -> None:
+    one = {"a": torch.tensor([0.0, 1.0, torch.nan]), "b": torch.ones(2, 2)}
+    assert train.different_numbers(one, {name: tensor.clone() for name, tensor in one.items()}) == 0
+    assert train.different_numbers(one, {**one, "a": torch.tensor([-0.0, 1.0, torch.nan])}) == 1
+    assert train.different_numbers(one, {**one, "b": torch.ones(3, 2)}) == 4
+    assert train.different_numbers(one, {"a": one["a"]}) == 4
+
+
+def test_parts_add_up_to_the_step(scene: Path) -> None:
+    rows = _run("profile", scene)
+    operations = [f"{phase} step" for phase in ("warmup", "prune", "quantize", "finetune")]
+    assert list(dict.fromkeys(row.operation for row in rows)) == operations
+    for operation in operations:
+        whole, *parts = [row for row in rows if row.operation == operation]
+        assert whole.method == profile.WHOLE
+        assert sum(row.values["share %"] for row in parts) == pytest.approx(100)
+        names = {row.method for row in parts}
+        assert {"blend", "blend backward", "Adam", profile.LIGHTNING, profile.UNEXPLAINED} <= names
+        assert ("quantizer: search" in names) == (operation == "quantize step")
+        assert "torch's operators" in whole.note
+
+
+def test_names_are_put_into_the_first_part_that_fits() -> None:
+    own = {
+        "nsvq_lightning.rendering.cpu.blend.blend": Own(0.5, 1),
+        "nsvq_lightning.rendering.cpu.blend.blend_backward": Own(0.25, 1),
+        "nsvq_lightning.rendering.cpu.blend.total_slots": Own(0.125, 1),
+        "nsvq_lightning.rendering.cpu.rasterizer._flat": Own(0.0001, 28),
+        "nsvq_lightning.rendering.cpu.dssim.sweep_image": Own(0.003, 1),
+        "[LightningModule]SplatModule.optimizer_step": Own(0.005, 1),
+        "run_training_batch": Own(0.1, 1),
+    }
+    assert profile.parts_of(own) == {
+        "blend": Own(0.5, 1),
+        "blend backward": Own(0.375, 2),
+        "rasterizer, its Python": Own(0.0001, 28),
+        "loss": Own(0.003, 1),
+        "Adam": Own(0.005, 1),
+    }
 
 
 def test_files_of_level_paper_and_ply_lose_nothing(scene: Path) -> None:
@@ -110,14 +231,15 @@ def test_image_errors_leave_out_a_flipped_pixel_and_count_it() -> None:
     truth = torch.rand(8, 9, 3, generator=torch.Generator().manual_seed(0)).double()
     image = truth + 1e-6
     image[2, 3, 1] += 0.01
-    values, usual = render.image_errors(image, truth)
+    values = render.image_errors(image, truth)
     assert values["max error"] == pytest.approx(1e-6)
     assert values["mean error"] == pytest.approx(1e-6)
     assert values["pixels left out"] == values["pixels above 1e-3"] == 1
-    assert not usual[2, 3]
-    assert int(usual.sum()) == 71
-    same, _ = render.image_errors(truth, truth)
-    assert set(same.values()) == {0}
+    assert set(render.image_errors(truth, truth).values()) == {0}
+    # Where the pixels are given, the jump counts.
+    every = render.image_errors(image, truth, torch.ones(8, 9, dtype=torch.bool))
+    assert every["max error"] == pytest.approx(0.01, rel=1e-3)
+    assert every["pixels left out"] == 0
 
 
 def test_wrong_codes_are_counted_with_what_they_add() -> None:
@@ -133,8 +255,18 @@ def test_wrong_optimizer_is_found() -> None:
     def wrong(groups: list[dict[str, object]]) -> torch.optim.Optimizer:
         return torch.optim.Adam(groups, eps=1e-8)
 
-    assert optimizer.errors_after(3, wrong)["update error"] > 1e-3
-    assert optimizer.errors_after(3, optimizer.build_adam)["update error"] < 1e-3
+    everything = optimizer.SCENARIOS[0]
+    assert optimizer.errors_after(3, optimizer.Method(wrong), everything)["update error"] > 1e-3
+    assert optimizer.errors_after(3, optimizer.METHODS["build_adam"], everything)["update error"] < 1e-3
+
+
+def test_rows_and_bands_that_are_skipped(scene: Path) -> None:
+    rows = {(row.operation, row.method): row.values["update error"] for row in _run("optimizer", scene)}
+    every, hidden, first_band = (scenario.operation for scenario in optimizer.SCENARIOS)
+    assert max(rows[operation, "build_adam"] for operation in (every, hidden, first_band)) < 1e-3
+    assert rows[first_band, "build_adam, no skip of adam_bands"] == rows[first_band, "build_adam"]
+    # What the switch changes is stated, not hidden.
+    assert rows[hidden, "build_adam, skip adam_rows"] > 0.01
 
 
 def test_wrong_quantize_step_is_found() -> None:
@@ -143,10 +275,11 @@ def test_wrong_quantize_step_is_found() -> None:
     results = quantize.step(attributes, 0)
     assert max(quantize.step_errors(attributes, results).values()) < 1e-4
     quantized, gradient, codes = results["quats"]
-    x = attributes["quats"].x.detach()[attributes["quats"].rows]
+    table, rows, upstream = attributes["quats"].x.detach(), attributes["quats"].rows, attributes["quats"].upstream
+    x, straight_through = table[rows], torch.zeros_like(table).index_copy(0, rows, upstream)
     for broken, key in (
         ((x + 1.01 * (quantized - x), gradient, codes), "length error"),
-        ((quantized, gradient.roll(1, 0), codes), "gradient error"),
+        ((quantized, straight_through, codes), "gradient error"),
         ((quantized, gradient, codes.roll(1)), "wrong codes"),
     ):
         assert quantize.step_errors(attributes, {**results, "quats": broken})[key] > 1e-3
@@ -168,8 +301,8 @@ def test_errors_are_relative_and_the_worst_comes_first() -> None:
 
 
 def test_plain_loss_is_the_loss_of_the_package_in_another_way() -> None:
-    image, target = (tensor.double() for tensor in loss.image_pair(30, 41))
-    value, gradient = loss.loss_and_gradient("plain torch", image, target)
-    expected, expected_gradient = loss.loss_and_gradient("fused", image, target)  # plain torch too, in float64
+    image, target = loss.image_pair(30, 41)
+    value, gradient = loss.loss_and_gradient("plain torch", image.double(), target)
+    expected, expected_gradient = loss.loss_and_gradient("fused", image.double(), target)  # plain torch too, in float64
     torch.testing.assert_close(value, expected, rtol=1e-12, atol=0)
     torch.testing.assert_close(gradient, expected_gradient, rtol=1e-9, atol=1e-15)

@@ -11,7 +11,9 @@ import torch
 from nsvq_lightning import save
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.sizes import SIZES
-from nsvq_lightning.benchmark.workloads import scene_workload, synthetic_workload, workloads
+from nsvq_lightning.benchmark.views import FADING, write_views
+from nsvq_lightning.benchmark.workloads import scene_workload, single_workload, synthetic_workload, workloads
+from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats import RawSplats, Splats
 
@@ -97,3 +99,39 @@ def test_empty_scene_is_refused(tmp_path: Path) -> None:
     save(Splats(3), path)
     with pytest.raises(ValueError, match="no splat"):
         scene_workload(path)
+
+
+def test_folder_is_seen_by_its_first_train_camera(demo_scene: Path, tmp_path: Path) -> None:
+    scene = load_scene(demo_scene)
+    (workload,) = workloads(Settings((1,), scene=demo_scene))
+    assert str(workload) == "scene 96x72"
+    assert workload.camera is not scene.cameras[0]
+    assert torch.equal(workload.camera.viewmat, scene.cameras[scene.train[0]].viewmat)
+    assert torch.equal(workload.splats.means, scene.points)
+    path = tmp_path / "trained.ply"
+    save(RawSplats(*(tensor[:50] for tensor in synthetic_workload("A20k").splats)), path)
+    other = single_workload(Settings((1,), scene=demo_scene, init_from=path), "B100k")
+    assert str(other) == "scene trained.ply 96x72"
+    assert torch.equal(other.camera.viewmat, workload.camera.viewmat)
+    assert len(other.splats.means) == 50
+
+
+def test_quick_runs_take_the_smallest_scene() -> None:
+    assert single_workload(Settings((1,), quick=True), "B100k").name == "A20k"
+
+
+def test_views_are_photos_of_the_workload_from_around(tmp_path: Path) -> None:
+    source = synthetic_workload("A20k").crop(64, 48)
+    scene = load_scene(write_views(source, tmp_path / "views", views=9))
+    assert len(scene) == 9
+    middle = scene.view(4)
+    torch.testing.assert_close(middle.camera.viewmat, source.camera.viewmat)
+    assert middle.camera.intrinsics == pytest.approx(source.camera.intrinsics)
+    expected = FADING * render(source.splats, source.camera).image.clamp(0, 1)
+    assert float((middle.image / 255 - expected).abs().max()) < 0.51 / 255
+    # All look at the middle of the splats from the same distance.
+    depth = [float((source.splats.means @ c.viewmat[2, :3] + c.viewmat[2, 3]).median()) for c in scene.cameras]
+    assert max(depth) - min(depth) < 0.05 * max(depth)
+    turns = [float(torch.linalg.vector_norm(c.viewmat[:3, :3] - source.camera.viewmat[:3, :3])) for c in scene.cameras]
+    assert turns[0] == pytest.approx(turns[-1], rel=1e-3)
+    assert turns[0] > turns[3] > 0.05

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
@@ -23,7 +25,8 @@ from nsvq_lightning.io.ply import read_ply, write_ply
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, Quantizer
 from nsvq_lightning.quantized import build_quantizers
 from nsvq_lightning.random import generator
-from nsvq_lightning.splats import ATTRIBUTES, Splats
+from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.splats import ATTRIBUTES, Splats, SplatTensors
 
 __all__ = ["Codec", "codecs", "compressed", "read_errors", "run"]
 
@@ -59,10 +62,20 @@ def _rows(workload: Workload, setting: str, settings: Settings, folder: Path) ->
     count = len(workload.splats.means)
     name = f"{workload.name}, {setting} codebooks"
     sizes, errors, cases = {}, {}, []
+    with use_threads(max(settings.threads)):
+        truth = _image(workload.splats, workload)
     for index, codec in enumerate(kinds):
         path = folder / f"{index}{codec.suffix}"
         sizes[codec.name] = codec.write(path)
-        errors[codec.name] = read_errors(codec.read(path), codec.stored, SplatArrays.from_splats(workload.splats))
+        read = codec.read(path)
+        with use_threads(max(settings.threads)):
+            image = _image(read.to_splats(), workload)
+            meant = _image(codec.stored.to_splats(), workload)
+        errors[codec.name] = {
+            "image error": float((image - meant).abs().mean()),
+            "image error with codebooks": float((image - truth).abs().mean()),
+            **read_errors(read, codec.stored, SplatArrays.from_splats(workload.splats)),
+        }
         cases += [_write_case(codec, path), _read_case(codec, path)]
     rows = []
     for threads in settings.threads:
@@ -78,6 +91,12 @@ def _rows(workload: Workload, setting: str, settings: Settings, folder: Path) ->
                 }
                 rows.append(Row("codec", name, codec.name, operation, threads, timing, values))
     return rows
+
+
+@torch.no_grad()
+def _image(splats: SplatTensors, workload: Workload) -> Tensor:
+    """The workload's view of some splats ``[H, W, 3]``."""
+    return render(splats, workload.camera, background=workload.background).image
 
 
 def _write_case(codec: Codec, path: Path) -> Case:

@@ -24,7 +24,7 @@ def run(settings: Settings) -> list[Row]:
     """Time loss and gradient of one image pair with every number of threads."""
     image, target = image_pair(*SIZE)
     with use_threads(max(settings.threads)):
-        truth = loss_and_gradient("plain torch", image.double(), target.double())
+        truth = loss_and_gradient("plain torch", image.double(), target)
         errors = {name: _errors(loss_and_gradient(name, image, target), truth) for name in METHODS}
     rows = []
     for threads in settings.threads:
@@ -39,13 +39,15 @@ def _case(method: str, image: Tensor, target: Tensor) -> Case:
 
 
 def image_pair(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """A smooth random picture, and the same with an error of 0.05, as in the middle of a training ``[H, W, 3]``."""
+    """A smooth random photo ``[H, W, 3]`` uint8, and before it the same with an error of 0.05, as in a training."""
     draw = generator(0, 0, "loss")
     coarse = torch.rand(1, 3, height // 16 + 1, width // 16 + 1, generator=draw)
     smooth = functional.interpolate(coarse, (height, width), mode="bilinear")[0].movedim(0, -1)
-    target = smooth.contiguous()
-    image = (target + 0.05 * torch.randn(target.shape, generator=draw)).clamp(0, 1)
-    return image, target
+    target = (255 * smooth).round().byte().contiguous()
+    noise = torch.randn(target.shape, generator=draw)
+    # No value is almost right: the gradient of its absolute error would be the sign of a rounding.
+    noise = noise.sign() * (0.05 * noise.abs()).clamp_min(1e-3)
+    return (target / 255 + noise).clamp(0, 1), target
 
 
 def loss_and_gradient(method: str, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
@@ -58,7 +60,7 @@ def loss_and_gradient(method: str, image: Tensor, target: Tensor) -> tuple[Tenso
 
 def plain_loss(image: Tensor, target: Tensor, dssim_weight: float) -> Tensor:
     """(1 - λ)·L1 + λ·(1 - SSIM) with depthwise separable convolutions, the fastest that plain torch has for it."""
-    taps = ssim_window().to(image)
+    taps, target = ssim_window().to(image), target.to(image.dtype) / 255
     x, y = image.movedim(-1, 0), target.movedim(-1, 0)
     planes = torch.cat([x, y, x * x, y * y, x * y])[None]
     count = planes.shape[1]

@@ -11,7 +11,7 @@ from torch import Tensor
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.timing import Case, measure, use_threads
-from nsvq_lightning.benchmark.workloads import Workload, scene_workload, synthetic_workload
+from nsvq_lightning.benchmark.workloads import Workload, single_workload
 from nsvq_lightning.quantize import QUANTIZED, codebook_sizes, kmeans, nearest, nearest_reference
 from nsvq_lightning.random import generator
 
@@ -38,11 +38,12 @@ class Search(NamedTuple):
 
 def run(settings: Settings) -> list[Row]:
     """Time every method on every attribute with every number of threads."""
-    source = scene_workload(settings.scene) if settings.scene is not None else synthetic_workload("B100k")
-    return [row for search in searches(source, ROWS[settings.quick]) for row in _rows(search, settings)]
+    setting = "1k" if settings.quick else "16k"
+    found = searches(single_workload(settings, "B100k"), ROWS[settings.quick], setting)
+    return [row for search in found for row in _rows(search, settings)]
 
 
-def searches(source: Workload, rows: int, setting: str = "16k") -> list[Search]:
+def searches(source: Workload, rows: int, setting: str) -> list[Search]:
     """A search for each quantized attribute, with codebooks of two steps of k-means on all splats."""
     sizes = codebook_sizes(setting)
     found = []

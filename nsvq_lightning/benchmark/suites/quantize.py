@@ -1,4 +1,4 @@
-"""A quantize step of training on all four attributes, and the k-means that places their codebooks."""
+"""A quantize step of training on all four attributes."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from nsvq_lightning.benchmark.errors import relative_l2
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.timing import Case, measure, use_threads
-from nsvq_lightning.benchmark.workloads import Workload, scene_workload, synthetic_workload
+from nsvq_lightning.benchmark.workloads import single_workload
 from nsvq_lightning.optim import LearningRates
-from nsvq_lightning.quantize import NSVQ, QUANTIZED, CodebookQuantizer, codebook_sizes, kmeans, nearest_reference
+from nsvq_lightning.quantize import NSVQ, QUANTIZED, CodebookQuantizer, nearest_reference
 from nsvq_lightning.quantized import build_quantizers
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats import RawSplats, Splats
 
-__all__ = ["Attribute", "kmeans_error", "plain_step", "prepare", "run", "step", "step_errors"]
+__all__ = ["Attribute", "plain_step", "prepare", "run", "step", "step_errors"]
 
 VISIBLE = 0.8
 """Share of the splats that a camera sees."""
 CHUNK = 1 << 22
-CHECKED_ROWS, CHECKED_CODES = 4_000, 256
-"""Size at which k-means is repeated in float64; the codes of a step are checked on that many rows an attribute."""
+CHECKED_ROWS = 4_000
+"""Rows an attribute whose codes are checked."""
 
 
 class Attribute(NamedTuple):
@@ -51,19 +51,9 @@ Results = dict[str, tuple[Tensor, Tensor, Tensor]]
 
 
 def run(settings: Settings) -> list[Row]:
-    """Time the step and the start of the codebooks with every number of threads."""
+    """Time the step with every number of threads."""
     setting = "1k" if settings.quick else "16k"
-    source = _source(settings, "B100k")
-    return [*_step_rows(source, setting, settings), *_start_rows(_source(settings, "C500k"), setting, settings)]
-
-
-def _source(settings: Settings, full: str) -> Workload:
-    if settings.scene is not None:
-        return scene_workload(settings.scene)
-    return synthetic_workload("A20k" if settings.quick else full)
-
-
-def _step_rows(source: Workload, setting: str, settings: Settings) -> list[Row]:
+    source = single_workload(settings, "B100k")
     with use_threads(max(settings.threads)):
         attributes = prepare(source.splats, setting)
         errors = {"NSVQ": step_errors(attributes, step(attributes, 0))}
@@ -168,39 +158,3 @@ def step_errors(attributes: Mapping[str, Attribute], results: Results) -> dict[s
         "length error": max(lengths),
         "wrong codes": float(wrong),
     }
-
-
-def _start_rows(source: Workload, setting: str, settings: Settings) -> list[Row]:
-    sizes = codebook_sizes(setting)
-    every = {name: attribute.rows(getattr(source.splats, name)) for name, attribute in QUANTIZED.items()}
-    every = {name: rows for name, rows in every.items() if rows.shape[1] > 0}
-    with use_threads(max(settings.threads)):
-        errors = {name: {"distortion error": kmeans_error(rows)} for name, rows in every.items()}
-    note = f"10 Lloyd steps; error on {CHECKED_ROWS} rows with {CHECKED_CODES} codes"
-    rows = []
-    for threads in settings.threads:
-        timings = measure([_start_case(name, every[name], sizes[name]) for name in every], settings, threads)
-        for name in every:
-            workload = f"{source.name} {name}: {len(every[name])} rows, D {every[name].shape[1]}, K {sizes[name]}"
-            rows.append(
-                Row("quantize", workload, "kmeans", "k-means start", threads, timings[name], errors[name], note)
-            )
-    return rows
-
-
-def _start_case(name: str, rows: Tensor, codes: int) -> Case:
-    return Case(name, lambda: kmeans(rows, codes, generator(0, 0, "start", name)))
-
-
-def kmeans_error(rows: Tensor) -> float:
-    """Relative difference of the mean squared distance to a codebook computed in float64 from the same start."""
-    some = rows[torch.randperm(len(rows), generator=generator(0, 0, "checked"))[:CHECKED_ROWS]]
-    start = some[: min(CHECKED_CODES, len(some))]
-    truth = _distortion(some, kmeans(some.double(), len(start), generator(0), start=start.double()))
-    found = _distortion(some, kmeans(some, len(start), generator(0), start=start))
-    return abs(found - truth) / truth if truth > 0 else found
-
-
-def _distortion(rows: Tensor, codebook: Tensor) -> float:
-    rows, codebook = rows.double(), codebook.double()
-    return float((rows - codebook[nearest_reference(rows, codebook)]).square().sum(1).mean())

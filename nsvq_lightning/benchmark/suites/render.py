@@ -1,39 +1,87 @@
-"""Back-ends of :func:`nsvq_lightning.render` against its float64 oracle.
+"""Back-ends of :func:`nsvq_lightning.render`, and what can be saved by asking for less, against its float64 oracle.
 
-Errors are measured on a crop in the middle of the view, whose pixels see the same splats as in the whole view: the
-oracle would take minutes for the whole. Where two splats are equally deep, or α is 1/255, to rounding, float32 decides
+The oracle has everything: all SH bands, every pixel. So the error of a lower SH degree is that of the colours it leaves
+out, and the error of a smaller picture, blown up to the full size, that of the detail it does not have.
+
+Where the oracle would take minutes for the whole view, errors are measured on a crop in its middle, whose pixels see
+the same splats. Where two splats are equally deep, or α is 1/255, to rounding, float32 decides
 by chance and the pixel's error jumps by orders of magnitude. Such pixels are counted, and left out of the other
 errors: they say nothing about the quality of the arithmetic.
 """
 
 from __future__ import annotations
 
-import math
+from bisect import bisect_right
 from contextlib import suppress
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from nsvq_lightning.benchmark.errors import relative_l2, worst_first
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.timing import Case, measure, use_threads
 from nsvq_lightning.benchmark.workloads import Workload, workloads
+from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import BACKENDS, render, resolve_backend
-from nsvq_lightning.splats import RawSplats
+from nsvq_lightning.rendering.reference import TILE
+from nsvq_lightning.splats import RawSplats, sh_degree_of
 
-__all__ = ["image_errors", "run"]
+__all__ = ["Accuracy", "Method", "accuracies", "image_errors", "run"]
 
 REFERENCE = "reference"
 FORWARD, BOTH = "forward", "forward + backward"
-ORACLE_WORK = {True: 1.2e8, False: 6e8}
-"""Splats times pixels that the oracle is given, quick and full: a second, and up to half a minute on one core."""
+ORACLE_PAIRS = {True: 4e6, False: 8e7}
+"""Pairs of a splat and a pixel of the tiles it touches that the oracle is given, quick and full: half a minute on one
+core at most."""
+CROP_STEP = 8
+"""Pixels by which the height of a crop grows."""
 REFERENCE_SPLATS = 20_000
 """Plain torch is timed up to this many splats; beyond, one image takes it most of a minute."""
 FLIPPED = 1e-3
 OUTLIER = 10.0
 """A pixel is left out if its error is this many times the median of the errors that are not 0."""
+
+
+class Accuracy(NamedTuple):
+    """What is asked of a back-end.
+
+    Attributes:
+        label: Name in the tables, behind that of the back-end.
+        sh_degree: Highest SH degree; None for all.
+        shrink: The picture is rendered this many times smaller, and blown up.
+    """
+
+    label: str = ""
+    sh_degree: int | None = None
+    shrink: int = 1
+
+
+FULL = Accuracy()
+
+
+class Method(NamedTuple):
+    """A back-end and what is asked of it."""
+
+    backend: str
+    accuracy: Accuracy = FULL
+
+    def __str__(self) -> str:
+        return ("plain torch" if self.backend == REFERENCE else self.backend) + self.accuracy.label
+
+    def picture(self, splats: RawSplats, workload: Workload) -> Tensor:
+        """Image ``[H, W, 3]`` of the workload's view."""
+        camera, background = workload.camera, workload.background.to(splats.means.dtype)
+        view = _smaller(camera, self.accuracy.shrink)
+        image = render(
+            splats, view, sh_degree=self.accuracy.sh_degree, background=background, backend=self.backend
+        ).image
+        if self.accuracy.shrink == 1:
+            return image
+        size = camera.height, camera.width
+        return functional.interpolate(image.movedim(-1, 0)[None], size, mode="bilinear")[0].movedim(0, -1)
 
 
 class _Traced(NamedTuple):
@@ -44,32 +92,48 @@ class _Traced(NamedTuple):
 
 
 def run(settings: Settings) -> list[Row]:
-    """Time every back-end on every workload with every number of threads; errors once a workload."""
+    """Time every method on every workload with every number of threads; errors once a workload."""
     return [row for workload in workloads(settings) for row in _rows(workload, settings)]
+
+
+def accuracies(stored_degree: int) -> list[Accuracy]:
+    """What can be asked for: everything first, then each lower SH degree, then smaller pictures."""
+    lower = [Accuracy(f", SH {degree}", degree) for degree in reversed(range(stored_degree))]
+    return [FULL, *lower, Accuracy(", half size", shrink=2), Accuracy(", quarter size", shrink=4)]
+
+
+def _smaller(camera: Camera, shrink: int) -> Camera:
+    """The same view with fewer pixels."""
+    if shrink == 1:
+        return camera
+    width, height = (max(1, round(side / shrink)) for side in (camera.width, camera.height))
+    scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
+    return Camera(camera.K * scale, camera.viewmat, width, height)
 
 
 def _rows(workload: Workload, settings: Settings) -> list[Row]:
     small = len(workload.splats.means) <= REFERENCE_SPLATS
-    crop = workload.crop(*_crop_size(workload, settings.quick))
-    fast = _fast_backends(workload.splats.means)
+    crop = _crop(workload, ORACLE_PAIRS[settings.quick])
+    asked = accuracies(sh_degree_of(workload.splats.shN))
+    fast = [Method(name, accuracy) for name in _fast_backends(workload.splats.means) for accuracy in asked]
+    plain = Method(REFERENCE)
     # In a quick run even 20k splats are too much for plain torch: it is compared on the crop.
-    jobs = [(workload, [*fast, REFERENCE] if small and not settings.quick else fast)]
+    jobs = [(workload, [*fast, plain] if small and not settings.quick else fast)]
     if small and settings.quick:
-        jobs.append((crop, [*fast, REFERENCE]))
+        jobs.append((crop, [fast[0], plain]))
     with use_threads(max(settings.threads)):
-        errors = _errors(crop, sorted({name for _, names in jobs for name in names}))
-    note = f"errors on the middle {crop.camera.width}x{crop.camera.height} pixels"
+        errors = _errors(crop, list(dict.fromkeys(method for _, methods in jobs for method in methods)))
+    size = f"{crop.camera.width}x{crop.camera.height}"
+    whole = crop.camera.height == workload.camera.height
+    note = "errors on all pixels" if whole else f"errors on the middle {size} pixels"
     rows = []
     for threads in settings.threads:
-        for where, names in jobs:
-            cases = [case for name in names for case in _cases(where, name)]
-            for (name, operation), timing in zip(
-                ((name, operation) for name in names for operation in (FORWARD, BOTH)),
-                measure(cases, settings, threads).values(),
-                strict=True,
-            ):
-                values = errors[name, operation]
-                rows.append(Row("render", str(where), _label(name), operation, threads, timing, values, note))
+        for where, methods in jobs:
+            keys = [(method, operation) for method in methods for operation in (FORWARD, BOTH)]
+            cases = [_case(where, *key) for key in keys]
+            for key, timing in zip(keys, measure(cases, settings, threads).values(), strict=True):
+                method, operation = key
+                rows.append(Row("render", str(where), str(method), operation, threads, timing, errors[key], note))
     return rows
 
 
@@ -82,63 +146,92 @@ def _fast_backends(like: Tensor) -> list[str]:
     return [name for name in dict.fromkeys(usable) if name != REFERENCE]
 
 
-def _label(backend: str) -> str:
-    return "plain torch" if backend == REFERENCE else backend
-
-
-def _cases(workload: Workload, backend: str) -> list[Case]:
+def _case(workload: Workload, method: Method, operation: str) -> Case:
     leaves = RawSplats(*(tensor.clone().requires_grad_() for tensor in workload.splats))
 
     def forward() -> None:
         with torch.no_grad():
-            render(leaves, workload.camera, background=workload.background, backend=backend)
+            method.picture(leaves, workload)
 
     def both() -> None:
-        image = render(leaves, workload.camera, background=workload.background, backend=backend).image
-        torch.autograd.grad(image, leaves, workload.image_gradient)
+        torch.autograd.grad(method.picture(leaves, workload), leaves, workload.image_gradient)
 
-    return [Case(f"{backend} {FORWARD}", forward), Case(f"{backend} {BOTH}", both)]
-
-
-def _crop_size(workload: Workload, quick: bool) -> tuple[int, int]:
-    """Width and height in pixels, 3:2, that keep the oracle within its work."""
-    pixels = ORACLE_WORK[quick] / len(workload.splats.means)
-    height = max(16, 8 * int(math.sqrt(pixels / 1.5) / 8))
-    return min(3 * height // 2, workload.camera.width), min(height, workload.camera.height)
+    return Case(f"{method} {operation}", forward if operation == FORWARD else both)
 
 
-def _errors(crop: Workload, backends: list[str]) -> dict[tuple[str, str], dict[str, float]]:
-    """Errors by back-end and operation."""
-    truth = _trace(crop, REFERENCE, torch.float64)
+def _crop(workload: Workload, most_pairs: float) -> Workload:
+    """The largest middle of the view, 3:2 or all of it, that is not too much for the oracle."""
+    tallest = -(-workload.camera.height // CROP_STEP)
+
+    def of(steps: int) -> Workload:
+        height = min(CROP_STEP * steps, workload.camera.height)
+        whole = height == workload.camera.height
+        return workload.crop(workload.camera.width if whole else min(3 * height // 2, workload.camera.width), height)
+
+    too_tall = bisect_right(range(2, tallest + 1), most_pairs, key=lambda steps: _pairs(of(steps)))
+    return of(min(2, tallest) if too_tall == 0 else 1 + too_tall)
+
+
+@torch.no_grad()
+def _pairs(workload: Workload) -> float:
+    """About how many pairs of a splat and a pixel the oracle blends: the pixels of all tiles a splat touches."""
+    seen = render(workload.splats, workload.camera)
+    centres, radii = seen.means2d[seen.radii > 0], seen.radii[seen.radii > 0, None]
+    last = torch.tensor([workload.camera.width, workload.camera.height]) - 1
+    first_tile = ((centres - radii).clamp_min(0) / TILE).floor()
+    tiles = (torch.minimum(centres + radii, last) / TILE).floor() - first_tile + 1
+    return float(tiles.clamp_min(0).prod(1).sum()) * TILE**2
+
+
+def _errors(crop: Workload, methods: list[Method]) -> dict[tuple[Method, str], dict[str, float]]:
+    """Errors by method and operation; pixels are left out by what the back-end does with everything asked for."""
+    truth = _trace(crop, Method(REFERENCE), torch.float64)
+    usual, expected = {}, {}
+    for name in dict.fromkeys(method.backend for method in methods):
+        usual[name] = _usual(_trace(crop, Method(name), torch.float32).image, truth.image)
+        expected[name] = _gradients(truth, crop.image_gradient.double() * usual[name][..., None])
     errors = {}
-    for backend in backends:
-        result = _trace(crop, backend, torch.float32)
-        errors[backend, FORWARD], usual = image_errors(result.image, truth.image)
-        weights = crop.image_gradient * usual[..., None]
-        gradients = _gradients(result, weights)
-        expected = _gradients(truth, weights.double())
-        by_name = {name: relative_l2(gradients[name], expected[name]) for name in expected}
-        errors[backend, BOTH] = worst_first("gradient error", by_name)
+    for method in methods:
+        result, counted = _trace(crop, method, torch.float32), usual[method.backend]
+        errors[method, FORWARD] = image_errors(result.image, truth.image, counted)
+        gradients = _gradients(result, crop.image_gradient * counted[..., None])
+        by_name = {name: relative_l2(gradients[name], g) for name, g in expected[method.backend].items()}
+        errors[method, BOTH] = worst_first("gradient error", by_name)
     return errors
 
 
-def image_errors(image: Tensor, truth: Tensor) -> tuple[dict[str, float], Tensor]:
-    """Errors of an image ``[H, W, 3]``, largest over the channels, and the pixels ``[H, W]`` bool that entered them."""
-    error = (image.detach().double() - truth.detach()).abs().amax(-1)
+def _pixel_errors(image: Tensor, truth: Tensor) -> Tensor:
+    return (image.detach().double() - truth.detach()).abs().amax(-1)
+
+
+def _usual(image: Tensor, truth: Tensor) -> Tensor:
+    """Pixels ``[H, W]`` bool without those that jumped."""
+    error = _pixel_errors(image, truth)
     typical = error[error > 0].median() if bool((error > 0).any()) else error.new_zeros(())
-    usual = error <= OUTLIER * typical
-    values = {
+    return error <= OUTLIER * typical
+
+
+def image_errors(image: Tensor, truth: Tensor, usual: Tensor | None = None) -> dict[str, float]:
+    """Errors of an image ``[H, W, 3]``, largest over the channels.
+
+    Args:
+        image: What is judged.
+        truth: What it should be.
+        usual: Pixels ``[H, W]`` bool that enter; by default those without a jump.
+    """
+    error = _pixel_errors(image, truth)
+    usual = _usual(image, truth) if usual is None else usual
+    return {
         "max error": float(error[usual].max()),
         "mean error": float(error[usual].mean()),
         "pixels left out": float((~usual).sum()),
         "pixels above 1e-3": float((error > FLIPPED).sum()),
     }
-    return values, usual
 
 
-def _trace(crop: Workload, backend: str, dtype: torch.dtype) -> _Traced:
+def _trace(crop: Workload, method: Method, dtype: torch.dtype) -> _Traced:
     splats = RawSplats(*(tensor.to(dtype, copy=True).requires_grad_() for tensor in crop.splats))
-    return _Traced(splats, render(splats, crop.camera, background=crop.background.to(dtype), backend=backend).image)
+    return _Traced(splats, method.picture(splats, crop))
 
 
 def _gradients(traced: _Traced, weights: Tensor) -> dict[str, Tensor]:
