@@ -7,12 +7,12 @@ from numba import prange
 
 from nsvq_lightning.rendering.cpu.jit import inline, kernel
 from nsvq_lightning.rendering.cpu.lanes import get, prefetch, put
-from nsvq_lightning.rendering.cpu.records import EXTENT, GROUP_SHIFT, GROUP_TILES, ORIGIN, RECORD
+from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES
 
 DIGIT_BITS = 11
 DIGITS = 1 << DIGIT_BITS
 AHEAD = 16
-"""How many records ahead the scattered reads are asked for."""
+"""How many splats ahead a box is asked for."""
 
 
 @kernel
@@ -62,11 +62,21 @@ def tile_index(x, y, group_columns):
     return group * GROUP_TILES + ((y & inside) << GROUP_SHIFT) + (x & inside)
 
 
+@inline
+def tile_range(boxes, place):
+    """First column and row of a box, and the ones behind its last."""
+    box = np.int64(get(boxes, place))
+    x, y = box & 0xFFFF, (box >> 16) & 0xFFFF
+    return x, y, x + ((box >> 32) & 0xFFFF), y + (box >> 48)
+
+
 @kernel
-def count_tiles(threads, count, ids, integers, group_columns, histogram, offsets):
+def count_tiles(threads, count, order, boxes, group_columns, histogram, offsets):
     """How many splats touch each tile: ``offsets[t]`` is where the list of tile t begins; returns the length of all.
 
-    ``histogram`` [threads, tiles] becomes the place of each thread's first entry in every tile.
+    ``order`` are the places of the visible splats, front to back; ``boxes`` their tiles, by place: first column and
+    row, columns and rows, 16 bits each. ``histogram`` [threads, tiles] becomes the place of each thread's first entry
+    in every tile.
     """
     tiles = offsets.shape[0] - 1
     for thread in prange(threads):
@@ -75,13 +85,12 @@ def count_tiles(threads, count, ids, integers, group_columns, histogram, offsets
         last = count * (thread + 1) // threads
         for i in range(count * thread // threads, last):
             if i + AHEAD < last:
-                prefetch(integers, RECORD * np.int64(get(ids, i + AHEAD)) + ORIGIN)
-            o = RECORD * np.int64(get(ids, i))
-            origin, extent = np.int64(get(integers, o + ORIGIN)), np.int64(get(integers, o + EXTENT))
-            x0, y0 = origin & 0xFFFF, origin >> 16
-            for y in range(y0, y0 + (extent >> 16)):
-                for x in range(x0, x0 + (extent & 0xFFFF)):
-                    row[tile_index(x, y, group_columns)] += 1
+                prefetch(boxes, np.int64(get(order, i + AHEAD)))
+            x0, y0, x1, y1 = tile_range(boxes, np.int64(get(order, i)))
+            for y in range(y0, y1):
+                for x in range(x0, x1):
+                    tile = tile_index(x, y, group_columns)
+                    put(row, tile, get(row, tile) + 1)
     total = 0
     for tile in range(tiles):
         offsets[tile] = total
@@ -94,21 +103,21 @@ def count_tiles(threads, count, ids, integers, group_columns, histogram, offsets
 
 
 @kernel
-def fill_tiles(threads, count, ids, integers, group_columns, histogram, entries):
-    """Write every splat into the lists of its tiles, keeping the order of ``ids``."""
+def fill_tiles(threads, count, order, boxes, group_columns, histogram, ids, entries):
+    """Write the row of every splat (``ids``, by place) into the lists of its tiles, keeping the order."""
     for thread in prange(threads):
         row = histogram[thread]
         last = count * (thread + 1) // threads
         for i in range(count * thread // threads, last):
             if i + AHEAD < last:
-                prefetch(integers, RECORD * np.int64(get(ids, i + AHEAD)) + ORIGIN)
-            splat_row = get(ids, i)
-            o = RECORD * np.int64(splat_row)
-            origin, extent = np.int64(get(integers, o + ORIGIN)), np.int64(get(integers, o + EXTENT))
-            x0, y0 = origin & 0xFFFF, origin >> 16
-            for y in range(y0, y0 + (extent >> 16)):
-                for x in range(x0, x0 + (extent & 0xFFFF)):
+                prefetch(boxes, np.int64(get(order, i + AHEAD)))
+                prefetch(ids, np.int64(get(order, i + AHEAD)))
+            place = np.int64(get(order, i))
+            x0, y0, x1, y1 = tile_range(boxes, place)
+            splat_row = get(ids, place)
+            for y in range(y0, y1):
+                for x in range(x0, x1):
                     tile = tile_index(x, y, group_columns)
-                    place = row[tile]
-                    row[tile] = place + 1
-                    put(entries, place, splat_row)
+                    entry = get(row, tile)
+                    put(row, tile, entry + 1)
+                    put(entries, entry, splat_row)

@@ -447,13 +447,17 @@ def finish_records(
     integers,
     ids,
     keys,
+    order,
+    boxes,
     means2d,
     radii,
     scratch,
 ):
     """Join the runs of all threads to ``ids`` (ascending rows, padded by 16), number the slots and add the colours.
 
-    Also writes the projected centres ``means2d [N·2]`` and ``radii [N]`` of the visible splats.
+    Also writes, by place in ``ids``, the depths as ``keys``, the places themselves as ``order`` and the tiles that a
+    splat touches as ``boxes`` (first column and row, columns and rows, 16 bits each), and the projected centres
+    ``means2d [N·2]`` and ``radii [N]`` of the visible splats.
     """
     blocks = (records.shape[0] // RECORD + 15) // 16
     total = counts.sum()
@@ -466,6 +470,12 @@ def finish_records(
             put(integers, RECORD * row + SLOT, np.int64(get(integers, RECORD * row + SLOT)) + slot)
             # Depths are positive, so their bits sort as integers.
             put(keys, start + k, get(integers, RECORD * row + DEPTH))
+            put(order, start + k, start + k)
+            origin, extent = (
+                np.int64(get(integers, RECORD * row + ORIGIN)),
+                np.int64(get(integers, RECORD * row + EXTENT)),
+            )
+            put(boxes, start + k, origin | (extent << 32))
             put(means2d, 2 * row, get(records, RECORD * row + X))
             put(means2d, 2 * row + 1, get(records, RECORD * row + Y))
             put(radii, row, get(integers, RECORD * row + RADIUS))

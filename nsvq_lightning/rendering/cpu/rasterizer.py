@@ -66,7 +66,9 @@ class _Frame:
         self.scratch = self.work.rows("projection", self.threads, PROJECTION_SCRATCH)
         self.count = self.slots = 0
         nothing = np.empty(0, np.int32)
-        self.ids = self.sorted_ids = self.entries = self.offsets = self.touched = self.ends = self.sums = nothing
+        self.ids = self.order = self.boxes = self.entries = self.offsets = self.touched = self.ends = self.sums = (
+            nothing
+        )
 
     def __del__(self) -> None:
         work = getattr(self, "work", None)
@@ -84,29 +86,29 @@ class _Frame:
         return found, counts, slots
 
     def finish(self, sh0: Array, shN: Array, stride: int, degree: int, means2d: Array, radii: Array) -> None:
-        """Complete the records and list the visible splats by row (``ids``) and by depth (``sorted_ids``)."""
+        """Complete the records; list the visible splats by row (``ids``) and, as places there, by depth (``order``)."""
         runs = self.project()
         self.ids = self.work.array("ids", self.count + 16, np.int32)
         keys = self.work.array("keys", self.count + 1, np.int32)
+        order = self.work.array("order", self.count, np.int32)
+        self.boxes = self.work.array("boxes", self.count, np.int64)
         finish_records(
             self.threads, self.camera, self.geometry[0], sh0, shN, stride, degree, *runs, self.records, self.integers,
-            self.ids, keys, means2d, radii, self.scratch,
+            self.ids, keys, order, self.boxes, means2d, radii, self.scratch,
         )  # fmt: skip
-        order = self.work.array("order", self.count, np.int32)
-        other = self.work.array("order2", self.count, np.int32)
-        order[:] = self.ids[: self.count]
         if self.count:
+            other = self.work.array("order2", self.count, np.int32)
             keys2 = self.work.array("keys2", self.count + 1, np.int32)
             histogram = self.work.rows("digits", self.threads, DIGITS, np.int64)
             if sort_by_depth(self.threads, self.count, keys, order, keys2, other, histogram):
                 order = other
-        self.sorted_ids = order
+        self.order = order
 
     def bin(self) -> None:
         """List the splats of every tile, front to back."""
         histogram = self.work.rows("tile_counts", self.threads, self.tiles, np.int64)
         self.offsets = self.work.array("offsets", self.tiles + 1, np.int64)
-        listed = self.threads, self.count, self.sorted_ids, self.integers, self.group_columns, histogram
+        listed = self.threads, self.count, self.order, self.boxes, self.group_columns, histogram
         total = count_tiles(*listed, self.offsets)
         if total > MAX_ENTRIES:
             raise RuntimeError(
@@ -114,7 +116,7 @@ class _Frame:
                 "listed; the scales have probably diverged (lower their learning rate or prune large splats)"
             )
         self.entries = self.work.array("entries", total, np.int32)
-        fill_tiles(*listed, self.entries)
+        fill_tiles(*listed, self.ids, self.entries)
 
 
 _GRID = pixel_grid()
