@@ -11,6 +11,7 @@ import torch
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, render, resolve_backend, visible
+from nsvq_lightning.skips import switched
 from nsvq_lightning.splats import ATTRIBUTES, RawSplats, Splats
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -234,3 +235,16 @@ def test_bad_arguments_say_what_to_do() -> None:
         render(splats, camera, background=torch.zeros(4))
     with pytest.raises(ValueError, match="float64"):
         render(RawSplats(*(tensor.double() for tensor in splats.raw())), camera, backend="cpu")
+
+
+@pytest.mark.parametrize("name", ["blocks", "saturated", "sh_bands"])
+@pytest.mark.parametrize("sh_degree", [0, 2])
+def test_what_the_rasterizer_skips_changes_no_bit(name: str, sh_degree: int) -> None:
+    splats, camera = random_splats(3000, log_scale=-1.5)._replace(opacities=torch.full((3000,), 4.0)), front_camera()
+    standard, gradients = run(splats, camera, "cpu", torch.float32, sh_degree=sh_degree)
+    assert (standard.alpha > 0.999).float().mean() > 0.5
+    with switched(**{name: False}):
+        everything, all_gradients = run(splats, camera, "cpu", torch.float32, sh_degree=sh_degree)
+    assert torch.equal(everything.image, standard.image)
+    assert torch.equal(everything.depth, standard.depth)
+    assert [key for key in gradients if not torch.equal(gradients[key], all_gradients[key])] == []

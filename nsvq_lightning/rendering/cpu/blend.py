@@ -195,7 +195,7 @@ def blend_one(batch, r, alpha, t, after, left, sums):
 
 
 @inline
-def blend_block(block, count, batch, grid, state, touched, first):
+def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
     """Blend a batch into one block; returns whether a pixel of it is still open."""
     o = 16 * block
     t, left = load(state, T + o), load(state, T_LEFT + o)
@@ -227,7 +227,7 @@ def blend_block(block, count, batch, grid, state, touched, first):
         left, sums = blend_one(batch, r1, a1, t1, t2, left, sums)
         left, sums = blend_one(batch, r2, a2, t2, t3, left, sums)
         left, sums = blend_one(batch, r3, a3, t3, t4, left, sums)
-        if not any_lane(t4 >= splat(TRANSMITTANCE_MIN)):
+        if drop_closed and not any_lane(t4 >= splat(TRANSMITTANCE_MIN)):
             for j in range(j3 + 1, count):
                 put(touched, first + j, get(touched, first + j) & ~bit)
             bit = 0
@@ -290,6 +290,8 @@ def blend_tile(
     transmittance,
     depth,
     state,
+    cull_blocks,
+    drop_closed,
 ):
     """Blend one tile; returns the end of the part of its list that was looked at."""
     zero, one = splat(F(0)), splat(F(1))
@@ -321,7 +323,9 @@ def blend_tile(
             o = RECORD * j
             store(batch, o, load(records, r))
             x, y = get(records, r + X) - fx, get(records, r + Y) - fy
-            mask = reachable_blocks(batch, o, x, y, grid) & alive
+            mask = alive
+            if cull_blocks:
+                mask &= reachable_blocks(batch, o, x, y, grid)
             u0, v0 = offsets_at(get(records, r + A), get(records, r + B), get(records, r + C), x, y)
             put(batch, o + X, u0)
             put(batch, o + Y, v0)
@@ -330,7 +334,7 @@ def blend_tile(
         while reached != 0:
             block = lowest_bit(reached)
             reached &= reached - 1
-            if blend_block(block, count, batch, grid, state, touched, i) == 0:
+            if blend_block(block, count, batch, grid, state, touched, i, drop_closed) == 0:
                 alive &= ~(1 << block)
         i += count
     for block in range(BLOCKS):
@@ -365,9 +369,14 @@ def blend(
     transmittance,
     depth,
     scratch,
+    cull_blocks,
+    drop_closed,
     counter,
 ):
-    """Blend all tiles, handed out dynamically; a pixel depends on its own tile only."""
+    """Blend all tiles, handed out dynamically; a pixel depends on its own tile only.
+
+    ``cull_blocks`` leaves out the blocks that a splat cannot reach, ``drop_closed`` those whose pixels are all closed.
+    """
     tiles = offsets.shape[0] - 1
     for thread in prange(threads):
         while True:
@@ -378,7 +387,7 @@ def blend(
             if left < width and top < height:
                 ends[tile] = blend_tile(
                     records, entries, np.int64(offsets[tile]), np.int64(offsets[tile + 1]), left, top, width, height,
-                    background, grid, touched, image, transmittance, depth, scratch[thread],
+                    background, grid, touched, image, transmittance, depth, scratch[thread], cull_blocks, drop_closed,
                 )  # fmt: skip
             else:
                 ends[tile] = offsets[tile]

@@ -354,38 +354,26 @@ def lane_sum(context, builder, sig, values):
     return builder.extract_element(total, _i32(0))
 
 
-def _interleave_step(step: int) -> tuple[list[int], list[int]]:
-    """Lanes to take from two vectors so that adding both picks halves their blocks of ``step`` lanes pairwise."""
-    if step == 1:
-        low = [lane for q in range(0, WIDTH, 4) for lane in (q, 16 + q, q + 1, 17 + q)]
-        high = [lane for q in range(0, WIDTH, 4) for lane in (q + 2, 18 + q, q + 3, 19 + q)]
-    elif step == 2:
-        low = [lane for q in range(0, WIDTH, 4) for lane in (q, q + 1, 16 + q, 17 + q)]
-        high = [lane for q in range(0, WIDTH, 4) for lane in (q + 2, q + 3, 18 + q, 19 + q)]
-    else:
-        low = [start + lane for start in (0, 8, 16, 24) for lane in range(4)]
-        high = [start + lane for start in (4, 12, 20, 28) for lane in range(4)]
-    return low, high
-
-
 @_function(Lanes, 1)
 def lane_sums(context, builder, sig, values):
     """``lane_sums((v0, v1, …))``: lane i of the result is the sum of the lanes of vector i, 0 beyond the last."""
     vectors = list(cgutils.unpack_tuple(builder, values[0], len(sig.args[0])))
     vectors += [None] * (WIDTH - len(vectors))
     zero = _constant(0.0)
-    step = 1
-    while len(vectors) > 1:
-        low, high = _interleave_step(step)
+    for step in (1, 2, 4, 8):
+        # Lanes with this bit belong to the second of two vectors from now on; each takes in its neighbour's half.
+        second_half = [bool(lane & step) for lane in range(WIDTH)]
+        kept = ir.Constant(_VM, second_half)
+        moved = [(lane ^ step) + WIDTH * of_second for lane, of_second in enumerate(second_half)]
         merged = []
         for first, second in zip(vectors[0::2], vectors[1::2], strict=True):
-            if first is None and second is None:
+            if first is None:
                 merged.append(None)
                 continue
-            first, second = (zero if part is None else part for part in (first, second))
-            parts = _shuffle(builder, first, second, low), _shuffle(builder, first, second, high)
-            merged.append(builder.fadd(*parts, flags=_CONTRACT))
-        vectors, step = merged, 2 * step
+            second = zero if second is None else second
+            own, other = builder.select(kept, second, first), _shuffle(builder, first, second, moved)
+            merged.append(builder.fadd(own, other, flags=_CONTRACT))
+        vectors = merged
     return vectors[0]
 
 

@@ -253,6 +253,19 @@ def prefetch_sh(array, ids, start, end, stride, used):
 
 
 @inline
+def coefficients_of(degree):
+    """Floats in an SH row beyond the constant term."""
+    return 3 * ((degree + 1) * (degree + 1) - 1)
+
+
+@inline
+def clear_bands(columns, degree, evaluated):
+    """Zero the columns of the bands above ``degree``."""
+    for k in range(coefficients_of(degree), coefficients_of(evaluated)):
+        store(columns, 16 * k, splat(F(0)))
+
+
+@inline
 def gather_sh(shN, ids, start, stride, count, columns):
     """The first ``count`` coefficients of 16 rows, one vector a column, into the scratch array ``columns``."""
     if stride == SH_ROW:
@@ -398,17 +411,18 @@ def project_range(camera, means, quats, scales, logits, first, last, records, in
 
 
 @inline
-def color_range(camera, means, sh0, shN, stride, degree, ids, first, last, records, scratch):
+def color_range(camera, means, sh0, shN, stride, degree, evaluated, ids, first, last, records, scratch):
     """Colours into the records of ``ids[first:last]``; the list is padded to whole vectors."""
     zero = splat(F(0))
-    coefficients = 3 * ((degree + 1) * (degree + 1) - 1)
+    coefficients = coefficients_of(evaluated)
     for start in range(first, last, 16):
         prefetch_sh(shN, ids, start + AHEAD, last, stride, coefficients)
         mean = gather_rows3(means, ids, start)
         direction, _ = unit_direction(camera, mean)
-        if degree > 0:
+        if evaluated > 0:
             gather_sh(shN, ids, start, stride, coefficients, scratch)
-        r, g, b = color(degree, direction, gather_rows3(sh0, ids, start), scratch)
+            clear_bands(scratch, degree, evaluated)
+        r, g, b = color(evaluated, direction, gather_rows3(sh0, ids, start), scratch)
         store(scratch, 0, vmax(r, zero))
         store(scratch, 16, vmax(g, zero))
         store(scratch, 32, vmax(b, zero))
@@ -440,6 +454,7 @@ def finish_records(
     shN,
     stride,
     degree,
+    evaluated,
     found,
     counts,
     slots,
@@ -484,7 +499,9 @@ def finish_records(
                 put(ids, total + k, get(ids, total - 1))
     for thread in prange(threads):
         first, last = 16 * ((total + 15) // 16 * thread // threads), 16 * ((total + 15) // 16 * (thread + 1) // threads)
-        color_range(camera, means, sh0, shN, stride, degree, ids, first, min(last, total), records, scratch[thread])
+        color_range(
+            camera, means, sh0, shN, stride, degree, evaluated, ids, first, min(last, total), records, scratch[thread]
+        )
 
 
 @inline
@@ -586,32 +603,34 @@ def scatter_sh(gradient, columns, ids, start, stride, count):
 
 
 @inline
-def color_backward(camera, degree, stride, mean, shN, ids, start, rgb, g_sh0, g_shN, scratch):
+def color_backward(camera, degree, evaluated, stride, mean, shN, ids, start, rgb, g_sh0, g_shN, scratch):
     """Gradients of the SH coefficients; returns that of the mean through the viewing direction."""
     zero = splat(F(0))
     d, inverse = unit_direction(camera, mean)
-    coefficients = 3 * ((degree + 1) * (degree + 1) - 1)
+    coefficients = coefficients_of(evaluated)
     columns, gradient, e = scratch[:768], scratch[768:1536], scratch[1536:]
-    if degree > 0:
+    if evaluated > 0:
         gather_sh(shN, ids, start, stride, coefficients, columns)
+        clear_bands(columns, degree, evaluated)
     k = splat(C0)
     scatter_rows3(g_sh0, ids, start, (k * rgb[0], k * rgb[1], k * rgb[2]))
-    if degree == 0:
+    if evaluated == 0:
         scatter_sh(g_shN, gradient, ids, start, stride, 0)
         return zero, zero, zero
     b1 = bands1(d)
     for i in range(3):
         put_band(gradient, e, columns, i, b1[i], rgb)
-    if degree > 1:
+    if evaluated > 1:
         b2 = bands2(d)
         for i in range(5):
             put_band(gradient, e, columns, 3 + i, b2[i], rgb)
-    if degree > 2:
+    if evaluated > 2:
         b3 = bands3(d)
         for i in range(7):
             put_band(gradient, e, columns, 8 + i, b3[i], rgb)
+    clear_bands(gradient, degree, evaluated)
     scatter_sh(g_shN, gradient, ids, start, stride, coefficients)
-    gx, gy, gz = direction_gradient(degree, d, e)
+    gx, gy, gz = direction_gradient(evaluated, d, e)
     radial = dot3(gx, gy, gz, d[0], d[1], d[2])
     return fnma(radial, d[0], gx) * inverse, fnma(radial, d[1], gy) * inverse, fnma(radial, d[2], gz) * inverse
 
@@ -697,6 +716,7 @@ def project_backward(
     shN,
     stride,
     degree,
+    evaluated,
     ids,
     count,
     records,
@@ -717,7 +737,7 @@ def project_backward(
     """
     blocks = (count + 15) // 16
     n = logits.shape[0]
-    coefficients = 3 * ((degree + 1) * (degree + 1) - 1)
+    coefficients = coefficients_of(evaluated)
     for thread in prange(threads):
         work = scratch[thread]
         slot = work[2048:].view(np.int32)
@@ -756,7 +776,9 @@ def project_backward(
                 select(record[GREEN] > zero, total[SUM_GREEN], zero),
                 select(record[BLUE] > zero, total[SUM_BLUE], zero),
             )
-            gx, gy, gz = color_backward(camera, degree, stride, mean, shN, ids, start, rgb, g_sh0, g_shN, work)
+            gx, gy, gz = color_backward(
+                camera, degree, evaluated, stride, mean, shN, ids, start, rgb, g_sh0, g_shN, work
+            )
             scatter_rows3(g_means, ids, start, (g_mean[0] + gx, g_mean[1] + gy, g_mean[2] + gz))
             scatter_rows4(g_quats, ids, start, g_quat)
             scatter_rows3(g_scales, ids, start, g_scale)

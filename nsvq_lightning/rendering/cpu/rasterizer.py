@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from nsvq_lightning.rendering.cpu.jit import thread_count
 from nsvq_lightning.rendering.cpu.projection import finish_records, project_backward, project_splats
 from nsvq_lightning.rendering.cpu.records import CAMERA, GROUP_TILES, RECORD, group_grid
 from nsvq_lightning.rendering.cpu.workspace import Array, Workspace, recycled
+from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats import SplatTensors
 
 __all__ = ["render_cpu", "visible_cpu"]
@@ -85,7 +87,9 @@ class _Frame:
         self.count, self.slots = int(counts.sum()), int(slots.sum())
         return found, counts, slots
 
-    def finish(self, sh0: Array, shN: Array, stride: int, degree: int, means2d: Array, radii: Array) -> None:
+    def finish(
+        self, sh0: Array, shN: Array, stride: int, degrees: tuple[int, int], means2d: Array, radii: Array
+    ) -> None:
         """Complete the records; list the visible splats by row (``ids``) and, as places there, by depth (``order``)."""
         runs = self.project()
         self.ids = self.work.array("ids", self.count + 16, np.int32)
@@ -93,7 +97,7 @@ class _Frame:
         order = self.work.array("order", self.count, np.int32)
         self.boxes = self.work.array("boxes", self.count, np.int64)
         finish_records(
-            self.threads, self.camera, self.geometry[0], sh0, shN, stride, degree, *runs, self.records, self.integers,
+            self.threads, self.camera, self.geometry[0], sh0, shN, stride, *degrees, *runs, self.records, self.integers,
             self.ids, keys, order, self.boxes, means2d, radii, self.scratch,
         )  # fmt: skip
         if self.count:
@@ -130,9 +134,11 @@ class _Project(torch.autograd.Function):
         means, *_, sh0, shN = attributes
         means2d = means.new_zeros(frame.n, 2)
         radii = torch.zeros(frame.n, dtype=torch.int32)
-        ctx.frame, ctx.degree, ctx.stride = frame, degree, 3 * shN.shape[1]
+        # Bands above the active degree count as zero, whether they are left out or evaluated.
+        degrees = degree, degree if is_on("sh_bands") else math.isqrt(shN.shape[1] + 1) - 1
+        ctx.frame, ctx.degrees, ctx.stride = frame, degrees, 3 * shN.shape[1]
         ctx.save_for_backward(*attributes)
-        frame.finish(_flat(sh0), _flat(shN), ctx.stride, degree, _flat(means2d), _flat(radii))
+        frame.finish(_flat(sh0), _flat(shN), ctx.stride, degrees, _flat(means2d), _flat(radii))
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
         return means2d, means.new_zeros(()), radii
@@ -149,7 +155,7 @@ class _Project(torch.autograd.Function):
         *_, sh0, shN = ctx.saved_tensors
         gradients = [recycled(tuple(tensor.shape)) for tensor in ctx.saved_tensors]
         project_backward(
-            frame.threads, frame.camera, *frame.geometry, _flat(sh0), _flat(shN), ctx.stride, ctx.degree,
+            frame.threads, frame.camera, *frame.geometry, _flat(sh0), _flat(shN), ctx.stride, *ctx.degrees,
             frame.ids, frame.count, frame.records, frame.integers, frame.sums, _flat(g_means2d),
             *(_flat(gradient) for gradient in gradients), frame.scratch,
         )  # fmt: skip
@@ -172,7 +178,8 @@ class _Blend(torch.autograd.Function):
         blend(
             frame.threads, frame.records, frame.entries, frame.offsets, frame.group_columns, frame.width, frame.height,
             _flat(background), _GRID, frame.touched, frame.ends, _flat(image), _flat(transmittance), _flat(depth),
-            work.rows("blend", frame.threads, FORWARD_SCRATCH), np.zeros(1, np.int64),
+            work.rows("blend", frame.threads, FORWARD_SCRATCH), is_on("blocks"), is_on("saturated"),
+            np.zeros(1, np.int64),
         )  # fmt: skip
         ctx.frame = frame
         ctx.set_materialize_grads(False)
