@@ -13,16 +13,21 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from nsvq_lightning.benchmark.registry import ALL, SUITES, load_suite, suite_names
-from nsvq_lightning.benchmark.report import as_json, as_markdown, fill_in, suite_tables
+from nsvq_lightning.benchmark.report import as_json, as_markdown, fill_in, results_line, suite_tables
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.sizes import SIZES
+from nsvq_lightning.benchmark.switch_table import PLACE as SWITCHES
+from nsvq_lightning.benchmark.switch_table import fill_switches, scene_name, shares_saved
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.skips import SKIPS
 
 __all__ = ["main"]
 
 log = logging.getLogger(__name__)
+
+TRAIN = "train"
+"""The suite that measures switches."""
 
 EXAMPLES = """
 
@@ -75,7 +80,7 @@ def _read_document(path: Path | None, suites: Sequence[str], parser: argparse.Ar
         return None
     document = path.read_text(encoding="utf-8")
     try:
-        fill_in(document, dict.fromkeys(suites, ""))
+        _filled(document, dict.fromkeys(suites, ""))
     except ValueError as error:
         parser.error(f"{path}: {error}")
     return document
@@ -210,7 +215,22 @@ def _write(results: _Results, folder: Path | None, target: Path | None, document
             draw_suite(folder / f"{name}.png", rows, SUITES[name])
     if target is not None and document is not None:
         tables = {name: suite_tables(results.machine, results.settings, rows) for name, rows in by_suite.items()}
-        _write_text(target, fill_in(document, tables))
+        saved = shares_saved(by_suite.get(TRAIN, ()))
+        _write_text(target, _filled(document, tables, scene_name(results.settings), saved))
+
+
+def _filled(document: str, tables: Mapping[str, str], scene: str = "", saved: Mapping[str, float] | None = None) -> str:
+    """The document with the tables of the suites; the switches may have a table of their own, instead of ``train``'s.
+
+    Raises:
+        ValueError: There is no place for a suite.
+    """
+    wanted = dict(tables)
+    if TRAIN in wanted and SWITCHES in document:
+        document = fill_switches(document, scene, saved)
+        if results_line(TRAIN) not in document:
+            del wanted[TRAIN]
+    return fill_in(document, wanted)
 
 
 def _write_text(path: Path, text: str) -> None:

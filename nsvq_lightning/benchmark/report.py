@@ -10,7 +10,7 @@ from typing import Any
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
 
-__all__ = ["as_json", "as_markdown", "fill_in", "suite_tables"]
+__all__ = ["as_json", "as_markdown", "between", "fill_in", "replace_between", "results_line", "suite_tables"]
 
 
 END = "<!-- end -->"
@@ -58,13 +58,40 @@ def fill_in(document: str, tables: Mapping[str, str]) -> str:
         ValueError: There is no place for a suite.
     """
     for suite, text in tables.items():
-        start = f"<!-- results: {suite} -->\n"
-        before, found, rest = document.partition(start)
-        _, closed, after = rest.partition(END)
-        if not found or not closed:
-            raise ValueError(f"there is no place for {suite}: it needs the lines {start.strip()!r} and {END!r}")
-        document = f"{before}{start}\n{text}\n\n{END}{after}"
+        document = replace_between(document, results_line(suite), text)
     return document
+
+
+def results_line(suite: str) -> str:
+    """The line of a document after which the tables of a suite go."""
+    return f"<!-- results: {suite} -->"
+
+
+def between(document: str, start: str) -> str:
+    """What stands between the line ``start`` and the next ``<!-- end -->``.
+
+    Raises:
+        ValueError: There is no such place.
+    """
+    return _split(document, start)[1].strip()
+
+
+def replace_between(document: str, start: str, text: str) -> str:
+    """Put ``text`` between the line ``start`` and the next ``<!-- end -->``.
+
+    Raises:
+        ValueError: There is no such place.
+    """
+    before, _, after = _split(document, start)
+    return f"{before}{start}\n\n{text}\n\n{END}{after}"
+
+
+def _split(document: str, start: str) -> tuple[str, str, str]:
+    before, found, rest = document.partition(f"{start}\n")
+    inside, closed, after = rest.partition(END)
+    if not found or not closed:
+        raise ValueError(f"no place for a table: it needs the lines {start!r} and {END!r}")
+    return before, inside, after
 
 
 def _operations(rows: Sequence[Row], heading: str) -> Iterator[str]:

@@ -13,6 +13,7 @@ from nsvq_lightning.benchmark import cli, timing
 from nsvq_lightning.benchmark.registry import SUITES
 from nsvq_lightning.benchmark.report import fill_in
 from nsvq_lightning.benchmark.suites import loss
+from nsvq_lightning.skips import SKIPS
 
 SMALL = ["loss", "--quick", "--repeats", "1", "--threads", "1"]
 
@@ -73,8 +74,20 @@ def test_document_gets_the_tables(tmp_path: Path, capsys: pytest.CaptureFixture[
     document.write_text("no place")
     with pytest.raises(SystemExit):
         cli.main([*SMALL, "--document", str(document)])
-    assert "there is no place for loss" in capsys.readouterr().err
+    assert "it needs the lines '<!-- results: loss -->'" in capsys.readouterr().err
     assert document.read_text() == "no place"
+
+
+def test_switches_have_their_own_table(tmp_path: Path) -> None:
+    document = tmp_path / "page.md"
+    document.write_text("<!-- switches -->\n<!-- end -->\n")
+    arguments = ["train", "--quick", "--threads", "1", "--steps", "4", "--document", str(document)]
+    assert cli.main([*arguments, "--switches", "metrics,adam_rows"]) == 0
+    lines = {line.split("|")[1].strip(): line for line in document.read_text().splitlines() if line.startswith("|")}
+    assert lines["switch"].endswith("| saves on demo |")
+    assert lines["`metrics`"].endswith(" % |")
+    assert lines["`blocks`"].endswith("| – |")
+    assert {f"`{name}`" for name in SKIPS} == lines.keys() - {"switch", "---"}
 
 
 def test_every_suite_has_its_place_in_the_documentation() -> None:

@@ -83,9 +83,9 @@ def test_tables_are_put_where_a_document_has_a_place() -> None:
     assert once == document.replace("old\n", "\nnew\n\n")
     assert fill_in(once, {"loss": "new"}) == once
     assert "<!-- results: codec -->\n\nx\n\n<!-- end -->\n" in fill_in(once, {"codec": "x"})
-    with pytest.raises(ValueError, match="no place for nearest: it needs the lines"):
+    with pytest.raises(ValueError, match="it needs the lines '<!-- results: nearest -->'"):
         fill_in(document, {"nearest": "x"})
-    with pytest.raises(ValueError, match="no place for loss"):
+    with pytest.raises(ValueError, match="results: loss"):
         fill_in("<!-- results: loss -->\n", {"loss": "x"})
 
 

@@ -22,6 +22,7 @@ from torch import Tensor
 from nsvq_lightning.benchmark.fitting import Step, StepClock, fit, one_phase, quiet, training_callbacks
 from nsvq_lightning.benchmark.row import Row, Timing
 from nsvq_lightning.benchmark.settings import Settings
+from nsvq_lightning.benchmark.switch_table import turned_round
 from nsvq_lightning.benchmark.timing import Case, milliseconds, sgemm, use_threads
 from nsvq_lightning.benchmark.trainees import Trainee, trainee
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
@@ -95,8 +96,7 @@ def settings_of(settings: Settings) -> list[Setting]:
     if not settings.switches:
         chosen.append(Setting("without codebooks", {"codebooks": None}, {}, most))
     for name in settings.switches:
-        on = not SKIPS[name].default
-        chosen.append(Setting(f"{'skip' if on else 'no skip of'} {name}", codebooks, {name: on}, most))
+        chosen.append(Setting(turned_round(name), codebooks, {name: not SKIPS[name].default}, most))
     return chosen
 
 
