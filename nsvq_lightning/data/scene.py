@@ -44,8 +44,11 @@ class View:
     image: Tensor
 
     def to(self, device: torch.device | str, **kwargs: object) -> View:
-        """The view on another device; Lightning calls it to move a batch."""
-        return replace(self, camera=self.camera.to(device), image=self.image.to(device))
+        """The view on another device, itself where it is there; Lightning calls it to move a batch."""
+        camera, image = self.camera.to(device), self.image.to(device)
+        if camera is self.camera and image is self.image:
+            return self
+        return replace(self, camera=camera, image=image)
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,6 +58,8 @@ class Camera:
     def to(
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None, **kwargs: object
     ) -> Camera:
-        """The camera with both matrices on ``device`` and in ``dtype``."""
+        """The camera with both matrices on ``device`` and in ``dtype``; itself where they are so already."""
         K, viewmat = (matrix.to(device=device, dtype=dtype) for matrix in (self.K, self.viewmat))
+        if K is self.K and viewmat is self.viewmat:
+            return self
         return Camera(K, viewmat, self.width, self.height, self._intrinsics)

@@ -38,6 +38,15 @@ def test_view_carries_its_own_name_pose_and_picture(make_scene: SceneFactory) ->
     assert (moved.name, moved.index, moved.image.dtype) == ("003.png", 3, torch.uint8)
 
 
+def test_a_view_that_is_where_it_should_be_is_not_rebuilt(make_scene: SceneFactory) -> None:
+    view = load_scene(make_scene()).view(0)
+    assert view.to("cpu") is view
+    moved = view.to("meta")
+    assert moved.image.device.type == moved.camera.K.device.type == moved.camera.viewmat.device.type == "meta"
+    assert moved.camera.intrinsics == view.camera.intrinsics
+    assert view.camera.to(dtype=torch.float64).K.dtype == torch.float64
+
+
 def test_points_and_extent(make_scene: SceneFactory) -> None:
     root = make_scene()
     scene = load_scene(root)
