@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any
 
 import torch
@@ -152,13 +153,19 @@ class SplatAdam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        for group in self.param_groups:
-            for parameter in group["params"]:
-                if parameter.grad is not None:
-                    self._update(group, parameter, parameter.grad)
+        # All counts first: an update empties the caches, and Python is slow to start again after each.
+        updates = [
+            self._update_of(group, parameter, parameter.grad)
+            for group in self.param_groups
+            for parameter in group["params"]
+            if parameter.grad is not None
+        ]
+        for update in updates:
+            update()
         return loss
 
-    def _update(self, group: dict[str, Any], parameter: Tensor, gradient: Tensor) -> None:
+    def _update_of(self, group: dict[str, Any], parameter: Tensor, gradient: Tensor) -> Callable[[], None]:
+        """Count one more step of a parameter; the function that does it."""
         from nsvq_lightning.rendering.cpu.adam import adam_step
 
         state = self.state[parameter]
@@ -166,7 +173,8 @@ class SplatAdam(torch.optim.Adam):
             state["step"] = torch.zeros(())
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
         state["step"] += 1
-        adam_step(
+        return partial(
+            adam_step,
             parameter,
             gradient.contiguous(),
             state["exp_avg"],
