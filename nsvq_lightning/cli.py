@@ -19,6 +19,15 @@ OWN_COMMANDS = {"info": "nsvq_lightning.info", "benchmark": "nsvq_lightning.benc
 TRACEBACK = "NSVQ_TRACEBACK"
 """Environment variable that makes errors show their traceback."""
 
+ENVIRONMENT = {
+    # Waiting OpenMP threads otherwise spin: as soon as anything else runs on the machine, the threads that have work
+    # wait for those that only spin, and a step takes several times as long.
+    "OMP_WAIT_POLICY": "passive",
+    # Large tensors in large pages: a step of 100k splats takes 3 % less time, one of 500k splats 4 %.
+    "THP_MEM_ALLOC_ENABLE": "1",
+}
+"""What torch and OpenMP read when they are loaded, unless the user has set it."""
+
 NOT_ACTIONABLE = (
     "does not have many workers",  # views come from a cache in memory; workers would each hold a copy
     "args parameter is intended",  # we pass the arguments after looking configs up
@@ -40,6 +49,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0, or 1 after an error in the user's files.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
     if arguments and arguments[0] in OWN_COMMANDS:
         command: Callable[[Sequence[str]], int] = import_module(OWN_COMMANDS[arguments[0]]).main
         return command(arguments[1:])
@@ -47,9 +58,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run_lightning(arguments: list[str]) -> int:
-    # Waiting OpenMP threads otherwise spin: as soon as anything else runs on the machine, the threads that have work
-    # wait for those that only spin, and a step takes several times as long. Must be set before torch loads OpenMP.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     for message in NOT_ACTIONABLE:
         warnings.filterwarnings("ignore", f".*{message}.*")
     from nsvq_lightning.lightning_cli import SplatCLI

@@ -49,8 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         0, or 1 after a one-line error if the scene cannot be read or the results not be written. Wrong arguments end
         the process with status 2.
     """
-    # Read when torch is loaded. As in ``nsvq fit``, waiting threads sleep; torch's profiler keeps its diary to itself.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    # Read when torch is loaded: its profiler keeps its diary to itself.
     os.environ.setdefault("KINETO_LOG_LEVEL", "99")
     parser = _parser()
     options = parser.parse_args(argv)

@@ -19,7 +19,6 @@ from nsvq_lightning.rendering.cpu.jit import inline, kernel
 from nsvq_lightning.rendering.cpu.lanes import (
     any_lane,
     column_bits,
-    divide_fast,
     exp2,
     fetch_add,
     fma,
@@ -484,7 +483,7 @@ def splat_backward(records, row, blocks, left, top, with_depth, state):
         weight = select(open_, alpha * t, zero)
         store(state, s + B_REST, fnma(weight, d, rest))
         store(state, s + B_T, vmax(after, splat(TINY)))
-        h = select(open_ & (raw <= highest), divide_fast(alpha, one - alpha) * (td - rest), zero)
+        h = select(open_ & (raw <= highest), alpha / (one - alpha) * (td - rest), zero)
         s_r, s_g, s_b = fma(weight, g_r, s_r), fma(weight, g_g, s_g), fma(weight, g_b, s_b)
         hu, hv = h * u, h * v
         s_h, s_u, s_v = s_h + h, s_u + hu, s_v + hv

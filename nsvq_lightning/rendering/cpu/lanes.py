@@ -219,12 +219,6 @@ def fnma(context, builder, sig, values):
 
 
 @_function(Lanes, 2)
-def divide_fast(context, builder, sig, values):
-    """``x / y`` where the CPU may use its reciprocal estimate with a refinement step."""
-    return builder.fdiv(*values, flags=("contract", "nsz", "arcp", "reassoc", "afn"))
-
-
-@_function(Lanes, 2)
 def vmin(context, builder, sig, values):
     """The smaller of two; the second one where the first is NaN."""
     return builder.select(builder.fcmp_ordered("<", *values), *values)
