@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from functools import partial
 from typing import Any
 
 import torch
@@ -153,7 +152,7 @@ class SplatAdam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        # All counts first: an update empties the caches, and Python is slow to start again after each.
+        # All are prepared before the first is done, see `adam_update`.
         updates = [
             self._update_of(group, parameter, parameter.grad)
             for group in self.param_groups
@@ -166,15 +165,14 @@ class SplatAdam(torch.optim.Adam):
 
     def _update_of(self, group: dict[str, Any], parameter: Tensor, gradient: Tensor) -> Callable[[], None]:
         """Count one more step of a parameter; the function that does it."""
-        from nsvq_lightning.rendering.cpu.adam import adam_step
+        from nsvq_lightning.rendering.cpu.adam import adam_update
 
         state = self.state[parameter]
         if not state:
             state["step"] = torch.zeros(())
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
         state["step"] += 1
-        return partial(
-            adam_step,
+        return adam_update(
             parameter,
             gradient.contiguous(),
             state["exp_avg"],

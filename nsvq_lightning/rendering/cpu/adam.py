@@ -7,6 +7,8 @@ helps is to touch less of it: only the leading columns, or only the rows that ha
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numba import prange
@@ -17,7 +19,7 @@ from nsvq_lightning.rendering.cpu.lanes import any_lane, fma, get, load, prefetc
 from nsvq_lightning.rendering.cpu.records import F
 from nsvq_lightning.rendering.cpu.workspace import Array, Workspace
 
-__all__ = ["adam_step"]
+__all__ = ["adam_update"]
 
 WIDTH = 16
 AHEAD = 256
@@ -136,7 +138,7 @@ def update_rows(threads, rows, stride, weights, gradients, firsts, seconds, pack
                     update_one(weights, gradients, firsts, seconds, o + k, factors)
 
 
-def adam_step(
+def adam_update(
     weights: Tensor,
     gradients: Tensor,
     first: Tensor,
@@ -148,8 +150,10 @@ def adam_step(
     eps: float,
     columns: int | None = None,
     rows_with_gradient: bool = False,
-) -> None:
-    """Adam in place on ``[N, ...]``, all contiguous float32 on the CPU.
+) -> Callable[[], None]:
+    """Prepare Adam in place on ``[N, ...]``, all contiguous float32 on the CPU; what is returned does the step.
+
+    Several steps are best prepared together and then done: each empties the caches, and Python is slow to come back.
 
     Args:
         weights: What is trained.
@@ -168,13 +172,16 @@ def adam_step(
     tables = [tensor.detach().numpy().reshape(-1) for tensor in (weights, gradients, first, second)]
     threads, rows, stride = thread_count(), weights.shape[0], math.prod(weights.shape[1:])
     if rows_with_gradient:
-        work = Workspace.borrow()
-        update_rows(threads, rows, stride, *tables, packed, work.rows("marks", threads, BLOCK * stride))
-        work.give_back()
-    elif columns is not None and -(-columns // WIDTH) * WIDTH <= stride:
-        update_columns(threads, rows, stride, columns, *tables, packed)
-    else:
-        update_all(threads, *tables, packed)
+        return partial(_update_rows, threads, rows, stride, *tables, packed)
+    if columns is not None and -(-columns // WIDTH) * WIDTH <= stride:
+        return partial(update_columns, threads, rows, stride, columns, *tables, packed)
+    return partial(update_all, threads, *tables, packed)
+
+
+def _update_rows(threads: int, rows: int, stride: int, *tables: Array) -> None:
+    work = Workspace.borrow()
+    update_rows(threads, rows, stride, *tables, work.rows("marks", threads, BLOCK * stride))
+    work.give_back()
 
 
 def _factors(step: int, lr: float, betas: tuple[float, float], eps: float) -> Array:
