@@ -56,9 +56,7 @@ SKIPS = {
         # rendering
         Skip("blocks", "4x4 blocks of pixels", "a splat cannot reach them"),
         Skip("saturated", "blocks of pixels", "all their pixels are opaque"),
-        Skip("culled", "colours and records of splats", "they are out of view"),
         Skip("sh_bands", "SH bands in the renderer", "they are above the active degree"),
-        Skip("depth", "the depth image", "nobody asked for it"),
         Skip("first_render", "a render that finds the visible splats", "the projection alone tells them"),
         # quantization
         Skip("visible_search", "the nearest code of a splat", "it is not visible in this step"),
