@@ -172,9 +172,9 @@ class SplatModel(LightningModule):
     @torch.no_grad()
     def _visible_rows(self, raw: RawSplats, camera: Camera) -> Tensor:
         """Rows of the splats that can change the image, ascending."""
-        skip = is_on("first_render")
-        mask = visible(raw, camera, backend=self.backend) if skip else self._render(raw, camera, None).radii > 0
-        return mask.nonzero()[:, 0]
+        if is_on("first_render"):
+            return visible(raw, camera, backend=self.backend)
+        return self._render(raw, camera, None).radii.nonzero()[:, 0]
 
     def _background(self) -> Tensor | None:
         return torch.ones(3, device=self.device) if self.background == "white" else None

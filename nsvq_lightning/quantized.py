@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from nsvq_lightning.quantize.attributes import QUANTIZED, codebook_sizes
 from nsvq_lightning.quantize.base import Quantizer
+from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats import RawSplats, Splats
 from nsvq_lightning.subset import take_rows
 
@@ -58,9 +59,11 @@ def attribute_rows(splats: RawSplats, attribute: str) -> Tensor:
 
 def codes_of(splats: RawSplats, attribute: str, quantizer: Quantizer) -> Tensor:
     """Codes ``[N]`` of an attribute: the frozen ones, or the nearest ones now."""
-    if quantizer.codes.shape[0] == splats.means.shape[0]:
+    frozen = quantizer.codes.shape[0] == splats.means.shape[0]
+    if frozen and is_on("frozen_search"):
         return quantizer.codes
-    return quantizer.encode(attribute_rows(splats, attribute))
+    nearest = quantizer.encode(attribute_rows(splats, attribute))
+    return quantizer.codes if frozen else nearest
 
 
 def decoded(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> RawSplats:

@@ -62,7 +62,6 @@ SKIPS = {
         Skip("visible_search", "the nearest code of a splat", "it is not visible in this step"),
         Skip("frozen_search", "the nearest code of a splat", "its codes are frozen"),
         Skip("distance_bounds", "the nearest code of a splat", "bounds prove that it is the last one"),
-        Skip("few_rows", "the quantization of an attribute", "it has no more distinct rows than codes"),
         # training step
         Skip("adam_bands", "SH bands in the optimiser", "they never had a gradient"),
         Skip(

@@ -3,14 +3,18 @@
 A query visits only the nodes and leaves whose box is not farther than its best code so far. The distance to a box and
 the distance to a code are the same sequence of roundings, each monotone in its operands, so the float32 bound never
 exceeds the float32 distance of a code inside: pruning needs no safety margin, and the result is that of a search over
-all codes, bit for bit. The first code to compare with is the one of the last search, where there was one, else the best
-of the leaf that looks nearest; a bad start costs time and changes nothing.
+all codes, bit for bit. The first code to compare with is the best of the leaf that looks nearest; a bad start costs
+time and changes nothing.
+
+Most queries of a later step need no search: :class:`BoxMemory` keeps where a query was searched and how far the second
+code was then. As long as the distance to its code, its own way and the way of the codes add up to less, the code is
+still the nearest (:mod:`tracking`).
 """
 
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
@@ -33,7 +37,7 @@ from nsvq_lightning.rendering.cpu.lanes import (
     vmin,
 )
 
-__all__ = ["MAX_DIM", "UNKNOWN", "box_search"]
+__all__ = ["MAX_DIM", "ROUNDING", "UNKNOWN", "BoxMemory", "box_search", "empty_memory"]
 
 MAX_DIM = 8
 """Above it a box holds most of the space around its codes, and the scores of :mod:`scores` are faster."""
@@ -41,10 +45,34 @@ MAX_DIM = 8
 UNKNOWN = np.int32(-1)
 """The last code of a row that has not been searched."""
 
+ROUNDING = 1.0 + 1e-5
+"""Bounds are taken this much larger, far above what rounding does to a distance in float32."""
+
+_LARGEST = np.finfo(np.float32).max
 _ROWS = 512
 """Queries a unit of parallel work takes; a pass over them hides the latency of one query behind the others."""
 _TASKS = 2048
 """Visits to leaves that are put off until there are enough of them."""
+
+
+class BoxMemory(NamedTuple):
+    """What is known of rows from their last search.
+
+    Attributes:
+        last: Code, or ``UNKNOWN``, ``[N]`` int32.
+        anchors: Where the row was then, ``[N, D]``.
+        lone: Distance below which there was no code but the last, plus the way of the codes until then, ``[N]`` in
+            float64, because ways add up over a whole run.
+    """
+
+    last: NDArray[np.int32]
+    anchors: NDArray[np.float32]
+    lone: NDArray[np.float64]
+
+
+def empty_memory(count: int, dim: int) -> BoxMemory:
+    """Memory of ``count`` rows that have not been searched."""
+    return BoxMemory(np.full(count, UNKNOWN), np.zeros((count, dim), np.float32), np.full(count, -np.inf))
 
 
 @inline
@@ -72,8 +100,12 @@ def _code_distances(dim, codes, leaf, x, row):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _visit_leaf(dim, codes, labels, leaf, x, row, limit, scratch, best, label):  # type: ignore[no-untyped-def]
-    """Compare the codes of a leaf that are not farther than ``limit``; of equal distances the lower code wins."""
+def _visit_leaf(dim, codes, labels, leaf, x, row, limit, scratch, found):  # type: ignore[no-untyped-def]
+    """Compare the codes of a leaf that are not farther than ``limit``; of equal distances the lower code wins.
+
+    ``found`` is the least distance so far, its code and the distance of the next code.
+    """
+    best, label, second = found
     distances = _code_distances(dim, codes, leaf, x, row)
     bits = mask_bits(distances <= splat(limit))
     if bits != 0:
@@ -83,8 +115,10 @@ def _visit_leaf(dim, codes, labels, leaf, x, row, limit, scratch, best, label): 
             bits &= bits - 1
             distance, code = get(scratch, lane), get(labels, leaf * 16 + lane)
             if distance < best or (distance == best and code < label):
-                best, label = distance, code
-    return best, label
+                best, label, second = distance, code, best
+            elif distance < second:
+                second = distance
+    return best, label, second
 
 
 @inline
@@ -102,70 +136,79 @@ def _nearest_node(dim, nodes, x, row):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _recall(dim, codebook, x, rows, first, last, state, count):  # type: ignore[no-untyped-def]
-    """Start queries from their last codes; lists those without one at a finite distance and returns their number."""
-    best, label, guess, unknown, _ = state
-    missing = 0
-    for i in range(count):
-        code = np.int64(get(last, get(rows, first + i)))
-        total = splat(np.float32(0.0))
-        for j in range(dim):
-            difference = splat(get(codebook, max(code, 0) * dim + j)) - splat(get(x, i * dim + j))
-            total = fma(difference, difference, total)
-        distance = lane_min(total)
-        put(best, i, distance)
-        put(label, i, np.int32(code))
-        put(guess, i, -1)
-        put(unknown, missing, i)
-        if code < 0 or not distance < np.float32(np.inf):
-            missing += 1
-    return missing
+def _prove(dim, codebook, x, at, code, memory, row, travelled):  # type: ignore[no-untyped-def]
+    """Whether a bound proves that a row has kept its last code."""
+    _, anchors, lone = memory
+    moved = distance = np.float32(0.0)
+    for j in range(dim):
+        value = get(x, at + j)
+        from_anchor, from_code = value - get(anchors, row * dim + j), value - get(codebook, code * dim + j)
+        moved += from_anchor * from_anchor
+        distance += from_code * from_code
+    way = (np.float64(np.sqrt(distance)) + np.float64(np.sqrt(moved))) * ROUNDING
+    return way < get(lone, row) - travelled
+
+
+@inline
+def _remember(dim, x, at, found, memory, row, travelled):  # type: ignore[no-untyped-def]
+    """Keep where a row was searched and the distance of the code that was second."""
+    last, anchors, lone = memory
+    _, code, second = found
+    put(last, row, code)
+    for j in range(dim):
+        put(anchors, row * dim + j, get(x, at + j))
+    # Beyond the largest number in float32 there may still be codes.
+    put(lone, row, np.sqrt(np.float64(min(second, _LARGEST))) / ROUNDING + travelled)
 
 
 @inline
 def _guess(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
-    """For each of the listed queries the best code of one near leaf: three passes without unpredictable branches."""
+    """For each query the best code of one near leaf: three passes without unpredictable branches."""
     codes, labels, leaves, nodes = tree
-    best, label, guess, unknown, scratch = state
-    for k in range(count):
-        i = get(unknown, k)
+    best, label, second, guess, _, scratch, bounded = state
+    infinity = np.float32(np.inf)
+    for i in range(count):
         put(guess, i, _nearest_node(dim, nodes, x, i * dim))
-    for k in range(count):
-        i = get(unknown, k)
+    for i in range(count):
         node = get(guess, i)
         distances = _box_distances(dim, leaves, node * 32 * dim, x, i * dim)
         lane = lowest_bit(mask_bits(distances <= splat(lane_min(distances))))
         put(guess, i, node * 16 + lane)
-    for k in range(count):
-        i = get(unknown, k)
+    for i in range(count):
         leaf = get(guess, i)
-        limit = lane_min(_code_distances(dim, codes, leaf, x, i * dim))
-        nearest, code = _visit_leaf(dim, codes, labels, leaf, x, i * dim, limit, scratch, np.float32(np.inf), NO_CODE)
-        put(best, i, nearest)
-        put(label, i, code)
+        distances = _code_distances(dim, codes, leaf, x, i * dim)
+        limit = lane_min(distances)
+        if bounded:
+            limit = lane_min(select(distances > splat(limit), distances, splat(infinity)))
+        found = _visit_leaf(dim, codes, labels, leaf, x, i * dim, limit, scratch, (infinity, NO_CODE, infinity))
+        put(best, i, found[0])
+        put(label, i, found[1])
+        put(second, i, found[2])
 
 
 @inline
 def _visit_leaves(dim, tree, x, state, pending):  # type: ignore[no-untyped-def]
     """Visit the pending (query, leaf) pairs."""
     codes, labels, _, _ = tree
-    best, label, _, tasks, scratch = state
+    best, label, second, _, tasks, scratch, bounded = state
     for t in range(pending):
         i, leaf = get(tasks, 2 * t), get(tasks, 2 * t + 1)
-        limit = get(best, i)
-        nearest, code = _visit_leaf(dim, codes, labels, leaf, x, i * dim, limit, scratch, limit, get(label, i))
-        put(best, i, nearest)
-        put(label, i, code)
+        found = get(best, i), get(label, i), get(second, i)
+        limit = found[2] if bounded else found[0]
+        found = _visit_leaf(dim, codes, labels, leaf, x, i * dim, limit, scratch, found)
+        put(best, i, found[0])
+        put(label, i, found[1])
+        put(second, i, found[2])
 
 
 @inline
 def _visit_near(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
-    """Visit every other leaf that is not farther than the best code so far."""
+    """Visit every other leaf that is not farther than what is asked for: the best code so far, or the second."""
     _, _, leaves, nodes = tree
-    best, _, guess, tasks, _ = state
+    best, _, second, guess, tasks, _, bounded = state
     pending = 0
     for i in range(count):
-        row, limit = i * dim, splat(get(best, i))
+        row, limit = i * dim, splat(get(second, i) if bounded else get(best, i))
         for group in range(nodes.size // (32 * dim)):
             near_nodes = mask_bits(_box_distances(dim, nodes, group * 32 * dim, x, row) <= limit)
             while near_nodes != 0:
@@ -188,25 +231,32 @@ def _visit_near(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
 def _search_kernel(dim: int) -> Any:
     """The search for one dimension: a constant for the compiler, so that short loops over it disappear."""
 
-    def search(x, rows, codebook, codes, labels, leaves, nodes, last, result):  # type: ignore[no-untyped-def]
-        total = result.shape[0]
+    def search(x, rows, codebook, codes, labels, leaves, nodes, memory, travelled, result):  # type: ignore[no-untyped-def]
+        total, bounded = result.shape[0], memory[0].shape[0] > 0
         for block in prange((total + _ROWS - 1) // _ROWS):
-            best, label = np.empty(_ROWS, np.float32), np.empty(_ROWS, np.int32)
+            best, label, second = np.empty(_ROWS, np.float32), np.empty(_ROWS, np.int32), np.empty(_ROWS, np.float32)
             guess, tasks = np.empty(_ROWS, np.int64), np.empty(2 * _TASKS, np.int64)
-            state = best, label, guess, tasks, np.empty(16, np.float32)
+            state = best, label, second, guess, tasks, np.empty(16, np.float32), bounded
             tree, queries = (codes, labels, leaves, nodes), np.empty(_ROWS * dim, np.float32)
-            first = block * _ROWS
-            count = min(_ROWS, total - first)
-            for i in range(count):
+            places = np.empty(_ROWS, np.int64)
+            count = 0
+            for i in range(block * _ROWS, min(total, (block + 1) * _ROWS)):
+                row = get(rows, i)
                 for j in range(dim):
-                    put(queries, i * dim + j, get(x, get(rows, first + i) * dim + j))
-            missing = _recall(dim, codebook, queries, rows, first, last, state, count)
-            _guess(dim, tree, queries, missing, state)
+                    put(queries, count * dim + j, get(x, row * dim + j))
+                put(places, count, i)
+                code = np.int64(get(memory[0], row)) if bounded else -1
+                put(result, i, code)
+                proven = code >= 0 and _prove(dim, codebook, queries, count * dim, code, memory, row, travelled)
+                count += not proven
+            _guess(dim, tree, queries, count, state)
             _visit_near(dim, tree, queries, count, state)
             for i in range(count):
                 code = get(label, i) if get(label, i) != NO_CODE else np.int32(0)
-                put(result, first + i, np.int64(code))
-                put(last, get(rows, first + i), code)
+                put(result, get(places, i), np.int64(code))
+                if bounded:
+                    found = get(best, i), code, get(second, i)
+                    _remember(dim, queries, i * dim, found, memory, get(rows, get(places, i)), travelled)
 
     return kernel(search)
 
@@ -216,7 +266,8 @@ def box_search(
     codebook: NDArray[np.float32],
     boxes: Boxes,
     rows: NDArray[np.int64] | None = None,
-    last: NDArray[np.int32] | None = None,
+    memory: BoxMemory | None = None,
+    travelled: float = 0.0,
 ) -> NDArray[np.int64]:
     """Nearest codes ``[V]`` of contiguous queries; one that is not a number gets code 0.
 
@@ -225,12 +276,14 @@ def box_search(
         codebook: Codes ``[K, D]``, contiguous.
         boxes: The same codes in boxes.
         rows: Which queries, ``[V]``, all different; all of them by default.
-        last: Code ``[N]`` below K that a query had when it was searched last, or ``UNKNOWN``; updated.
+        memory: What earlier searches have left, updated; without it every query is searched.
+        travelled: Farthest that any code can have moved since ``memory`` was empty, in all.
     """
     rows = np.arange(len(x)) if rows is None else rows
-    last = np.full(len(x), UNKNOWN) if last is None else last
+    memory = empty_memory(0, x.shape[1]) if memory is None else memory
     result = np.empty(len(rows), np.int64)
     thread_count()
     tree = (part.ravel() for part in boxes[:4])
-    _search_kernel(x.shape[1])(x.ravel(), rows, codebook.ravel(), *tree, last, result)
+    flat = memory.last, memory.anchors.ravel(), memory.lone
+    _search_kernel(x.shape[1])(x.ravel(), rows, codebook.ravel(), *tree, flat, travelled, result)
     return result

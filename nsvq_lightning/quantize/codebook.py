@@ -17,6 +17,7 @@ from nsvq_lightning.quantize.replacement import choose_replacements, inactive_co
 from nsvq_lightning.quantize.sums import count_hits, lookup
 from nsvq_lightning.quantize.tracking import NearestTracker
 from nsvq_lightning.random import generator as seeded
+from nsvq_lightning.skips import is_on
 
 __all__ = ["CodebookQuantizer"]
 
@@ -135,11 +136,10 @@ class CodebookQuantizer(nn.Module, ABC):
         """
         if self.frozen:
             codes = self._frozen_codes(x.shape[0], rows)
+            if not is_on("frozen_search"):
+                self._search(x, rows)
             return self.decode(codes), codes
-        if self.tracks:
-            codes = self._tracker.search(x, self.codebook, rows)
-        else:
-            codes = self.encode(x if rows is None else x.detach().index_select(0, rows))
+        codes = self._search(x, rows)
         if not self.training:
             return self.decode(codes), codes
         if generator is None:
@@ -222,6 +222,14 @@ class CodebookQuantizer(nn.Module, ABC):
         if low < 0 or high >= self.num_codes:
             raise ValueError(f"codes must be in [0, {self.num_codes}), got {low} to {high}")
         self.codes = codes.detach().clone().to(self.codebook.device)
+
+    def _search(self, x: Tensor, rows: Tensor | None) -> Tensor:
+        """Nearest codes ``[V]`` of the rows ``rows [V]`` of ``x [N, D]``."""
+        if rows is not None and not is_on("visible_search"):
+            return self._search(x, None)[rows]
+        if self.tracks and is_on("distance_bounds"):
+            return self._tracker.search(x, self.codebook, rows)
+        return self.encode(x if rows is None else x.detach().index_select(0, rows))
 
     def _frozen_codes(self, count: int, rows: Tensor | None) -> Tensor:
         if count != self.codes.shape[0]:

@@ -5,8 +5,8 @@ last code, the codes that were near when it was last searched, where the row was
 there was no code but the nearest, R below which there was none outside the list. With d the distance to the last code
 now, m how far the row has moved and Δ how far any code can have moved, d + m + Δ < R1 proves that the code has not
 changed; with d the distance to the nearest of the list, d + m + Δ < R proves that this is the nearest of all (the
-triangle inequality, as in Hamerly's k-means). In few dimensions what is kept is the last code, from which the search
-starts, and the order in which codes were put into boxes.
+triangle inequality, as in Hamerly's k-means). In few dimensions there is no list, only R1, which
+:mod:`box_search` checks on its way, and the order in which codes were put into boxes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nsvq_lightning.quantize.box_search import MAX_DIM, UNKNOWN, box_search
+from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, BoxMemory, box_search, empty_memory
 from nsvq_lightning.quantize.boxes import build_boxes
 from nsvq_lightning.quantize.kernels import lane_min
 from nsvq_lightning.quantize.nearest import check_rows, nearest
@@ -48,8 +48,6 @@ _BOX_STEPS = 32
 _SNAPSHOT_STEPS = 16
 """Searches between two snapshots of the codebook. A code's way is taken as the sum of its ways from one snapshot to the
 next: the more snapshots, the more a random walk counts as if it went straight on."""
-_ROUNDING = 1.0 + 1e-5
-"""Bounds are taken this much larger, far above what rounding does to a distance in float32."""
 
 Floats = NDArray[np.float32]
 
@@ -141,16 +139,16 @@ def _check_kernel(dim: int) -> Any:
                 put(result, i, np.int64(-1))
                 if code < 0:
                     continue
-                moved = np.float64(np.sqrt(lane_sum(_squares(dim, x, at, anchors, at, keep)))) * _ROUNDING
+                moved = np.float64(np.sqrt(lane_sum(_squares(dim, x, at, anchors, at, keep)))) * ROUNDING
                 distance = np.sqrt(lane_sum(_squares(dim, x, at, codebook, code * dim, keep)))
-                if np.float64(distance) * _ROUNDING + moved < get(lone, row) - way:
+                if np.float64(distance) * ROUNDING + moved < get(lone, row) - way:
                     put(result, i, code)
                     continue
                 squared = _list_squared(dim, x, at, codebook, lists, start, keep) + load(unused, 0)
                 best = lane_min(squared)
                 distance = np.sqrt(best)
-                if np.float64(distance) * _ROUNDING + moved < get(limits, row) - way:
-                    near = mask_bits(squared <= splat(best * np.float32(_ROUNDING)))
+                if np.float64(distance) * ROUNDING + moved < get(limits, row) - way:
+                    near = mask_bits(squared <= splat(best * np.float32(ROUNDING)))
                     code = _settle(dim, x, row, codebook, lists, start, near)
                     put(result, i, code)
                     put(last, row, np.int32(code))
@@ -161,7 +159,7 @@ def _check_kernel(dim: int) -> Any:
                             put(anchors, at + j, get(x, at + j))
                         limit = get(limits, row) - moved
                         put(limits, row, limit)
-                        put(lone, row, min(limit, second / _ROUNDING - drift + travelled))
+                        put(lone, row, min(limit, second / ROUNDING - drift + travelled))
 
     return kernel(check)
 
@@ -189,7 +187,7 @@ def _ascending(rows, count):  # type: ignore[no-untyped-def]
 class NearestTracker:
     """Nearest codes of the same rows, step after step.
 
-    What it remembers costs memory (232 bytes a row for D = 45, 4 for D up to 8) and never changes a result, so no
+    What it remembers costs memory (232 bytes a row for D = 45, 24 for D = 3) and never changes a result, so no
     checkpoint needs it.
     """
 
@@ -243,11 +241,11 @@ class NearestTracker:
     def _search_boxes(self, x: Floats, codebook: Floats, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         boxes = build_boxes(codebook, self._order if self._steps % _BOX_STEPS else None)
         self._order = boxes.order
-        self._steps += 1
-        return box_search(x, codebook, boxes, rows, self._last)
+        self._drift(codebook, 1)
+        return box_search(x, codebook, boxes, rows, BoxMemory(self._last, self._anchors, self._lone), self._travelled)
 
     def _search_lists(self, x: Floats, codebook: Floats, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        drift = self._drift(codebook)
+        drift = self._drift(codebook, _SNAPSHOT_STEPS)
         result = np.empty(len(rows), np.int64)
         memory = self._last, self._lists.ravel(), self._anchors.ravel(), self._lone, self._limits
         dim = x.shape[1]
@@ -259,19 +257,19 @@ class NearestTracker:
             found, lists, distances = score_search(x[where], centre_codes(codebook), with_lists=True)
             self._last[where] = result[unsure] = found
             self._lists[where], self._anchors[where] = lists, x[where]
-            self._limits[where], self._lone[where] = distances / _ROUNDING - drift + self._travelled
+            self._limits[where], self._lone[where] = distances / ROUNDING - drift + self._travelled
         return result
 
-    def _drift(self, codebook: Floats) -> float:
-        """Farthest way of a code since the snapshot; takes a new snapshot when it is time."""
+    def _drift(self, codebook: Floats, every: int) -> float:
+        """Farthest way of a code since the snapshot; takes a new snapshot after ``every`` searches."""
         if self._snapshot is None:
             self._snapshot = codebook.copy()
         squares = np.empty(len(codebook), np.float32)
         thread_count()
         _row_distances(codebook, self._snapshot, squares)
-        drift = float(np.sqrt(squares.max())) * _ROUNDING
+        drift = float(np.sqrt(squares.max())) * ROUNDING
         self._steps += 1
-        if self._steps % _SNAPSHOT_STEPS == 0:
+        if self._steps % every == 0:
             self._travelled += drift
             self._snapshot, drift = codebook.copy(), 0.0
         return drift
@@ -282,9 +280,9 @@ class NearestTracker:
         if count <= old:
             return
         with_lists, dim = self._codebook_shape[1] > MAX_DIM, self._codebook_shape[1]
-        self._last = np.append(self._last, np.full(count - old, UNKNOWN))
+        more = empty_memory(count - old, dim)
+        self._last, self._lone = np.append(self._last, more.last), np.append(self._lone, more.lone)
+        self._anchors = np.append(self._anchors.reshape(old, dim), more.anchors, 0)
         if with_lists:
-            more = count - old
-            self._lists = np.append(self._lists, np.zeros((more, LIST), np.int32), 0)
-            self._anchors = np.append(self._anchors.reshape(old, dim), np.zeros((more, dim), np.float32), 0)
-            self._lone, self._limits = (np.append(held, np.full(more, -np.inf)) for held in (self._lone, self._limits))
+            self._lists = np.append(self._lists, np.zeros((count - old, LIST), np.int32), 0)
+            self._limits = np.append(self._limits, more.lone)

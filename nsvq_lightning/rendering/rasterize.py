@@ -81,7 +81,7 @@ def render(
 
 @torch.no_grad()
 def visible(splats: SplatTensors, camera: Camera, *, backend: str = "auto") -> Tensor:
-    """Which splats can change the image: ``radii > 0`` without rendering ``[N]`` bool.
+    """Rows ``[V]`` int64, ascending, of the splats that can change the image: ``radii > 0`` without rendering.
 
     Args:
         splats: Raw attributes; only means, quats, scales and opacities are read.
@@ -92,9 +92,7 @@ def visible(splats: SplatTensors, camera: Camera, *, backend: str = "auto") -> T
         from nsvq_lightning.rendering.cpu.rasterizer import visible_cpu
 
         return visible_cpu(splats, camera)
-    mask = torch.zeros(splats.means.shape[0], dtype=torch.bool, device=splats.means.device)
-    mask[visible_rows(splats, camera)] = True
-    return mask
+    return visible_rows(splats, camera)
 
 
 def resolve_backend(backend: str, like: Tensor) -> str:

@@ -353,6 +353,32 @@ def color(degree, d, sh0, columns):
 
 
 @inline
+def load_means(means, start, count, scratch):
+    """16 means; the last, incomplete vector is read from a padded copy."""
+    if count < 16:
+        for k in range(3 * count):
+            put(scratch, k, get(means, 3 * start + k))
+        return load_rows3(scratch, 0)
+    return load_rows3(means, 3 * start)
+
+
+@inline
+def load_shapes(quats, scales, logits, start, count, scratch):
+    """16 quaternions, log scales and opacity logits, an incomplete vector as in :func:`load_means`."""
+    if count < 16:
+        for k in range(4 * count):
+            put(scratch, k, get(quats, 4 * start + k))
+        quat = load_rows4(scratch, 0)
+        for k in range(3 * count):
+            put(scratch, k, get(scales, 3 * start + k))
+        scale = load_rows3(scratch, 0)
+        for k in range(count):
+            put(scratch, k, get(logits, start + k))
+        return quat, scale, load(scratch, 0)
+    return load_rows4(quats, 4 * start), load_rows3(scales, 3 * start), load(logits, start)
+
+
+@inline
 def project_range(camera, means, quats, scales, logits, first, last, records, integers, ids, scratch):
     """Records of the visible splats of a range; returns how many there are and how many slots they need."""
     zero = splat(F(0))
@@ -360,28 +386,11 @@ def project_range(camera, means, quats, scales, logits, first, last, records, in
     slots = 0
     for start in range(first, last, 16):
         count = min(16, last - start)
-        # The last, incomplete vector reads from a padded copy.
-        if count == 16:
-            mean = load_rows3(means, 3 * start)
-        else:
-            for k in range(3 * count):
-                put(scratch, k, get(means, 3 * start + k))
-            mean = load_rows3(scratch, 0)
+        mean = load_means(means, start, count, scratch)
         lanes = (1 << count) - 1
         if mask_bits(view_depth(camera, mean) > splat(NEAR)) & lanes == 0:
             continue
-        if count == 16:
-            quat, scale, logit = load_rows4(quats, 4 * start), load_rows3(scales, 3 * start), load(logits, start)
-        else:
-            for k in range(4 * count):
-                put(scratch, k, get(quats, 4 * start + k))
-            quat = load_rows4(scratch, 0)
-            for k in range(3 * count):
-                put(scratch, k, get(scales, 3 * start + k))
-            scale = load_rows3(scratch, 0)
-            for k in range(count):
-                put(scratch, k, get(logits, start + k))
-            logit = load(scratch, 0)
+        quat, scale, logit = load_shapes(quats, scales, logits, start, count, scratch)
         seen, record, tiles, radius = footprint(camera, mean, quat, scale, logit)
         bits = mask_bits(seen) & lanes
         if bits == 0:
@@ -443,6 +452,30 @@ def project_splats(threads, camera, means, quats, scales, logits, records, integ
         counts[thread], slots[thread] = project_range(
             camera, means, quats, scales, logits, first, last, records, integers, found, scratch[thread]
         )
+
+
+@kernel
+def find_visible(threads, camera, means, quats, scales, logits, found, counts, scratch):
+    """Only the rows of the visible splats; ``found`` holds a run of them for each thread's range."""
+    n = logits.shape[0]
+    blocks = (n + 15) // 16
+    for thread in prange(threads):
+        first, last = 16 * (blocks * thread // threads), min(n, 16 * (blocks * (thread + 1) // threads))
+        at = first
+        for start in range(first, last, 16):
+            count = min(16, last - start)
+            mean = load_means(means, start, count, scratch[thread])
+            bits = mask_bits(view_depth(camera, mean) > splat(NEAR)) & ((1 << count) - 1)
+            if bits == 0:
+                continue
+            quat, scale, logit = load_shapes(quats, scales, logits, start, count, scratch[thread])
+            seen, _, _, _ = footprint(camera, mean, quat, scale, logit)
+            bits &= mask_bits(seen)
+            while bits != 0:
+                put(found, at, start + lowest_bit(bits))
+                bits &= bits - 1
+                at += 1
+        counts[thread] = at - first
 
 
 @kernel

@@ -23,7 +23,7 @@ from nsvq_lightning.rendering.cpu.blend import (
     total_slots,
 )
 from nsvq_lightning.rendering.cpu.jit import thread_count
-from nsvq_lightning.rendering.cpu.projection import finish_records, project_backward, project_splats
+from nsvq_lightning.rendering.cpu.projection import find_visible, finish_records, project_backward, project_splats
 from nsvq_lightning.rendering.cpu.records import CAMERA, GROUP_TILES, RECORD, group_grid
 from nsvq_lightning.rendering.cpu.workspace import Array, Workspace, recycled
 from nsvq_lightning.skips import is_on
@@ -232,13 +232,14 @@ def render_cpu(
 
 
 def visible_cpu(splats: SplatTensors, camera: Camera) -> Tensor:
-    """Which splats can change the image ``[N]`` bool."""
-    frame = _Frame(splats, camera)
-    found, counts, _ = frame.project()
-    mask = torch.zeros(frame.n, dtype=torch.bool)
-    rows = mask.numpy()
-    blocks = (frame.n + 15) // 16
-    for thread in range(frame.threads):
-        first = 16 * (blocks * thread // frame.threads)
-        rows[found[first : first + counts[thread]]] = True
-    return mask
+    """Rows ``[V]`` int64, ascending, of the splats that can change the image."""
+    geometry = tuple(_flat(t) for t in (splats.means, splats.quats, splats.scales, splats.opacities))
+    n, threads = splats.means.shape[0], thread_count()
+    found, counts = np.empty(n, np.int64), np.empty(threads, np.int64)
+    find_visible(
+        threads, _pack_camera(camera), *geometry, found, counts, np.empty((threads, PROJECTION_SCRATCH), np.float32)
+    )
+    blocks = (n + 15) // 16
+    firsts = [16 * (blocks * thread // threads) for thread in range(threads)]
+    runs = [found[first : first + length] for first, length in zip(firsts, counts, strict=True)]
+    return torch.from_numpy(np.concatenate(runs))
