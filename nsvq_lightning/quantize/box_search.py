@@ -252,10 +252,10 @@ def _search_kernel(dim: int) -> Any:
             _guess(dim, tree, queries, count, state)
             _visit_near(dim, tree, queries, count, state)
             for i in range(count):
-                code = get(label, i) if get(label, i) != NO_CODE else np.int32(0)
-                put(result, get(places, i), np.int64(code))
+                nearest = get(label, i) if get(label, i) != NO_CODE else np.int32(0)
+                put(result, get(places, i), np.int64(nearest))
                 if bounded:
-                    found = get(best, i), code, get(second, i)
+                    found = get(best, i), nearest, get(second, i)
                     _remember(dim, queries, i * dim, found, memory, get(rows, get(places, i)), travelled)
 
     return kernel(search)
