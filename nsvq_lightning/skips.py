@@ -10,6 +10,9 @@ Switches hold for the whole process, so set them before work starts, not while a
 
 Things that look alike and have no switch, because switching them off would only call a function that returns its
 argument: the sum over processes where there is one process, and gradients of what nothing depends on.
+
+Nor has an attribute with no more distinct rows than codes: its codebook starts as these rows, but from the first step
+on training moves rows and codes apart, so that they must be searched like any others.
 """
 
 from __future__ import annotations

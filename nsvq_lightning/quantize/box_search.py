@@ -136,12 +136,12 @@ def _nearest_node(dim, nodes, x, row):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _prove(dim, codebook, x, at, code, memory, row, travelled):  # type: ignore[no-untyped-def]
+def _prove(dim, codebook, x, row, code, memory, travelled):  # type: ignore[no-untyped-def]
     """Whether a bound proves that a row has kept its last code."""
     _, anchors, lone = memory
     moved = distance = np.float32(0.0)
     for j in range(dim):
-        value = get(x, at + j)
+        value = get(x, row * dim + j)
         from_anchor, from_code = value - get(anchors, row * dim + j), value - get(codebook, code * dim + j)
         moved += from_anchor * from_anchor
         distance += from_code * from_code
@@ -242,13 +242,14 @@ def _search_kernel(dim: int) -> Any:
             count = 0
             for i in range(block * _ROWS, min(total, (block + 1) * _ROWS)):
                 row = get(rows, i)
-                for j in range(dim):
-                    put(queries, count * dim + j, get(x, row * dim + j))
+                last = np.int64(get(memory[0], row)) if bounded else np.int64(UNKNOWN)
+                put(result, i, last)
                 put(places, count, i)
-                code = np.int64(get(memory[0], row)) if bounded else -1
-                put(result, i, code)
-                proven = code >= 0 and _prove(dim, codebook, queries, count * dim, code, memory, row, travelled)
-                count += not proven
+                count += not (last >= 0 and _prove(dim, codebook, x, row, last, memory, travelled))
+            for i in range(count):
+                row = get(rows, get(places, i))
+                for j in range(dim):
+                    put(queries, i * dim + j, get(x, row * dim + j))
             _guess(dim, tree, queries, count, state)
             _visit_near(dim, tree, queries, count, state)
             for i in range(count):
