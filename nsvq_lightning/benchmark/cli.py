@@ -225,7 +225,8 @@ def _filled(document: str, tables: Mapping[str, str], scene: str = "", saved: Ma
         ValueError: There is no place for a suite.
     """
     wanted = dict(tables)
-    if TRAIN in wanted and SWITCHES in document:
+    # On a line of its own: a text may speak of it, too.
+    if TRAIN in wanted and SWITCHES in document.splitlines():
         document = fill_switches(document, scene, saved)
         if results_line(TRAIN) not in document:
             del wanted[TRAIN]

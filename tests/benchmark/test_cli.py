@@ -120,3 +120,8 @@ def test_help_does_not_load_torch() -> None:
     root = Path(__file__).resolve().parents[2]
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
     assert "--quick" in done.stdout
+
+
+def test_a_place_is_a_line_of_its_own() -> None:
+    document = f"text about `{cli.SWITCHES}`\n<!-- results: train -->\n<!-- end -->\n"
+    assert cli._filled(document, {"train": "table"}) == document.replace("<!-- end -->", "\ntable\n\n<!-- end -->")
