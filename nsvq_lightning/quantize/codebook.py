@@ -38,8 +38,6 @@ class CodebookQuantizer(nn.Module, ABC):
         window: Iterations in the window, scalar int64.
         codes: Frozen codes ``[N]`` int64, empty until :meth:`freeze`.
         fitted: Whether the codebook has been placed, scalar bool.
-        tracks: Whether a search in :meth:`forward` starts from the codes of earlier steps (:mod:`tracking`), True at
-            first. It changes the time, never a result.
 
     Raises:
         ValueError: An argument is out of range.
@@ -57,7 +55,6 @@ class CodebookQuantizer(nn.Module, ABC):
             if value < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
         self.kmeans_steps = kmeans_steps
-        self.tracks = True
         self._tracker = NearestTracker()
         self.codebook = nn.Parameter(torch.zeros(num_codes, dim))
         self.register_buffer("usage", torch.zeros(num_codes, dtype=torch.int64))
@@ -227,7 +224,7 @@ class CodebookQuantizer(nn.Module, ABC):
         """Nearest codes ``[V]`` of the rows ``rows [V]`` of ``x [N, D]``."""
         if rows is not None and not is_on("visible_search"):
             return self._search(x, None)[rows]
-        if self.tracks and is_on("distance_bounds"):
+        if is_on("distance_bounds"):
             return self._tracker.search(x, self.codebook, rows)
         return self.encode(x if rows is None else x.detach().index_select(0, rows))
 
