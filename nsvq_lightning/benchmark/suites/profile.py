@@ -39,7 +39,7 @@ WHOLE, LIGHTNING, UNEXPLAINED = "whole step", "Lightning", "unexplained"
 
 PARTS = (
     ("data", ("*train_dataloader_next", "*batch_to_device", "nsvq_lightning.data.*")),
-    ("project", ("*.project_splats", "*._Frame.project")),
+    ("project", ("*.project_splats", "*.find_visible", "*._Frame.project")),
     ("SH and records", ("*.finish_records",)),
     ("sort", ("*.sort_by_depth",)),
     ("bin", ("*.count_tiles", "*.fill_tiles", "*._Frame.bin")),
@@ -49,9 +49,9 @@ PARTS = (
     ("loss", ("nsvq_lightning.losses.*", "*.cpu.dssim.*")),
     ("rows of visible splats", ("*.cpu.rows.*", "nsvq_lightning.subset.*")),
     ("Adam", ("*.optimizer_step", "nsvq_lightning.optim.*", "*.cpu.adam.*")),
-    ("density statistics", ("*.DensityControl._observe", "*.screen_gradient", "*.add_table", "*.cpu.statistics.*")),
+    ("density statistics", ("*.DensityControl._observe", "*.add_view", "*.add_table", "*.cpu.statistics.*")),
     ("rasterizer, its Python", ("nsvq_lightning.rendering.*",)),
-    ("quantizer: noise backward", ("*.substitute_backward", "*.substitution._sum*", "*Substitution.backward")),
+    ("quantizer: noise backward", ("*.substitute_backward", "*.substitution._add_parts", "*Substitution.backward")),
     ("quantizer: noise", ("*.substitution.*", "*.quantize.noise.*", "*.quantize.nsvq.*")),
     ("quantizer: count", ("*.CodebookQuantizer.count",)),
     ("quantizer: decode", ("*.quantize.sums.*", "*.CodebookQuantizer.decode", "nsvq_lightning.quantized.*")),
