@@ -37,7 +37,6 @@ from nsvq_lightning.rendering.cpu.lanes import (
     store,
     store_block,
     store_rgb_block,
-    trailing_zeros,
     vmax,
     vmin,
 )
@@ -171,26 +170,28 @@ def accumulate(batch, r, weight, sums):
 
 
 @inline
+def waiting(touched, first, count, block):
+    """Which of the next 64 splats, of which ``count`` belong to the batch, reach a block, as bits."""
+    if count <= 0:
+        return np.int64(0)
+    bits = column_bits(touched, first, block)
+    return bits if count >= 64 else bits & ((1 << count) - 1)
+
+
+@inline
 def next_splat(low, high, base):
     """Take the lowest bit of a queue of 128; without one the position is 128."""
     if low == 0:
         low, high, base = high, np.int64(0), np.int64(64)
-    return base + trailing_zeros(low), low & (low - 1), high, base
+    return base + lowest_bit(low), low & (low - 1), high, base
 
 
 @inline
 def blend_one(batch, r, alpha, t, after, left, sums):
     """Add one splat where it leaves the pixel open; returns the transmittance left and the sums."""
-    red, green, blue, depth = sums
     open_ = after >= splat(TRANSMITTANCE_MIN)
     weight = select(open_, alpha * t, splat(F(0)))
-    sums = (
-        fma(weight, splat(get(batch, r + RED)), red),
-        fma(weight, splat(get(batch, r + GREEN)), green),
-        fma(weight, splat(get(batch, r + BLUE)), blue),
-        fma(weight, splat(get(batch, r + DEPTH)), depth),
-    )
-    return select(open_, after, left), sums
+    return select(open_, after, left), accumulate(batch, r, weight, sums)
 
 
 @inline
@@ -201,14 +202,8 @@ def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
     sums = load(state, R_SUM + o), load(state, G_SUM + o), load(state, B_SUM + o), load(state, Z_SUM + o)
     x, y = load(grid, o), load(grid, 256 + o)
     bit = 1 << block
-    low = column_bits(touched, first, block)
-    high = np.int64(0)
-    if count < 64:
-        low &= (1 << count) - 1
-    elif count > 64:
-        high = column_bits(touched, first + 64, block)
-        if count < 128:
-            high &= (1 << (count - 64)) - 1
+    low = waiting(touched, first, count, block)
+    high = waiting(touched, first + 64, count - 64, block)
     base = np.int64(0)
     while low | high != 0:
         j0, low, high, base = next_splat(low, high, base)

@@ -314,12 +314,6 @@ def any_lane(context, builder, sig, values):
 
 @_function(types.int64, 1)
 def lowest_bit(context, builder, sig, values):
-    """Position of the lowest set bit of an integer that is not 0."""
-    return builder.cttz(values[0], _i1(1))
-
-
-@_function(types.int64, 1)
-def trailing_zeros(context, builder, sig, values):
     """Position of the lowest set bit of an integer; 64 for 0."""
     return builder.cttz(values[0], _i1(0))
 

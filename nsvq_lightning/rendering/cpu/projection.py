@@ -519,11 +519,8 @@ def finish_records(
             # Depths are positive, so their bits sort as integers.
             put(keys, start + k, get(integers, RECORD * row + DEPTH))
             put(order, start + k, start + k)
-            origin, extent = (
-                np.int64(get(integers, RECORD * row + ORIGIN)),
-                np.int64(get(integers, RECORD * row + EXTENT)),
-            )
-            put(boxes, start + k, origin | (extent << 32))
+            extent = np.int64(get(integers, RECORD * row + EXTENT))
+            put(boxes, start + k, np.int64(get(integers, RECORD * row + ORIGIN)) | (extent << 32))
             put(means2d, 2 * row, get(records, RECORD * row + X))
             put(means2d, 2 * row + 1, get(records, RECORD * row + Y))
             put(radii, row, get(integers, RECORD * row + RADIUS))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,7 @@ from nsvq_lightning.rendering.cpu.projection import find_visible, finish_records
 from nsvq_lightning.rendering.cpu.records import CAMERA, GROUP_TILES, RECORD, group_grid
 from nsvq_lightning.rendering.cpu.workspace import Array, Workspace, recycled
 from nsvq_lightning.skips import is_on
-from nsvq_lightning.splats import SplatTensors
+from nsvq_lightning.splats import SplatTensors, sh_degree_of
 
 __all__ = ["render_cpu", "visible_cpu"]
 
@@ -68,9 +67,8 @@ class _Frame:
         self.scratch = self.work.rows("projection", self.threads, PROJECTION_SCRATCH)
         self.count = self.slots = 0
         nothing = np.empty(0, np.int32)
-        self.ids = self.order = self.boxes = self.entries = self.offsets = self.touched = self.ends = self.sums = (
-            nothing
-        )
+        self.ids = self.order = self.boxes = self.entries = nothing
+        self.offsets = self.touched = self.ends = self.sums = nothing
 
     def __del__(self) -> None:
         work = getattr(self, "work", None)
@@ -135,7 +133,7 @@ class _Project(torch.autograd.Function):
         means2d = means.new_zeros(frame.n, 2)
         radii = torch.zeros(frame.n, dtype=torch.int32)
         # Bands above the active degree count as zero, whether they are left out or evaluated.
-        degrees = degree, degree if is_on("sh_bands") else math.isqrt(shN.shape[1] + 1) - 1
+        degrees = degree, degree if is_on("sh_bands") else sh_degree_of(shN)
         ctx.frame, ctx.degrees, ctx.stride = frame, degrees, 3 * shN.shape[1]
         ctx.save_for_backward(*attributes)
         frame.finish(_flat(sh0), _flat(shN), ctx.stride, degrees, _flat(means2d), _flat(radii))
