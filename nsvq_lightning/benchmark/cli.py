@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from nsvq_lightning.benchmark.registry import ALL, SUITES, load_suite, suite_names
-from nsvq_lightning.benchmark.report import as_json, as_markdown, fill_in, results_line, suite_tables
+from nsvq_lightning.benchmark.report import as_json, as_markdown, fill_in, has_place, results_line, suite_tables
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.sizes import SIZES
@@ -225,10 +225,9 @@ def _filled(document: str, tables: Mapping[str, str], scene: str = "", saved: Ma
         ValueError: There is no place for a suite.
     """
     wanted = dict(tables)
-    # On a line of its own: a text may speak of it, too.
-    if TRAIN in wanted and SWITCHES in document.splitlines():
+    if TRAIN in wanted and has_place(document, SWITCHES):
         document = fill_switches(document, scene, saved)
-        if results_line(TRAIN) not in document:
+        if not has_place(document, results_line(TRAIN)):
             del wanted[TRAIN]
     return fill_in(document, wanted)
 

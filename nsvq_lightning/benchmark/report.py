@@ -10,7 +10,7 @@ from typing import Any
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
 
-__all__ = ["as_json", "as_markdown", "between", "fill_in", "replace_between", "results_line", "suite_tables"]
+__all__ = ["as_json", "as_markdown", "between", "fill_in", "has_place", "replace_between", "results_line", "suite_tables"]
 
 
 END = "<!-- end -->"
@@ -65,6 +65,11 @@ def fill_in(document: str, tables: Mapping[str, str]) -> str:
 def results_line(suite: str) -> str:
     """The line of a document after which the tables of a suite go."""
     return f"<!-- results: {suite} -->"
+
+
+def has_place(document: str, start: str) -> bool:
+    """Whether a document has the line ``start``; a text may speak of it, too."""
+    return start in document.splitlines()
 
 
 def between(document: str, start: str) -> str:
