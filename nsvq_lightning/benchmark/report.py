@@ -10,7 +10,16 @@ from typing import Any
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
 
-__all__ = ["as_json", "as_markdown", "between", "fill_in", "has_place", "replace_between", "results_line", "suite_tables"]
+__all__ = [
+    "as_json",
+    "as_markdown",
+    "between",
+    "fill_in",
+    "has_place",
+    "replace_between",
+    "results_line",
+    "suite_tables",
+]
 
 
 END = "<!-- end -->"

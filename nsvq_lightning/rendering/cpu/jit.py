@@ -20,11 +20,21 @@ _OPTIONS: dict[str, Any] = {
     "nogil": True,
 }
 
-_PACKAGE = Path(__file__).parents[2]
-_SOURCES = hashlib.sha256()
-for _path in sorted([*Path(__file__).parent.glob("*.py"), *(_PACKAGE / "quantize").glob("*.py")]):
-    _SOURCES.update(_path.read_bytes())
-_STAMP = _SOURCES.hexdigest()
+
+def _stamp() -> str:
+    """Digest of all sources that kernels are made of: the files that import something of this folder, and its own."""
+    package = Path(__file__).parents[2]
+    digest = hashlib.sha256()
+    for path in sorted([*Path(__file__).parent.glob("*.py"), *package.glob("*/*.py")]):
+        source = path.read_bytes()
+        if path.parent == Path(__file__).parent or any(
+            name in source for name in (b"rendering.cpu.jit import", b"rendering.cpu.lanes import")
+        ):
+            digest.update(source)
+    return digest.hexdigest()
+
+
+_STAMP = _stamp()
 
 
 def inline(function: Callable[..., Any]) -> Any:
@@ -35,8 +45,8 @@ def inline(function: Callable[..., Any]) -> Any:
 def kernel(function: Callable[..., Any], parallel: bool = True) -> Any:
     """Compile a kernel once a machine and keep it on disk. To wake the threads costs more than some need in all.
 
-    Numba looks only at a kernel's own file to tell whether a stored one is stale; here every file of the back-end
-    counts, because kernels contain the code of their helpers.
+    Numba looks only at a kernel's own file to tell whether a stored one is stale; here every file with a kernel or a
+    helper of one counts, because kernels contain the code of their helpers.
     """
     dispatcher = numba.njit(parallel=parallel, cache=True, **_OPTIONS)(function)
     files = getattr(dispatcher._cache, "_cache_file", None)
