@@ -14,7 +14,14 @@ from nsvq_lightning.rendering.cpu.lanes import get, put
 from nsvq_lightning.rendering.cpu.projection import clear
 from nsvq_lightning.rendering.cpu.workspace import recycled
 
-__all__ = ["gather_rows", "spread_rows"]
+__all__ = ["clear_between", "gather_rows", "spread_rows"]
+
+
+@inline
+def clear_between(rows, i, columns, table):
+    """Zero the rows of a table between the ``i - 1``-th and the ``i``-th of ``rows``; past the last, up to the end."""
+    first = columns * (get(rows, i - 1) + 1) if i > 0 else 0
+    clear(table, first, columns * get(rows, i) if i < rows.shape[0] else table.shape[0])
 
 
 @inline
@@ -33,18 +40,13 @@ def _gather(threads, columns, source, rows, target):
 
 @kernel
 def _spread(threads, columns, source, rows, target):
-    count, total = rows.shape[0], target.shape[0]
+    count = rows.shape[0]
     for thread in prange(threads):
-        first, last = count * thread // threads, count * (thread + 1) // threads
-        # Every thread clears what it passes by, the last one up to the end.
-        done = columns * (get(rows, first - 1) + 1) if first > 0 else 0
-        for i in range(first, last):
-            place = columns * get(rows, i)
-            clear(target, done, place)
-            _copy(source, columns * i, target, place, columns)
-            done = place + columns
+        for i in range(count * thread // threads, count * (thread + 1) // threads):
+            clear_between(rows, i, columns, target)
+            _copy(source, columns * i, target, columns * get(rows, i), columns)
         if thread == threads - 1:
-            clear(target, done, total)
+            clear_between(rows, count, columns, target)
 
 
 def gather_rows(table: Tensor, rows: Tensor) -> Tensor:
