@@ -232,12 +232,8 @@ def render_cpu(
 def visible_cpu(splats: SplatTensors, camera: Camera) -> Tensor:
     """Rows ``[V]`` int64, ascending, of the splats that can change the image."""
     geometry = tuple(_flat(t) for t in (splats.means, splats.quats, splats.scales, splats.opacities))
-    n, threads = splats.means.shape[0], thread_count()
-    found, counts = np.empty(n, np.int64), np.empty(threads, np.int64)
-    find_visible(
-        threads, _pack_camera(camera), *geometry, found, counts, np.empty((threads, PROJECTION_SCRATCH), np.float32)
-    )
-    blocks = (n + 15) // 16
-    firsts = [16 * (blocks * thread // threads) for thread in range(threads)]
-    runs = [found[first : first + length] for first, length in zip(firsts, counts, strict=True)]
-    return torch.from_numpy(np.concatenate(runs))
+    threads = thread_count()
+    found, runs = np.empty(splats.means.shape[0], np.int64), np.empty((threads, 2), np.int64)
+    scratch = np.empty((threads, PROJECTION_SCRATCH), np.float32)
+    find_visible(threads, _pack_camera(camera), *geometry, found, runs, scratch)
+    return torch.from_numpy(np.concatenate([found[first:last] for first, last in runs]))
