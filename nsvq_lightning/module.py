@@ -13,6 +13,7 @@ from torchmetrics import Metric
 
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.host import log_interval
+from nsvq_lightning.io.arrays import sh_coefficients
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.losses import photometric_loss
 from nsvq_lightning.metrics import eight_bit, image_metrics, psnr
@@ -131,7 +132,7 @@ class SplatModule(SplatModel):
         set_lr(optimizer, "means", rate)
         # Noise substitution scales a whole row, so from there on every coefficient has a gradient.
         degree = self.active_sh_degree if self.phase < Phase.QUANTIZE else self.splats.sh_degree
-        set_columns(optimizer, "shN", 3 * ((degree + 1) ** 2 - 1))
+        set_columns(optimizer, "shN", 3 * sh_coefficients(degree))
 
     def training_step(self, batch: View, batch_idx: int) -> dict[str, Any] | None:
         """Loss of one view: (1 - w)·L1 + w·(1 - SSIM) + λ·Σ opacity (paper, section 3.3).
