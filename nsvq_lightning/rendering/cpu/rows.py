@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
 from numba import prange
 from torch import Tensor
 
+from nsvq_lightning.rendering.cpu.arrays import flat
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
 from nsvq_lightning.rendering.cpu.lanes import get, put
 from nsvq_lightning.rendering.cpu.projection import clear
@@ -52,21 +52,16 @@ def _spread(threads, columns, source, rows, target):
 def gather_rows(table: Tensor, rows: Tensor) -> Tensor:
     """The rows ``rows [V]`` of a float32 table ``[N, ...]`` on the CPU: ``[V, ...]``."""
     out = torch.empty(rows.shape[0], *table.shape[1:])
-    _gather(thread_count(), _columns(table), _flat(table), rows.numpy(), _flat(out))
+    _gather(thread_count(), _columns(table), flat(table), rows.numpy(), flat(out))
     return out
 
 
 def spread_rows(values: Tensor, rows: Tensor, count: int) -> Tensor:
     """A table ``[count, ...]`` of zeros but for ``values [V, ...]`` at the ascending ``rows [V]``."""
     table = recycled((count, *values.shape[1:]))
-    _spread(thread_count(), _columns(values), _flat(values), rows.numpy(), _flat(table))
+    _spread(thread_count(), _columns(values), flat(values), rows.numpy(), flat(table))
     return table
 
 
 def _columns(table: Tensor) -> int:
     return math.prod(table.shape[1:])
-
-
-def _flat(tensor: Tensor) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
-    flat: np.ndarray[tuple[int], np.dtype[np.float32]] = tensor.detach().contiguous().numpy().reshape(-1)
-    return flat
