@@ -60,7 +60,7 @@ def test_a_search_is_rare_where_little_moves(dim: int, searched: list[int]) -> N
     assert 0 <= sum(searched) - 600 < 0.02 * 40 * 300
 
 
-def test_equal_codes(searched: list[int]) -> None:
+def test_equal_codes() -> None:
     """Copies of codes, as replacement makes them, tie exactly: the lower one is right, lists or not."""
     tracker = NearestTracker()
     for x, codebook, rows in walk(45, 5, 1e-4):
