@@ -20,6 +20,7 @@ from nsvq_lightning.state import Stopwatch
 
 if TYPE_CHECKING:
     from nsvq_lightning.io.compressed import CompressedScene
+    from nsvq_lightning.io.precision import Storage
 
 __all__ = [
     "SplatHost",
@@ -63,6 +64,8 @@ class SplatHost(Protocol):
     """Seed of every draw."""
     background: str
     """``black``, ``white`` or ``random``."""
+    storage: Storage
+    """How the scene is stored."""
 
     @property
     def quantizers(self) -> Mapping[str, Quantizer]:

@@ -52,7 +52,8 @@ def test_a_run_leaves_scene_report_config_and_checkpoint(finished: Path) -> None
     assert config["model"]["quantizer"]["init_args"] == {"kmeans_steps": 3}
     assert config["model"]["codebooks"] == {"scales": 16, "sh0": 8}
     metrics = json.loads((finished / "metrics.json").read_text())
-    assert metrics["formula"]["matches"]
+    assert metrics["level"] == "compact"
+    assert metrics["paper_level"]["matches_formula"]
     assert [end["phase"] for end in metrics["phases"]] == [phase.name.lower() for phase in Phase]
 
 
