@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest
-from nsvq_lightning.quantize.replacement import choose_replacements, inactive_codes
+from nsvq_lightning.quantize.replacement import copy_codes, inactive_codes, split_codes
 from nsvq_lightning.quantize.sums import count_hits, lookup
 from nsvq_lightning.quantize.tracking import NearestTracker
 from nsvq_lightning.random import generator as seeded
@@ -174,14 +174,24 @@ class CodebookQuantizer(nn.Module, ABC):
         return math.exp(-float((share * share.log()).sum()))
 
     @torch.no_grad()
-    def replace_unused(self, generator: torch.Generator, threshold: float = 0.01) -> Tensor:
-        """Replace inactive codes by copies of active ones and start a new window (paper, section 3.1).
+    def replace_unused(
+        self,
+        generator: torch.Generator,
+        rows: Tensor | None = None,
+        jitter: float = 0.5,
+        threshold: float = 0.01,
+    ) -> Tensor:
+        """Replace inactive codes by active ones and start a new window (paper, section 3.1).
 
-        A code is inactive if it was hit in less than ``threshold`` of the window's iterations. The copies are a
-        permutation of a random set of active codes, plus noise of 1e-12. The optimiser's state is not touched.
+        A code is inactive if it was hit in less than ``threshold`` of the window's iterations. By the paper's rule the
+        new codes are copies of a permutation of a random set of active codes, plus noise of 1e-12. With ``rows`` the
+        codes that distort most are split instead (:func:`~nsvq_lightning.quantize.replacement.split_codes`). The
+        optimiser's state is not touched.
 
         Args:
             generator: Source of the choice and of the noise.
+            rows: Rows of the scene ``[N, D]``, or None for the paper's rule.
+            jitter: With ``rows``: where a new code lies between the code that is split and one of its rows, in (0, 1].
             threshold: Share of the iterations, in [0, 1].
 
         Returns:
@@ -192,15 +202,18 @@ class CodebookQuantizer(nn.Module, ABC):
         """
         inactive = inactive_codes(self.usage, self.window, threshold)
         replaced = inactive.nonzero()[:, 0]
-        active = (~inactive).nonzero()[:, 0]
+        active = self.codebook[~inactive]
         if len(replaced) and not len(active):
             _log.warning("no code was active in %d iterations; the codebook is left as it is", int(self.window))
             replaced = replaced[:0]
         if len(replaced):
-            source = choose_replacements(active, len(replaced), generator)
-            noise = torch.randn(len(replaced), self.dim, generator=generator, device=generator.device)
+            if rows is None:
+                new = copy_codes(active, len(replaced), generator)
+            else:
+                new = split_codes(active, rows.detach(), len(replaced), jitter, generator)
+            replaced = replaced[: len(new)]
             self._tracker.forget()
-            self.codebook[replaced] = self.codebook[source] + 1e-12 * noise.to(self.codebook)
+            self.codebook[replaced] = new
         self.reset_usage()
         return replaced
 

@@ -1,11 +1,13 @@
-"""Which codes are replaced and by which (paper, section 3.1): decisions only, the codebook is edited by its owner."""
+"""Which codes are replaced and by what (paper, section 3.1): decisions only, the codebook is edited by its owner."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-__all__ = ["choose_replacements", "inactive_codes"]
+from nsvq_lightning.quantize.nearest import nearest
+
+__all__ = ["choose_replacements", "copy_codes", "inactive_codes", "split_codes"]
 
 
 def inactive_codes(usage: Tensor, window: Tensor | int, threshold: float) -> Tensor:
@@ -30,3 +32,39 @@ def choose_replacements(active: Tensor, count: int, generator: torch.Generator) 
     rounds = -(-count // len(active))
     order = [torch.randperm(len(active), generator=generator, device=generator.device) for _ in range(rounds)]
     return active[torch.cat(order)[:count].to(active.device)]
+
+
+def copy_codes(active: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """The paper's new codes ``[count, D]``: random ones of the active codes ``[A, D]``, plus noise of 1e-12.
+
+    In float32 the noise seldom changes a number, so that a copy gets rows only once training has moved it.
+    """
+    source = choose_replacements(torch.arange(len(active), device=active.device), count, generator)
+    noise = torch.randn(count, active.shape[1], generator=generator, device=generator.device)
+    return active[source] + 1e-12 * noise.to(active)
+
+
+def split_codes(active: Tensor, rows: Tensor, count: int, jitter: float, generator: torch.Generator) -> Tensor:
+    """New codes next to those active ones that distort the rows most, each where it takes rows over at once.
+
+    Rows are drawn without replacement, each with a chance that grows with its squared distance to its code (the D²
+    sampling of k-means++, Arthur and Vassilvitskii 2007), so a code is split in proportion to its share of the
+    distortion. A new code c + jitter · (x − c) is by that share of the cell's radius away from c, towards a row x.
+
+    Args:
+        active: Active codes ``[A, D]``, A > 0.
+        rows: Rows of the scene ``[N, D]``.
+        count: New codes wanted.
+        jitter: In (0, 1]: near 0 a copy of the code, at 1 the row itself.
+        generator: Source of the draw.
+
+    Returns:
+        New codes ``[count, D]``; fewer where fewer rows have a distance to their code.
+    """
+    sources = active[nearest(rows, active)]
+    squared = (rows - sources).square().sum(1)
+    # The largest of w / e with e ~ Exp(1) are a draw without replacement with chances w (Efraimidis and Spirakis 2006).
+    draws = torch.empty(len(rows), dtype=torch.float64, device=generator.device).exponential_(generator=generator)
+    keys = squared.double() / draws.to(squared.device)
+    drawn = keys.topk(min(count, int((squared > 0).sum()))).indices
+    return sources[drawn] + jitter * (rows[drawn] - sources[drawn])
