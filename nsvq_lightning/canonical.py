@@ -86,18 +86,19 @@ def canonical(scales: Tensor, quats: Tensor, form: Form) -> Canonical:
     directed = squared >= MIN_SQUARED_NORM
     quats = torch.where(directed, quats, identity[0])
     lengths = torch.where(directed, squared, 1.0).sqrt()
-    if form == "sign":
-        turns, order = identity.expand(len(quats), 4, 4), None
-    else:
+    if form == "full":
         order = scales.argsort(dim=1, descending=True, stable=True)
         turns = _turns_to(order, quats)
+    else:
+        order = torch.arange(3, device=scales.device).expand_as(scales)
+        turns = identity.expand(len(quats), 4, 4)
     turned = _apply(turns, quats)
     signs = torch.where(turned[:, :1] < 0, -1.0, 1.0).to(quats)
     axes = torch.eye(3, dtype=scales.dtype, device=scales.device)
     return Canonical(
-        scales if order is None else scales.gather(1, order),
+        scales.gather(1, order),
         signs * turned / lengths,
-        axes.expand(len(scales), 3, 3) if order is None else axes[order],
+        axes[order],
         (signs * lengths)[:, :, None] * turns,
     )
 

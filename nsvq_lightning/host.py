@@ -159,7 +159,7 @@ def train_contributions(trainer: Trainer, host: SplatHost) -> Tensor:
     if scene is None:
         raise ValueError(
             "contributions of splats need the train views: fit with a data module that has a scene, or leave "
-            "importance weights and contribution pruning off"
+            "contribution pruning and weights by contribution off"
         )
     own = scene.train[trainer.global_rank :: trainer.world_size]
     cameras = (scene.cameras[index].to(host.device) for index in own)

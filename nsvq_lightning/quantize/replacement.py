@@ -25,7 +25,7 @@ def choose_replacements(active: Tensor, count: int, generator: torch.Generator) 
     """``count`` active codes in random order; none is taken twice before all were taken once.
 
     Args:
-        active: Active codes ``[A]``, A > 0.
+        active: Active codes, their numbers ``[A]`` or themselves ``[A, D]``, A > 0.
         count: Codes to replace.
         generator: Source of the permutations.
     """
@@ -39,9 +39,9 @@ def copy_codes(active: Tensor, count: int, generator: torch.Generator) -> Tensor
 
     In float32 the noise seldom changes a number, so that a copy gets rows only once training has moved it.
     """
-    source = choose_replacements(torch.arange(len(active), device=active.device), count, generator)
+    copies = choose_replacements(active, count, generator)
     noise = torch.randn(count, active.shape[1], generator=generator, device=generator.device)
-    return active[source] + 1e-12 * noise.to(active)
+    return copies + 1e-12 * noise.to(active)
 
 
 def split_codes(active: Tensor, rows: Tensor, count: int, jitter: float, generator: torch.Generator) -> Tensor:
