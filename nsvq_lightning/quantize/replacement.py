@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from nsvq_lightning.quantize.far_rows import draw_far_rows
 from nsvq_lightning.quantize.nearest import nearest
 
 __all__ = ["choose_replacements", "copy_codes", "inactive_codes", "split_codes"]
@@ -47,9 +48,9 @@ def copy_codes(active: Tensor, count: int, generator: torch.Generator) -> Tensor
 def split_codes(active: Tensor, rows: Tensor, count: int, jitter: float, generator: torch.Generator) -> Tensor:
     """New codes next to those active ones that distort the rows most, each where it takes rows over at once.
 
-    Rows are drawn without replacement, each with a chance that grows with its squared distance to its code (the D²
-    sampling of k-means++, Arthur and Vassilvitskii 2007), so a code is split in proportion to its share of the
-    distortion. A new code c + jitter · (x − c) is by that share of the cell's radius away from c, towards a row x.
+    For each far row x that is drawn (:func:`~nsvq_lightning.quantize.far_rows.draw_far_rows`) its code c is split: the
+    new code c + jitter · (x − c) is by that share of the cell's radius away from c. So codes are split in proportion to
+    their share of the distortion.
 
     Args:
         active: Active codes ``[A, D]``, A > 0.
@@ -61,10 +62,5 @@ def split_codes(active: Tensor, rows: Tensor, count: int, jitter: float, generat
     Returns:
         New codes ``[count, D]``; fewer where fewer rows have a distance to their code.
     """
-    sources = active[nearest(rows, active)]
-    squared = (rows - sources).square().sum(1)
-    # The largest of w / e with e ~ Exp(1) are a draw without replacement with chances w (Efraimidis and Spirakis 2006).
-    draws = torch.empty(len(rows), dtype=torch.float64, device=generator.device).exponential_(generator=generator)
-    keys = squared.double() / draws.to(squared.device)
-    drawn = keys.topk(min(count, int((squared > 0).sum()))).indices
-    return sources[drawn] + jitter * (rows[drawn] - sources[drawn])
+    far = rows[draw_far_rows(rows, active, count, generator)]
+    return active[nearest(far, active)].lerp(far, jitter)

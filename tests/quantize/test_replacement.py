@@ -1,4 +1,4 @@
-"""Splitting codes: where new codes lie, how often a row is drawn, and what it does to the distortion."""
+"""Splitting codes: where new codes lie, and what it does to the distortion."""
 
 from __future__ import annotations
 
@@ -34,18 +34,6 @@ def test_a_new_code_lies_on_the_way_to_a_row_and_takes_it_over() -> None:
     assert (torch.bincount(codes, minlength=10)[2:] > 0).all()
     # All but about 1/3000 of the distortion is in the second cell.
     assert (new.amin(1) > 5).all()
-
-
-def test_rows_are_drawn_by_squared_distance() -> None:
-    rows = torch.tensor([[1.0], [-3.0], [0.0]])
-    drawn = [float(split_codes(torch.zeros(1, 1), rows, 1, 1.0, generator(seed))) for seed in range(1000)]
-    assert 60 < drawn.count(1.0) < 140  # 100 expected, deviation 9.5
-    assert drawn.count(1.0) + drawn.count(-3.0) == 1000
-
-
-def test_rows_without_distance_are_never_drawn() -> None:
-    rows = torch.tensor([[0.0], [0.0], [2.0]])
-    assert split_codes(torch.zeros(1, 1), rows, 3, 0.5, generator(0)).tolist() == [[1.0]]
 
 
 def test_splitting_helps_at_once_where_copies_do_not() -> None:
