@@ -31,6 +31,9 @@ class CanonicalCovariance(Callback):
     same. Rows are not kept canonical afterwards: they move continuously and take their codes along, while a row that
     jumped to another representative would lose its code.
 
+    With 4k codes on 187 k splats, right after k-means for scales and rotations, test PSNR was 30.47 dB with ``none``,
+    30.61 dB with ``sign`` and 31.17 dB with ``full``, of 31.64 dB unquantized; ``auto`` took the last.
+
     Args:
         mode: ``none`` leaves everything as it is, as in the paper; ``sign`` gives quaternions length 1 and w ≥ 0;
             ``full`` also sorts the axes and takes the smallest rotation; ``auto`` takes the form whose covariances

@@ -93,6 +93,7 @@ class CodebookReplacement(Callback):
 
     By the paper's rule the last replacement falls right before the codes freeze, so that the new codes never train; a
     smaller ``end`` leaves them time. Its copies are equal to the codes they are copied from, which take all the rows.
+    Few codes are concerned: after k-means on 182 k splats, 0 to 5 of 16 384 codes were inactive in a window.
 
     Args:
         start: First replacement.

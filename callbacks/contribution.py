@@ -25,6 +25,9 @@ class ContributionPruning(Callback):
     A splat contributes its blending weight, summed over all pixels (:func:`nsvq_lightning.importance.contributions`):
     unlike opacity this also finds splats that are hidden behind others, or small. The paper prunes by opacity alone.
 
+    Of 187 k splats at iteration 18 000, before any further training: share 0.001 took 11 % of them and 0.03 dB of test
+    PSNR, 0.003 18 % and 0.11 dB, 0.01 30 % and 0.38 dB.
+
     Args:
         share: Share of the light that may go: the least contributing splats that together send at most this much of
             it. 0 removes nothing, as in the paper.

@@ -211,17 +211,16 @@ def test_options_are_reached_from_the_command_line(capsys: pytest.CaptureFixture
             [
                 *("fit", f"--data.root={demo_scene}", "--callbacks.canonical.mode=sign"),
                 *("--callbacks.contribution.share=0.25", "--callbacks.codebook_init.weights=contribution"),
-                "--callbacks.codebook_init.weighted=[quats, sh0]",
+                *("--callbacks.codebook_init.weighted=[quats, sh0]", "--model.quantizer=NSVQ"),
+                "--model.quantizer.start=spread",
                 *("--callbacks.codebook_replacement.jitter=0.25", "--callbacks.codebook_replacement.end=40000"),
                 *("--callbacks.phases.quantize_end=30000", "--callbacks.phases.reference_total=32000"),
                 "--print_config",
             ]
         )
-    found = {
-        name: callback["init_args"]
-        for name, callback in yaml.safe_load(capsys.readouterr().out)["callbacks"].items()
-        if "init_args" in callback
-    }
+    config = yaml.safe_load(capsys.readouterr().out)
+    found = {name: one["init_args"] for name, one in config["callbacks"].items() if "init_args" in one}
+    assert config["model"]["quantizer"]["init_args"]["start"] == "spread"
     assert found["canonical"] == {"mode": "sign"}
     assert found["contribution"] == {"share": 0.25, "at": 18_500}
     assert found["codebook_init"] == {"weights": "contribution", "weighted": ["quats", "sh0"]}
@@ -235,3 +234,6 @@ def test_the_shipped_config_runs(demo_scene: Path, tmp_path: Path, capsys: pytes
     quiet = ["--callbacks.progress=null", "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
     assert main(["fit", "--config=better_4k", *arguments, *quiet, "--trainer.max_steps=30", "--model.sh_degree=1"]) == 0
     assert "rendered from the decoded file" in capsys.readouterr().out
+    config = yaml.safe_load(next(tmp_path.rglob("config.yaml")).read_text())
+    assert config["model"]["quantizer"]["init_args"]["start"] == "spread"
+    assert config["callbacks"]["canonical"]["init_args"]["mode"] == "auto"
