@@ -60,4 +60,4 @@ def row_weights(contribution: Tensor) -> Tensor:
 
     The least weight is a hundredth of the mean.
     """
-    return contribution + 0.01 * contribution.mean().clamp_min(torch.finfo(contribution.dtype).tiny)
+    return contribution + (0.01 * contribution.mean()).clamp_min(torch.finfo(contribution.dtype).tiny)
