@@ -28,6 +28,8 @@ DEFAULT_CALLBACKS: dict[str, type[Callback]] = {
     "sh_degree": callbacks.ShDegreeSchedule,
     "density": callbacks.DensityControl,
     "opacity": callbacks.OpacityRegularization,
+    "contribution": callbacks.ContributionPruning,
+    "canonical": callbacks.CanonicalCovariance,
     "codebook_init": callbacks.CodebookInit,
     "codebook_replacement": callbacks.CodebookReplacement,
     "freeze": callbacks.FreezeCodes,
