@@ -17,6 +17,7 @@ from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats import RawSplats, Splats
+from nsvq_lightning.viewpoints import look_at, middle_of
 
 __all__ = ["Workload", "folder_workload", "scene_workload", "single_workload", "synthetic_workload", "workloads"]
 
@@ -133,10 +134,8 @@ def scene_workload(path: Path) -> Workload:
         FormatError: It is damaged.
     """
     splats = _finite_splats(path)
-    means = splats.means.double()
-    centre = means.median(0).values
-    reach = float(np.quantile((means - centre).norm(dim=1).numpy(), 0.8))
-    camera = _camera(800, 533, centre.numpy(), 2 * max(reach, 1e-3))
+    centre, reach = middle_of(splats.means.numpy())
+    camera = _camera(800, 533, centre, 2 * reach)
     return Workload(path.name, splats, camera, torch.tensor(BACKGROUND), _image_gradient(camera, SEED))
 
 
@@ -200,24 +199,12 @@ def _positions(count: int, rng: np.random.Generator) -> Floats:
 
 def _camera(width: int, height: int, target: Floats, distance: float) -> Camera:
     """A camera that looks at ``target`` from above and aside, y down."""
-    eye = target + distance * np.array(
-        [
-            math.cos(ELEVATION) * math.sin(AZIMUTH),
-            -math.sin(ELEVATION),
-            -math.cos(ELEVATION) * math.cos(AZIMUTH),
-        ]
+    direction = (
+        math.cos(ELEVATION) * math.sin(AZIMUTH),
+        -math.sin(ELEVATION),
+        -math.cos(ELEVATION) * math.cos(AZIMUTH),
     )
-    forward = target - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(np.array([0.0, 1.0, 0.0]), forward)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    view = np.eye(4)
-    view[:3, :3] = rotation
-    view[:3, 3] = -rotation @ eye
-    focal = 0.5 * width / math.tan(math.radians(FIELD_OF_VIEW) / 2)
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
-    return Camera(K, _tensor(view), width, height)
+    return look_at(target, target + distance * np.array(direction), width, height, math.radians(FIELD_OF_VIEW))
 
 
 def _image_gradient(camera: Camera, seed: int) -> Tensor:

@@ -1,0 +1,64 @@
+"""Cameras for a scene that came without any: around it, looking at where most of its splats are."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from nsvq_lightning.rendering.camera import Camera
+
+__all__ = ["cameras_around", "look_at", "middle_of"]
+
+ELEVATIONS = (0.1, 0.5)
+"""Radians above the horizon, y down, in turns."""
+
+
+def look_at(target: NDArray[np.float64], eye: NDArray[np.float64], width: int, height: int, angle: float) -> Camera:
+    """A camera at ``eye [3]`` that has ``target [3]`` in its centre, y down.
+
+    Args:
+        target: World position.
+        eye: World position, not straight above or below the target.
+        width: Pixels.
+        height: Pixels.
+        angle: Horizontal field of view, radians.
+    """
+    forward = target - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(np.array([0.0, 1.0, 0.0]), forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    view = np.eye(4)
+    view[:3, :3] = rotation
+    view[:3, 3] = -rotation @ eye
+    focal = 0.5 * width / math.tan(angle / 2)
+    intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
+    return Camera(intrinsics, torch.from_numpy(view.astype(np.float32)), width, height)
+
+
+def middle_of(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
+    """The median ``[3]`` of positions ``[N, 3]``, N > 0, and the distance from it that holds four fifths of them."""
+    points = means.astype(np.float64)
+    middle = np.median(points, axis=0)
+    return middle, max(float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.8)), 1e-3)
+
+
+def cameras_around(means: NDArray[np.float32], count: int, width: int = 800, height: int = 533) -> list[Camera]:
+    """Cameras on a ring around a scene, alternately low and high, twice as far as four fifths of its splats reach.
+
+    Args:
+        means: Positions ``[N, 3]``, N > 0.
+        count: Number of cameras.
+        width: Pixels.
+        height: Pixels.
+    """
+    middle, reach = middle_of(means)
+    cameras = []
+    for number in range(count):
+        turn, rise = 2 * math.pi * number / count, ELEVATIONS[number % len(ELEVATIONS)]
+        direction = (math.cos(rise) * math.sin(turn), -math.sin(rise), -math.cos(rise) * math.cos(turn))
+        cameras.append(look_at(middle, middle + 2 * reach * np.array(direction), width, height, math.radians(60)))
+    return cameras
