@@ -31,7 +31,7 @@ class Row:
         bytes_by_level: Size of the file at each compression level.
         seconds: Training time from the first iteration on, as if nothing had been shared.
         trunk_seconds: The part of ``seconds`` that was trained once for all runs with this trunk; 0 without one.
-        psnr_before: PSNR of the plain splats at the end of the prune phase, dB.
+        psnr_before: PSNR of the plain splats at the end of the prune phase, dB; None without codebooks.
         version: Version of the package that trained it.
         folder: Folder of the run.
         error: Why it has failed; empty otherwise.

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.container import LEVELS, read_nsvq, write_nsvq
 from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.schedule import Phase
 from nsvq_lightning.sweep.plan import Run
 from nsvq_lightning.sweep.plot import draw_sweep
 from nsvq_lightning.sweep.results import Row, as_markdown
@@ -19,6 +20,9 @@ from nsvq_lightning.sweep.training import Runner, Training, TrainingError, run_s
 from nsvq_lightning.tables import write_csv
 
 __all__ = ["Sweep"]
+
+TRUNK_PHASES = tuple(phase.name.lower() for phase in Phase if phase <= Phase.PRUNE)
+"""Names of the phases before anything is quantized."""
 
 log = logging.getLogger(__name__)
 
@@ -127,7 +131,7 @@ def _names(run: Run) -> dict[str, Any]:
 def _row(run: Run, training: Training) -> Row:
     """The row of a finished run."""
     metrics, record = training.metrics, training.record or {}
-    before = metrics["before_quantization"]
+    before = metrics["before_quantization"] if run.codebooks else None
     return Row(
         **_names(run),
         psnr=metrics["psnr"],
@@ -136,11 +140,17 @@ def _row(run: Run, training: Training) -> Row:
         splats=metrics["num_splats"],
         bytes_by_level=record["bytes_by_level"],
         seconds=metrics["train_seconds"],
-        trunk_seconds=before["seconds"] if record["trunk"] is not None else 0.0,
+        trunk_seconds=_trunk_seconds(metrics) if record["trunk"] is not None else 0.0,
         psnr_before=before["psnr"] if before is not None else None,
         version=record["version"],
         folder=training.folder,
     )
+
+
+def _trunk_seconds(metrics: Mapping[str, Any]) -> float:
+    """Seconds at the last evaluation of the trunk, which is at its end."""
+    seconds: float = max(entry["seconds"] for entry in metrics["phases"] if entry["phase"] in TRUNK_PHASES)
+    return seconds
 
 
 def _said(row: Row) -> str:

@@ -67,7 +67,7 @@ def resolve(arguments: Sequence[str]) -> Settings:
         raise ValueError(f"a sweep has checkpoints of its own; leave ckpt_path={settings['ckpt_path']} out")
     del settings["trainer"]["default_root_dir"]
     settings["trainer"]["logger"] = False
-    settings["callbacks"]["progress"] = None
+    del settings["callbacks"]["progress"]
     return settings
 
 

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import signal
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 import pytest
 
@@ -107,6 +112,9 @@ def test_a_run_that_fails_is_noted_and_stops_no_other(swept: tuple[Sweep, InProc
         path = row.folder / "scene.nsvq"
         assert int(line["bytes"]) == int(line["bytes_paper"]) == path.stat().st_size
         assert float(line["psnr"]) == metrics_of(row.folder)["psnr"]
+        before = metrics_of(row.folder)["before_quantization"]
+        assert isinstance(before, dict)
+        assert line["psnr_before"] == (str(before["psnr"]) if line["codebooks"] else "")
     assert table[3]["psnr"] == ""
     assert table[3]["error"]
     assert (sweep.folder / "results.png").is_file()
@@ -178,6 +186,31 @@ def test_a_process_that_fails_says_why(tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match="killed by signal 9, perhaps for want of memory"):
         training.run(lambda arguments, log: -9)
     assert training.record is None
+
+
+def test_an_interrupted_sweep_leaves_no_process_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+
+    class Noted(subprocess.Popen[bytes]):
+        def __init__(self, *args: Any, **more: Any) -> None:
+            super().__init__(*args, **more)
+            started.append(self)
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    os.mkfifo(tmp_path / "never.ply")  # nobody writes into it, so reading it does not end
+    monkeypatch.setattr(subprocess, "Popen", Noted)
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, 0.5)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_subprocess(["info", str(tmp_path / "never.ply")], tmp_path / "log.txt")
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    (process,) = started
+    assert process.returncode == -signal.SIGTERM
 
 
 def test_the_command_says_what_it_would_do(
