@@ -80,19 +80,23 @@ def plan(request: Request) -> list[Run]:
 
     Raises:
         SystemExit: A configuration or option is wrong; a line on stderr says how.
-        ValueError: A codebook size is unknown, a scene is no folder, or two scenes or configurations have one name.
+        ValueError: A codebook size is unknown, a scene is no folder, two scenes or configurations have one name, or the
+            data module takes no root or seed.
     """
     for name in request.codebooks:
         codebook_sizes(name)
-    for scene in request.scenes:
-        if not scene.is_dir():
-            raise ValueError(f"{scene} is no folder; --scenes takes COLMAP folders with commas between them")
+    for root in request.scenes:
+        if not root.is_dir():
+            raise ValueError(f"{root} is no folder; --scenes takes COLMAP folders with commas between them")
     _check_names("scenes", [_scene_name(scene) for scene in request.scenes])
     _check_names("configurations", [Path(config).stem for config in request.configs])
     variants = [variant for config in request.configs or (None,) for variant in _variants(request, config)]
     places = product(request.scenes or (None,), request.seeds or (None,), variants)
-    runs = [_place(config, settings, scene, seed) for scene, seed, (config, settings) in places]
-    return list({digest(run.settings): run for run in reversed(runs)}.values())[::-1]
+    runs: dict[str, Run] = {}
+    for scene, seed, (config, settings) in places:
+        run = _place(config, settings, scene, seed)
+        runs.setdefault(digest(run.settings), run)
+    return list(runs.values())
 
 
 def _check_names(what: str, names: Sequence[str]) -> None:
@@ -126,6 +130,9 @@ def _variants(request: Request, config: str | None) -> Iterator[tuple[str, Setti
 def _place(config: str, settings: Settings, scene: Path | None, seed: int | None) -> Run:
     """The run of a variant on a scene with a seed."""
     data = settings["data"]["init_args"]
+    if not {"root", "seed"} <= data.keys():
+        kind = settings["data"]["class_path"]
+        raise ValueError(f"{kind} takes no root or no seed, by which a sweep tells its runs apart; give it both")
     root = Path(data["root"]) if scene is None else scene
     # Absolute, so that the same sweep started from another folder finds its runs.
     data = data | {"root": str(root.resolve())}

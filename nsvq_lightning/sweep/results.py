@@ -109,33 +109,41 @@ def series_of(rows: Sequence[Row]) -> Callable[[Row], str]:
     return names[-1]
 
 
-def as_markdown(rows: Sequence[Row]) -> str:
-    """A table of the means over the seeds, with their standard deviation, and a list of what has failed."""
-    head = ["scene", "config", "quantizer", "codebooks", "runs", "PSNR, dB", "SSIM", "MB", "splats", "PSNR before, dB"]
-    head.append("seconds")
-    cells = []
-    for group in grouped(rows):
-        first = group.rows[0]
-        names = [first.scene, first.config, first.quantizer or "–", first.codebooks or "–", str(len(group.rows))]
-        numbers = [("psnr", 1.0, ".2f"), ("ssim", 1.0, ".4f"), ("bytes", 1e-6, ".3f"), ("splats", 1.0, ",.0f")]
-        numbers += [("psnr_before", 1.0, ".2f"), ("seconds", 1.0, ",.0f")]
-        cells.append([*names, *(_plus_minus(group, *number) for number in numbers)])
-    parts = ["# nsvq sweep"]
-    if cells:
-        parts += [markdown_table(head, cells, words=head[:4]), LEGEND]
-    failed = [
-        f"* {row.scene}, {row.config}, {row.codebooks}, seed {row.seed}: {row.error}" for row in rows if row.error
-    ]
-    if failed:
-        parts.append("\n".join(["Failed:", "", *failed]))
-    return "\n\n".join(parts) + "\n"
+NAMES = ("scene", "config", "quantizer", "codebooks")
+"""Columns of the table that say which runs a line is about."""
 
+NUMBERS = {
+    "PSNR, dB": ("psnr", 1.0, ".2f"),
+    "SSIM": ("ssim", 1.0, ".4f"),
+    "MB": ("bytes", 1e-6, ".3f"),
+    "splats": ("splats", 1.0, ",.0f"),
+    "PSNR before, dB": ("psnr_before", 1.0, ".2f"),
+    "seconds": ("seconds", 1.0, ",.0f"),
+}
+"""Attribute of a row, its factor and its format by the head of the column."""
 
 LEGEND = (
     "Mean ± standard deviation over the runs, which differ in the seed. PSNR and SSIM are those of the decoded file on "
     "the test views; before: of the plain splats at the end of the prune phase. Seconds are those of a whole training, "
     "though runs may have shared its first part (`trunk_seconds` in the CSV)."
 )
+
+
+def as_markdown(rows: Sequence[Row]) -> str:
+    """A table of the means over the seeds, with their standard deviation, and a list of what has failed."""
+    cells = []
+    for group in grouped(rows):
+        names = [getattr(group.rows[0], name) or "–" for name in NAMES]
+        cells.append([*names, str(len(group.rows)), *(_plus_minus(group, *number) for number in NUMBERS.values())])
+    parts = ["# nsvq sweep"]
+    if cells:
+        parts += [markdown_table([*NAMES, "runs", *NUMBERS], cells, words=NAMES), LEGEND]
+    failed = [
+        f"* {row.scene}, {row.config}, {row.codebooks}, seed {row.seed}: {row.error}" for row in rows if row.error
+    ]
+    if failed:
+        parts.append("\n".join(["Failed:", "", *failed]))
+    return "\n\n".join(parts) + "\n"
 
 
 def _plus_minus(group: Group, name: str, scale: float, form: str) -> str:

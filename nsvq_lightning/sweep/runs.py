@@ -65,14 +65,16 @@ class Sweep:
         """
         trainings = [self.training(run) for run in runs]
         rows = {t.folder: _row(run, t) for run, t in zip(runs, trainings, strict=True) if t.record is not None}
+        if rows:
+            self._write(list(rows.values()))
         for number, (run, training) in enumerate(zip(runs, trainings, strict=True), start=1):
             counted = f"[{number}/{len(runs)}] {run.title}"
             if training.folder in rows:
                 log.info("%s: finished before", counted)
-            else:
-                log.info("%s: see %s", counted, training.folder / "log.txt")
-                rows[training.folder] = self._train_one(run, training)
-                log.info("%s: %s", counted, _said(rows[training.folder]))
+                continue
+            log.info("%s: see %s", counted, training.folder / "log.txt")
+            rows[training.folder] = self._train_one(run, training)
+            log.info("%s: %s", counted, _said(rows[training.folder]))
             self._write([rows[t.folder] for t in trainings if t.folder in rows])
         return [rows[training.folder] for training in trainings]
 

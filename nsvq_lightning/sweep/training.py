@@ -43,8 +43,9 @@ class Training:
 
     @classmethod
     def under(cls, parent: Path, title: str, settings: Settings) -> Training:
-        """The training of these settings in ``parent``."""
-        return cls(parent / f"{title}-{digest(settings)}", settings)
+        """The training of these settings in ``parent``; the title is for people, and that of the first stays."""
+        name = digest(settings)
+        return cls(next(parent.glob(f"*-{name}"), parent / f"{title}-{name}"), settings)
 
     @property
     def checkpoint(self) -> Path:
@@ -58,7 +59,7 @@ class Training:
             record: dict[str, Any] = json.loads(self._record_path.read_text())
         except FileNotFoundError:
             return None
-        return record if record["digest"] == digest(self.settings) else None
+        return record
 
     @property
     def metrics(self) -> dict[str, Any]:
@@ -91,8 +92,7 @@ class Training:
 
     def finish(self, **notes: Any) -> None:
         """Note that the training is done, with JSON values that are to be remembered."""
-        record = {"digest": digest(self.settings), "version": __version__, **notes}
-        write_text(self._record_path, json.dumps(record, indent=2) + "\n")
+        write_text(self._record_path, json.dumps({"version": __version__, **notes}, indent=2) + "\n")
 
     def drop_checkpoints(self) -> None:
         """Remove the checkpoints, which are larger than everything else."""

@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -29,6 +31,7 @@ OPTIONS = (
     "--callbacks.phases.min_reset_interval=11",
     "--callbacks.phases.min_replacement_interval=5",
     "--callbacks.density.rules.grad_threshold=5e-6",
+    "--callbacks.density.max_splats=1500",
     "--callbacks.report.every=20",
     "--callbacks.report.lpips=false",
 )
@@ -127,6 +130,32 @@ def test_a_rerun_skips_what_is_finished(swept: tuple[Sweep, InProcess, list[Row]
     assert Sweep(sweep.folder, runner).train(runs)[:3] == rows[:3]
     assert len(runner.calls) == 1  # what failed is tried again, from the trunk
     assert not list(sweep.folder.glob("runs/*none*/checkpoints"))
+
+
+def test_settings_are_known_again_under_another_name(
+    swept: tuple[Sweep, InProcess, list[Row]], runs: list[Run]
+) -> None:
+    sweep, _, rows = swept
+    runner = InProcess()
+    (row,) = Sweep(sweep.folder, runner).train([replace(runs[0], config="renamed")])
+    assert runner.calls == []
+    assert row == replace(rows[0], config="renamed")
+
+
+def test_a_run_stopped_after_its_last_step_is_only_measured(
+    swept: tuple[Sweep, InProcess, list[Row]], runs: list[Run], tmp_path: Path
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(swept[0].folder, copy)
+    sweep = Sweep(copy, InProcess(), keep_checkpoints=True)
+    folder = sweep.training(runs[0]).folder
+    shutil.rmtree(folder)
+    (first,) = sweep.train(runs[:1])
+    for name in ("finished.json", "metrics.json", "scene.nsvq"):
+        (folder / name).unlink()
+    (second,) = sweep.train(runs[:1])
+    assert second.seconds == pytest.approx(first.seconds, abs=0.05)
+    assert replace(second, seconds=first.seconds) == first
 
 
 def test_an_interrupted_run_goes_on_from_its_checkpoint(
