@@ -104,7 +104,7 @@ def series_of(rows: Sequence[Row]) -> Callable[[Row], str]:
         lambda row: f"{row.config}, {row.quantizer or 'not quantized'}",
     ]
     for name in names:
-        if len({(name(row), row.scene, row.codebooks, row.seed, row.steps) for row in rows}) == len(rows):
+        if len({(name(row), row.scene, row.codebooks, row.seed) for row in rows}) == len(rows):
             return name
     return names[-1]
 
