@@ -60,15 +60,22 @@ def test_a_line_of_the_csv_has_a_column_a_level() -> None:
 
 
 def test_the_picture_shows_every_point(tmp_path: Path) -> None:
-    def drawn(rows: list[Row]) -> int:
-        """Pixels in the colour of the first curve."""
+    blue, orange = (180, 119, 31), (14, 127, 255)  # the first two of tab10, BGR
+
+    def drawn(rows: list[Row], colour: tuple[int, int, int] = blue) -> int:
+        """Pixels in the colour of a curve, the first by default."""
         draw_sweep(tmp_path / "sweep.png", rows)
         image = cv2.imread(str(tmp_path / "sweep.png"))
-        return int((abs(image.astype(int) - (180, 119, 31)).max(-1) < 20).sum())  # the first of tab10, BGR
+        return int((abs(image.astype(int) - colour).max(-1) < 20).sum())
 
     one = drawn([row(0)])
     whiskers = drawn([row(0), row(1, 34.0)])
     curve = drawn([row(0), row(1, 34.0), row(0, 36.0, codebooks="4k", bytes=3_000_000)])
     assert 0 < one < whiskers < curve
+    plain = row(config="plain", quantizer="", codebooks="", bytes=90_000_000)
+    # A dashed line across the panel, which does not squeeze the curve into a corner.
+    assert drawn([row(0), row(0, 36.0, codebooks="4k", bytes=3_000_000), plain], orange) > 2 * one
+    assert drawn([row(0), row(0, scene="horns")]) > one
+    assert drawn([plain]) > 0  # nothing else to compare it with: a point
     with pytest.raises(ValueError, match="no run has a PSNR"):
         draw_sweep(tmp_path / "none.png", [row(psnr=None)])
