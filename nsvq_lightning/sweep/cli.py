@@ -24,7 +24,7 @@ Options of 'nsvq fit' may follow; they hold for every run: --data.factor=2 --cal
 
 examples:
   nsvq sweep --scenes fox --codebooks 0.5k,1k,2k,4k,8k,16k --seeds 0,1,2 --max-steps 4500 --output sweeps/fox
-  nsvq sweep --scenes fox,horns --configs nsvq_4k,straight_through_4k,own.yaml --output sweeps/quantizers
+  nsvq sweep --scenes fox,horns --configs nsvq_4k,plain,own.yaml --output sweeps/own
 """
 
 INTERRUPTED = 130
