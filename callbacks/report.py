@@ -77,7 +77,8 @@ class MetricReport(Callback):
         host = as_host(pl_module)
         self._evaluate_if_due(trainer, host, trainer.global_step, always=True)
         if trainer.is_global_zero and host.history and not is_trial(trainer):
-            write_curve(output_folder(trainer) / "curve.png", host.history, host.schedule)
+            with host.stopwatch.paused(host.device):
+                write_curve(output_folder(trainer) / "curve.png", host.history, host.schedule)
 
     def _evaluate_if_due(self, trainer: Trainer, host: SplatHost, iteration: int, always: bool = False) -> None:
         done = host.history[-1]["iteration"] if host.history else 0

@@ -13,7 +13,11 @@ from pathlib import Path
 
 __all__ = ["find_config", "main", "resolve_configs"]
 
-OWN_COMMANDS = {"info": "nsvq_lightning.info", "benchmark": "nsvq_lightning.benchmark.cli"}
+OWN_COMMANDS = {
+    "info": "nsvq_lightning.info",
+    "benchmark": "nsvq_lightning.benchmark.cli",
+    "sweep": "nsvq_lightning.sweep.cli",
+}
 """Commands without a trainer: modules with a ``main(argv)``, which must not pay for Lightning's start."""
 
 TRACEBACK = "NSVQ_TRACEBACK"

@@ -125,6 +125,11 @@ class SplatModel(LightningModule):
         """Seconds spent training so far, evaluations left out."""
         return self.state.train_seconds
 
+    @property
+    def is_fitting(self) -> bool:
+        """Whether a trainer fits the module now, not evaluates it."""
+        return self._trainer is not None and self._trainer.state.fn == "fit"
+
     def rows(self, attribute: str) -> Tensor:
         """Rows ``[N, D]`` of a quantized attribute, detached."""
         return attribute_rows(self.splats.raw(), attribute)
@@ -204,8 +209,7 @@ class SplatModel(LightningModule):
         if "schedule" not in checkpoint:
             return
         stored = Schedule(**checkpoint["schedule"])
-        fitting = self._trainer is not None and self._trainer.state.fn == "fit"
-        if not fitting:
+        if not self.is_fitting:
             self.schedule = stored
         elif stored != self.schedule:
             log.warning(

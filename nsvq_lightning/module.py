@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torchmetrics import Metric
 
+from nsvq_lightning.branch import branch_checkpoint, can_branch
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.host import log_interval
 from nsvq_lightning.io.arrays import sh_coefficients
@@ -122,6 +123,12 @@ class SplatModule(SplatModel):
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """One Adam, one named group for each attribute and codebook."""
         return build_adam(param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Take over history and schedule; a fit from before the quantize phase goes on with this module's codebooks."""
+        super().on_load_checkpoint(checkpoint)
+        if self.is_fitting and can_branch(checkpoint, self.codebooks):
+            branch_checkpoint(checkpoint, self.codebooks, self.configure_optimizers())
 
     def on_train_start(self) -> None:
         """Take the learning rates of this run, not those of a checkpoint; start counting the training time."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,12 +11,14 @@ from typing import Any
 
 from nsvq_lightning.compress import formula_bytes
 from nsvq_lightning.evaluation import ViewScore
+from nsvq_lightning.figures import new_figure, write_figure
 from nsvq_lightning.host import SplatHost
-from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.container import read_header
 from nsvq_lightning.io.paper import paper_header
 from nsvq_lightning.schedule import Phase, Schedule
+from nsvq_lightning.tables import write_csv
 
 __all__ = ["paper_level", "summarize", "write_curve", "write_curve_csv", "write_metrics", "write_views"]
 
@@ -77,27 +77,22 @@ def paper_level(scene: CompressedScene) -> dict[str, Any]:
 def write_metrics(path: Path, metrics: Mapping[str, Any]) -> None:
     """Write the numbers as JSON, atomically; a PSNR that is infinite (no error at all) becomes null."""
     text = json.dumps(_json_value(metrics), indent=2, allow_nan=False) + "\n"
-    _write_text(path, text)
+    write_text(path, text)
 
 
 def write_views(path: Path, scores: Sequence[ViewScore]) -> None:
     """Write one row a test view, atomically."""
-    _write_rows(path, [asdict(score) for score in scores])
+    write_csv(path, [asdict(score) for score in scores])
 
 
 def write_curve_csv(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
     """Write one row an evaluation, atomically."""
-    _write_rows(path, history)
+    write_csv(path, history)
 
 
 def write_curve(path: Path, history: Sequence[Mapping[str, Any]], schedule: Schedule) -> None:
     """Draw PSNR and number of splats over the iterations, phases shaded, atomically."""
-    # Drawn without pyplot, which keeps global state and may look for a display.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 4), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
+    figure = new_figure(8, 4)
     quality = figure.add_subplot()
     count = quality.twinx()
     iterations = [entry["iteration"] for entry in history]
@@ -113,10 +108,7 @@ def write_curve(path: Path, history: Sequence[Mapping[str, Any]], schedule: Sche
     count.set_ylabel("splats", color="#b5651d")
     count.set_ylim(bottom=0)
     quality.legend(loc="lower right", fontsize="small")
-    picture = io.BytesIO()
-    canvas.print_png(picture)
-    with atomic_write(path) as file:
-        file.write(picture.getvalue())
+    write_figure(path, figure)
 
 
 def _phase_ends(history: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -135,16 +127,3 @@ def _json_value(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_json_value(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    _write_text(path, text.getvalue())
-
-
-def _write_text(path: Path, text: str) -> None:
-    with atomic_write(path) as file:
-        file.write(text.encode())

@@ -49,9 +49,10 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
 
 
 def test_the_words_are_those_of_the_front_end() -> None:
+    from nsvq_lightning.cli import OWN_COMMANDS
     from nsvq_lightning.lightning_cli import SplatCLI
 
-    assert set(lightning_script.COMMANDS) == {*SplatCLI.subcommands(), "info", "benchmark"}
+    assert set(lightning_script.COMMANDS) == {*SplatCLI.subcommands(), *OWN_COMMANDS}
 
 
 @pytest.mark.parametrize("arguments", [["fit", "--config", "a.yaml"], ["info", "x.ply"], ["validate"], ["--help"], []])

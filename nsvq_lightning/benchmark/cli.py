@@ -19,6 +19,7 @@ from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.sizes import SIZES
 from nsvq_lightning.benchmark.switch_table import PLACE as SWITCHES
 from nsvq_lightning.benchmark.switch_table import fill_switches, scene_name, shares_saved
+from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.skips import SKIPS
 
@@ -208,14 +209,14 @@ def _write(results: _Results, folder: Path | None, target: Path | None, document
     by_suite = results.by_suite()
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-        _write_text(folder / "benchmark.json", results.json())
-        _write_text(folder / "benchmark.md", results.markdown())
+        write_text(folder / "benchmark.json", results.json())
+        write_text(folder / "benchmark.md", results.markdown())
         for name, rows in by_suite.items():
             draw_suite(folder / f"{name}.png", rows, SUITES[name])
     if target is not None and document is not None:
         tables = {name: suite_tables(results.machine, results.settings, rows) for name, rows in by_suite.items()}
         saved = shares_saved(by_suite.get(TRAIN, ()))
-        _write_text(target, _filled(document, tables, scene_name(results.settings), saved))
+        write_text(target, _filled(document, tables, scene_name(results.settings), saved))
 
 
 def _filled(document: str, tables: Mapping[str, str], scene: str = "", saved: Mapping[str, float] | None = None) -> str:
@@ -230,10 +231,3 @@ def _filled(document: str, tables: Mapping[str, str], scene: str = "", saved: Ma
         if not has_place(document, results_line(TRAIN)):
             del wanted[TRAIN]
     return fill_in(document, wanted)
-
-
-def _write_text(path: Path, text: str) -> None:
-    from nsvq_lightning.io.atomic import atomic_write
-
-    with atomic_write(path) as file:
-        file.write(text.encode())

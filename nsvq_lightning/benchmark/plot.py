@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,11 +9,10 @@ from typing import Any
 
 from nsvq_lightning.benchmark.registry import Suite
 from nsvq_lightning.benchmark.row import Row
-from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.figures import colours_of, draw_keys, markers_of, new_figure, write_figure
 
 __all__ = ["draw_suite"]
 
-MARKERS = "os^Dvph*X<>"
 COLUMNS = 2
 PANEL = (6.4, 4.2)
 """Inches across and down."""
@@ -50,10 +48,7 @@ def draw_suite(path: Path, rows: Sequence[Row], suite: Suite) -> None:
         rows = [row for row in rows if row.operation in operations]
         figure = _figure([(rows, *panel[1:]) for panel in panels], _draw_values)
         _draw_keys(figure, rows)
-    picture = io.BytesIO()
-    figure.canvas.print_figure(picture, format="png", bbox_inches="tight")
-    with atomic_write(path) as file:
-        file.write(picture.getvalue())
+    write_figure(path, figure)
 
 
 Panel = tuple[Sequence[Row], str, str]
@@ -71,16 +66,11 @@ def _values(rows: Sequence[Row], drawn: Sequence[str]) -> list[Panel]:
 
 
 def _figure(panels: Sequence[Panel], draw: Callable[[Any, Sequence[Row], Panel], None]) -> Any:
-    # Drawn without pyplot, which keeps global state and may look for a display.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     across = min(COLUMNS, len(panels))
     down = -(-len(panels) // across)
     rows = panels[0][0]
     keys = max(len(_distinct(rows, "method")), len(_distinct(rows, "workload"))) if draw is _draw_values else 0
-    figure = Figure(figsize=(PANEL[0] * across, PANEL[1] * down + LEGEND_LINE * keys), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(PANEL[0] * across, PANEL[1] * down + LEGEND_LINE * keys)
     axes = figure.subplots(down, across, squeeze=False).ravel()
     for axis in axes[len(panels) :]:
         axis.set_axis_off()
@@ -92,12 +82,7 @@ def _figure(panels: Sequence[Panel], draw: Callable[[Any, Sequence[Row], Panel],
 
 def _styles(rows: Sequence[Row]) -> tuple[dict[str, Any], dict[str, str]]:
     """Colour of each method and marker of each workload, the same in all panels."""
-    from matplotlib import colormaps
-
-    methods, workloads = _distinct(rows, "method"), _distinct(rows, "workload")
-    palette = colormaps["tab10" if len(methods) <= 10 else "tab20"]
-    colours = {method: palette(index % palette.N) for index, method in enumerate(methods)}
-    return colours, {workload: MARKERS[index % len(MARKERS)] for index, workload in enumerate(workloads)}
+    return colours_of(_distinct(rows, "method")), markers_of(_distinct(rows, "workload"))
 
 
 def _draw_values(axis: Any, rows: Sequence[Row], panel: Panel) -> None:
@@ -149,17 +134,9 @@ def _draw_points(axis: Any, rows: Sequence[Row], value: str, styles: tuple[dict[
 
 def _draw_keys(figure: Any, rows: Sequence[Row]) -> None:
     """What colours, markers and hollow markers mean, below the panels."""
-    from matplotlib.lines import Line2D
-
-    colours, markers = _styles(rows)
     threads = sorted({row.threads for row in rows})
-    by_colour = [Line2D([], [], marker="s", linestyle="", color=colour, label=name) for name, colour in colours.items()]
-    by_marker = [Line2D([], [], marker=mark, linestyle="", color="0.4", label=name) for name, mark in markers.items()]
-    if len(threads) > 1:
-        hollow = f"hollow: {', '.join(map(str, threads[:-1]))} instead of {threads[-1]} threads"
-        by_marker.append(Line2D([], [], marker="o", linestyle="", color="0.4", markerfacecolor="none", label=hollow))
-    figure.legend(handles=by_colour, loc="outside lower left", fontsize=8, frameon=False)
-    figure.legend(handles=by_marker, loc="outside lower right", fontsize=8, frameon=False)
+    hollow = f"hollow: {', '.join(map(str, threads[:-1]))} instead of {threads[-1]} threads"
+    draw_keys(figure, *_styles(rows), hollow if len(threads) > 1 else None)
 
 
 def _draw_bars(axis: Any, rows: Sequence[Row], panel: Panel) -> None:

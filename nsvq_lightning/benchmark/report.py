@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
+from nsvq_lightning.tables import markdown_table
 
 __all__ = [
     "as_json",
@@ -115,7 +116,7 @@ def _operations(rows: Sequence[Row], heading: str) -> Iterator[str]:
         common = [name for name in ("workload", "threads") if len({getattr(row, name) for row in chosen}) == 1]
         said = {"workload": chosen[0].workload, "threads": _counted(chosen[0].threads, "thread")}
         yield f"{heading} {operation}" + "".join(f", {said[name]}" for name in common)
-        yield _table(*_columns(chosen, common))
+        yield markdown_table(*_columns(chosen, common), words=("workload", "method"))
         yield from _notes(chosen)
 
 
@@ -165,22 +166,6 @@ def number(value: float) -> str:
     if abs(value) >= 100:
         return f"{value:,.0f}"
     return f"{value:.3g}"
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table that also reads well as plain text; words stand left, numbers right."""
-    lines = [list(head), *map(list, rows)]
-    widths = [max(3, *map(len, column)) for column in zip(*lines, strict=True)]
-    words = [name in ("workload", "method") for name in head]
-    rule = ["-" * width if word else "-" * (width - 1) + ":" for word, width in zip(words, widths, strict=True)]
-    padded = [
-        [
-            cell.ljust(width) if word else cell.rjust(width)
-            for word, cell, width in zip(words, line, widths, strict=True)
-        ]
-        for line in lines
-    ]
-    return "\n".join(f"| {' | '.join(line)} |" for line in [padded[0], rule, *padded[1:]])
 
 
 def _notes(rows: Sequence[Row]) -> list[str]:

@@ -1,0 +1,74 @@
+"""Go on from a checkpoint with other codebooks: before the quantize phase they have learned nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from nsvq_lightning.schedule import Phase
+from nsvq_lightning.splats import ATTRIBUTES
+
+__all__ = ["branch_checkpoint", "branch_optimizer_state", "can_branch"]
+
+CODEBOOKS = "codebooks."
+"""Prefix of the codebooks in a module's state."""
+
+PHASE = "state._phase"
+"""The phase of the last trained iteration in a module's state."""
+
+
+def can_branch(checkpoint: Mapping[str, Any], codebooks: nn.ModuleDict) -> bool:
+    """Whether a checkpoint is from before the quantize phase and has other codebooks, in number or size, than these."""
+    state = checkpoint["state_dict"]
+    if PHASE not in state or Phase(int(state[PHASE])) >= Phase.QUANTIZE:
+        return False
+    stored = {name: value.shape for name, value in state.items() if name.startswith(CODEBOOKS)}
+    return stored != {name: value.shape for name, value in _prefixed(codebooks).items()}
+
+
+def branch_checkpoint(checkpoint: dict[str, Any], codebooks: nn.ModuleDict, optimizer: Optimizer) -> None:
+    """Exchange the codebooks of a checkpoint for fresh ones, in place.
+
+    Splats, side tables, their moments in the optimiser, the loops and the states of the callbacks stay; so the run that
+    goes on is, bit for bit, the run that had these codebooks from its start.
+
+    Args:
+        checkpoint: Checkpoint of a run that has not quantized yet (:func:`can_branch`).
+        codebooks: Untrained quantizers of the module that goes on, by attribute.
+        optimizer: A new optimiser of that module, whose groups are named.
+    """
+    state = checkpoint["state_dict"]
+    kept = {name: value for name, value in state.items() if not name.startswith(CODEBOOKS)}
+    checkpoint["state_dict"] = kept | _prefixed(codebooks)
+    if checkpoint.get("optimizer_states"):
+        (stored,) = checkpoint["optimizer_states"]
+        checkpoint["optimizer_states"] = [branch_optimizer_state(stored, optimizer.state_dict())]
+
+
+def branch_optimizer_state(stored: Mapping[str, Any], fresh: Mapping[str, Any]) -> dict[str, Any]:
+    """State of an optimiser with the groups of ``fresh``: attributes of the splats as stored, codebooks untrained.
+
+    Args:
+        stored: ``state_dict()`` of the optimiser that has trained; its groups are named.
+        fresh: ``state_dict()`` of an optimiser that has not, with the groups to end up with.
+    """
+    groups = {group["name"]: group for group in stored["param_groups"]}
+    merged: dict[str, Any] = {"state": {}, "param_groups": []}
+    for group in fresh["param_groups"]:
+        if group["name"] not in ATTRIBUTES:
+            merged["param_groups"].append(dict(group))
+            continue
+        old = groups[group["name"]]
+        merged["param_groups"].append({**old, "params": list(group["params"])})
+        # A state dict knows parameters by their place in the list of all; codebooks before them would shift it.
+        for place, old_place in zip(group["params"], old["params"], strict=True):
+            if old_place in stored["state"]:
+                merged["state"][place] = stored["state"][old_place]
+    return merged
+
+
+def _prefixed(codebooks: nn.ModuleDict) -> dict[str, Tensor]:
+    return {f"{CODEBOOKS}{name}": value for name, value in codebooks.state_dict().items()}

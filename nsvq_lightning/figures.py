@@ -1,0 +1,58 @@
+"""Matplotlib figures without pyplot, and the keys of pictures that have a colour and a marker for each point."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from nsvq_lightning.io.atomic import atomic_write
+
+__all__ = ["colours_of", "draw_keys", "markers_of", "new_figure", "write_figure"]
+
+MARKERS = "os^Dvph*X<>"
+"""Matplotlib markers that are told apart in print."""
+
+
+def new_figure(width: float, height: float) -> Any:
+    """An empty figure, inches; pyplot keeps global state and may look for a display, so it is not used."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def write_figure(path: Path, figure: Any) -> None:
+    """Write a figure as PNG, cut to what is drawn, atomically."""
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", bbox_inches="tight")
+    with atomic_write(path) as file:
+        file.write(picture.getvalue())
+
+
+def colours_of(names: Sequence[str]) -> dict[str, Any]:
+    """A colour for each name."""
+    from matplotlib import colormaps
+
+    palette = colormaps["tab10" if len(names) <= 10 else "tab20"]
+    return {name: palette(index % palette.N) for index, name in enumerate(names)}
+
+
+def markers_of(names: Sequence[str]) -> dict[str, str]:
+    """A marker for each name."""
+    return {name: MARKERS[index % len(MARKERS)] for index, name in enumerate(names)}
+
+
+def draw_keys(figure: Any, colours: Mapping[str, Any], markers: Mapping[str, str], hollow: str | None = None) -> None:
+    """Say below a figure what its colours, markers and, where it has them, hollow markers mean."""
+    from matplotlib.lines import Line2D
+
+    def handle(marker: str, colour: Any, label: str, face: Any = None) -> Any:
+        return Line2D([], [], marker=marker, linestyle="", color=colour, markerfacecolor=face, label=label)
+
+    by_colour = [handle("s", colour, name) for name, colour in colours.items()]
+    by_marker = [handle(marker, "0.4", name) for name, marker in markers.items()]
+    if hollow is not None:
+        by_marker.append(handle("o", "0.4", hollow, "none"))
+    figure.legend(handles=by_colour, loc="outside lower left", fontsize=8, frameon=False)
+    figure.legend(handles=by_marker, loc="outside lower right", fontsize=8, frameon=False)

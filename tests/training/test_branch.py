@@ -1,0 +1,90 @@
+"""A run that leaves a shared trunk is the run that was trained from its start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning.pytorch import Callback, Trainer
+from torch import nn
+
+from nsvq_lightning.branch import branch_optimizer_state, can_branch
+from nsvq_lightning.callbacks import PhaseSchedule, RunCheckpoint
+from nsvq_lightning.module import SplatModule
+from nsvq_lightning.schedule import Phase, Schedule
+
+RunFactory = Callable[..., tuple[Trainer, SplatModule]]
+Recipe = Callable[..., dict[str, Callback]]
+
+INTERVALS = {"min_density_interval": 4, "min_reset_interval": 11, "min_replacement_interval": 5}
+PRUNE_END = Schedule(total=60, **INTERVALS).ends[Phase.PRUNE]
+
+
+def checkpoint_of(trainer: Trainer) -> Path:
+    return Path(trainer.default_root_dir) / "checkpoints" / "last.ckpt"
+
+
+def outcome(trainer: Trainer, module: SplatModule) -> tuple[bytes, list[dict[str, Any]]]:
+    """The file, and every evaluation without its time."""
+    scene = (Path(trainer.default_root_dir) / "scene.nsvq").read_bytes()
+    return scene, [{name: value for name, value in entry.items() if name != "seconds"} for entry in module.history]
+
+
+@pytest.fixture(scope="module")
+def trunk(run: RunFactory, recipe: Recipe) -> Path:
+    """Checkpoint of a run without codebooks, and without the callbacks that drive them, at the end of pruning."""
+    parts = recipe(phases=PhaseSchedule(total=60, **INTERVALS), checkpoint=RunCheckpoint())
+    for name in ("codebook_init", "codebook_replacement", "freeze", "export"):
+        del parts[name]
+    trainer, module = run(parts.values(), module={"codebooks": None}, max_steps=PRUNE_END)
+    assert trainer.global_step == PRUNE_END
+    assert len(module.splats) > 500  # density control has worked: the moments were edited, too
+    return checkpoint_of(trainer)
+
+
+@pytest.mark.parametrize(
+    "codebooks",
+    [{"scales": 24, "quats": 24, "sh0": 16, "shN": 16}, {"scales": 5, "shN": 8}, None],
+    ids=["all four", "two of four", "none"],
+)
+def test_a_branch_ends_in_the_bytes_of_the_run_trained_from_its_start(
+    run: RunFactory, recipe: Recipe, trunk: Path, codebooks: dict[str, int] | None
+) -> None:
+    whole = run(recipe().values(), module={"codebooks": codebooks})
+    branched = run(recipe().values(), ckpt_path=trunk, module={"codebooks": codebooks})
+    assert outcome(*branched) == outcome(*whole)
+    trunk_seconds = float(torch.load(trunk, weights_only=True)["state_dict"]["state._train_seconds"])
+    assert branched[1].train_seconds > trunk_seconds > 0
+
+
+def test_codebooks_may_change_until_they_are_placed() -> None:
+    module = SplatModule(sh_degree=1, codebooks={"scales": 12})
+    for phase in Phase:
+        module.phase = phase
+        stored = {"state_dict": module.state_dict()}
+        for others in ({"scales": 7}, {"scales": 12, "quats": 12}, None):
+            fits = can_branch(stored, SplatModule(sh_degree=1, codebooks=others).codebooks)
+            assert fits is (phase < Phase.QUANTIZE)
+        # Codebooks of the same sizes are the run's own: they are loaded, not exchanged.
+        assert not can_branch(stored, module.codebooks)
+
+
+def test_moments_follow_their_parameters_when_groups_move() -> None:
+    def adam(*names: str) -> torch.optim.Adam:
+        groups = [{"params": [nn.Parameter(torch.full((2,), 1.0))], "lr": 0.1, "name": name} for name in names]
+        return torch.optim.Adam(groups)
+
+    trained = adam("codebook_scales", "means", "sh0", "codebook_sh0")
+    for step, group in enumerate(trained.param_groups):
+        group["params"][0].grad = torch.full((2,), float(step + 1))
+    trained.step()
+    target = adam("means", "sh0", "codebook_scales")
+    target.load_state_dict(branch_optimizer_state(trained.state_dict(), target.state_dict()))
+    states = {group["name"]: target.state[group["params"][0]] for group in target.param_groups}
+    # Adam's first moment after one step is 0.1 times the gradient, which was the place in the old order.
+    assert float(states["means"]["exp_avg"][0]) == pytest.approx(0.2)
+    assert float(states["sh0"]["exp_avg"][0]) == pytest.approx(0.3)
+    assert states["codebook_scales"] == {}  # another codebook: no moments
