@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,8 @@ class Row:
         ssim: Of the decoded file on the test views.
         bytes: Size of the file.
         splats: Their number.
-        bytes_by_level: Size of the file at each compression level.
+        bytes_paper: Size that the file has at level ``paper``.
+        psnr_paper: PSNR of the scene before it was stored, which is that of level ``paper``, dB.
         seconds: Training time from the first iteration on, as if nothing had been shared.
         trunk_seconds: The part of ``seconds`` that was trained once for all runs with this trunk; 0 without one.
         psnr_before: PSNR of the plain splats at the end of the prune phase, dB; None without codebooks.
@@ -47,7 +48,8 @@ class Row:
     ssim: float | None = None
     bytes: int | None = None
     splats: int | None = None
-    bytes_by_level: Mapping[str, int] = field(default_factory=dict)
+    bytes_paper: int | None = None
+    psnr_paper: float | None = None
     seconds: float | None = None
     trunk_seconds: float | None = None
     psnr_before: float | None = None
@@ -55,16 +57,9 @@ class Row:
     folder: Path = Path()
     error: str = ""
 
-    def as_csv(self, levels: Sequence[str]) -> dict[str, Any]:
-        """The row as cells, with a column for each level."""
-        cells = dict(vars(self))
-        sizes = cells.pop("bytes_by_level")
-        columns: dict[str, Any] = {}
-        for name, value in cells.items():
-            columns[name] = value
-            if name == "splats":
-                columns |= {f"bytes_{level}": sizes.get(level) for level in levels}
-        return columns
+    def as_csv(self) -> dict[str, Any]:
+        """The row as cells."""
+        return dict(vars(self))
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import logging
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from nsvq_lightning.io.atomic import write_text
-from nsvq_lightning.io.container import LEVELS, read_nsvq, write_nsvq
-from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.schedule import Phase
 from nsvq_lightning.sweep.plan import Run
 from nsvq_lightning.sweep.plot import draw_sweep
@@ -85,9 +82,8 @@ class Sweep:
             if trunk is not None and not training.checkpoint.is_file():
                 self._train_trunk(trunk)
             training.run(self._runner, trunk.checkpoint if trunk is not None else None)
-            sizes = bytes_by_level(training.folder / "scene.nsvq")
-            training.finish(bytes_by_level=sizes, trunk=trunk.folder.name if trunk is not None else None)
-        except (TrainingError, FormatError, OSError) as error:
+            training.finish(trunk=trunk.folder.name if trunk is not None else None)
+        except (TrainingError, OSError) as error:
             return Row(**_names(run), folder=training.folder, error=str(error))
         if not self.keep_checkpoints:
             training.drop_checkpoints()
@@ -107,22 +103,10 @@ class Sweep:
         trunk.finish()
 
     def _write(self, rows: Sequence[Row]) -> None:
-        levels = list(dict.fromkeys(level for row in rows for level in row.bytes_by_level))
-        write_csv(self.folder / "results.csv", [row.as_csv(levels) for row in rows])
+        write_csv(self.folder / "results.csv", [row.as_csv() for row in rows])
         write_text(self.folder / "results.md", as_markdown(rows))
         if any(row.psnr is not None for row in rows):
             draw_sweep(self.folder / "results.png", rows)
-
-
-def bytes_by_level(path: Path) -> dict[str, int]:
-    """Bytes of a scene at each compression level.
-
-    Raises:
-        FormatError: The file cannot be read.
-    """
-    scene = read_nsvq(path)
-    with tempfile.TemporaryDirectory(prefix="nsvq-sweep-") as folder:
-        return {level: write_nsvq(Path(folder) / f"{level}.nsvq", scene, level) for level in LEVELS}
 
 
 def _names(run: Run) -> dict[str, Any]:
@@ -140,7 +124,8 @@ def _row(run: Run, training: Training) -> Row:
         ssim=metrics["ssim"],
         bytes=metrics["file_bytes"],
         splats=metrics["num_splats"],
-        bytes_by_level=record["bytes_by_level"],
+        bytes_paper=metrics["paper_level"]["file_bytes"],
+        psnr_paper=metrics["phases"][-1]["psnr"],
         seconds=metrics["train_seconds"],
         trunk_seconds=_trunk_seconds(metrics) if record["trunk"] is not None else 0.0,
         psnr_before=before["psnr"] if before is not None else None,

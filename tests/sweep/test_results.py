@@ -53,10 +53,9 @@ def test_the_table_has_a_line_a_group_and_names_failures() -> None:
     assert "* fox, nsvq_1k, 4k, seed 0: killed by signal 9" in text
 
 
-def test_a_line_of_the_csv_has_a_column_a_level() -> None:
-    cells = row(bytes_by_level={"paper": 5}, folder=Path("a")).as_csv(["paper", "compact"])
-    assert (cells["bytes_paper"], cells["bytes_compact"]) == (5, None)
-    assert "bytes_by_level" not in cells
+def test_a_line_of_the_csv_has_both_levels() -> None:
+    cells = row(bytes_paper=5, folder=Path("a")).as_csv()
+    assert (cells["bytes"], cells["bytes_paper"], cells["psnr_paper"]) == (2_000_000, 5, None)
 
 
 def test_the_picture_shows_every_point(tmp_path: Path) -> None:

@@ -113,7 +113,7 @@ def test_a_run_that_fails_is_noted_and_stops_no_other(swept: tuple[Sweep, InProc
     assert [line["config"] for line in table] == ["small", "large", "none", "wrong"]
     for line, row in zip(table[:3], rows, strict=False):
         path = row.folder / "scene.nsvq"
-        assert int(line["bytes"]) == int(line["bytes_paper"]) == path.stat().st_size
+        assert int(line["bytes"]) == path.stat().st_size < int(line["bytes_paper"])
         assert float(line["psnr"]) == metrics_of(row.folder)["psnr"]
         before = metrics_of(row.folder)["before_quantization"]
         assert isinstance(before, dict)
