@@ -16,6 +16,7 @@ __all__ = ["find_config", "main", "resolve_configs"]
 OWN_COMMANDS = {
     "info": "nsvq_lightning.info",
     "benchmark": "nsvq_lightning.benchmark.cli",
+    "compress": "nsvq_lightning.compress_command",
     "sweep": "nsvq_lightning.sweep.cli",
 }
 """Commands without a trainer: modules with a ``main(argv)``, which must not pay for Lightning's start."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 from nsvq_lightning.io.atomic import atomic_write
@@ -13,9 +13,7 @@ from nsvq_lightning.io.frame import frame, read_frame, read_header
 from nsvq_lightning.io.header import Header
 from nsvq_lightning.io.precision import DEFAULT_LEVEL, LEVELS, Precision, check_level
 
-__all__ = ["DEFAULT_LEVEL", "LEVELS", "CompressedScene", "encode", "read_header", "read_nsvq", "write_nsvq"]
-
-Decode = Callable[[Header, Mapping[str, memoryview]], CompressedScene]
+__all__ = ["DEFAULT_LEVEL", "LEVELS", "CompressedScene", "decode", "encode", "read_header", "read_nsvq", "write_nsvq"]
 
 
 def encode(
@@ -67,17 +65,22 @@ def read_nsvq(path: str | os.PathLike[str]) -> CompressedScene:
     """
     header, streams = read_frame(path)
     with naming_file(path):
-        scene = _decoder(header.level)(header, streams)
+        scene = decode(header, streams)
     return replace(scene, stored_bytes=os.path.getsize(path))
 
 
-def _decoder(level: str) -> Decode:
-    if level == "compact":
+def decode(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene:
+    """Scene from header and streams of any level.
+
+    Raises:
+        FormatError: Of a newer level, or the streams are not what the header says.
+    """
+    if header.level == "compact":
         from nsvq_lightning.io.compact import decode_compact
 
-        return decode_compact
-    if level == "paper":
+        return decode_compact(header, streams)
+    if header.level == "paper":
         from nsvq_lightning.io.paper import decode_paper
 
-        return decode_paper
-    raise FormatError(f"compression level {level!r}; this release reads {', '.join(LEVELS)}: update it")
+        return decode_paper(header, streams)
+    raise FormatError(f"compression level {header.level!r}; this release reads {', '.join(LEVELS)}: update it")

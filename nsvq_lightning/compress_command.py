@@ -1,0 +1,188 @@
+"""``nsvq compress``: an existing splat file made small, without photos or fine-tuned with them."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.precision import DEFAULT_LEVEL, LEVELS, Storage
+
+if TYPE_CHECKING:
+    from nsvq_lightning.io.arrays import SplatArrays
+    from nsvq_lightning.posthoc import Candidate
+    from nsvq_lightning.rendering.camera import Camera
+
+__all__ = ["main"]
+
+log = logging.getLogger("nsvq_lightning.compress")
+
+DEFAULT_CODEBOOKS = "16k"
+SYNTHETIC_CAMERAS = 8
+MOST_CAMERAS = 24
+"""Train views that errors are measured in, spread evenly over the folder's."""
+
+EPILOG = """\
+The error is the root mean square difference between pictures of the scene before and after, of channels in [0, 1]:
+0.01 is 40 dB, 0.003 is 50 dB. Pictures are the train views of --data.root, or taken from around the scene.
+
+examples:
+  nsvq compress scene.ply scene.nsvq
+  nsvq compress scene.ply scene.nsvq --max-error 0.01
+  nsvq compress scene.ply scene.nsvq --target-bytes 2000000
+  nsvq compress scene.ply scene.nsvq --data.root photos --max-steps 3000     # codebooks trained with the photos
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Compress a file.
+
+    Args:
+        argv: Arguments after ``nsvq compress``; those of the process if None.
+
+    Returns:
+        0, or 1 after an error in the user's files or an aim that cannot be reached. Wrong arguments end the process
+        with status 2.
+    """
+    parser = _parser()
+    options = parser.parse_args(argv)
+    if options.output.suffix.lower() != ".nsvq":
+        parser.error(f"{options.output}: the compressed scene is a .nsvq file; 'nsvq export' writes other formats")
+    if options.max_steps is not None and options.root is None:
+        parser.error("--max-steps trains with photos: give their COLMAP folder with --data.root")
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
+    try:
+        return _compress(options)
+    except (ValueError, OSError) as error:
+        sys.stderr.write(f"nsvq compress: {error}\n")
+        return 1
+
+
+def _compress(options: argparse.Namespace) -> int:
+    from nsvq_lightning.io.arrays import SplatArrays
+    from nsvq_lightning.io.formats import load
+
+    source: Path = options.input
+    arrays = SplatArrays.from_splats(load(source)).finite()
+    if len(arrays) == 0:
+        raise ValueError(f"{source} holds no splat with finite numbers; there is nothing to compress")
+    cameras = _cameras(options.root, arrays)
+    candidate = _candidate(options, arrays, cameras)
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    if options.root is not None and options.max_steps != 0:
+        if not candidate.rung.codebooks:
+            log.info("nothing to train: %s is exact enough without codebooks", source)
+        else:
+            return _train(options, candidate)
+    with atomic_write(options.output) as file:
+        file.write(candidate.data)
+    before, after = source.stat().st_size, len(candidate.data)
+    sys.stdout.write(
+        f"{options.output}: {len(arrays):,} splats in {after:,} bytes, {before / after:.1f} times smaller than "
+        f"{source.name}\n  {candidate.rung.name}, error {candidate.error:.4g} ({candidate.psnr:.2f} dB against the "
+        f"original in {len(cameras)} pictures)\n"
+    )
+    return 0
+
+
+def _cameras(root: Path | None, arrays: SplatArrays) -> list[Camera]:
+    """Views that errors are measured in."""
+    if root is None:
+        from nsvq_lightning.viewpoints import cameras_around
+
+        return cameras_around(arrays.means, SYNTHETIC_CAMERAS)
+    from nsvq_lightning.data.scene import load_scene
+
+    scene = load_scene(root)
+    chosen = scene.train[:: -(-len(scene.train) // MOST_CAMERAS)]
+    return [scene.cameras[index] for index in chosen]
+
+
+def _candidate(options: argparse.Namespace, arrays: SplatArrays, cameras: list[Camera]) -> Candidate:
+    from nsvq_lightning.posthoc import RUNGS, Compressor, finest_within, smallest_within
+
+    compressor = Compressor(arrays, cameras, Storage(options.level), options.seed)
+    if options.max_error is not None:
+        return smallest_within(compressor, options.max_error)
+    if options.target_bytes is not None:
+        return finest_within(compressor, options.target_bytes)
+    rungs = {rung.name: rung for rung in RUNGS}
+    return compressor.at(rungs[options.codebooks] if options.codebooks != "none" else RUNGS[1])
+
+
+def _train(options: argparse.Namespace, candidate: Candidate) -> int:
+    """Train the candidate's codebooks with photos: quantize and fine-tune phase only, from the splats as they are."""
+    from nsvq_lightning.cli import main as run
+
+    steps = 3000 if options.max_steps is None else options.max_steps
+    precision = vars(candidate.storage.precision)
+    codebooks = ", ".join(f"{name}: {codes}" for name, codes in candidate.rung.codebooks.items())
+    folder = options.output.parent / f"{options.output.stem}_training"
+    status = run(
+        [
+            "fit",
+            f"--data.root={options.root}",
+            f"--model.init_from={options.input}",
+            f"--model.sh_degree={candidate.scene.sh_degree}",
+            f"--model.codebooks={{{codebooks}}}",
+            "--model.rates.means=1.6e-6",  # a trained scene is past the decay of this rate
+            f"--model.seed={options.seed}",
+            f"--model.storage.level={candidate.storage.level}",
+            *(f"--model.storage.precision.{name}={value}" for name, value in precision.items()),
+            "--callbacks.phases.warmup_end=0",
+            "--callbacks.phases.prune_end=0",
+            "--callbacks.density=null",
+            "--callbacks.canonical.mode=auto",
+            "--callbacks.codebook_init.weights=contribution",
+            "--callbacks.export.formats=[nsvq]",
+            f"--trainer.max_steps={steps}",
+            f"--trainer.default_root_dir={folder}",
+        ]
+    )
+    if status == 0:
+        (run_folder,) = sorted(folder.glob("*/version_*"), key=lambda path: path.stat().st_mtime)[-1:]
+        with atomic_write(options.output) as file, open(run_folder / "scene.nsvq", "rb") as trained:
+            shutil.copyfileobj(trained, file)
+        sys.stdout.write(f"{options.output}: {options.output.stat().st_size:,} bytes\n")
+    return status
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="nsvq compress",
+        description="Make a splat file small: codebooks by k-means, entropy coding. Photos are not needed.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("input", type=Path, metavar="SCENE", help="splat file, .ply or .nsvq")
+    parser.add_argument("output", type=Path, metavar="OUT.nsvq", help="file to write")
+    aim = parser.add_mutually_exclusive_group()
+    names = ("16k", "8k", "4k", "2k", "1k", "0.5k", "128k", "64k", "32k", "none")
+    aim.add_argument(
+        "--codebooks", choices=names, default=DEFAULT_CODEBOOKS, help=f"codebook sizes; {DEFAULT_CODEBOOKS} by default"
+    )
+    aim.add_argument(
+        "--max-error", type=_positive(float), metavar="E", help="the smallest file with this error at most"
+    )
+    aim.add_argument("--target-bytes", type=_positive(int), metavar="B", help="the best file of at most so many bytes")
+    parser.add_argument("--level", choices=LEVELS, default=DEFAULT_LEVEL, help=f"{DEFAULT_LEVEL} by default")
+    parser.add_argument("--seed", type=int, default=0, help="seed of k-means")
+    parser.add_argument("--data.root", dest="root", type=Path, metavar="FOLDER", help="COLMAP folder with the photos")
+    parser.add_argument("--max-steps", type=int, metavar="N", help="iterations with photos: 3000; 0 for none")
+    return parser
+
+
+def _positive(kind: type[int] | type[float]) -> type[int] | type[float]:
+    def parse(text: str) -> int | float:
+        value = kind(text)
+        if not 0 < value < float("inf"):
+            raise argparse.ArgumentTypeError(f"must be above 0, got {text}")
+        return value
+
+    return parse  # type: ignore[return-value]

@@ -1,0 +1,210 @@
+"""Compress a scene that is trained already: k-means, and the smallest of several settings that is good enough."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nsvq_lightning.canonical import canonical
+from nsvq_lightning.compress import compress
+from nsvq_lightning.covariance_error import form_errors
+from nsvq_lightning.importance import contributions, row_weights
+from nsvq_lightning.io.arrays import SplatArrays
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.container import decode, encode
+from nsvq_lightning.io.frame import frame, unframe
+from nsvq_lightning.io.precision import Precision, Storage
+from nsvq_lightning.quantize import NSVQ, QUANTIZED, Quantizer, codebook_sizes
+from nsvq_lightning.quantized import attribute_rows
+from nsvq_lightning.random import generator
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.splats import RawSplats
+
+__all__ = ["RUNGS", "Candidate", "Compressor", "Rung", "finest_within", "smallest_within"]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One setting of the ladder from large and exact to small.
+
+    Attributes:
+        name: What messages call it.
+        codebooks: Codes by attribute; empty without codebooks.
+        coarseness: Factor on the errors of :class:`~nsvq_lightning.io.precision.Precision`.
+    """
+
+    name: str
+    codebooks: Mapping[str, int]
+    coarseness: float = 1.0
+
+
+def _sizes(codes: int) -> dict[str, int]:
+    return {name: max(1, int(codes * attribute.code_share)) for name, attribute in QUANTIZED.items()}
+
+
+RUNGS: tuple[Rung, ...] = (
+    Rung("no codebooks, a quarter of the errors", {}, 0.25),
+    Rung("no codebooks", {}),
+    *(Rung(f"{codes // 1024}k", _sizes(codes), 0.5) for codes in (1 << 17, 1 << 16, 1 << 15)),
+    *(Rung(name, codebook_sizes(name)) for name in ("16k", "8k", "4k", "2k", "1k", "0.5k")),
+    Rung("0.5k, twice the errors", codebook_sizes("0.5k"), 2.0),
+    Rung("0.25k, four times the errors", _sizes(256), 4.0),
+)
+"""Settings from the most exact to the smallest."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A scene compressed at one rung.
+
+    Attributes:
+        rung: The setting.
+        scene: What is stored.
+        storage: How.
+        data: The file.
+        error: Root mean square difference of its pictures to those of the original, of channels in [0, 1].
+    """
+
+    rung: Rung
+    scene: CompressedScene
+    storage: Storage
+    data: bytes
+    error: float
+
+    @property
+    def psnr(self) -> float:
+        """The error in dB."""
+        return math.inf if self.error == 0 else -20 * math.log10(self.error)
+
+
+class Compressor:
+    """Compresses one scene at any rung, each at most once.
+
+    Before k-means, scales and rotations take the canonical form that suits the scene, and codes of rotations and
+    colours are placed by how much each splat contributes to the pictures.
+
+    Args:
+        splats: The scene, finite.
+        cameras: Views that errors and contributions are measured in.
+        storage: Level and precision, which rungs make coarser or finer.
+        seed: Seed of k-means.
+
+    Raises:
+        ValueError: There are no splats, or no cameras.
+    """
+
+    def __init__(self, splats: SplatArrays, cameras: Sequence[Camera], storage: Storage, seed: int = 0) -> None:
+        if len(splats) == 0 or not cameras:
+            raise ValueError(f"cannot compress {len(splats)} splats seen by {len(cameras)} cameras")
+        self._splats = RawSplats(*(tensor.detach() for tensor in splats.to_splats().raw()))
+        self._cameras, self._storage, self._seed = cameras, storage, seed
+        self._pictures = [_picture(self._splats, camera) for camera in cameras]
+        self._weights = row_weights(contributions(self._splats, cameras, render))
+        self._done: dict[str, Candidate] = {}
+
+    def at(self, rung: Rung) -> Candidate:
+        """The scene at a rung."""
+        if rung.name not in self._done:
+            self._done[rung.name] = self._compressed(rung)
+            found = self._done[rung.name]
+            log.info("%s: %s bytes, error %.4g (%.2f dB)", rung.name, f"{len(found.data):,}", found.error, found.psnr)
+        return self._done[rung.name]
+
+    def _compressed(self, rung: Rung) -> Candidate:
+        scene = self._quantized(rung.codebooks)
+        errors = {name: rung.coarseness * value for name, value in vars(self._storage.precision).items()}
+        errors["opacity"] = min(errors["opacity"], 0.25)
+        storage = replace(self._storage, precision=Precision(**errors))
+        data = b"".join(frame(*encode(scene, storage.level, storage.precision)))
+        return Candidate(rung, scene, storage, data, self._error(data))
+
+    @torch.no_grad()
+    def _quantized(self, codebooks: Mapping[str, int]) -> CompressedScene:
+        splats = self._canonical(codebooks)
+        quantizers: dict[str, Quantizer] = {}
+        for name, codes in codebooks.items():
+            rows = attribute_rows(splats, name)
+            if rows.shape[1] == 0:
+                continue
+            # Scales spread over many sizes, of which each counts; a weight would leave the small ones none.
+            scales = name == "scales"
+            quantizers[name] = NSVQ(codes, rows.shape[1], start="spread" if scales else "sample")
+            weight = None if scales else self._weights
+            quantizers[name].fit(rows, weight, generator(self._seed, 0, "kmeans", name))
+        return compress(splats, quantizers, {"codebooks": {name: len(q.codebook) for name, q in quantizers.items()}})
+
+    def _canonical(self, codebooks: Mapping[str, int]) -> RawSplats:
+        codes = {name: codebooks[name] for name in ("scales", "quats") if name in codebooks}
+        if not codes:
+            return self._splats
+        scales, quats = self._splats.scales, self._splats.quats
+        errors = form_errors(scales, quats, codes, self._seed)
+        form = min(errors, key=errors.__getitem__)
+        if form == "none":
+            return self._splats
+        new = canonical(scales, quats, form)
+        return self._splats._replace(scales=new.scales, quats=new.quats)
+
+    def _error(self, data: bytes) -> float:
+        splats = RawSplats(*(tensor.detach() for tensor in decode(*unframe(data)).decode().raw()))
+        squares = [
+            float((_picture(splats, camera) - picture).double().square().mean())
+            for camera, picture in zip(self._cameras, self._pictures, strict=True)
+        ]
+        return math.sqrt(float(np.mean(squares)))
+
+
+@torch.no_grad()
+def _picture(splats: RawSplats, camera: Camera) -> Tensor:
+    return render(splats, camera).image.clamp(0, 1)
+
+
+def smallest_within(compressor: Compressor, error: float) -> Candidate:
+    """The coarsest rung whose error is at most ``error``.
+
+    Raises:
+        ValueError: Even the most exact rung has a larger one.
+    """
+    found = _last(lambda rung: compressor.at(rung).error <= error)
+    if found is None:
+        best = compressor.at(RUNGS[0])
+        raise ValueError(
+            f"no setting has an error of at most {error:g}: the most exact one has {best.error:.3g} in "
+            f"{len(best.data)} bytes; allow more, or use level 'paper' without codebooks, which loses nothing"
+        )
+    return compressor.at(found)
+
+
+def finest_within(compressor: Compressor, target: int) -> Candidate:
+    """The most exact rung whose file has at most ``target`` bytes.
+
+    Raises:
+        ValueError: Even the smallest rung has more.
+    """
+    found = _last(lambda rung: len(compressor.at(rung).data) > target)
+    rest = RUNGS[RUNGS.index(found) + 1 :] if found is not None else RUNGS
+    if not rest:
+        least = len(compressor.at(RUNGS[-1]).data)
+        raise ValueError(
+            f"the smallest file of this scene has {least} bytes, more than {target}; most of them are positions: "
+            "train with fewer splats (--callbacks.contribution.share, --callbacks.density.max_splats)"
+        )
+    return compressor.at(rest[0])
+
+
+def _last(holds: Callable[[Rung], bool]) -> Rung | None:
+    """The last rung for which something holds that holds up to some rung and not after it; None if for none."""
+    low, high = -1, len(RUNGS)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if holds(RUNGS[middle]) else (low, middle)
+    return RUNGS[low] if low >= 0 else None
