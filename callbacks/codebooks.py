@@ -9,7 +9,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from nsvq_lightning.host import SplatHost, as_host, next_iteration, sum_over_processes
+from nsvq_lightning.host import SplatHost, as_host, from_first_process, next_iteration, sum_over_processes
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.random import generator
 from nsvq_lightning.schedule import Phase
@@ -43,8 +43,7 @@ class CodebookInit(Callback):
         for name, quantizer in host.quantizers.items():
             if trainer.is_global_zero:
                 quantizer.fit(host.rows(name), generator=generator(host.seed, iteration, "kmeans", name))
-            if trainer.world_size > 1:
-                quantizer.codebook.data = trainer.strategy.broadcast(quantizer.codebook.data)
+            quantizer.codebook.data = from_first_process(trainer, quantizer.codebook.data)
         sizes = ", ".join(f"{name} {q.codebook.shape[0]}" for name, q in host.quantizers.items())
         if sizes:
             log.info("iteration %d: codebooks for %d splats: %s", iteration, len(host.splats), sizes)

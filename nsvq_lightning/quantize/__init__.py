@@ -1,11 +1,12 @@
 """Vector quantization of splat attributes."""
 
 from nsvq_lightning.quantize.attributes import QUANTIZED, QuantizedAttribute, codebook_sizes
-from nsvq_lightning.quantize.base import Quantizer
+from nsvq_lightning.quantize.base import Quantizer, Refittable
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest, nearest_reference
 from nsvq_lightning.quantize.nsvq import NSVQ
+from nsvq_lightning.quantize.straight_through import StraightThrough
 
 __all__ = [
     "NSVQ",
@@ -13,6 +14,8 @@ __all__ = [
     "CodebookQuantizer",
     "QuantizedAttribute",
     "Quantizer",
+    "Refittable",
+    "StraightThrough",
     "codebook_sizes",
     "kmeans",
     "nearest",
