@@ -142,7 +142,7 @@ def output_folder(trainer: Trainer) -> Path:
 
 def from_first_process(trainer: Trainer, tensor: Tensor) -> Tensor:
     """The first process's value of a tensor, on every process."""
-    return tensor if trainer.world_size == 1 else cast(Tensor, trainer.strategy.broadcast(tensor))
+    return tensor if trainer.world_size == 1 else trainer.strategy.broadcast(tensor)
 
 
 def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:
