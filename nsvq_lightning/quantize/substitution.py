@@ -256,7 +256,7 @@ def _add_parts(sums, total):  # type: ignore[no-untyped-def]
 
 
 def substitute(
-    seed: int, x: Floats, rows: Integers, codebook: Floats, codes: Integers, aim: float = 0.0, spread: float = 1.0
+    seed: int, x: Floats, rows: Integers, codebook: Floats, codes: Integers, *, aim: float = 0.0, spread: float = 1.0
 ) -> Floats:
     """``x + ‖x − c‖·d/‖d‖`` with ``d = aim·(c − x) + spread·v``, v ~ N(0, I), for some rows of a table, ``[V, D]``.
 
