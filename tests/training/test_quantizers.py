@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from nsvq_lightning.io.container import read_nsvq
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.quantize import CodebookQuantizer, DiVeQ, PostHoc, StraightThrough, VectorQuantizeAdapter, kmeans
 from nsvq_lightning.random import generator
-from nsvq_lightning.schedule import Phase, Schedule
+from nsvq_lightning.schedule import Phase
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 Recipe = Callable[..., dict[str, Callback]]
@@ -147,17 +147,15 @@ def test_post_hoc_stores_kmeans_of_the_final_rows(run: RunFactory, recipe: Recip
     assert scene_path(fit(MetricReport(every=2))[0]).read_bytes() == scene_path(trainer).read_bytes()
 
 
-def test_refits_scale_like_replacement() -> None:
-    def due(total: int, every: int = 100) -> list[int]:
-        host: Any = SimpleNamespace(schedule=Schedule(total=total))
-        return [i for i in range(1, total + 1) if CodebookRefit(every=every).is_due(host, i)]
-
-    assert due(45_000) == list(range(20_100, 43_001, 100))
-    assert due(4500) == list(range(2010, 4301, 50))
-    assert due(4500, 1000) == list(range(2100, 4301, 100))
-
-
-@pytest.mark.parametrize("bad", [{"every": 0}, {"steps": 0}])
-def test_impossible_refits_are_refused(bad: dict[str, int]) -> None:
-    with pytest.raises(ValueError, match="refits need"):
-        CodebookRefit(**bad)
+def test_the_quantizer_of_the_docs_trains(run: RunFactory, quantized_recipe: Recipe) -> None:
+    path = Path(__file__).resolve().parents[2] / "docs" / "quantizers.md"
+    if not path.exists():
+        pytest.skip("a source distribution has no docs")
+    page = path.read_text()
+    (source,) = re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+    namespace: dict[str, Any] = {}
+    exec(compile(source, "docs/quantizers.md", "exec"), namespace)
+    trainer, _ = run(quantized_recipe().values(), module={"quantizer": namespace["Halfway"]}, max_steps=20)
+    assert read_nsvq(scene_path(trainer)).config["quantizers"]["scales"] == "Halfway"
+    for kind in KINDS:  # and its table is complete
+        assert f"| `{kind.__name__}` |" in page
