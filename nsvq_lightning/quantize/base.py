@@ -35,6 +35,8 @@ class Quantizer(Protocol):
     ) -> tuple[Tensor, Tensor]:
         """Quantize rows of ``x [N, D]`` in training: differentiable ``x_q [V, D]``, codes ``[V]``; counts the usage.
 
+        One that leaves training alone returns the rows themselves, -1 as their codes, and counts nothing.
+
         ``rows [V]`` int64, ascending and all different, says which; without it all rows are quantized. Gathering them
         (:func:`nsvq_lightning.subset.take_rows`) is left to the quantizer, which may do it on the way.
         """

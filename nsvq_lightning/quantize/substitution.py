@@ -71,19 +71,8 @@ def _inverses(squared):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _dot(dim, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
-    """Product of two long rows. ``keep`` leaves out what the last vector has in common with the one before."""
-    total = splat(np.float32(0.0))
-    for j in range(0, dim // 16 * 16, 16):
-        total = fma(load(a, at_a + j), load(b, at_b + j), total)
-    if dim % 16:
-        total = fma(load(a, at_a + dim - 16) * load(keep, 0), load(b, at_b + dim - 16), total)
-    return lane_sum(total)
-
-
-@inline
 def _dot_difference(dim, g, at_g, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
-    """Product of a long row with the difference of two."""
+    """Product of a long row with a difference. ``keep`` leaves out what the last two vectors have in common."""
     total = splat(np.float32(0.0))
     for j in range(0, dim // 16 * 16, 16):
         total = fma(load(g, at_g + j), load(a, at_a + j) - load(b, at_b + j), total)
@@ -122,13 +111,13 @@ def _short_forward(dim: int) -> Any:
                 _copy_in(dim, x, rows, first, valid, values)
                 _copy_in(dim, codebook, codes, first, valid, chosen)
                 at = (first - block * _ROWS) * dim
-                squared = splat(np.float32(0.0))
+                error, squared = splat(np.float32(0.0)), splat(np.float32(0.0))
                 for j in range(dim):
                     residual = load(chosen, 16 * j) - load(values, 16 * j)
                     direction = fma(splat(aim), residual, splat(spread) * load(noise, at + 16 * j))
                     store(noise, at + 16 * j, direction)
-                    squared = fma(direction, direction, squared)
-                length = vsqrt(_residuals_squared(dim, values, chosen) * _inverses(squared))
+                    error, squared = fma(residual, residual, error), fma(direction, direction, squared)
+                length = vsqrt(error * _inverses(squared))
                 for j in range(dim):
                     store(values, 16 * j, fma(length, load(noise, at + 16 * j), load(values, 16 * j)))
                 for lane in range(valid):
@@ -152,12 +141,16 @@ def _long_forward(dim: int) -> Any:
                 if start == 0:
                     fill_normal(seed, i * vectors, 2 * vectors, noise, radius, angle)
                 at, code = get(rows, i) * dim, get(codes, i) * dim
+                error, squared = splat(np.float32(0.0)), splat(np.float32(0.0))
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
                     residual = load(codebook, code + place) - load(x, at + place)
-                    store(direction, place, fma(splat(aim), residual, splat(spread) * load(noise, start + place)))
-                squared = _residual_squared(dim, x, at, codebook, code, keep)
-                length = splat(np.sqrt(squared * _inverse(_dot(dim, direction, 0, direction, 0, keep))))
+                    way = fma(splat(aim), residual, splat(spread) * load(noise, start + place))
+                    store(direction, place, way)
+                    if j == vectors - 1:
+                        residual, way = residual * load(keep, 0), way * load(keep, 0)
+                    error, squared = fma(residual, residual, error), fma(way, way, squared)
+                length = splat(np.sqrt(lane_sum(error) * _inverse(lane_sum(squared))))
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
                     store(out, i * dim + place, fma(length, load(direction, place), load(x, at + place)))
