@@ -4,8 +4,10 @@ Each takes its decisions from the module's schedule and the trainer's step alone
 :class:`nsvq_lightning.host.SplatHost`; none knows another, and the order of their list does not matter.
 """
 
+from .canonical import CanonicalCovariance
 from .checkpoint import RunCheckpoint
 from .codebooks import CodebookInit, CodebookReplacement
+from .contribution import ContributionPruning
 from .density import DensityControl
 from .density_rules import DensityRules
 from .export import ExportScene
@@ -18,9 +20,11 @@ from .report import MetricReport
 from .sh_degree import ShDegreeSchedule
 
 __all__ = [
+    "CanonicalCovariance",
     "CodebookInit",
     "CodebookRefit",
     "CodebookReplacement",
+    "ContributionPruning",
     "DensityControl",
     "DensityRules",
     "ExportScene",

@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from nsvq_lightning.host import SplatHost, as_host, from_first_process, next_iteration, sum_over_processes
+from nsvq_lightning.edit import reset_moments
+from nsvq_lightning.host import (
+    SplatHost,
+    as_host,
+    from_first_process,
+    next_iteration,
+    raw_optimizer,
+    sum_over_processes,
+    train_contributions,
+)
+from nsvq_lightning.importance import row_weights
+from nsvq_lightning.optim import codebook_group
+from nsvq_lightning.quantize.attributes import QUANTIZED
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.random import generator
 from nsvq_lightning.schedule import Phase
@@ -29,9 +42,30 @@ def perplexity(usage: Tensor) -> float:
 
 
 class CodebookInit(Callback):
-    """At the first iteration of the quantize phase, fit every codebook to the rows of all splats (k-means)."""
+    """At the first iteration of the quantize phase, fit every codebook to the rows of all splats (k-means).
 
-    def __init__(self) -> None:
+    Args:
+        weights: What a splat counts in k-means: ``none`` counts all alike, as in the paper; ``contribution`` counts
+            each by its blending weight in the train views, so that codes go to what is seen.
+        weighted: The attributes this holds for. Scales are left out: a splat hardly contributes because it is small,
+            and what shows is a small one that gets the code of larger ones. Weighing all four, right after k-means
+            with 4k codes on 187 k splats, changed test PSNR by -0.37 dB for scales, +0.07 for rotations, +0.04 for
+            colours and +0.15 for SH.
+
+    Raises:
+        ValueError: Other weights, or an unknown attribute.
+    """
+
+    def __init__(
+        self,
+        weights: Literal["none", "contribution"] = "none",
+        weighted: Sequence[str] = ("quats", "sh0", "shN"),
+    ) -> None:
+        if weights not in ("none", "contribution"):
+            raise ValueError(f"weights must be 'none' or 'contribution', got {weights!r}")
+        if not set(weighted) <= set(QUANTIZED):
+            raise ValueError(f"weighted must be among {', '.join(QUANTIZED)}, got {', '.join(weighted)}")
+        self.weights, self.weighted = weights, weighted
         self._latch = StepLatch()
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
@@ -40,9 +74,11 @@ class CodebookInit(Callback):
         iteration = next_iteration(trainer)
         if iteration != host.schedule.first_of(Phase.QUANTIZE) or not self._latch.first_time(iteration):
             return
+        weights = row_weights(train_contributions(trainer, host)) if self.weights == "contribution" else None
         for name, quantizer in host.quantizers.items():
             if trainer.is_global_zero:
-                quantizer.fit(host.rows(name), generator=generator(host.seed, iteration, "kmeans", name))
+                weight = weights if name in self.weighted else None
+                quantizer.fit(host.rows(name), weight, generator=generator(host.seed, iteration, "kmeans", name))
             quantizer.codebook.data = from_first_process(trainer, quantizer.codebook.data)
         sizes = ", ".join(f"{name} {q.codebook.shape[0]}" for name, q in host.quantizers.items())
         if sizes:
@@ -55,15 +91,23 @@ class CodebookReplacement(Callback):
     All numbers are iterations of the reference run; the paper's are every 100 from 20 100 to 22 000, then every 500 up
     to 43 000. What counts as inactive is the quantizer's rule.
 
+    By the paper's rule the last replacement falls right before the codes freeze, so that the new codes never train; a
+    smaller ``end`` leaves them time. Its copies are equal to the codes they are copied from, which take all the rows.
+    Few codes are concerned: after k-means on 182 k splats, 0 to 5 of 16 384 codes were inactive in a window.
+
     Args:
         start: First replacement.
         early_end: Last one of the early series.
         early_every: Interval of the early series.
         end: Last one of the late series.
         late_every: Interval of the late series.
+        jitter: None copies random active codes, as in the paper. A number in (0, 1] splits the codes that distort most:
+            a row of the scene is drawn, with the chance of its squared distance to its code, and the new code is put
+            this share of the way from that code to the row.
+        reset_moments: Set Adam's moments of replaced codes to zero, instead of leaving those of the codes before.
 
     Raises:
-        ValueError: The iterations are not ascending, or an interval is below 1.
+        ValueError: The iterations are not ascending, an interval is below 1, or the jitter is not in (0, 1].
     """
 
     def __init__(
@@ -73,7 +117,11 @@ class CodebookReplacement(Callback):
         early_every: int = 100,
         end: int = 43_000,
         late_every: int = 500,
+        jitter: float | None = None,
+        reset_moments: bool = False,
     ) -> None:
+        if jitter is not None and not 0.0 < jitter <= 1.0:
+            raise ValueError(f"jitter must be None or above 0 and at most 1, got {jitter}")
         if not 0 < start <= early_end <= end or early_every < 1 or late_every < 1:
             raise ValueError(
                 "replacement needs 0 < start <= early_end <= end and intervals of at least 1, got "
@@ -81,6 +129,7 @@ class CodebookReplacement(Callback):
             )
         self.start, self.early_end, self.early_every = start, early_end, early_every
         self.end, self.late_every = end, late_every
+        self.jitter, self.reset_moments = jitter, reset_moments
         self._latch = StepLatch()
 
     def is_due(self, host: SplatHost, iteration: int) -> bool:
@@ -102,27 +151,22 @@ class CodebookReplacement(Callback):
             return
         values: dict[str, float] = {}
         for name, quantizer in host.quantizers.items():
-            replaced = self._replace(trainer, quantizer, host.seed, iteration, name, values)
-            log.debug("iteration %d: replaced %d codes of %s", iteration, replaced, name)
+            if trainer.world_size > 1:
+                quantizer.usage.copy_(sum_over_processes(trainer, quantizer.usage))
+                quantizer.window.copy_(sum_over_processes(trainer, quantizer.window))
+            values[f"codebook/{name}_perplexity"] = perplexity(quantizer.usage)
+            replaced = self._replace(quantizer, host.rows(name), generator(host.seed, iteration, "replace", name))
+            values[f"codebook/{name}_replaced"] = float(len(replaced))
+            if self.reset_moments:
+                reset_moments(raw_optimizer(trainer), codebook_group(name), replaced)
+            log.debug("iteration %d: replaced %d codes of %s", iteration, len(replaced), name)
         pl_module.log_dict(dict(values), batch_size=1)
 
-    def _replace(
-        self,
-        trainer: Trainer,
-        quantizer: Quantizer,
-        seed: int,
-        iteration: int,
-        name: str,
-        values: dict[str, float],
-    ) -> int:
-        """Replace in one codebook; adds what is logged to ``values``. Returns the number of replaced codes."""
-        if trainer.world_size > 1:
-            quantizer.usage.copy_(sum_over_processes(trainer, quantizer.usage))
-            quantizer.window.copy_(sum_over_processes(trainer, quantizer.window))
-        values[f"codebook/{name}_perplexity"] = perplexity(quantizer.usage)
-        replaced = quantizer.replace_unused(generator(seed, iteration, "replace", name))
-        values[f"codebook/{name}_replaced"] = float(replaced.shape[0])
-        return replaced.shape[0]
+    def _replace(self, quantizer: Quantizer, rows: Tensor, draws: torch.Generator) -> Tensor:
+        """Replace in one codebook, by the rule asked for; returns the replaced codes."""
+        if self.jitter is None:
+            return quantizer.replace_unused(draws)
+        return quantizer.replace_unused(draws, rows=rows, jitter=self.jitter)
 
     def state_dict(self) -> dict[str, Any]:
         """The last iteration codes were replaced at."""

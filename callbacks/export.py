@@ -39,5 +39,6 @@ class ExportScene(Callback):
         folder = output_folder(trainer) if self.folder is None else Path(self.folder)
         if is_trial(trainer) or not trainer.is_global_zero:
             return
-        for path in export_scene(as_host(pl_module).compressed(), folder, self.formats).values():
+        host = as_host(pl_module)
+        for path in export_scene(host.compressed(), folder, host.storage, self.formats).values():
             log.info("wrote %s (%d bytes)", path, path.stat().st_size)

@@ -20,7 +20,7 @@ from nsvq_lightning.io.container import read_nsvq
 from nsvq_lightning.metrics import build_lpips, eight_bit
 from nsvq_lightning.pictures import comparison, file_stem, write_png
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.report_files import summarize, write_curve, write_curve_csv, write_metrics, write_views
+from nsvq_lightning.report_files import paper_level, summarize, write_curve, write_curve_csv, write_metrics, write_views
 from nsvq_lightning.splats import RawSplats
 
 __all__ = ["MetricReport"]
@@ -54,6 +54,7 @@ class MetricReport(Callback):
         self.lpips = lpips
         self.pictures = pictures
         self._scene: CompressedScene | None = None
+        self._paper_level: dict[str, Any] = {}
         self._scores: list[ViewScore] = []
         self._lpips: Metric | None = None
         self._lpips_reason: str | None = None
@@ -121,7 +122,9 @@ class MetricReport(Callback):
         folder = output_folder(trainer)
         path = folder / "scene.nsvq"
         if trainer.is_global_zero:
-            export_scene(host.compressed(), folder, ("nsvq",))
+            scene = host.compressed()
+            export_scene(scene, folder, host.storage, ("nsvq",))
+            self._paper_level = paper_level(scene)
         trainer.strategy.barrier("scene.nsvq")
         self._scene = read_nsvq(path)
         # Detached tensors, not the module: as a submodule it would enter checkpoints.
@@ -164,7 +167,7 @@ class MetricReport(Callback):
         folder = output_folder(trainer)
         if trainer.is_global_zero:
             lpips = (None, self._lpips_reason) if self._lpips is None else (_mean(scores, "lpips"), None)
-            metrics = summarize(folder / "scene.nsvq", self._scene, scores, lpips, host)
+            metrics = summarize(folder / "scene.nsvq", self._scene, scores, lpips, host, self._paper_level)
             write_metrics(folder / "metrics.json", metrics)
             write_views(folder / "views.csv", scores)
         self._scene, self._lpips = None, None

@@ -14,6 +14,7 @@ from nsvq_lightning.io.arrays import finite_rows
 from nsvq_lightning.io.compressed import QUANTIZABLE, CompressedScene
 from nsvq_lightning.io.container import write_nsvq
 from nsvq_lightning.io.formats import save
+from nsvq_lightning.io.precision import Storage
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.quantized import attribute_rows, codes_of
 from nsvq_lightning.splats import RawSplats, sh_degree_of
@@ -48,7 +49,9 @@ def compress(splats: RawSplats, quantizers: Mapping[str, Quantizer], config: Map
     )
 
 
-def export_scene(scene: CompressedScene, folder: Path, formats: tuple[str, ...] = EXPORT_FORMATS) -> dict[str, Path]:
+def export_scene(
+    scene: CompressedScene, folder: Path, storage: Storage, formats: tuple[str, ...] = EXPORT_FORMATS
+) -> dict[str, Path]:
     """Write ``scene.<format>`` into ``folder`` for each format, atomically; the same scene gives the same bytes.
 
     Returns:
@@ -64,7 +67,7 @@ def export_scene(scene: CompressedScene, folder: Path, formats: tuple[str, ...] 
             raise ValueError(f"unknown export format {suffix!r}; choose from {', '.join(EXPORT_FORMATS)}")
         paths[suffix] = folder / f"scene.{suffix}"
         if suffix == "nsvq":
-            write_nsvq(paths[suffix], scene)
+            write_nsvq(paths[suffix], scene, storage.level, storage.precision)
         else:
             save(scene.decode(), paths[suffix])
     return paths

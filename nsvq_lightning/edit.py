@@ -17,11 +17,20 @@ from torch.optim import Optimizer
 from nsvq_lightning.optim import find_group
 from nsvq_lightning.splats import ATTRIBUTES, Splats
 
-__all__ = ["append_rows", "drop_non_finite", "finite_rows", "keep_rows", "replace_attribute", "reset_moments"]
+__all__ = [
+    "append_rows",
+    "change_coordinates",
+    "drop_non_finite",
+    "finite_rows",
+    "keep_rows",
+    "replace_attribute",
+    "reset_moments",
+]
 
 log = logging.getLogger(__name__)
 
-MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq")
+FIRST_MOMENT = "exp_avg"
+MOMENTS = (FIRST_MOMENT, "exp_avg_sq", "max_exp_avg_sq")
 """Per-row state of Adam; everything else in its state belongs to the whole parameter."""
 
 
@@ -84,6 +93,32 @@ def replace_attribute(splats: Splats, optimizer: Optimizer, name: str, values: T
     if values.shape != parameter.shape:
         raise ValueError(f"{name} must keep its shape {list(parameter.shape)}, got {list(values.shape)}")
     _rebind(splats, optimizer, name, values.detach().to(parameter), lambda moment: moment)
+
+
+def change_coordinates(splats: Splats, optimizer: Optimizer, name: str, values: Tensor, maps: Tensor) -> None:
+    """Overwrite all rows of one attribute by other coordinates of the same splats, and take the moments along.
+
+    The mean of gradients becomes ``maps · mean``, that of their squares ``maps² · mean``, which is exact where a map
+    only moves and scales components, and otherwise takes them for uncorrelated.
+
+    Args:
+        splats: The ``N`` splats.
+        optimizer: Their optimiser.
+        name: The attribute, with rows of D numbers.
+        values: Its rows ``[N, D]`` in the new coordinates.
+        maps: ``[N, D, D]``: a gradient by the old coordinates, multiplied by it, is that by the new ones.
+
+    Raises:
+        ValueError: ``values`` or ``maps`` has another shape than the attribute asks for.
+    """
+    if maps.shape != (*values.shape, values.shape[-1]):
+        raise ValueError(f"maps of {name} must be {[*values.shape, values.shape[-1]]}, got {list(maps.shape)}")
+    replace_attribute(splats, optimizer, name, values)
+    state = optimizer.state.get(find_group(optimizer, name)["params"][0], {})
+    for key in MOMENTS:
+        if key in state:
+            factors = maps if key == FIRST_MOMENT else maps.square()
+            state[key] = (factors * state[key][:, None, :]).sum(2)
 
 
 def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -> None:

@@ -11,6 +11,7 @@ from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor
 from torch.optim import Optimizer
 
+from nsvq_lightning.importance import contributions
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render
@@ -20,6 +21,7 @@ from nsvq_lightning.state import Stopwatch
 
 if TYPE_CHECKING:
     from nsvq_lightning.io.compressed import CompressedScene
+    from nsvq_lightning.io.precision import Storage
 
 __all__ = [
     "SplatHost",
@@ -32,6 +34,7 @@ __all__ = [
     "raw_optimizer",
     "splat_host",
     "sum_over_processes",
+    "train_contributions",
 ]
 
 
@@ -64,6 +67,8 @@ class SplatHost(Protocol):
     """Seed of every draw."""
     background: str
     """``black``, ``white`` or ``random``."""
+    storage: Storage
+    """How the scene is stored."""
 
     @property
     def quantizers(self) -> Mapping[str, Quantizer]:
@@ -151,3 +156,20 @@ def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:
         return tensor
     reduced = trainer.strategy.reduce(tensor, reduce_op="sum")
     return cast(Tensor, reduced)
+
+
+def train_contributions(trainer: Trainer, host: SplatHost) -> Tensor:
+    """Blending weight ``[N]`` of each splat in all train views, see :func:`nsvq_lightning.importance.contributions`.
+
+    Raises:
+        ValueError: The trainer has no data module with a scene.
+    """
+    scene = getattr(getattr(trainer, "datamodule", None), "scene", None)
+    if scene is None:
+        raise ValueError(
+            "contributions of splats need the train views: fit with a data module that has a scene, or leave "
+            "contribution pruning and weights by contribution off"
+        )
+    own = scene.train[trainer.global_rank :: trainer.world_size]
+    cameras = (scene.cameras[index].to(host.device) for index in own)
+    return sum_over_processes(trainer, contributions(host.splats, cameras, host.render_splats))

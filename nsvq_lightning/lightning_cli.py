@@ -28,6 +28,8 @@ DEFAULT_CALLBACKS: dict[str, type[Callback]] = {
     "sh_degree": callbacks.ShDegreeSchedule,
     "density": callbacks.DensityControl,
     "opacity": callbacks.OpacityRegularization,
+    "contribution": callbacks.ContributionPruning,
+    "canonical": callbacks.CanonicalCovariance,
     "codebook_init": callbacks.CodebookInit,
     "codebook_refit": callbacks.CodebookRefit,
     "codebook_replacement": callbacks.CodebookReplacement,

@@ -15,6 +15,7 @@ from nsvq_lightning import __version__
 from nsvq_lightning.compress import compress
 from nsvq_lightning.hyperparameters import plain
 from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.precision import Storage
 from nsvq_lightning.optim import LearningRates
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.quantized import attribute_rows, build_quantizers, decoded, noisy_rows
@@ -50,6 +51,7 @@ class SplatModel(LightningModule):
         rates: Learning rates.
         backend: Rasterizer.
         seed: Seed of every draw.
+        storage: How the scene is stored.
 
     Raises:
         ValueError: An argument is out of range.
@@ -66,6 +68,7 @@ class SplatModel(LightningModule):
         rates: LearningRates,
         backend: str,
         seed: int,
+        storage: Storage,
     ) -> None:
         super().__init__()
         if background not in ("black", "white", "random"):
@@ -77,6 +80,7 @@ class SplatModel(LightningModule):
         self.rates = rates
         self.backend = backend
         self.seed = seed
+        self.storage = storage
         self.splats = splats
         self.codebooks = nn.ModuleDict(build_quantizers(quantizer, codebooks, splats))
         self.state = RunState()

@@ -13,7 +13,9 @@ from torchmetrics import Metric
 
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.host import log_interval
+from nsvq_lightning.io.arrays import sh_coefficients
 from nsvq_lightning.io.formats import load
+from nsvq_lightning.io.precision import Storage
 from nsvq_lightning.losses import photometric_loss
 from nsvq_lightning.metrics import eight_bit, image_metrics, psnr
 from nsvq_lightning.model import SplatModel
@@ -53,6 +55,7 @@ class SplatModule(SplatModel):
         rates: Learning rates.
         backend: Rasterizer, see :func:`nsvq_lightning.render`.
         seed: Seed of every draw of the run except the order of the views.
+        storage: Level of the compressed file, and how exactly it stores the scene.
         init_from: ``.ply`` or ``.nsvq`` file to start from instead of the scene's points.
         splats: Splats to start from, for use from Python.
 
@@ -71,13 +74,15 @@ class SplatModule(SplatModel):
         rates: LearningRates = LearningRates(),  # noqa: B008  frozen
         backend: str = "auto",
         seed: int = 0,
+        storage: Storage = Storage(),  # noqa: B008  frozen
         init_from: str | None = None,
         splats: Splats | None = None,
     ) -> None:
-        # A checkpoint stores the rates as a plain dictionary.
+        # A checkpoint stores these as plain dictionaries.
         rates = LearningRates(**rates) if isinstance(rates, Mapping) else rates
+        storage = Storage.from_dict(storage) if isinstance(storage, Mapping) else storage
         start = splats if splats is not None else Splats(sh_degree)
-        super().__init__(start, quantizer, codebooks, background, dssim_weight, rates, backend, seed)
+        super().__init__(start, quantizer, codebooks, background, dssim_weight, rates, backend, seed, storage)
         self.save_hyperparameters(ignore=["splats"])
         self.init_from = init_from
         self.view_metrics = image_metrics()
@@ -131,7 +136,7 @@ class SplatModule(SplatModel):
         set_lr(optimizer, "means", rate)
         # Noise substitution scales a whole row, so from there on every coefficient has a gradient.
         degree = self.active_sh_degree if self.phase < Phase.QUANTIZE else self.splats.sh_degree
-        set_columns(optimizer, "shN", 3 * ((degree + 1) ** 2 - 1))
+        set_columns(optimizer, "shN", 3 * sh_coefficients(degree))
 
     def training_step(self, batch: View, batch_idx: int) -> dict[str, Any] | None:
         """Loss of one view: (1 - w)·L1 + w·(1 - SSIM) + λ·Σ opacity (paper, section 3.3).

@@ -17,9 +17,10 @@ from nsvq_lightning.host import SplatHost
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.container import read_header
+from nsvq_lightning.io.paper import paper_header
 from nsvq_lightning.schedule import Phase, Schedule
 
-__all__ = ["summarize", "write_curve", "write_curve_csv", "write_metrics", "write_views"]
+__all__ = ["paper_level", "summarize", "write_curve", "write_curve_csv", "write_metrics", "write_views"]
 
 PHASE_COLOURS = {Phase.WARMUP: "#dfe8f5", Phase.PRUNE: "#f8e6d0", Phase.QUANTIZE: "#dcefdc", Phase.FINETUNE: "#efe0f0"}
 
@@ -30,6 +31,7 @@ def summarize(
     scores: Sequence[ViewScore],
     lpips: tuple[float | None, str | None],
     host: SplatHost,
+    paper: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Everything ``metrics.json`` says; sizes in bytes, PSNR in dB, times in seconds.
 
@@ -39,9 +41,9 @@ def summarize(
         scores: Score of each test view.
         lpips: Mean LPIPS, or None and why.
         host: The module, for its history and schedule.
+        paper: :func:`paper_level` of the scene that was stored.
     """
-    file_bytes, header_bytes = path.stat().st_size, read_header(path).size
-    formula = formula_bytes(scene, header_bytes)
+    file_bytes = path.stat().st_size
     ends = _phase_ends(host.history)
     return {
         "psnr": _mean([score.psnr for score in scores]),
@@ -53,10 +55,22 @@ def summarize(
         "file_bytes": file_bytes,
         "plain_bytes": scene.plain_bytes,
         "ratio": scene.plain_bytes / file_bytes,
-        "formula": {"bytes": formula, "header_bytes": header_bytes, "matches": formula == file_bytes},
+        "level": read_header(path).level,
+        "paper_level": dict(paper),
         "train_seconds": host.train_seconds,
         "before_quantization": next((end for end in ends if end["phase"] == Phase.PRUNE.name.lower()), None),
         "phases": ends,
+    }
+
+
+def paper_level(scene: CompressedScene) -> dict[str, Any]:
+    """Bytes of the scene at level ``paper``, beside those of the paper's formula."""
+    header = paper_header(scene)
+    formula = formula_bytes(scene, header.size)
+    return {
+        "file_bytes": header.file_bytes,
+        "header_bytes": header.size,
+        "matches_formula": formula == header.file_bytes,
     }
 
 

@@ -39,7 +39,7 @@ class SplatTrainer(Trainer):
         path.parent.mkdir(parents=True, exist_ok=True)
         scene = model.compressed()
         if path.suffix.lower() == ".nsvq":
-            write_nsvq(path, scene)
+            write_nsvq(path, scene, model.storage.level, model.storage.precision)
         else:
             save(scene.decode(), path)
         log.info("wrote %s: %d splats, %d bytes", path, len(scene), path.stat().st_size)

@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from lightning.pytorch import Callback, LightningDataModule, LightningModule, Trainer
@@ -19,7 +20,7 @@ from nsvq_lightning.host import as_host
 from nsvq_lightning.lightning_cli import DEFAULT_CALLBACKS, default_loggers
 from nsvq_lightning.schedule import Phase
 
-__all__ = ["Step", "StepClock", "fit", "one_phase", "quiet", "training_callbacks"]
+__all__ = ["Step", "StepClock", "fit", "one_phase", "quiet", "quiet_trainer", "training_callbacks"]
 
 WATCHING = frozenset({"report", "export", "predictions", "checkpoint", "progress"})
 """Callbacks of ``nsvq fit`` that write files or lines but train nothing; the benchmark measures by itself."""
@@ -89,23 +90,35 @@ def fit(
 ) -> None:
     """Train on the CPU without a word, with loggers that write into a folder that is removed afterwards."""
     with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder, quiet():
-        trainer = Trainer(
-            accelerator="cpu",
-            devices=1,
-            max_steps=steps,
-            max_epochs=-1,
-            limit_val_batches=0,
-            num_sanity_val_steps=0,
-            use_distributed_sampler=False,
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            default_root_dir=folder,
-            logger=default_loggers(folder, "benchmark"),
-            callbacks=list(callbacks),
-            profiler=profiler,
+        loggers = default_loggers(folder, "benchmark")
+        trainer = quiet_trainer(
+            folder, steps, limit_val_batches=0, logger=loggers, callbacks=list(callbacks), profiler=profiler
         )
         trainer.fit(module, datamodule=data)
+
+
+def quiet_trainer(folder: str | Path, steps: int, **settings: Any) -> Trainer:
+    """A trainer of ``steps`` iterations on the CPU that shows nothing and stores nothing.
+
+    Args:
+        folder: Where what ``settings`` ask for is written.
+        steps: Optimiser steps.
+        settings: Further arguments of :class:`lightning.pytorch.Trainer`, or others in place of those chosen here.
+    """
+    chosen: dict[str, Any] = {
+        "accelerator": "cpu",
+        "devices": 1,
+        "max_steps": steps,
+        "max_epochs": -1,
+        "num_sanity_val_steps": 0,
+        "use_distributed_sampler": False,
+        "logger": False,
+        "enable_checkpointing": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+        "default_root_dir": folder,
+    }
+    return Trainer(**(chosen | settings))
 
 
 @contextmanager

@@ -11,49 +11,73 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.frame import frame, read_frame, read_header
 from nsvq_lightning.io.header import Header
-from nsvq_lightning.io.paper import decode_paper, encode_paper
+from nsvq_lightning.io.precision import DEFAULT_LEVEL, LEVELS, Precision, check_level
 
-__all__ = ["LEVELS", "CompressedScene", "read_header", "read_nsvq", "write_nsvq"]
+__all__ = ["DEFAULT_LEVEL", "LEVELS", "CompressedScene", "encode", "read_header", "read_nsvq", "write_nsvq"]
 
-Encode = Callable[[CompressedScene], tuple[Header, dict[str, bytes]]]
 Decode = Callable[[Header, Mapping[str, memoryview]], CompressedScene]
 
-LEVELS: dict[str, tuple[Encode, Decode]] = {"paper": (encode_paper, decode_paper)}
-"""Encoder and decoder of each compression level."""
 
-
-def write_nsvq(path: str | os.PathLike[str], scene: CompressedScene, level: str = "paper") -> int:
-    """Write a scene; the same scene and level give the same bytes.
+def encode(
+    scene: CompressedScene, level: str = DEFAULT_LEVEL, precision: Precision | None = None
+) -> tuple[Header, dict[str, bytes]]:
+    """Header and streams of a scene; the same arguments give the same bytes.
 
     Args:
-        path: File to write, replaced atomically.
         scene: The scene.
-        level: Key of :data:`LEVELS`.
-
-    Returns:
-        Bytes of the file.
+        level: One of :data:`LEVELS`.
+        precision: Largest errors of level ``compact``; level ``paper`` has none.
 
     Raises:
         ValueError: Unknown level, or ``config`` is not made of JSON values.
     """
-    if level not in LEVELS:
-        raise ValueError(f"unknown compression level {level!r}; there is {', '.join(LEVELS)}")
-    header, streams = LEVELS[level][0](scene)
-    parts = frame(header, streams)
+    check_level(level)
+    # The level's module only: entropy coding waits for Numba, which level ``paper`` has no use for.
+    if level == "compact":
+        from nsvq_lightning.io.compact import encode_compact
+
+        return encode_compact(scene, precision)
+    from nsvq_lightning.io.paper import encode_paper
+
+    return encode_paper(scene)
+
+
+def write_nsvq(
+    path: str | os.PathLike[str],
+    scene: CompressedScene,
+    level: str = DEFAULT_LEVEL,
+    precision: Precision | None = None,
+) -> int:
+    """Write a scene to a file, replaced atomically; arguments and errors as of :func:`encode`.
+
+    Returns:
+        Bytes of the file.
+    """
+    parts = frame(*encode(scene, level, precision))
     with atomic_write(path) as file:
         file.writelines(parts)
     return sum(map(len, parts))
 
 
 def read_nsvq(path: str | os.PathLike[str]) -> CompressedScene:
-    """Read a scene; the arrays are exactly those that were written.
+    """Read a scene: of level ``paper`` exactly what was written, of ``compact`` within its precision, splats reordered.
 
     Raises:
         FormatError: The file is truncated, altered, of a newer version or level, or no ``.nsvq`` file.
     """
     header, streams = read_frame(path)
     with naming_file(path):
-        if header.level not in LEVELS:
-            raise FormatError(f"compression level {header.level!r}; this release reads {', '.join(LEVELS)}: update it")
-        scene = LEVELS[header.level][1](header, streams)
+        scene = _decoder(header.level)(header, streams)
     return replace(scene, stored_bytes=os.path.getsize(path))
+
+
+def _decoder(level: str) -> Decode:
+    if level == "compact":
+        from nsvq_lightning.io.compact import decode_compact
+
+        return decode_compact
+    if level == "paper":
+        from nsvq_lightning.io.paper import decode_paper
+
+        return decode_paper
+    raise FormatError(f"compression level {level!r}; this release reads {', '.join(LEVELS)}: update it")

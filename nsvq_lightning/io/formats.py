@@ -13,6 +13,7 @@ from nsvq_lightning.io.arrays import SplatArrays
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.container import read_nsvq, write_nsvq
 from nsvq_lightning.io.ply import read_ply, write_ply
+from nsvq_lightning.io.precision import DEFAULT_LEVEL, Precision
 
 if TYPE_CHECKING:
     from nsvq_lightning.splats import Splats, SplatTensors
@@ -62,7 +63,8 @@ def save(splats: SplatTensors, path: str | os.PathLike[str], **options: Any) -> 
         splats: The scene, for example :class:`nsvq_lightning.Splats`.
         path: File to write, replaced atomically; its suffix names the format.
         options: For ``.ply``: ``normals`` (bool, default True). For ``.nsvq``: ``config``, ``metrics``, ``origin``,
-            ``level``; plain splats have no codebooks, so all attributes are stored as they are.
+            ``level`` and ``precision``; plain splats have no codebooks, so level ``paper`` stores all attributes as
+            they are, and ``compact`` within its precision and in another order.
 
     Returns:
         Bytes of the file.
@@ -95,8 +97,15 @@ def _read_nsvq(path: Path) -> SplatArrays:
     return scene.arrays()
 
 
-def _write_nsvq(path: Path, arrays: SplatArrays, *, level: str = "paper", **header: Any) -> int:
-    return write_nsvq(path, CompressedScene.from_arrays(arrays.finite(), **header), level)
+def _write_nsvq(
+    path: Path,
+    arrays: SplatArrays,
+    *,
+    level: str = DEFAULT_LEVEL,
+    precision: Precision | None = None,
+    **header: Any,
+) -> int:
+    return write_nsvq(path, CompressedScene.from_arrays(arrays.finite(), **header), level, precision)
 
 
 FORMATS: dict[str, Format] = {

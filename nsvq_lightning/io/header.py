@@ -26,9 +26,11 @@ class AttributeEntry:
     Attributes:
         name: Attribute, for example ``quats``.
         dim: Numbers a splat, D.
-        storage: ``raw`` (its own stream, one row a splat) or ``codes`` (rows of a codebook).
-        codes: Rows of the codebook, K; 0 if raw.
-        bits: Bits of one code before entropy coding; 0 if raw.
+        storage: ``raw`` (float32, one row a splat), ``codes`` (rows of a codebook), ``steps`` (integers, one row a
+            splat), ``levels`` (shares of 1), or ``grid`` (cells of a grid).
+        codes: Rows of the codebook K, or number of levels; 0 where there are none.
+        bits: Bits of one code before entropy coding; 0 without codes.
+        step: What the integers of this attribute, or of its codebook, are multiples of; 0 for float32.
     """
 
     name: str
@@ -36,6 +38,7 @@ class AttributeEntry:
     storage: str
     codes: int = 0
     bits: int = 0
+    step: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -148,6 +151,7 @@ def _attribute(table: dict[str, Any]) -> AttributeEntry:
         storage=_entry(table, "storage", str),
         codes=_size(table, "codes"),
         bits=_size(table, "bits"),
+        step=_finite(table, "step"),
     )
 
 
@@ -179,6 +183,15 @@ def _items(table: object, key: str, kinds: tuple[type, ...]) -> list[Any]:
     if any(not isinstance(value, kinds) or isinstance(value, bool) for value in values):
         raise FormatError(f"damaged: header entry {key!r} has a member of the wrong type")
     return values
+
+
+def _finite(table: object, key: str) -> float:
+    value = table.get(key, 0.0) if isinstance(table, dict) else None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= sys.float_info.max:
+        raise FormatError(
+            f"damaged: header entry {key!r} must be a finite number, not negative, got {str(value)[:60]!r}"
+        )
+    return float(value)
 
 
 def _origin(table: object) -> tuple[float, float, float]:

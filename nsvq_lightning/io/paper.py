@@ -111,7 +111,7 @@ def _check_tables(header: Header) -> None:
     for entry in header.attributes:
         raw = entry.storage == "raw" and entry.codes == entry.bits == 0
         coded = entry.name in QUANTIZABLE and entry.storage == "codes" and 1 <= entry.codes <= 1 << 32
-        if not raw and not (coded and entry.bits == code_bits(entry.codes)):
+        if entry.step or (not raw and not (coded and entry.bits == code_bits(entry.codes))):
             raise FormatError(f"damaged: impossible attribute {entry}")
     if header.streams != tile(_layout(header.splats, header.attributes)):
         raise FormatError("damaged: the stream table does not fit the attribute table and the number of splats")

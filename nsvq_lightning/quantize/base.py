@@ -47,8 +47,12 @@ class Quantizer(Protocol):
     def decode(self, codes: Tensor) -> Tensor:
         """Codebook rows ``[N, D]`` of ``codes [N]``, differentiable in the codebook."""
 
-    def replace_unused(self, generator: torch.Generator) -> Tensor:
-        """Replace inactive codes by active ones, restart the window; returns the replaced codes ``[R]``."""
+    def replace_unused(self, generator: torch.Generator, rows: Tensor | None = None, jitter: float = 0.5) -> Tensor:
+        """Replace inactive codes by active ones, restart the window; returns the replaced codes ``[R]``.
+
+        Callbacks pass ``rows [N, D]`` and ``jitter`` only where they are asked to split codes by the distortion of
+        these rows; a quantizer that cannot may leave them out.
+        """
 
     def freeze(self, codes: Tensor) -> None:
         """Fix the codes ``[N]``; from now on only the codebook is trained."""

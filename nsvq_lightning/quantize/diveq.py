@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,14 +28,14 @@ class DiVeQ(CodebookQuantizer):
         dim: Numbers in a row, D.
         sigma: σ, in the unit of the attribute's raw space; small against quantization errors, which are some hundredths
             there.
-        kmeans_steps: Lloyd steps of :meth:`fit`.
+        **settings: Those of :class:`CodebookQuantizer`.
 
     Raises:
         ValueError: An argument is out of range.
     """
 
-    def __init__(self, num_codes: int, dim: int, *, sigma: float = 1e-3, kmeans_steps: int = 10) -> None:
-        super().__init__(num_codes, dim, kmeans_steps=kmeans_steps)
+    def __init__(self, num_codes: int, dim: int, *, sigma: float = 1e-3, **settings: Any) -> None:
+        super().__init__(num_codes, dim, **settings)
         if not (math.isfinite(sigma) and sigma >= 0):
             raise ValueError(f"sigma must be finite and at least 0, got {sigma}")
         self.sigma = sigma

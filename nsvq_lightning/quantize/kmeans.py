@@ -9,6 +9,7 @@ import torch
 from numba import prange
 from torch import Tensor
 
+from nsvq_lightning.quantize.far_rows import spread_rows
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.quantize.sums import sum_by_code
 from nsvq_lightning.rendering.cpu.jit import kernel, thread_count
@@ -28,6 +29,7 @@ def kmeans(
     steps: int = 10,
     all_reduce: AllReduce | None = None,
     start: Tensor | None = None,
+    spread: bool = False,
 ) -> Tensor:
     """Centroids of the rows under the (weighted) squared distance.
 
@@ -41,6 +43,8 @@ def kmeans(
         steps: Lloyd steps.
         all_reduce: Sum over processes that hold different rows; then every process must pass the same ``start``.
         start: Initial centroids ``[k, D]``; by default a random sample of the distinct rows.
+        spread: Without ``start``: start from distinct rows far apart
+            (:func:`~nsvq_lightning.quantize.far_rows.spread_rows`) instead.
 
     Returns:
         Centroids ``[k', D]`` with k' = min(k, number of distinct rows); where k is not smaller, the distinct rows
@@ -57,12 +61,16 @@ def kmeans(
         first = distinct_rows(x)
         if len(first) <= k:
             return x[first]
-        chosen = torch.randperm(len(first), generator=generator, device=generator.device)[:k].to(x.device)
-        start = x[first[chosen]]
+        start = spread_rows(x[first], k, generator) if spread else _sample(x[first], k, generator)
     centroids = start.detach().clone()
     for _ in range(steps):
         centroids = _lloyd_step(x, centroids, weight, all_reduce)
     return centroids
+
+
+def _sample(rows: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    chosen = torch.randperm(len(rows), generator=generator, device=generator.device)[:count]
+    return rows[chosen.to(rows.device)]
 
 
 def _checked(x: Tensor, k: int, weight: Tensor | None) -> tuple[Tensor, Tensor | None]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -18,18 +20,19 @@ class PostHoc(CodebookQuantizer):
     into being where they are needed, when the scene is evaluated, frozen or stored: :meth:`encode` fits the codebook to
     the rows it is given, by k-means from a fixed start, and returns their nearest codes. The codebook so depends on the
     rows alone, on every process and however often the scene was evaluated before; a file holds k-means of the final
-    rows. Once codes are frozen, codebook and codes are those of that moment, as with every other quantizer.
+    rows, all counted alike. Once codes are frozen, codebook and codes are those of that moment, as with every other
+    quantizer.
 
     ``configs/post_hoc_4k.yaml`` has no fine-tune phase, in which the codebooks would be trained after all.
 
     Args:
         num_codes: Codes K, at least 1.
         dim: Numbers in a row, D.
-        kmeans_steps: Lloyd steps of a fit.
+        **settings: Those of :class:`CodebookQuantizer`.
     """
 
-    def __init__(self, num_codes: int, dim: int, *, kmeans_steps: int = 10) -> None:
-        super().__init__(num_codes, dim, kmeans_steps=kmeans_steps)
+    def __init__(self, num_codes: int, dim: int, **settings: Any) -> None:
+        super().__init__(num_codes, dim, **settings)
         self.most_codes = num_codes
 
     def fit(self, x: Tensor, weight: Tensor | None = None, generator: torch.Generator | None = None) -> None:

@@ -1,11 +1,14 @@
-"""Which codes are replaced and by which (paper, section 3.1): decisions only, the codebook is edited by its owner."""
+"""Which codes are replaced and by what (paper, section 3.1): decisions only, the codebook is edited by its owner."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-__all__ = ["choose_replacements", "inactive_codes"]
+from nsvq_lightning.quantize.far_rows import draw_far_rows
+from nsvq_lightning.quantize.nearest import nearest
+
+__all__ = ["choose_replacements", "copy_codes", "inactive_codes", "split_codes"]
 
 
 def inactive_codes(usage: Tensor, window: Tensor | int, threshold: float) -> Tensor:
@@ -23,10 +26,41 @@ def choose_replacements(active: Tensor, count: int, generator: torch.Generator) 
     """``count`` active codes in random order; none is taken twice before all were taken once.
 
     Args:
-        active: Active codes ``[A]``, A > 0.
+        active: Active codes, their numbers ``[A]`` or themselves ``[A, D]``, A > 0.
         count: Codes to replace.
         generator: Source of the permutations.
     """
     rounds = -(-count // len(active))
     order = [torch.randperm(len(active), generator=generator, device=generator.device) for _ in range(rounds)]
     return active[torch.cat(order)[:count].to(active.device)]
+
+
+def copy_codes(active: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """The paper's new codes ``[count, D]``: random ones of the active codes ``[A, D]``, plus noise of 1e-12.
+
+    In float32 the noise seldom changes a number, so that a copy gets rows only once training has moved it.
+    """
+    copies = choose_replacements(active, count, generator)
+    noise = torch.randn(count, active.shape[1], generator=generator, device=generator.device)
+    return copies + 1e-12 * noise.to(active)
+
+
+def split_codes(active: Tensor, rows: Tensor, count: int, jitter: float, generator: torch.Generator) -> Tensor:
+    """New codes next to those active ones that distort the rows most, each where it takes rows over at once.
+
+    For each far row x that is drawn (:func:`~nsvq_lightning.quantize.far_rows.draw_far_rows`) its code c is split: the
+    new code c + jitter · (x − c) is by that share of the cell's radius away from c. So codes are split in proportion to
+    their share of the distortion.
+
+    Args:
+        active: Active codes ``[A, D]``, A > 0.
+        rows: Rows of the scene ``[N, D]``.
+        count: New codes wanted.
+        jitter: In (0, 1]: near 0 a copy of the code, at 1 the row itself.
+        generator: Source of the draw.
+
+    Returns:
+        New codes ``[count, D]``; fewer where fewer rows have a distance to their code.
+    """
+    far = rows[draw_far_rows(rows, active, count, generator)]
+    return active[nearest(far, active)].lerp(far, jitter)

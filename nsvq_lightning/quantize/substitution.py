@@ -22,6 +22,7 @@ from nsvq_lightning.quantize.noise import fill_normal
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
 from nsvq_lightning.rendering.cpu.lanes import fma, get, lane_sum, load, put, select, splat, store, vsqrt
 from nsvq_lightning.rendering.cpu.projection import clear
+from nsvq_lightning.rendering.cpu.rows import clear_between
 from nsvq_lightning.rendering.cpu.workspace import recycled
 
 __all__ = ["substitute", "substitute_backward"]
@@ -158,12 +159,6 @@ def _long_forward(dim: int) -> Any:
     return kernel(forward)
 
 
-@inline
-def _clear_between(rows, i, dim, table):  # type: ignore[no-untyped-def]
-    """Clear the rows of ``table`` between the chosen rows ``i - 1`` and ``i``."""
-    clear(table, (get(rows, i - 1) + 1) * dim if i > 0 else 0, get(rows, i) * dim)
-
-
 def _short_backward(dim: int) -> Any:
     def backward(grad, x, rows, codebook, codes, out, grad_x, sums):  # type: ignore[no-untyped-def]
         count, parts = codes.shape[0], sums.shape[0]
@@ -190,13 +185,13 @@ def _short_backward(dim: int) -> Any:
                     store(slope, 16 * j, load(slope, 16 * j) + radial)
                 for lane in range(valid):
                     i = first + lane
-                    _clear_between(rows, i, dim, grad_x)
+                    clear_between(rows, i, dim, grad_x)
                     at, code = get(rows, i) * dim, get(codes, i) * dim
                     for j in range(dim):
                         put(grad_x, at + j, get(slope, j * 16 + lane))
                         put(total, code + j, get(total, code + j) - get(chosen, j * 16 + lane))
             if part == parts - 1:
-                clear(grad_x, (get(rows, count - 1) + 1) * dim, grad_x.shape[0])
+                clear_between(rows, count, dim, grad_x)
 
     return kernel(backward)
 
@@ -215,7 +210,7 @@ def _long_backward(dim: int) -> Any:
                 at, code = get(rows, i) * dim, get(codes, i) * dim
                 scale = _dot_difference(dim, grad, i * dim, out, i * dim, x, at, keep)
                 scale *= _inverse(_residual_squared(dim, x, at, codebook, code, keep))
-                _clear_between(rows, i, dim, grad_x)
+                clear_between(rows, i, dim, grad_x)
                 # The last two vectors overlap, so a sum is read before it is written.
                 last = load(total, code + dim - 16)
                 for j in range(vectors):
@@ -225,7 +220,7 @@ def _long_backward(dim: int) -> Any:
                     before = last if j == vectors - 1 else load(total, code + place)
                     store(total, code + place, before - radial)
             if part == parts - 1:
-                clear(grad_x, (get(rows, count - 1) + 1) * dim, grad_x.shape[0])
+                clear_between(rows, count, dim, grad_x)
 
     return kernel(backward)
 
@@ -280,10 +275,6 @@ def substitute_backward(
     parts = max(_LEAST_PARTS, min(_MOST_PARTS, len(rows) // (4 * len(codebook))))
     sums = recycled((parts, codebook.size)).numpy()
     thread_count()
-    if len(rows) == 0:
-        grad_x.fill(0)
-        grad_codebook.fill(0)
-        return grad_x, grad_codebook
     flat = grad.ravel(), x.ravel(), rows, codebook.ravel(), codes, out.ravel()
     _kernels(x.shape[1])[1](*flat, grad_x.ravel(), sums)
     _add_parts(sums, grad_codebook.ravel())

@@ -31,7 +31,7 @@ class VectorQuantizeAdapter(CodebookQuantizer):
         dim: Numbers in a row, D.
         decay: Share of the old average that a step keeps.
         rotation_trick: Rotate and scale gradients from code to row instead of copying them; needs D > 1.
-        kmeans_steps: Lloyd steps of :meth:`fit`.
+        **settings: Those of :class:`CodebookQuantizer`.
 
     Raises:
         ImportError: The library is not installed.
@@ -41,9 +41,9 @@ class VectorQuantizeAdapter(CodebookQuantizer):
     library: Any
 
     def __init__(
-        self, num_codes: int, dim: int, *, decay: float = 0.99, rotation_trick: bool = False, kmeans_steps: int = 10
+        self, num_codes: int, dim: int, *, decay: float = 0.99, rotation_trick: bool = False, **settings: Any
     ) -> None:
-        super().__init__(num_codes, dim, kmeans_steps=kmeans_steps)
+        super().__init__(num_codes, dim, **settings)
         if not 0.0 <= decay < 1.0:
             raise ValueError(f"decay must be in [0, 1), got {decay}")
         self.decay = decay

@@ -205,7 +205,7 @@ def test_names_are_put_into_the_first_part_that_fits() -> None:
         "nsvq_lightning.rendering.cpu.blend.blend": Own(0.5, 1),
         "nsvq_lightning.rendering.cpu.blend.blend_backward": Own(0.25, 1),
         "nsvq_lightning.rendering.cpu.blend.total_slots": Own(0.125, 1),
-        "nsvq_lightning.rendering.cpu.rasterizer._flat": Own(0.0001, 28),
+        "nsvq_lightning.rendering.cpu.arrays.flat": Own(0.0001, 28),
         "nsvq_lightning.rendering.cpu.dssim.sweep_image": Own(0.003, 1),
         "[LightningModule]SplatModule.optimizer_step": Own(0.005, 1),
         "run_training_batch": Own(0.1, 1),

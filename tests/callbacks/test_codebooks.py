@@ -35,6 +35,21 @@ def test_a_short_run_replaces_over_windows_of_several_views() -> None:
     assert all(short.schedule.phase_at(i) is Phase.QUANTIZE for i in due)
 
 
+def test_replacement_can_stop_before_codes_freeze() -> None:
+    callback = CodebookReplacement(end=40_000)
+    assert [i for i in range(1, 45_001) if callback.is_due(host(), i)][-1] == 40_000
+    no_late_series = CodebookReplacement(end=22_000)
+    assert [i for i in range(1, 45_001) if no_late_series.is_due(host(), i)] == [*range(20_100, 22_001, 100)]
+
+
+def test_a_shorter_quantize_phase_keeps_the_papers_times() -> None:
+    schedule = PhaseSchedule(quantize_end=30_000, reference_total=32_000).schedule(32_000)
+    assert schedule.first_of(Phase.FINETUNE) == 30_001
+    short: Any = SimpleNamespace(schedule=schedule)
+    due = [i for i in range(1, 32_001) if CodebookReplacement().is_due(short, i)]
+    assert due == [*range(20_100, 22_001, 100), *range(22_500, 30_001, 500)]
+
+
 @pytest.mark.parametrize(
     ("usage", "expected"), [([0, 0, 0], 0.0), ([5, 0, 0], 1.0), ([3, 3, 3], 3.0), ([1, 1, 2], 2.0 * 2**0.5)]
 )

@@ -5,13 +5,14 @@ from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import pytest
 import torch
 from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor, nn
 
+from nsvq_lightning.benchmark.fitting import quiet_trainer
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
 from nsvq_lightning.data.sampler import ViewSampler
 from nsvq_lightning.data.scene import SceneError, View
@@ -43,20 +44,6 @@ class _Recorder(LightningModule):
         return torch.optim.SGD(self.parameters(), 0.1)
 
 
-def _trainer(folder: Path, steps: int, **arguments: Any) -> Trainer:
-    return Trainer(
-        accelerator="cpu",
-        devices=1,
-        max_steps=steps,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        default_root_dir=folder,
-        **arguments,
-    )
-
-
 def _on(data: ColmapDataModule, step: int, rank: int, world_size: int) -> ColmapDataModule:
     """The data module as it is on one of several processes."""
     trainer = SimpleNamespace(global_step=step, accumulate_grad_batches=1, global_rank=rank, world_size=world_size)
@@ -70,11 +57,11 @@ def test_run_resumed_sees_the_views_of_the_run_not_interrupted(
 ) -> None:
     root = str(make_scene())
     whole, first, second = _Recorder(), _Recorder(), _Recorder()
-    _trainer(tmp_path, 20, accumulate_grad_batches=accumulate).fit(whole, ColmapDataModule(root, seed=4))
-    trainer = _trainer(tmp_path, 7, accumulate_grad_batches=accumulate)
+    quiet_trainer(tmp_path, 20, accumulate_grad_batches=accumulate).fit(whole, ColmapDataModule(root, seed=4))
+    trainer = quiet_trainer(tmp_path, 7, accumulate_grad_batches=accumulate)
     trainer.fit(first, ColmapDataModule(root, seed=4))
     trainer.save_checkpoint(tmp_path / "a.ckpt")
-    _trainer(tmp_path, 20, accumulate_grad_batches=accumulate).fit(
+    quiet_trainer(tmp_path, 20, accumulate_grad_batches=accumulate).fit(
         second, ColmapDataModule(root, seed=4), ckpt_path=tmp_path / "a.ckpt", weights_only=True
     )
     assert len(first.trained) == 7 * accumulate
@@ -87,7 +74,7 @@ def test_run_resumed_sees_the_views_of_the_run_not_interrupted(
 
 def test_validation_within_a_fit_and_prediction(make_scene: SceneFactory, tmp_path: Path) -> None:
     data, module = ColmapDataModule(str(make_scene(views=18))), _Recorder()
-    trainer = _trainer(tmp_path, 10, val_check_interval=5, check_val_every_n_epoch=None, num_sanity_val_steps=0)
+    trainer = quiet_trainer(tmp_path, 10, val_check_interval=5, check_val_every_n_epoch=None)
     trainer.fit(module, data)
     assert module.validated == ["000.png", "008.png", "016.png"] * 2
     trainer.predict(module, data, return_predictions=False)

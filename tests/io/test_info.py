@@ -31,7 +31,7 @@ def _scene(n: int) -> CompressedScene:
 
 def test_text_for_a_compressed_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "x.nsvq"
-    write_nsvq(path, _scene(1000))
+    write_nsvq(path, _scene(1000), "paper")
     assert main([str(path)]) == 0
     text = capsys.readouterr().out
     lines = [line.split() for line in text.splitlines()]

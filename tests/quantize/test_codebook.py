@@ -2,15 +2,19 @@ from __future__ import annotations
 
 import logging
 import math
+from itertools import chain
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from nsvq_lightning.quantize import NSVQ, Quantizer
+from nsvq_lightning.quantize import codebook as codebook_module
 from nsvq_lightning.quantize.replacement import choose_replacements
 from nsvq_lightning.quantize.sums import lookup
+from nsvq_lightning.quantize.tracking import NearestTracker
 from nsvq_lightning.random import generator
+from nsvq_lightning.skips import switched
 
 
 def fitted(num_codes: int = 8, dim: int = 3, count: int = 100) -> tuple[NSVQ, Tensor]:
@@ -76,6 +80,73 @@ def test_perplexity_counts_equally_used_codes() -> None:
     assert quantizer.perplexity() == 0.0
     quantizer.count(torch.tensor([1, 1, 3, 5]))
     assert math.isclose(quantizer.perplexity(), 3.0)
+
+
+ROWS, SEEN, TRAINED, FROZEN = 300, 200, 7, 2
+
+
+@pytest.fixture
+def searches(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
+    """The searches of a quantizer: with or without bounds, and of how many rows."""
+    found: list[tuple[str, int]] = []
+    track, plain = NearestTracker.search, codebook_module.nearest
+
+    def tracking(tracker: NearestTracker, x: Tensor, codebook: Tensor, rows: Tensor | None = None) -> Tensor:
+        found.append(("bounds", len(x if rows is None else rows)))
+        return track(tracker, x, codebook, rows)
+
+    def searching(x: Tensor, codebook: Tensor) -> Tensor:
+        found.append(("plain", len(x)))
+        return plain(x, codebook)
+
+    monkeypatch.setattr(NearestTracker, "search", tracking)
+    monkeypatch.setattr(codebook_module, "nearest", searching)
+    return found
+
+
+def steps(dim: int) -> list[tuple[Tensor, ...]]:
+    """x_q, codes, usage and both gradients of steps that move rows and codes; the last ones have frozen codes."""
+    draw, quantizer = generator(dim), NSVQ(60, dim)
+    x = torch.randn(ROWS, dim, generator=draw).requires_grad_()
+    nn.init.normal_(quantizer.codebook, generator=draw)
+    optimizer = torch.optim.SGD([x, quantizer.codebook], lr=0.02)
+    results = []
+    for step in range(TRAINED + FROZEN):
+        if step == TRAINED - 2:
+            quantizer.codebook.data[40:50] = quantizer.codebook.data[:10]
+        if step == TRAINED:
+            quantizer.freeze(torch.arange(ROWS) % 60)
+        optimizer.zero_grad(set_to_none=False)
+        rows = (torch.arange(ROWS) % 3 != step % 3).nonzero()[:, 0]
+        x_q, codes = quantizer(x, generator(0, step), rows)
+        (x_q * torch.randn(x_q.shape, generator=draw)).sum().backward()
+        gradients = x.grad.clone(), quantizer.codebook.grad.clone()
+        results.append((x_q.detach(), codes, quantizer.usage.clone(), *gradients))
+        optimizer.step()
+    return results
+
+
+@pytest.mark.parametrize("dim", [3, 4, 45])
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("visible_search", [("bounds", ROWS)] * TRAINED),
+        ("frozen_search", [("bounds", SEEN)] * (TRAINED + FROZEN)),
+        ("distance_bounds", [("plain", SEEN)] * TRAINED),
+    ],
+)
+def test_searches_that_are_not_skipped_change_no_bit(
+    dim: int, name: str, expected: list[tuple[str, int]], searches: list[tuple[str, int]]
+) -> None:
+    standard = steps(dim)
+    assert searches == [("bounds", SEEN)] * TRAINED
+    searches.clear()
+    with switched(**{name: False}):
+        other = steps(dim)
+    assert searches == expected
+    assert all(map(torch.equal, chain(*standard), chain(*other)))
+    moved = standard[0][1] != standard[3][1]  # the same rows
+    assert 0 < int(moved.sum()) < SEEN
 
 
 def test_replacement_rule() -> None:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.cpu import rasterizer
 from nsvq_lightning.rendering.rasterize import Render, render, resolve_backend, visible
 from nsvq_lightning.skips import switched
 from nsvq_lightning.splats import ATTRIBUTES, RawSplats, Splats
@@ -161,7 +162,9 @@ def test_zero_quaternion_is_the_identity() -> None:
     assert torch.isfinite(gradients["quats"]).all()
 
 
-def test_visible_is_radii() -> None:
+@pytest.mark.parametrize("threads", [1, 3, 20])
+def test_visible_is_radii(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rasterizer, "thread_count", lambda: threads)
     splats, camera = random_splats(200, seed=11), front_camera(40, 30, cx=3.0)
     result = render(splats, camera)
     for backend in ("cpu", "reference"):

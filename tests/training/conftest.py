@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from lightning.pytorch import Callback, Trainer
 
+from nsvq_lightning.benchmark.fitting import quiet_trainer
 from nsvq_lightning.callbacks import (
     CodebookInit,
     CodebookReplacement,
@@ -67,18 +68,13 @@ def run(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFactor
         **trainer_arguments: Any,
     ) -> tuple[Trainer, SplatModule]:
         callbacks = list(callbacks)
-        settings: dict[str, Any] = {"max_steps": STEPS, "max_epochs": -1, "limit_val_batches": 0, **trainer_arguments}
-        trainer = Trainer(
-            accelerator="cpu",
-            devices=1,
-            logger=False,
+        trainer = quiet_trainer(
+            tmp_path_factory.mktemp("run"),
+            STEPS,
+            limit_val_batches=0,
             enable_checkpointing=any(isinstance(c, RunCheckpoint) for c in callbacks),
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            use_distributed_sampler=False,
-            default_root_dir=tmp_path_factory.mktemp("run"),
             callbacks=callbacks,
-            **settings,
+            **trainer_arguments,
         )
         splat_module = SplatModule(**{"sh_degree": 1, "codebooks": CODES, **(module or {})})
         trainer.fit(splat_module, datamodule=ColmapDataModule(str(demo_scene), factor=2), ckpt_path=ckpt_path)

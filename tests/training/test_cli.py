@@ -50,10 +50,11 @@ def test_a_run_leaves_scene_report_config_and_checkpoint(finished: Path) -> None
     assert {"scene.nsvq", "scene.ply", "metrics.json", "views.csv", "curve.csv", "curve.png", "renders"} <= names
     assert {"config.yaml", "metrics.csv", "checkpoints"} <= names
     config = yaml.safe_load((finished / "config.yaml").read_text())
-    assert config["model"]["quantizer"]["init_args"] == {"kmeans_steps": 3}
+    assert config["model"]["quantizer"]["init_args"] == {"kmeans_steps": 3, "start": "sample"}
     assert config["model"]["codebooks"] == {"scales": 16, "sh0": 8}
     metrics = json.loads((finished / "metrics.json").read_text())
-    assert metrics["formula"]["matches"]
+    assert metrics["level"] == "compact"
+    assert metrics["paper_level"]["matches_formula"]
     assert [end["phase"] for end in metrics["phases"]] == [phase.name.lower() for phase in Phase]
 
 

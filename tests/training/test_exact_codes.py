@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 import torch
-from lightning.pytorch import Trainer
 from torch import Tensor, nn
 
+from nsvq_lightning.benchmark.fitting import fit
 from nsvq_lightning.callbacks import CodebookInit, CodebookReplacement, PhaseSchedule
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.module import SplatModule
@@ -55,7 +55,7 @@ class Witness:
         last[rows] = codes
 
 
-def train(scene: Path, factor: Any, points: int, steps: int, folder: Path) -> Witness:
+def train(scene: Path, factor: Any, points: int, steps: int) -> Witness:
     """The quantize phase from the first codebooks on, with replacements, witnessed."""
     data = ColmapDataModule(str(scene), factor=factor)
     some = slice(None, None, -(-len(data.scene.points) // points))
@@ -66,31 +66,15 @@ def train(scene: Path, factor: Any, points: int, steps: int, folder: Path) -> Wi
     for name, quantizer in module.codebooks.items():
         witness.watch(name, quantizer)
     total, every = WARM_UP + steps, max(10, steps // 20)
-    trainer = Trainer(
-        accelerator="cpu",
-        devices=1,
-        max_steps=total,
-        max_epochs=-1,
-        limit_val_batches=0,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        use_distributed_sampler=False,
-        default_root_dir=folder,
-        callbacks=[
-            PhaseSchedule(
-                reference_total=None,
-                warmup_end=WARM_UP,
-                prune_end=WARM_UP,
-                quantize_end=total,
-                min_replacement_interval=every,
-            ),
-            CodebookInit(),
-            CodebookReplacement(WARM_UP + every, total, every, total, every),
-        ],
+    phases = PhaseSchedule(
+        reference_total=None,
+        warmup_end=WARM_UP,
+        prune_end=WARM_UP,
+        quantize_end=total,
+        min_replacement_interval=every,
     )
-    trainer.fit(module, datamodule=data)
+    replacement = CodebookReplacement(WARM_UP + every, total, every, total, every)
+    fit(module, data, [phases, CodebookInit(), replacement], total)
     return witness
 
 
@@ -102,13 +86,13 @@ def check(witness: Witness, steps: int) -> None:
         assert witness.moves[name] > steps, name
 
 
-def test_codes_in_training_are_the_nearest(demo_scene: Path, tmp_path: Path) -> None:
-    check(train(demo_scene, 2, 500, 40, tmp_path), 40)
+def test_codes_in_training_are_the_nearest(demo_scene: Path) -> None:
+    check(train(demo_scene, 2, 500, 40), 40)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["fox", "horns"])
-def test_codes_in_a_thousand_steps_on_a_real_scene(shared_scenes: Path, name: str, tmp_path: Path) -> None:
+def test_codes_in_a_thousand_steps_on_a_real_scene(shared_scenes: Path, name: str) -> None:
     if not (shared_scenes / name).is_dir():
         pytest.skip(f"the capture {name} is not here")
-    check(train(shared_scenes / name, 8, 1500, 1000, tmp_path), 1000)
+    check(train(shared_scenes / name, 8, 1500, 1000), 1000)

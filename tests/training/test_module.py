@@ -10,6 +10,7 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor, nn
 
+from nsvq_lightning.benchmark.fitting import fit
 from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
@@ -218,20 +219,10 @@ def test_a_run_can_start_from_a_file(demo_scene: Path, tmp_path: Path) -> None:
         init_from=str(tmp_path / "start.ply"),
         rates=LearningRates(means=1e-9, means_final=1e-9),
     )
-    trainer = Trainer(
-        accelerator="cpu",
-        max_steps=1,
-        max_epochs=-1,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        limit_val_batches=0,
-        callbacks=[PhaseSchedule()],
-        default_root_dir=tmp_path,
-    )
-    trainer.fit(module, datamodule=ColmapDataModule(str(demo_scene), factor=4))
+    data = ColmapDataModule(str(demo_scene), factor=4)
+    fit(module, data, [PhaseSchedule()], 1)
     torch.testing.assert_close(module.splats.means.detach(), start.means.detach(), atol=1e-6, rtol=0)
     assert module.active_sh_degree == 1
     wrong = SplatModule(sh_degree=2, codebooks=None, init_from=str(tmp_path / "start.ply"))
     with pytest.raises(ValueError, match="set sh_degree=1"):
-        trainer.fit(wrong, datamodule=ColmapDataModule(str(demo_scene), factor=4))
+        fit(wrong, data, [PhaseSchedule()], 1)

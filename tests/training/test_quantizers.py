@@ -14,6 +14,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.callbacks import CodebookRefit, CodebookReplacement, MetricReport, PhaseSchedule, RunCheckpoint
 from nsvq_lightning.io.container import read_nsvq
+from nsvq_lightning.io.precision import Storage
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.quantize import CodebookQuantizer, DiVeQ, PostHoc, StraightThrough, VectorQuantizeAdapter, kmeans
 from nsvq_lightning.random import generator
@@ -24,6 +25,7 @@ Recipe = Callable[..., dict[str, Callback]]
 Quantizers = type[CodebookQuantizer]
 
 KINDS = [StraightThrough, DiVeQ, PostHoc, VectorQuantizeAdapter]
+PAPER = Storage("paper")  # stores codes and codebooks as they are
 STEPS, PRUNE_END, MIDDLE, QUANTIZE_END = 60, 27, 46, 57
 
 
@@ -76,7 +78,7 @@ def finished(request: pytest.FixtureRequest, run: RunFactory, quantized_recipe: 
         pytest.importorskip("vector_quantize_pytorch")
     books = Books()
     callbacks = [*quantized_recipe(checkpoint=MiddleCheckpoint()).values(), books]
-    trainer, module = run(callbacks, module={"quantizer": request.param})
+    trainer, module = run(callbacks, module={"quantizer": request.param, "storage": PAPER})
     return request.param, trainer, module, books
 
 
@@ -99,7 +101,7 @@ def test_a_resumed_run_is_the_run_not_interrupted(
     kind, trainer, _, _ = finished
     path = Path(trainer.default_root_dir) / "checkpoints" / f"step-{MIDDLE}.ckpt"
     callbacks = quantized_recipe(checkpoint=RunCheckpoint(every=0)).values()
-    resumed, _ = run(callbacks, ckpt_path=path, module={"quantizer": kind})
+    resumed, _ = run(callbacks, ckpt_path=path, module={"quantizer": kind, "storage": PAPER})
     assert resumed.global_step == STEPS
     assert scene_path(resumed).read_bytes() == scene_path(trainer).read_bytes()
 
@@ -133,7 +135,7 @@ def test_neither_the_order_of_callbacks_nor_accumulation_matters_to_refits(
 def test_post_hoc_stores_kmeans_of_the_final_rows(run: RunFactory, recipe: Recipe) -> None:
     def fit(report: Callback) -> tuple[Trainer, SplatModule]:
         phases = PhaseSchedule(quantize_end=45_000, min_density_interval=4, min_reset_interval=11)
-        return run(recipe(phases=phases, report=report).values(), module={"quantizer": PostHoc})
+        return run(recipe(phases=phases, report=report).values(), module={"quantizer": PostHoc, "storage": PAPER})
 
     trainer, module = fit(Callback())
     assert module.phase is Phase.QUANTIZE

@@ -13,6 +13,7 @@ from nsvq_lightning.benchmark.errors import relative_l2, worst_first
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.timing import Case, measure, use_threads
+from nsvq_lightning.io.arrays import sh_coefficients
 from nsvq_lightning.optim import EPS, LearningRates, build_adam, param_groups, set_columns
 from nsvq_lightning.random import generator
 from nsvq_lightning.skips import switched
@@ -113,13 +114,13 @@ def _gradients(splats: Splats, step: int, scenario: Scenario) -> dict[str, Tenso
     hidden = torch.rand(len(splats), generator=generator(0, step, "visible")) >= scenario.visible
     for gradient in gradients.values():
         gradient[hidden] = 0
-    gradients["shN"][:, (scenario.sh_degree + 1) ** 2 - 1 :] = 0
+    gradients["shN"][:, sh_coefficients(scenario.sh_degree) :] = 0
     return gradients
 
 
 def _optimizer(method: Method, splats: Splats, scenario: Scenario) -> torch.optim.Optimizer:
     optimizer = method.build(param_groups(splats, {}, LearningRates(), extent=1.0))
-    set_columns(optimizer, "shN", 3 * ((scenario.sh_degree + 1) ** 2 - 1))
+    set_columns(optimizer, "shN", 3 * sh_coefficients(scenario.sh_degree))
     return optimizer
 
 

@@ -14,10 +14,11 @@ import numpy as np
 from numba import prange
 from torch import Tensor
 
+from nsvq_lightning.rendering.cpu.arrays import Array
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
 from nsvq_lightning.rendering.cpu.lanes import any_lane, fma, get, load, prefetch, put, select, splat, store, vsqrt
 from nsvq_lightning.rendering.cpu.records import F
-from nsvq_lightning.rendering.cpu.workspace import Array, Workspace
+from nsvq_lightning.rendering.cpu.workspace import Workspace
 
 __all__ = ["adam_update"]
 

@@ -442,25 +442,28 @@ def color_range(camera, means, sh0, shN, stride, degree, evaluated, ids, first, 
             put(records, o + 2, get(scratch, 32 + lane))
 
 
+@inline
+def vector_range(count, thread, threads):
+    """First and end of a thread's share of ``count`` splats: whole vectors, but for the last of all."""
+    vectors = (count + 15) // 16
+    return 16 * (vectors * thread // threads), min(count, 16 * (vectors * (thread + 1) // threads))
+
+
 @kernel
 def project_splats(threads, camera, means, quats, scales, logits, records, integers, found, counts, slots, scratch):
     """Project all splats: records of the visible ones; ``found`` holds a run of rows for each thread's range."""
-    n = logits.shape[0]
-    blocks = (n + 15) // 16
     for thread in prange(threads):
-        first, last = 16 * (blocks * thread // threads), min(n, 16 * (blocks * (thread + 1) // threads))
+        first, last = vector_range(logits.shape[0], thread, threads)
         counts[thread], slots[thread] = project_range(
             camera, means, quats, scales, logits, first, last, records, integers, found, scratch[thread]
         )
 
 
 @kernel
-def find_visible(threads, camera, means, quats, scales, logits, found, counts, scratch):
-    """Only the rows of the visible splats; ``found`` holds a run of them for each thread's range."""
-    n = logits.shape[0]
-    blocks = (n + 15) // 16
+def find_visible(threads, camera, means, quats, scales, logits, found, runs, scratch):
+    """Only the rows of the visible splats; thread t leaves them in ``found`` from ``runs[t, 0]`` to ``runs[t, 1]``."""
     for thread in prange(threads):
-        first, last = 16 * (blocks * thread // threads), min(n, 16 * (blocks * (thread + 1) // threads))
+        first, last = vector_range(logits.shape[0], thread, threads)
         at = first
         for start in range(first, last, 16):
             count = min(16, last - start)
@@ -475,7 +478,7 @@ def find_visible(threads, camera, means, quats, scales, logits, found, counts, s
                 put(found, at, start + lowest_bit(bits))
                 bits &= bits - 1
                 at += 1
-        counts[thread] = at - first
+        runs[thread, 0], runs[thread, 1] = first, at
 
 
 @kernel
@@ -507,10 +510,9 @@ def finish_records(
     splat touches as ``boxes`` (first column and row, columns and rows, 16 bits each), and the projected centres
     ``means2d [N·2]`` and ``radii [N]`` of the visible splats.
     """
-    blocks = (records.shape[0] // RECORD + 15) // 16
     total = counts.sum()
     for thread in prange(threads):
-        first = 16 * (blocks * thread // threads)
+        first, _ = vector_range(records.shape[0] // RECORD, thread, threads)
         start, slot = counts[:thread].sum(), slots[:thread].sum()
         for k in range(counts[thread]):
             row = np.int64(get(found, first + k))
@@ -528,10 +530,8 @@ def finish_records(
             for k in range(16):
                 put(ids, total + k, get(ids, total - 1))
     for thread in prange(threads):
-        first, last = 16 * ((total + 15) // 16 * thread // threads), 16 * ((total + 15) // 16 * (thread + 1) // threads)
-        color_range(
-            camera, means, sh0, shN, stride, degree, evaluated, ids, first, min(last, total), records, scratch[thread]
-        )
+        first, last = vector_range(total, thread, threads)
+        color_range(camera, means, sh0, shN, stride, degree, evaluated, ids, first, last, records, scratch[thread])
 
 
 @inline
@@ -765,14 +765,12 @@ def project_backward(
 
     ``sums[16·slot]`` of a splat's first slot holds its total; ``g_means2d [N·2]`` the gradient of its projected centre.
     """
-    blocks = (count + 15) // 16
-    n = logits.shape[0]
     coefficients = coefficients_of(evaluated)
     for thread in prange(threads):
         work = scratch[thread]
         slot = work[2048:].view(np.int32)
         # Between its first and last visible splat every thread clears the rows that it passes by.
-        begin, end = 16 * (blocks * thread // threads), min(count, 16 * (blocks * (thread + 1) // threads))
+        begin, end = vector_range(count, thread, threads)
         row = np.int64(get(ids, begin - 1)) + 1 if begin > 0 else 0
         for i in range(begin, end):
             here = np.int64(get(ids, i))
@@ -780,8 +778,8 @@ def project_backward(
                 clear_rows(row, here, stride, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN)
             row = here + 1
         if thread == threads - 1:
-            clear_rows(row, n, stride, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN)
-        for start in range(16 * (blocks * thread // threads), 16 * (blocks * (thread + 1) // threads), 16):
+            clear_rows(row, logits.shape[0], stride, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN)
+        for start in range(begin, end, 16):
             prefetch_sh(shN, ids, start + AHEAD, end, stride, coefficients)
             prefetch_sh(g_shN, ids, start + AHEAD, end, stride, stride)
             if start + AHEAD < end:

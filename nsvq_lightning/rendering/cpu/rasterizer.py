@@ -11,6 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import FRUSTUM_MARGIN
+from nsvq_lightning.rendering.cpu.arrays import Array, flat
 from nsvq_lightning.rendering.cpu.binning import DIGITS, count_tiles, fill_tiles, sort_by_depth
 from nsvq_lightning.rendering.cpu.blend import (
     BACKWARD_SCRATCH,
@@ -24,7 +25,7 @@ from nsvq_lightning.rendering.cpu.blend import (
 from nsvq_lightning.rendering.cpu.jit import thread_count
 from nsvq_lightning.rendering.cpu.projection import find_visible, finish_records, project_backward, project_splats
 from nsvq_lightning.rendering.cpu.records import CAMERA, GROUP_TILES, RECORD, group_grid
-from nsvq_lightning.rendering.cpu.workspace import Array, Workspace, recycled
+from nsvq_lightning.rendering.cpu.workspace import Workspace, recycled
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats import SplatTensors, sh_degree_of
 
@@ -46,10 +47,6 @@ def _pack_camera(camera: Camera) -> Array:
     return np.array(packed, np.float32).reshape(CAMERA)
 
 
-def _flat(tensor: Tensor) -> Array:
-    return tensor.detach().contiguous().numpy().reshape(-1)
-
-
 class _Frame:
     """One view of the splats on its way through the stages; holds its workspace as long as it lives."""
 
@@ -59,7 +56,7 @@ class _Frame:
         self.group_columns, group_rows = group_grid(camera.width, camera.height)
         self.tiles = self.group_columns * group_rows * GROUP_TILES
         self.n = splats.means.shape[0]
-        self.geometry = tuple(_flat(t) for t in (splats.means, splats.quats, splats.scales, splats.opacities))
+        self.geometry = tuple(flat(t) for t in (splats.means, splats.quats, splats.scales, splats.opacities))
         self.threads = thread_count()
         self.work = Workspace.borrow()
         self.records = self.work.array("records", RECORD * self.n)
@@ -136,7 +133,7 @@ class _Project(torch.autograd.Function):
         degrees = degree, degree if is_on("sh_bands") else sh_degree_of(shN)
         ctx.frame, ctx.degrees, ctx.stride = frame, degrees, 3 * shN.shape[1]
         ctx.save_for_backward(*attributes)
-        frame.finish(_flat(sh0), _flat(shN), ctx.stride, degrees, _flat(means2d), _flat(radii))
+        frame.finish(flat(sh0), flat(shN), ctx.stride, degrees, flat(means2d), flat(radii))
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
         return means2d, means.new_zeros(()), radii
@@ -153,9 +150,9 @@ class _Project(torch.autograd.Function):
         *_, sh0, shN = ctx.saved_tensors
         gradients = [recycled(tuple(tensor.shape)) for tensor in ctx.saved_tensors]
         project_backward(
-            frame.threads, frame.camera, *frame.geometry, _flat(sh0), _flat(shN), ctx.stride, *ctx.degrees,
-            frame.ids, frame.count, frame.records, frame.integers, frame.sums, _flat(g_means2d),
-            *(_flat(gradient) for gradient in gradients), frame.scratch,
+            frame.threads, frame.camera, *frame.geometry, flat(sh0), flat(shN), ctx.stride, *ctx.degrees,
+            frame.ids, frame.count, frame.records, frame.integers, frame.sums, flat(g_means2d),
+            *(flat(gradient) for gradient in gradients), frame.scratch,
         )  # fmt: skip
         return None, None, *gradients
 
@@ -175,7 +172,7 @@ class _Blend(torch.autograd.Function):
         frame.ends = work.array("ends", frame.tiles, np.int64)
         blend(
             frame.threads, frame.records, frame.entries, frame.offsets, frame.group_columns, frame.width, frame.height,
-            _flat(background), _GRID, frame.touched, frame.ends, _flat(image), _flat(transmittance), _flat(depth),
+            flat(background), _GRID, frame.touched, frame.ends, flat(image), flat(transmittance), flat(depth),
             work.rows("blend", frame.threads, FORWARD_SCRATCH), is_on("blocks"), is_on("saturated"),
             np.zeros(1, np.int64),
         )  # fmt: skip
@@ -200,14 +197,14 @@ class _Blend(torch.autograd.Function):
         blend_backward(
             frame.threads, frame.records, frame.integers, frame.entries, frame.offsets, frame.ends,
             frame.group_columns, frame.width, frame.height, _GRID, frame.touched,
-            *(_flat(tensor) for tensor in (image, transmittance, depth, g_image, g_alpha, g_depth)), with_alpha,
+            *(flat(tensor) for tensor in (image, transmittance, depth, g_image, g_alpha, g_depth)), with_alpha,
             with_depth,
             frame.sums, frame.slots, work.rows("blend_backward", frame.threads, BACKWARD_SCRATCH),
             np.zeros(1, np.int64),
         )  # fmt: skip
         total_slots(
             frame.threads, frame.ids, frame.count, frame.slots, frame.records, frame.integers, frame.sums,
-            _flat(g_means2d),
+            flat(g_means2d),
         )  # fmt: skip
         g_background = None
         if ctx.needs_input_grad[3]:
@@ -231,13 +228,9 @@ def render_cpu(
 
 def visible_cpu(splats: SplatTensors, camera: Camera) -> Tensor:
     """Rows ``[V]`` int64, ascending, of the splats that can change the image."""
-    geometry = tuple(_flat(t) for t in (splats.means, splats.quats, splats.scales, splats.opacities))
-    n, threads = splats.means.shape[0], thread_count()
-    found, counts = np.empty(n, np.int64), np.empty(threads, np.int64)
-    find_visible(
-        threads, _pack_camera(camera), *geometry, found, counts, np.empty((threads, PROJECTION_SCRATCH), np.float32)
-    )
-    blocks = (n + 15) // 16
-    firsts = [16 * (blocks * thread // threads) for thread in range(threads)]
-    runs = [found[first : first + length] for first, length in zip(firsts, counts, strict=True)]
-    return torch.from_numpy(np.concatenate(runs))
+    geometry = tuple(flat(t) for t in (splats.means, splats.quats, splats.scales, splats.opacities))
+    threads = thread_count()
+    found, runs = np.empty(splats.means.shape[0], np.int64), np.empty((threads, 2), np.int64)
+    scratch = np.empty((threads, PROJECTION_SCRATCH), np.float32)
+    find_visible(threads, _pack_camera(camera), *geometry, found, runs, scratch)
+    return torch.from_numpy(np.concatenate([found[first:last] for first, last in runs]))

@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 import sys
 import threading
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["Workspace", "recycled"]
+from nsvq_lightning.rendering.cpu.arrays import Array
 
-Array = np.ndarray[Any, np.dtype[Any]]
+__all__ = ["Workspace", "recycled"]
 
 _IDLE: list[Workspace] = []
 

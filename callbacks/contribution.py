@@ -1,0 +1,90 @@
+"""Remove the splats that hardly show in any photo."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from nsvq_lightning.edit import keep_rows
+from nsvq_lightning.host import SplatHost, as_host, next_iteration, raw_optimizer, train_contributions
+from nsvq_lightning.importance import least_contributing
+from nsvq_lightning.schedule import Phase
+
+from .latch import StepLatch
+
+__all__ = ["ContributionPruning"]
+
+log = logging.getLogger(__name__)
+
+
+class ContributionPruning(Callback):
+    """Once before the quantize phase, removes the splats that contribute least to the train views.
+
+    A splat contributes its blending weight, summed over all pixels (:func:`nsvq_lightning.importance.contributions`):
+    unlike opacity this also finds splats that are hidden behind others, or small. The paper prunes by opacity alone.
+
+    Of 187 k splats at iteration 18 000, before any further training: share 0.001 took 11 % of them and 0.03 dB of test
+    PSNR, 0.003 18 % and 0.11 dB, 0.01 30 % and 0.38 dB.
+
+    Args:
+        share: Share of the light that may go: the least contributing splats that together send at most this much of
+            it. 0 removes nothing, as in the paper.
+        at: Iteration of the reference run, before the quantize phase; some should be left to close the gaps.
+
+    Raises:
+        ValueError: ``share`` is not in [0, 1), or ``at`` is below 1.
+    """
+
+    def __init__(self, share: float = 0.0, at: int = 18_500) -> None:
+        if not 0.0 <= share < 1.0:
+            raise ValueError(f"share must be at least 0 and below 1, got {share}")
+        if at < 1:
+            raise ValueError(f"at must be at least 1, got {at}")
+        self.share = share
+        self.at = at
+        self._latch = StepLatch()
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Check that the pruning comes before the quantize phase.
+
+        Raises:
+            ValueError: It does not.
+        """
+        schedule = as_host(pl_module).schedule
+        if self.share and schedule.phase_at(schedule.iteration(self.at) + 1) > Phase.PRUNE:
+            raise ValueError(
+                f"contribution pruning at={self.at} must leave an iteration before the quantize phase, which starts "
+                f"after {schedule.prune_end}; lower at (--callbacks.contribution.at)"
+            )
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Prune after iteration ``at``, now that every callback has finished with it."""
+        host = as_host(pl_module)
+        iteration = next_iteration(trainer) - 1
+        if self.share and iteration == host.schedule.iteration(self.at) and self._latch.first_time(iteration):
+            self._prune(trainer, host)
+
+    def _prune(self, trainer: Trainer, host: SplatHost) -> None:
+        before = len(host.splats)
+        contribution = train_contributions(trainer, host)
+        if not bool(contribution.any()):
+            log.warning("iteration %d: no splat is seen by any train view; none is pruned", trainer.global_step)
+            return
+        keep_rows(host.splats, raw_optimizer(trainer), ~least_contributing(contribution, self.share))
+        log.info(
+            "iteration %d: pruned %d of %d splats, which sent at most %g of the light",
+            trainer.global_step,
+            before - len(host.splats),
+            before,
+            self.share,
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """The last iteration acted on."""
+        return {"last": self._latch.last}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Do not repeat what was done before the checkpoint."""
+        self._latch.last = state_dict["last"]

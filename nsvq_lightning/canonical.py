@@ -1,0 +1,118 @@
+"""One representative for the 48 pairs of scale and rotation that mean the same splat.
+
+The covariance R·diag(s²)·Rᵀ stays what it is when the three axes change their order or direction (24 rotations of the
+cube), when the quaternion changes its sign, and when it changes its length. Vectors that mean the same but lie apart
+cost a codebook codes; a canonical representative brings them together.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from nsvq_lightning.rendering.constants import MIN_SQUARED_NORM
+
+__all__ = ["FORMS", "Canonical", "Form", "canonical"]
+
+Form = Literal["none", "sign", "full"]
+FORMS: tuple[Form, ...] = ("none", "sign", "full")
+"""How much of the redundancy is removed, in ascending order."""
+
+
+def _right_products(quats: Tensor) -> Tensor:
+    """Matrices ``[M, 4, 4]`` with ``matrix @ q`` the product ``q ⊗ r`` for each quaternion r of ``quats [M, 4]``."""
+    w, x, y, z = quats.unbind(1)
+    rows = [[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]]
+    return torch.stack([torch.stack(row, 1) for row in rows], 1)
+
+
+_H = math.sqrt(0.5)
+_AXIS_TURNS = torch.tensor(
+    [
+        [1.0, 0.0, 0.0, 0.0],  # axes 0 1 2
+        [_H, _H, 0.0, 0.0],  # 0 2 1
+        [_H, 0.0, 0.0, _H],  # 1 0 2
+        [0.5, 0.5, 0.5, 0.5],  # 1 2 0
+        [0.5, -0.5, -0.5, -0.5],  # 2 0 1
+        [_H, 0.0, _H, 0.0],  # 2 1 0
+    ],
+    dtype=torch.float64,
+)
+"""For each order of the axes a rotation whose columns are, up to their signs, the unit vectors in that order."""
+
+
+_TURNS = _right_products(torch.eye(4, dtype=torch.float64)) @ _right_products(_AXIS_TURNS)[:, None]
+"""``[6, 4, 4, 4]``: for each order of the axes, then one of four half turns: a product from the right as a matrix."""
+
+
+class Canonical(NamedTuple):
+    """Scales and rotations in a canonical form, and what became of gradients by them.
+
+    Attributes:
+        scales: Log-scales ``[N, 3]``.
+        quats: Quaternions ``[N, 4]``, wxyz, of length 1.
+        scale_maps: ``[N, 3, 3]``; a gradient by the old log-scales, multiplied by it, is that by the new ones.
+        quat_maps: ``[N, 4, 4]``, the same for the quaternions.
+    """
+
+    scales: Tensor
+    quats: Tensor
+    scale_maps: Tensor
+    quat_maps: Tensor
+
+
+def canonical(scales: Tensor, quats: Tensor, form: Form) -> Canonical:
+    """Scales and rotations of the same covariances in a canonical form.
+
+    ``sign`` gives every quaternion length 1 and w ≥ 0. ``full`` also sorts the axes, longest first, and of the
+    rotations that are left takes the smallest, the one with the largest w. A quaternion too short to have a direction
+    is the identity, as for the renderer.
+
+    Args:
+        scales: Log-scales ``[N, 3]``.
+        quats: Quaternions ``[N, 4]``, wxyz, any length.
+        form: ``sign`` or ``full``.
+
+    Raises:
+        ValueError: Another form.
+    """
+    if form not in ("sign", "full"):
+        raise ValueError(f"a canonical form is 'sign' or 'full', got {form!r}")
+    squared = quats.square().sum(1, keepdim=True)
+    identity = torch.eye(4, dtype=quats.dtype, device=quats.device)
+    directed = squared >= MIN_SQUARED_NORM
+    quats = torch.where(directed, quats, identity[0])
+    lengths = torch.where(directed, squared, 1.0).sqrt()
+    if form == "full":
+        order = scales.argsort(dim=1, descending=True, stable=True)
+        turns = _turns_to(order, quats)
+    else:
+        order = torch.arange(3, device=scales.device).expand_as(scales)
+        turns = identity.expand(len(quats), 4, 4)
+    turned = _apply(turns, quats)
+    signs = torch.where(turned[:, :1] < 0, -1.0, 1.0).to(quats)
+    axes = torch.eye(3, dtype=scales.dtype, device=scales.device)
+    return Canonical(
+        scales.gather(1, order),
+        signs * turned / lengths,
+        axes[order],
+        (signs * lengths)[:, :, None] * turns,
+    )
+
+
+def _turns_to(order: Tensor, quats: Tensor) -> Tensor:
+    """Orthogonal matrices ``[N, 4, 4]`` that turn quaternions to axes in ``order [N, 3]`` by the smallest angle.
+
+    The order fixes a rotation up to half turns around the axes: one of four, the one that leaves the largest w.
+    """
+    number = 2 * order[:, 0] + (order[:, 1] > order[:, 2])
+    turns = _TURNS.to(quats)
+    w = _apply(turns[:, :, 0][number], quats)
+    return turns[number, w.abs().argmax(1)]
+
+
+def _apply(matrices: Tensor, rows: Tensor) -> Tensor:
+    return (matrices * rows[:, None, :]).sum(2)

@@ -1,0 +1,89 @@
+"""How a scene is stored: level, and how exactly."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+__all__ = ["DEFAULT_LEVEL", "LEVELS", "Precision", "Storage", "check_level"]
+
+LEVELS = ("compact", "paper")
+"""Compression levels: ``compact`` is small, ``paper`` stores float32 and whole bits, as the paper counts."""
+
+DEFAULT_LEVEL = "compact"
+
+
+@dataclass(frozen=True)
+class Precision:
+    """Largest errors of level ``compact``, each half a quantization step.
+
+    Attributes:
+        position: Of each coordinate, as a share of the splat's size: the geometric mean of its axis lengths. Small
+            splats get more digits than large ones, down to 2⁻²¹ of the extent of the scene.
+        opacity: Of the opacity, which is in [0, 1].
+        codebook: Of the numbers of a codebook, as a share of how much neighbouring codes typically differ.
+        scales: Of logarithms of axis lengths without a codebook; 0.01 is one per cent of the length.
+        quats: Of the components of normalised quaternions without a codebook.
+        sh0: Of constant colour coefficients without a codebook.
+        shN: Of higher colour coefficients without a codebook.
+
+    Raises:
+        ValueError: A number is not positive and finite, or the opacity's is above 1/4.
+    """
+
+    position: float = 0.05
+    opacity: float = 1 / 256
+    codebook: float = 0.125
+    scales: float = 0.02
+    quats: float = 0.005
+    sh0: float = 0.01
+    shN: float = 0.01
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"precision: {entry.name} must be a positive number, got {value}")
+        if self.opacity > 0.25:
+            raise ValueError(f"precision: opacity must be at most 0.25, got {self.opacity}")
+
+    @property
+    def opacity_levels(self) -> int:
+        """Number of levels that the opacity has."""
+        return max(2, math.ceil(0.5 / self.opacity))
+
+
+@dataclass(frozen=True)
+class Storage:
+    """How a run stores its scene.
+
+    Attributes:
+        level: One of :data:`LEVELS`.
+        precision: Largest errors of level ``compact``; level ``paper`` has none.
+
+    Raises:
+        ValueError: Unknown level.
+    """
+
+    level: str = DEFAULT_LEVEL
+    precision: Precision = field(default_factory=Precision)
+
+    def __post_init__(self) -> None:
+        check_level(self.level)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Storage:
+        """The settings from plain data, as a checkpoint keeps them."""
+        return cls(values["level"], Precision(**values["precision"]))
+
+
+def check_level(level: str) -> None:
+    """Refuse a level that there is not.
+
+    Raises:
+        ValueError: Unknown level.
+    """
+    if level not in LEVELS:
+        raise ValueError(f"unknown compression level {level!r}; there are {', '.join(LEVELS)}")

@@ -1,0 +1,225 @@
+"""Level ``compact``: errors within its precision, small, repeatable, and safe to read."""
+
+from __future__ import annotations
+
+import json
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from nsvq_lightning.io import CompressedScene, FormatError, read_header, read_nsvq, write_nsvq
+from nsvq_lightning.io.arrays import SplatArrays
+from nsvq_lightning.io.compressed import attribute_dims
+from nsvq_lightning.io.precision import Precision
+
+SIZES = {"quats": 64, "scales": 100, "sh0": 33, "shN": 16}
+
+
+def scene(n: int, sizes: dict[str, int] = SIZES, degree: int = 3, **header: Any) -> CompressedScene:
+    """A scene whose attributes have realistic sizes."""
+    rng = np.random.default_rng([n, degree, *sizes.values()])
+    dims = attribute_dims(degree)
+    centre = {"quats": 0.0, "scales": -4.0, "sh0": 0.0, "shN": 0.0}
+    spread = {"quats": 1.0, "scales": 1.0, "sh0": 1.0, "shN": 0.1}
+
+    def rows(name: str, count: int) -> NDArray[np.float32]:
+        return (centre[name] + spread[name] * rng.standard_normal((count, dims[name]))).astype(np.float32)
+
+    return CompressedScene(
+        means=(3 * rng.standard_normal((n, 3))).astype(np.float32),
+        opacities=(3 * rng.standard_normal(n)).astype(np.float32),
+        codes={name: rng.integers(0, k, n) for name, k in sizes.items()},
+        codebooks={name: rows(name, k) for name, k in sizes.items()},
+        raw={name: rows(name, n) for name in dims if name not in sizes},
+        sh_degree=degree,
+        **header,
+    )
+
+
+def matched(original: SplatArrays, back: SplatArrays) -> NDArray[np.intp]:
+    """Which original splat each decoded one is: the nearest position."""
+    from scipy.spatial import cKDTree
+
+    _, rows = cKDTree(original.means).query(back.means)
+    assert len(np.unique(rows)) == len(original)
+    return np.asarray(rows)
+
+
+def unit(quats: NDArray[np.float32]) -> NDArray[np.float64]:
+    rows: NDArray[np.float64] = quats.astype(np.float64)
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("sizes", [SIZES, {}, {"shN": 8}, {"scales": 1, "quats": 300}])
+def test_errors_stay_within_the_precision(tmp_path: Path, sizes: dict[str, int]) -> None:
+    original, path = (
+        scene(600, sizes, config={"seed": 1}, metrics={"psnr": 30.0}, origin=(1.0, 2.0, 1e6)),
+        tmp_path / "x.nsvq",
+    )
+    precision = Precision(position=0.1, opacity=1 / 64, scales=0.05, quats=0.01, sh0=0.02, shN=0.005)
+    assert write_nsvq(path, original, precision=precision) == path.stat().st_size
+    read = read_nsvq(path)
+    assert (read.config, read.metrics, read.origin) == (original.config, original.metrics, original.origin)
+    assert read.stored_bytes == path.stat().st_size
+    before, after = original.arrays(), read.arrays()
+    rows = matched(before, after)
+    size = np.exp(after.scales.astype(np.float64).mean(1))
+    assert (np.abs(after.means - before.means[rows]).max(1) <= 0.1001 * size + 1e-5).mean() > 0.998
+    opacity = 1 / (1 + np.exp(-before.opacities[rows].astype(np.float64)))
+    assert np.abs(1 / (1 + np.exp(-after.opacities.astype(np.float64))) - opacity).max() <= 1 / 64 + 1e-6
+    largest = {"scales": 0.05, "quats": 0.01, "sh0": 0.02, "shN": 0.005}
+    for name, error in largest.items():
+        was, now = getattr(before, name)[rows], getattr(after, name)
+        if name == "quats":
+            was, now = unit(was), now.astype(np.float64)
+        if name in sizes:
+            # A codebook's error follows the distance between its rows, here about as large as they are.
+            error = 0.5 * float(was.std())
+        assert np.abs(now - was).max() <= error + 1e-6
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_small_scenes_of_every_degree_come_back(tmp_path: Path, n: int, degree: int) -> None:
+    for sizes in ({}, {"quats": 1, "sh0": 3}):
+        write_nsvq(tmp_path / "x.nsvq", scene(n, sizes, degree))
+        read = read_nsvq(tmp_path / "x.nsvq")
+        assert (len(read), read.sh_degree) == (n, degree)
+        assert set(read.codebooks) == set(sizes)
+
+
+def test_finer_precision_is_nearer_and_larger(tmp_path: Path) -> None:
+    original, path = scene(2000), tmp_path / "x.nsvq"
+    sizes, errors = [], []
+    for position in (0.4, 0.1, 0.025):
+        sizes.append(write_nsvq(path, original, precision=Precision(position=position)))
+        back = read_nsvq(path).arrays()
+        rows = matched(original.arrays(), back)
+        errors.append(np.abs(back.means - original.means[rows]).mean())
+    assert sizes == sorted(sizes)
+    assert errors[0] > 3 * errors[1] > 9 * errors[2]
+    # A quarter of the error is two bits more for each of three coordinates.
+    assert 8 * (sizes[2] - sizes[1]) / 2000 == pytest.approx(6, abs=0.5)
+
+
+def test_rows_that_no_splat_uses_are_left_out_and_equal_ones_become_one(tmp_path: Path) -> None:
+    plain = scene(50, {"sh0": 40})
+    codebook = plain.codebooks["sh0"].copy()
+    codebook[3] = codebook[5]
+    codes = np.array([1, 3, 5, 7, 9])[np.arange(50) % 5]
+    original = CompressedScene(plain.means, plain.opacities, {"sh0": codes}, {"sh0": codebook}, plain.raw)
+    write_nsvq(tmp_path / "x.nsvq", original)
+    assert len(read_nsvq(tmp_path / "x.nsvq").codebooks["sh0"]) == 4
+
+
+def test_far_splats_keep_their_float(tmp_path: Path) -> None:
+    original = scene(3000)
+    original.means[10] = 1e9, -3.3e8, 1.5
+    write_nsvq(tmp_path / "x.nsvq", original)
+    back = read_nsvq(tmp_path / "x.nsvq").arrays()
+    np.testing.assert_array_equal(back.means[-1], original.means[10])
+    rows = matched(original.arrays(), back)
+    assert np.abs(back.means - original.means[rows]).max() < 0.05
+
+
+def test_same_scene_same_bytes_for_any_number_of_threads(tmp_path: Path) -> None:
+    files = []
+    threads = torch.get_num_threads()
+    try:
+        for count in (1, 2, 5):
+            torch.set_num_threads(count)
+            write_nsvq(tmp_path / f"{count}.nsvq", scene(5000))
+            files.append((tmp_path / f"{count}.nsvq").read_bytes())
+    finally:
+        torch.set_num_threads(threads)
+    assert files[0] == files[1] == files[2]
+
+
+def test_extreme_numbers_are_stored_or_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "x.nsvq"
+    original = scene(20, {})
+    original.raw["scales"][0] = 200.0
+    original.raw["scales"][1] = -1e4
+    original.raw["quats"][2] = 0.0
+    original.opacities[3:5] = 1e30, -1e30
+    write_nsvq(path, original)
+    back = read_nsvq(path).arrays()
+    assert all(np.isfinite(values).all() for values in vars(back).values())
+    assert [1.0, 0.0, 0.0, 0.0] in back.quats.tolist()
+    original.raw["shN"][5, 7] = 1e20
+    with pytest.raises(ValueError, match="shN: 1e\\+20 is too large"):
+        write_nsvq(path, original)
+    original.raw["shN"][5, 7] = np.nan
+    with pytest.raises(ValueError, match="shN: 1 numbers are not finite"):
+        write_nsvq(path, original)
+    assert len(read_nsvq(path)) == 20
+
+
+def test_every_changed_byte_and_every_truncation_is_one_clear_error(tmp_path: Path) -> None:
+    path = tmp_path / "x.nsvq"
+    write_nsvq(path, scene(30))
+    data = path.read_bytes()
+    for i in range(0, len(data), 7):
+        for bad in (data[:i], data[:i] + bytes([data[i] ^ 1]) + data[i + 1 :]):
+            path.write_bytes(bad)
+            with pytest.raises(FormatError, match=r"x\.nsvq: "):
+                read_nsvq(path)
+
+
+def altered(path: Path, change: Any) -> None:
+    """Change the header of a file and make its checksum fit again."""
+    data = path.read_bytes()
+    length = int.from_bytes(data[28:32], "little")
+    table = json.loads(data[32 : 32 + length])
+    change(table)
+    text = json.dumps(table).encode()
+    rest = data[24:28] + len(text).to_bytes(4, "little") + text + data[32 + length :]
+    path.write_bytes(data[:8] + blake2b(rest, digest_size=16).digest() + rest)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda t: t.update(splats=10**12),
+        lambda t: t.update(splats=300),
+        lambda t: t.update(splats=3),
+        lambda t: t.update(sh_degree=2),
+        lambda t: t["attributes"].pop(),
+        lambda t: t["attributes"][0].update(codes=10**9, bits=30),
+        lambda t: t["attributes"][0].update(codes=99),
+        lambda t: t["attributes"][0].update(step=0.0),
+        lambda t: t["attributes"][0].update(step="wide"),
+        lambda t: t["attributes"][0].update(storage="raw"),
+        lambda t: t["attributes"][1].update(storage="codes", codes=2, bits=1),
+        lambda t: t["attributes"][2].update(codes=1 << 30, bits=30),
+        lambda t: t["streams"][0].update(name="other"),
+    ],
+)
+def test_tables_that_do_not_fit_are_refused(tmp_path: Path, change: Any) -> None:
+    path = tmp_path / "x.nsvq"
+    write_nsvq(path, scene(30))
+    altered(path, change)
+    with pytest.raises(FormatError, match="damaged"):
+        read_nsvq(path)
+
+
+@pytest.mark.parametrize("bad", [{"position": 0.0}, {"opacity": 0.5}, {"shN": float("nan")}, {"quats": -1.0}])
+def test_precision_must_be_positive(bad: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=f"precision: {next(iter(bad))} must be"):
+        Precision(**bad)
+
+
+def test_it_is_much_smaller_than_the_level_paper(tmp_path: Path) -> None:
+    original = scene(20_000, {"quats": 512, "scales": 512, "sh0": 128, "shN": 128})
+    paper = write_nsvq(tmp_path / "p.nsvq", original, "paper")
+    compact = write_nsvq(tmp_path / "c.nsvq", original)
+    # Random codes have no structure to use: what is saved is in positions, opacities and codebooks.
+    assert compact < 0.55 * paper
+    streams = {stream.name: stream.length for stream in read_header(tmp_path / "c.nsvq").streams}
+    assert 8 * streams["means"] / 20_000 < 28
+    assert 8 * streams["opacities"] / 20_000 < 7.1

@@ -1,0 +1,71 @@
+"""Positions on a grid, against plain arithmetic."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nsvq_lightning.io.morton import AXIS_BITS, Grid, morton_keys, nearest_before, unmorton
+
+
+def test_keys_interleave_the_bits() -> None:
+    rng = np.random.default_rng(0)
+    cells = rng.integers(0, 1 << AXIS_BITS, (50, 3))
+    keys = morton_keys(cells, np.full(50, AXIS_BITS))
+    for cell, key in zip(cells, keys, strict=True):
+        digits = "".join(f"{int(x):021b}"[bit] for bit in range(21) for x in cell)
+        assert int(key) == int(digits, 2)
+    np.testing.assert_array_equal(unmorton(keys), cells)
+
+
+def test_lower_bits_of_a_shallow_cell_are_zero() -> None:
+    cells = np.random.default_rng(1).integers(0, 1 << AXIS_BITS, (22, 3))
+    depths = np.arange(22)
+    back = unmorton(morton_keys(cells, depths))
+    np.testing.assert_array_equal(back, cells >> (21 - depths)[:, None] << (21 - depths)[:, None])
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_positions_come_back_within_half_a_cell(scale: float) -> None:
+    rng = np.random.default_rng(2)
+    means = (scale * (rng.standard_normal((4000, 3)) + np.array([5.0, 0.0, -3.0]))).astype(np.float32)
+    widest = scale * np.exp(rng.normal(-5, 1.5, 4000))
+    grid = Grid.around(means, widest)
+    depths = grid.depths(np.log2(widest / grid.step))
+    cells, inside = grid.cells(means)
+    assert inside.all()
+    # The thousandth with the smallest splats shares the cells of the others.
+    allowed = np.maximum(widest, grid.step)[:, None] / 2 + 1e-6 * np.abs(means)
+    assert (np.abs(grid.centers(cells, depths) - means) <= allowed).all()
+    assert (widest < grid.step).mean() <= 0.0011
+
+
+def test_far_splats_do_not_make_the_grid_coarse() -> None:
+    rng = np.random.default_rng(3)
+    means = rng.standard_normal((5000, 3)).astype(np.float32)
+    near = Grid.around(means, np.full(5000, 1e-3))
+    means[7], means[8, 1] = 1e9, -1e7
+    grid = Grid.around(means, np.full(5000, 1e-3))
+    _, inside = grid.cells(means)
+    assert np.flatnonzero(~inside).tolist() == [7, 8]
+    assert grid.step == near.step == 1e-3
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 400])
+def test_neighbours_are_the_two_nearest_of_the_rows_before(count: int) -> None:
+    cells = np.random.default_rng(count).integers(0, 60, (count, 3))
+    found = nearest_before(cells)
+    for i in range(count):
+        rows = range(max(0, i - 16), i)
+        expected = sorted(rows, key=lambda j: (int(((cells[i] - cells[j]) ** 2).sum()), j))[:2]
+        assert found[i].tolist() == [*expected, -1, -1][:2]
+
+
+@pytest.mark.parametrize("means", [np.zeros((0, 3)), np.zeros((5, 3)), np.full((1, 3), 1e30)])
+def test_degenerate_scenes_have_a_grid(means: np.ndarray) -> None:
+    means = means.astype(np.float32)
+    grid = Grid.around(means, np.full(len(means), 1e-12))
+    cells, inside = grid.cells(means)
+    assert inside.all()
+    back = grid.centers(cells, np.full(len(means), AXIS_BITS))
+    np.testing.assert_allclose(back, means, rtol=1e-5, atol=1e-9)
