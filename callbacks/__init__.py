@@ -15,12 +15,14 @@ from .freeze import FreezeCodes
 from .opacity import OpacityRegularization
 from .phases import PhaseSchedule
 from .predictions import RenderWriter
+from .refit import CodebookRefit
 from .report import MetricReport
 from .sh_degree import ShDegreeSchedule
 
 __all__ = [
     "CanonicalCovariance",
     "CodebookInit",
+    "CodebookRefit",
     "CodebookReplacement",
     "ContributionPruning",
     "DensityControl",

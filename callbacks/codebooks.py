@@ -14,6 +14,7 @@ from nsvq_lightning.edit import reset_moments
 from nsvq_lightning.host import (
     SplatHost,
     as_host,
+    from_first_process,
     next_iteration,
     raw_optimizer,
     sum_over_processes,
@@ -78,8 +79,7 @@ class CodebookInit(Callback):
             if trainer.is_global_zero:
                 weight = weights if name in self.weighted else None
                 quantizer.fit(host.rows(name), weight, generator=generator(host.seed, iteration, "kmeans", name))
-            if trainer.world_size > 1:
-                quantizer.codebook.data = trainer.strategy.broadcast(quantizer.codebook.data)
+            quantizer.codebook.data = from_first_process(trainer, quantizer.codebook.data)
         sizes = ", ".join(f"{name} {q.codebook.shape[0]}" for name, q in host.quantizers.items())
         if sizes:
             log.info("iteration %d: codebooks for %d splats: %s", iteration, len(host.splats), sizes)

@@ -6,7 +6,7 @@ from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from nsvq_lightning.host import as_host, next_iteration
+from nsvq_lightning.host import as_host, from_first_process, next_iteration
 from nsvq_lightning.schedule import Phase
 
 from .latch import StepLatch
@@ -27,7 +27,4 @@ class FreezeCodes(Callback):
         if iteration != host.schedule.first_of(Phase.FINETUNE) or not self._latch.first_time(iteration):
             return
         for name, quantizer in host.quantizers.items():
-            codes = quantizer.encode(host.rows(name))
-            if trainer.world_size > 1:
-                codes = trainer.strategy.broadcast(codes)
-            quantizer.freeze(codes)
+            quantizer.freeze(from_first_process(trainer, quantizer.encode(host.rows(name))))

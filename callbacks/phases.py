@@ -29,7 +29,7 @@ class PhaseSchedule(Callback):
         quantize_end: Last iteration of the quantize phase in the reference run.
         min_density_interval: Lower limit of the interval of density control in this run.
         min_reset_interval: Lower limit of the interval of opacity resets in this run.
-        min_replacement_interval: Lower limit of the window of code replacement in this run.
+        min_replacement_interval: Lower limit of the window of code replacement and of the interval of refits.
 
     Raises:
         ValueError: See :class:`~nsvq_lightning.schedule.Schedule`.

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = [
     "SplatHost",
     "as_host",
+    "from_first_process",
     "is_trial",
     "log_interval",
     "next_iteration",
@@ -142,6 +143,11 @@ def log_interval(trainer: Trainer) -> int:
 def output_folder(trainer: Trainer) -> Path:
     """Where a run writes its files: the logger's folder, without a logger the default root folder."""
     return Path(trainer.log_dir or trainer.default_root_dir)
+
+
+def from_first_process(trainer: Trainer, tensor: Tensor) -> Tensor:
+    """The first process's value of a tensor, on every process."""
+    return tensor if trainer.world_size == 1 else trainer.strategy.broadcast(tensor)
 
 
 def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 import nsvq_lightning.callbacks as callbacks
-import nsvq_lightning.quantize.nsvq  # noqa: F401  short class names resolve to what is imported
+import nsvq_lightning.quantize  # noqa: F401  short class names resolve to what is imported
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
 from nsvq_lightning.host import is_trial, output_folder
 from nsvq_lightning.module import SplatModule
@@ -31,6 +31,7 @@ DEFAULT_CALLBACKS: dict[str, type[Callback]] = {
     "contribution": callbacks.ContributionPruning,
     "canonical": callbacks.CanonicalCovariance,
     "codebook_init": callbacks.CodebookInit,
+    "codebook_refit": callbacks.CodebookRefit,
     "codebook_replacement": callbacks.CodebookReplacement,
     "freeze": callbacks.FreezeCodes,
     "report": callbacks.MetricReport,

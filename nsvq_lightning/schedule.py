@@ -17,8 +17,8 @@ density control: interval        proportionally, not below ``min_density_interva
 opacity resets                   proportionally, interval not below ``min_reset_interval`` (opacities need some
                                  hundred steps of Adam to come back)
 pruning in the prune phase       proportionally
-replacement of codes             proportionally, interval not below ``min_replacement_interval`` (a code is called
-                                 unused after a window of views)
+replacement, refits of codes     proportionally, interval not below ``min_replacement_interval`` (a code is called
+                                 unused after a window of views; to refit codes takes as long as some steps)
 decay of the position's rate     proportionally (30 000 of 45 000)
 λ of the opacities               inversely: what it takes from an opacity in a whole phase stays the same
 learning rates, thresholds       not at all
@@ -66,7 +66,8 @@ class Schedule:
         quantize_end: Last iteration of the quantize phase, in the reference run; fine-tuning takes the rest.
         min_density_interval: Lower limit of the interval of density control, in iterations of this run.
         min_reset_interval: Lower limit of the interval of opacity resets, in iterations of this run.
-        min_replacement_interval: Lower limit of the window of code replacement, in iterations of this run.
+        min_replacement_interval: Lower limit of the window of code replacement and of the interval of refits, in
+            iterations of this run.
 
     To give ends in iterations of this run, set ``reference_total`` to ``total``: then nothing scales.
 
@@ -158,7 +159,7 @@ class Schedule:
         return range(step, self.iteration(last) + 1, step)
 
     def replacement_times(self, start: int, last: int, every: int) -> range:
-        """Iterations at which inactive codes are replaced."""
+        """Iterations at which inactive codes are replaced, or codebooks refitted."""
         return self.times(start, last, every, self.min_replacement_interval)
 
     def sh_degree_at(self, iteration: int, every: int, highest: int) -> int:

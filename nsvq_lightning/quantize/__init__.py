@@ -1,18 +1,27 @@
 """Vector quantization of splat attributes."""
 
 from nsvq_lightning.quantize.attributes import QUANTIZED, QuantizedAttribute, codebook_sizes
-from nsvq_lightning.quantize.base import Quantizer
+from nsvq_lightning.quantize.base import Quantizer, Refittable
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
+from nsvq_lightning.quantize.diveq import DiVeQ
 from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest, nearest_reference
 from nsvq_lightning.quantize.nsvq import NSVQ
+from nsvq_lightning.quantize.post_hoc import PostHoc
+from nsvq_lightning.quantize.straight_through import StraightThrough
+from nsvq_lightning.quantize.vector_quantize import VectorQuantizeAdapter
 
 __all__ = [
     "NSVQ",
     "QUANTIZED",
     "CodebookQuantizer",
+    "DiVeQ",
+    "PostHoc",
     "QuantizedAttribute",
     "Quantizer",
+    "Refittable",
+    "StraightThrough",
+    "VectorQuantizeAdapter",
     "codebook_sizes",
     "kmeans",
     "nearest",

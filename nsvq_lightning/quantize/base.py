@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-__all__ = ["Quantizer"]
+__all__ = ["Quantizer", "Refittable"]
 
 
 @runtime_checkable
@@ -35,6 +35,8 @@ class Quantizer(Protocol):
     ) -> tuple[Tensor, Tensor]:
         """Quantize rows of ``x [N, D]`` in training: differentiable ``x_q [V, D]``, codes ``[V]``; counts the usage.
 
+        One that leaves training alone returns the rows themselves, -1 as their codes, and counts nothing.
+
         ``rows [V]`` int64, ascending and all different, says which; without it all rows are quantized. Gathering them
         (:func:`nsvq_lightning.subset.take_rows`) is left to the quantizer, which may do it on the way.
         """
@@ -54,3 +56,17 @@ class Quantizer(Protocol):
 
     def freeze(self, codes: Tensor) -> None:
         """Fix the codes ``[N]``; from now on only the codebook is trained."""
+
+
+@runtime_checkable
+class Refittable(Protocol):
+    """Quantizer whose codebook gets no gradient in the quantize phase, but is moved to the rows now and then.
+
+    :class:`nsvq_lightning.callbacks.CodebookRefit` does so with every quantizer that offers it.
+    """
+
+    codebook: Tensor
+    """Codebook ``[K, D]`` in the raw space of the attribute."""
+
+    def refit(self, x: Tensor, steps: int) -> None:
+        """Move the codebook to the rows ``x [N, D]`` by ``steps`` steps of k-means from where it is; K stays."""

@@ -29,13 +29,21 @@ class NSVQ(CodebookQuantizer):
 
 
 def noise_substitution(
-    x: Tensor, codebook: Tensor, codes: Tensor, generator: torch.Generator, rows: Tensor | None = None
+    x: Tensor,
+    codebook: Tensor,
+    codes: Tensor,
+    generator: torch.Generator,
+    rows: Tensor | None = None,
+    *,
+    aim: float = 0.0,
+    spread: float = 1.0,
 ) -> Tensor:
-    """``x + ‖x − c‖·v/‖v‖`` with c the code of each row and v ~ N(0, I).
+    """``x + ‖x − c‖·d̂`` with c the code of each row and the direction d̂ = d/‖d‖ a constant for the gradient.
 
-    The gradients are closed forms. With g the gradient of the result, v̂ = v/‖v‖ and r = x − c: that of x is
-    g + (g·v̂) r/‖r‖, that of a code is −Σ (g·v̂) r/‖r‖ over its rows, always summed in the same order. The radial term
-    is 0 where r is 0.
+    By default d = v ~ N(0, I); in general ``d = aim·(c − x) + spread·v``.
+
+    The gradients are closed forms. With g the gradient of the result and r = x − c: that of x is g + (g·d̂) r/‖r‖, that
+    of a code is −Σ (g·d̂) r/‖r‖ over its rows, always summed in the same order. The radial term is 0 where r is 0.
 
     Args:
         x: Table ``[N, D]``.
@@ -43,26 +51,31 @@ def noise_substitution(
         codes: Code of each chosen row, ``[V]`` int64.
         generator: Source of the noise, on any device; one seed is drawn from it.
         rows: Rows ``[V]`` of the table, int64, ascending, all different; all of them by default.
+        aim: Weight of the way to the code in the direction.
+        spread: Weight of the noise in the direction.
 
     Returns:
         Rows ``[V, D]`` at the distance ‖x − c‖ from those of ``x``.
     """
-    seed = draw_seed(generator)
-    result: Tensor = _NoiseSubstitution.apply(x, codebook, codes, rows, seed)  # type: ignore[no-untyped-call]
+    mix = draw_seed(generator), aim, spread
+    result: Tensor = _Substitution.apply(x, codebook, codes, rows, mix)  # type: ignore[no-untyped-call]
     return result
 
 
-class _NoiseSubstitution(torch.autograd.Function):
+class _Substitution(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, x: Tensor, codebook: Tensor, codes: Tensor, rows: Tensor | None, seed: int) -> Tensor:
-        ctx.seed = seed
+    def forward(
+        ctx: Any, x: Tensor, codebook: Tensor, codes: Tensor, rows: Tensor | None, mix: tuple[int, float, float]
+    ) -> Tensor:
+        ctx.mix = mix
         if _has_kernel(x):
+            seed, aim, spread = mix
             rows = torch.arange(x.shape[0]) if rows is None else rows
-            out = torch.from_numpy(substitute(seed, *_arrays(x, rows, codebook, codes)))
+            out = torch.from_numpy(substitute(seed, *_arrays(x, rows, codebook, codes), aim=aim, spread=spread))
         else:
             chosen = x if rows is None else x.index_select(0, rows)
-            length: Tensor = (chosen - codebook[codes]).norm(dim=1, keepdim=True)
-            out = chosen + length * _directions(chosen, seed)
+            residual = chosen - codebook[codes]
+            out = chosen + residual.norm(dim=1, keepdim=True) * _directions(residual, *mix)
         ctx.save_for_backward(x, codebook, codes, rows, out)
         return out
 
@@ -75,9 +88,7 @@ class _NoiseSubstitution(torch.autograd.Function):
             return torch.from_numpy(grads[0]), torch.from_numpy(grads[1]), None, None, None
         chosen = x if rows is None else x.index_select(0, rows)
         residual = chosen - codebook[codes]
-        length = residual.norm(dim=1, keepdim=True)
-        along = (grad * _directions(chosen, ctx.seed)).sum(1, keepdim=True) / torch.where(length > 0, length, torch.inf)
-        radial = along * residual
+        radial = (grad * _directions(residual, *ctx.mix)).sum(1, keepdim=True) * _unit(residual)
         grad_x = grad + radial
         if rows is not None:
             grad_x = torch.zeros_like(x).index_copy_(0, rows, grad_x)
@@ -92,9 +103,14 @@ def _has_kernel(x: Tensor) -> bool:
     return x.device.type == "cpu" and x.dtype == torch.float32
 
 
-def _directions(x: Tensor, seed: int) -> Tensor:
-    """Random unit vectors in the shape of ``x [N, D]``."""
-    generator = torch.Generator(x.device).manual_seed(seed)
-    noise = torch.randn(x.shape, dtype=x.dtype, device=x.device, generator=generator)
-    length = noise.norm(dim=1, keepdim=True)
-    return noise / torch.where(length > 0, length, torch.inf)
+def _directions(residual: Tensor, seed: int, aim: float, spread: float) -> Tensor:
+    """Unit vectors ``[V, D]`` of the directions for the residuals x − c."""
+    generator = torch.Generator(residual.device).manual_seed(seed)
+    noise = torch.randn(residual.shape, dtype=residual.dtype, device=residual.device, generator=generator)
+    return _unit(spread * noise - aim * residual)
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    """Rows of length 1, and 0 for those without length."""
+    length: Tensor = vectors.norm(dim=1, keepdim=True)
+    return vectors / torch.where(length > 0, length, torch.inf)

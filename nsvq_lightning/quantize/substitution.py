@@ -1,9 +1,9 @@
-"""Noise substitution on the CPU: gather, residual, noise and result of a row in one pass, its gradients in another.
+"""Substitution of the error on the CPU: gather, residual, noise and result of a row in one pass, gradients in another.
 
 Rows are read out of the whole table, and their gradient is written back into one. Short rows are handled 16 at a time,
 one row a lane. Rows of 16 and more numbers are handled one at a time, in vectors along the row of which the last two
-may overlap. The backward pass takes the direction of the noise from the result, not from a second draw: with x̃ - x =
-‖r‖ v̂ the radial term (g·v̂) r/‖r‖ is (g·(x̃ - x)) r/‖r‖².
+may overlap. The backward pass takes the direction from the result, not from a second draw: with x̃ - x = ‖r‖ d̂ the
+radial term (g·d̂) r/‖r‖ is (g·(x̃ - x)) r/‖r‖².
 
 The sums of a code go over the rows in their order. A part of the rows has sums of its own, which are added in the order
 of the parts; where the parts lie depends on the sizes alone, so the bits do not depend on the number of threads.
@@ -72,19 +72,8 @@ def _inverses(squared):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _dot(dim, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
-    """Product of two long rows. ``keep`` leaves out what the last vector has in common with the one before."""
-    total = splat(np.float32(0.0))
-    for j in range(0, dim // 16 * 16, 16):
-        total = fma(load(a, at_a + j), load(b, at_b + j), total)
-    if dim % 16:
-        total = fma(load(a, at_a + dim - 16) * load(keep, 0), load(b, at_b + dim - 16), total)
-    return lane_sum(total)
-
-
-@inline
 def _dot_difference(dim, g, at_g, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
-    """Product of a long row with the difference of two."""
+    """Product of a long row with a difference. ``keep`` leaves out what the last two vectors have in common."""
     total = splat(np.float32(0.0))
     for j in range(0, dim // 16 * 16, 16):
         total = fma(load(g, at_g + j), load(a, at_a + j) - load(b, at_b + j), total)
@@ -112,7 +101,7 @@ def _inverse(squared):  # type: ignore[no-untyped-def]
 
 
 def _short_forward(dim: int) -> Any:
-    def forward(seed, x, rows, codebook, codes, out):  # type: ignore[no-untyped-def]
+    def forward(seed, aim, spread, x, rows, codebook, codes, out):  # type: ignore[no-untyped-def]
         count = codes.shape[0]
         for block in prange((count + _ROWS - 1) // _ROWS):
             noise, radius, angle = np.empty(_ROWS * dim, np.float32), np.empty(16, np.float32), np.empty(16, np.float32)
@@ -123,10 +112,13 @@ def _short_forward(dim: int) -> Any:
                 _copy_in(dim, x, rows, first, valid, values)
                 _copy_in(dim, codebook, codes, first, valid, chosen)
                 at = (first - block * _ROWS) * dim
-                squared = splat(np.float32(0.0))
+                error, squared = splat(np.float32(0.0)), splat(np.float32(0.0))
                 for j in range(dim):
-                    squared = fma(load(noise, at + 16 * j), load(noise, at + 16 * j), squared)
-                length = vsqrt(_residuals_squared(dim, values, chosen) * _inverses(squared))
+                    residual = load(chosen, 16 * j) - load(values, 16 * j)
+                    direction = fma(splat(aim), residual, splat(spread) * load(noise, at + 16 * j))
+                    store(noise, at + 16 * j, direction)
+                    error, squared = fma(residual, residual, error), fma(direction, direction, squared)
+                length = vsqrt(error * _inverses(squared))
                 for j in range(dim):
                     store(values, 16 * j, fma(length, load(noise, at + 16 * j), load(values, 16 * j)))
                 for lane in range(valid):
@@ -139,22 +131,30 @@ def _short_forward(dim: int) -> Any:
 def _long_forward(dim: int) -> Any:
     vectors = -(-dim // 16)
 
-    def forward(seed, x, rows, codebook, codes, out):  # type: ignore[no-untyped-def]
+    def forward(seed, aim, spread, x, rows, codebook, codes, out):  # type: ignore[no-untyped-def]
         count = codes.shape[0]
         for block in prange((count + _ROWS - 1) // _ROWS):
             radius, angle, keep = np.empty(16, np.float32), np.empty(16, np.float32), np.ones(16, np.float32)
             keep[: vectors * 16 - dim] = 0
-            noise = np.empty(2 * vectors * 16, np.float32)
+            noise, direction = np.empty(2 * vectors * 16, np.float32), np.empty(vectors * 16, np.float32)
             for i in range(block * _ROWS, min(count, (block + 1) * _ROWS)):
                 start = i % 2 * vectors * 16
                 if start == 0:
                     fill_normal(seed, i * vectors, 2 * vectors, noise, radius, angle)
                 at, code = get(rows, i) * dim, get(codes, i) * dim
-                squared = _residual_squared(dim, x, at, codebook, code, keep)
-                length = splat(np.sqrt(squared * _inverse(_dot(dim, noise, start, noise, start, keep))))
+                error, squared = splat(np.float32(0.0)), splat(np.float32(0.0))
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
-                    store(out, i * dim + place, fma(length, load(noise, start + place), load(x, at + place)))
+                    residual = load(codebook, code + place) - load(x, at + place)
+                    way = fma(splat(aim), residual, splat(spread) * load(noise, start + place))
+                    store(direction, place, way)
+                    if j == vectors - 1:
+                        residual, way = residual * load(keep, 0), way * load(keep, 0)
+                    error, squared = fma(residual, residual, error), fma(way, way, squared)
+                length = splat(np.sqrt(lane_sum(error) * _inverse(lane_sum(squared))))
+                for j in range(vectors):
+                    place = min(16 * j, dim - 16)
+                    store(out, i * dim + place, fma(length, load(direction, place), load(x, at + place)))
 
     return kernel(forward)
 
@@ -243,19 +243,24 @@ def _add_parts(sums, total):  # type: ignore[no-untyped-def]
             total[i] = value
 
 
-def substitute(seed: int, x: Floats, rows: Integers, codebook: Floats, codes: Integers) -> Floats:
-    """``x + ‖x − c‖·v̂`` with random directions v̂ for some rows of a table, ``[V, D]``.
+def substitute(
+    seed: int, x: Floats, rows: Integers, codebook: Floats, codes: Integers, *, aim: float = 0.0, spread: float = 1.0
+) -> Floats:
+    """``x + ‖x − c‖·d/‖d‖`` with ``d = aim·(c − x) + spread·v``, v ~ N(0, I), for some rows of a table, ``[V, D]``.
 
     Args:
-        seed: 63 random bits; a direction is a function of them and of the position in ``rows``.
+        seed: 63 random bits; v is a function of them and of the position in ``rows``.
         x: Table ``[N, D]``.
         rows: Which rows of it, ``[V]``.
         codebook: Codes ``[K, D]``.
         codes: Code of each chosen row, ``[V]``.
+        aim: Weight of the way to the code in the direction d.
+        spread: Weight of the noise in it.
     """
     out = recycled((len(rows), x.shape[1])).numpy()
     thread_count()
-    _kernels(x.shape[1])[0](seed, x.ravel(), rows, codebook.ravel(), codes, out.ravel())
+    flat = x.ravel(), rows, codebook.ravel(), codes, out.ravel()
+    _kernels(x.shape[1])[0](seed, np.float32(aim), np.float32(spread), *flat)
     return out
 
 

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -232,6 +233,29 @@ def test_plain_and_demo_configs_parse(demo_scene: Path, capsys: pytest.CaptureFi
     with pytest.raises(SystemExit):
         main(["fit", "--config=demo.yaml", "--print_config"])
     assert "DemoDataModule" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "quantizer"), [("straight_through", "StraightThrough"), ("diveq", "DiVeQ"), ("post_hoc", "PostHoc")]
+)
+def test_configs_of_other_quantizers_differ_from_nsvq_in_that_alone(
+    name: str, quantizer: str, demo_scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from nsvq_lightning import quantize
+
+    def config(name: str, *more: str) -> dict[str, Any]:
+        with pytest.raises(SystemExit):
+            main(["fit", "--config", f"{name}_4k.yaml", f"--data.root={demo_scene}", *more, "--print_config"])
+        parsed: dict[str, Any] = yaml.safe_load(capsys.readouterr().out)
+        return parsed
+
+    ours, theirs = config(name), config("nsvq", f"--model.quantizer={quantizer}")  # short names resolve
+    home = getattr(quantize, quantizer)
+    assert ours["model"]["quantizer"]["class_path"].rpartition(".")[2] == home.__name__
+    if name == "post_hoc":
+        assert ours["callbacks"]["phases"]["init_args"].pop("quantize_end") == 45_000
+        assert theirs["callbacks"]["phases"]["init_args"].pop("quantize_end") == 43_000
+    assert ours == theirs
 
 
 def test_configs_are_found_as_files_first_then_by_name(tmp_path: Path) -> None:

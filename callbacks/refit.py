@@ -1,0 +1,63 @@
+"""Move codebooks that no gradient trains to the rows as they are now."""
+
+from __future__ import annotations
+
+import logging
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+from torch.optim import Optimizer
+
+from nsvq_lightning.host import SplatHost, as_host, from_first_process, next_iteration
+from nsvq_lightning.quantize.base import Refittable
+from nsvq_lightning.schedule import Phase
+
+__all__ = ["CodebookRefit"]
+
+log = logging.getLogger(__name__)
+
+
+class CodebookRefit(Callback):
+    """Refits codebooks to the rows of all splats in the quantize phase, as CompGS does (Navaneet et al. 2024).
+
+    Only quantizers that offer it (:class:`nsvq_lightning.quantize.base.Refittable`, such as ``StraightThrough``) are
+    refitted; for others it does nothing. CompGS runs up to 10 steps of k-means every 100 iterations.
+
+    A refit comes between backward pass and update: once a step, also with gradient accumulation, and before the other
+    callbacks replace codes or evaluate, so that the order of their list does not matter.
+
+    Args:
+        every: Iterations of the reference run between two refits.
+        steps: Lloyd steps of a refit.
+
+    Raises:
+        ValueError: ``every`` or ``steps`` is below 1.
+    """
+
+    def __init__(self, every: int = 100, steps: int = 10) -> None:
+        if every < 1 or steps < 1:
+            raise ValueError(f"refits need every >= 1 and steps >= 1, got every={every}, steps={steps}")
+        self.every = every
+        self.steps = steps
+
+    def is_due(self, host: SplatHost, iteration: int) -> bool:
+        """Whether codebooks are refitted in this iteration."""
+        schedule = host.schedule
+        if schedule.phase_at(iteration) is not Phase.QUANTIZE:
+            return False
+        return iteration in schedule.replacement_times(
+            schedule.prune_end + self.every, schedule.quantize_end, self.every
+        )
+
+    def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
+        """Refit when it is time, on the first process."""
+        host = as_host(pl_module)
+        iteration = next_iteration(trainer)
+        if not self.is_due(host, iteration):
+            return
+        for name, quantizer in host.quantizers.items():
+            if not isinstance(quantizer, Refittable):
+                continue
+            if trainer.is_global_zero:
+                quantizer.refit(host.rows(name), self.steps)
+            quantizer.codebook.data = from_first_process(trainer, quantizer.codebook.data)
+            log.debug("iteration %d: refitted the codebook of %s", iteration, name)

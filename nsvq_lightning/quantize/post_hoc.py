@@ -1,0 +1,65 @@
+"""k-means of the finished splats: what vector quantization costs that training knows nothing of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nsvq_lightning.quantize.codebook import CodebookQuantizer
+from nsvq_lightning.subset import take_rows
+
+__all__ = ["PostHoc"]
+
+
+class PostHoc(CodebookQuantizer):
+    """Quantizer that leaves training alone: the codebook is k-means of whatever rows are encoded.
+
+    In training the rows pass as they are; nothing is searched or counted, so that no code is ever replaced. Codes come
+    into being where they are needed, when the scene is evaluated, frozen or stored: :meth:`encode` fits the codebook to
+    the rows it is given, by k-means from a fixed start, and returns their nearest codes. The codebook so depends on the
+    rows alone, on every process and however often the scene was evaluated before; a file holds k-means of the final
+    rows, all counted alike. Once codes are frozen, codebook and codes are those of that moment, as with every other
+    quantizer.
+
+    ``configs/post_hoc_4k.yaml`` has no fine-tune phase, in which the codebooks would be trained after all.
+
+    Args:
+        num_codes: Codes K, at least 1.
+        dim: Numbers in a row, D.
+        **settings: Those of :class:`CodebookQuantizer`.
+    """
+
+    def __init__(self, num_codes: int, dim: int, **settings: Any) -> None:
+        super().__init__(num_codes, dim, **settings)
+        self.most_codes = num_codes
+
+    def fit(self, x: Tensor, weight: Tensor | None = None, generator: torch.Generator | None = None) -> None:
+        """Place the codebook on rows, see :meth:`CodebookQuantizer.fit`; K may have been smaller for other rows."""
+        self._resize(self.most_codes)
+        super().fit(x, weight, generator)
+
+    def forward(
+        self, x: Tensor, generator: torch.Generator | None = None, rows: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """In training the rows ``[V, D]`` themselves, and -1 as the code of each; else hard codes."""
+        if self.frozen or not self.training:
+            return super().forward(x, generator, rows)
+        count = len(x) if rows is None else len(rows)
+        codes = torch.full((count,), -1, dtype=torch.int64, device=x.device)
+        return self.approximate(x, codes, generator, rows), codes
+
+    def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator | None, rows: Tensor | None) -> Tensor:
+        """The rows ``rows [V]`` of ``x [N, D]`` themselves."""
+        return x if rows is None else take_rows(x, rows)
+
+    def encode(self, x: Tensor) -> Tensor:
+        """Nearest codes ``[N]`` int64 of ``x [N, D]``, in a codebook that is fitted to ``x`` unless it is frozen."""
+        if not self.frozen:
+            self.fit(x.detach())
+        return super().encode(x)
+
+    def _search(self, x: Tensor, rows: Tensor | None) -> Tensor:
+        codes = self.encode(x)
+        return codes if rows is None else codes[rows]
