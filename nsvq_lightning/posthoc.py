@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 import torch
@@ -137,9 +138,10 @@ class Compressor:
                 continue
             # Scales spread over many sizes, of which each counts; a weight would leave the small ones none.
             scales = name == "scales"
-            quantizers[name] = NSVQ(codes, rows.shape[1], start="spread" if scales else "sample")
+            quantizer = NSVQ(codes, rows.shape[1], start="spread" if scales else "sample")
             weight = None if scales else self._weights
-            quantizers[name].fit(rows, weight, generator(self._seed, 0, "kmeans", name))
+            quantizer.fit(rows, weight, generator(self._seed, 0, "kmeans", name))
+            quantizers[name] = cast(Quantizer, quantizer)
         return compress(splats, quantizers, {"codebooks": {name: len(q.codebook) for name, q in quantizers.items()}})
 
     def _canonical(self, codebooks: Mapping[str, int]) -> RawSplats:
