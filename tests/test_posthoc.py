@@ -1,0 +1,181 @@
+"""Compressing a scene that is trained already: the ladder, and ``nsvq compress``."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nsvq_lightning.cli import main
+from nsvq_lightning.io import CompressedScene, read_header, read_nsvq, write_ply
+from nsvq_lightning.io.arrays import SplatArrays
+from nsvq_lightning.io.formats import load
+from nsvq_lightning.io.precision import Precision, Storage
+from nsvq_lightning.posthoc import RUNGS, Compressor, finest_within, smallest_within
+from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.viewpoints import cameras_around, middle_of
+
+
+def arrays(count: int = 1500, degree: int = 1) -> SplatArrays:
+    """A ball of splats."""
+    rng = np.random.default_rng(count)
+    coefficients = (degree + 1) ** 2 - 1
+    return SplatArrays(
+        means=rng.standard_normal((count, 3), np.float32),
+        quats=rng.standard_normal((count, 4), np.float32),
+        scales=(-2.5 + 0.5 * rng.standard_normal((count, 3))).astype(np.float32),
+        opacities=rng.standard_normal(count, np.float32),
+        sh0=rng.standard_normal((count, 1, 3), np.float32),
+        shN=(0.1 * rng.standard_normal((count, coefficients, 3))).astype(np.float32),
+    )
+
+
+@pytest.fixture(scope="module")
+def compressor() -> Compressor:
+    scene = arrays()
+    return Compressor(scene, cameras_around(scene.means, 2, 96, 64), Storage())
+
+
+def test_cameras_stand_around_and_look_at_the_middle() -> None:
+    means = arrays().means + np.float32(7)
+    middle, reach = middle_of(means)
+    cameras = cameras_around(means, 5, 120, 80)
+    places = []
+    for camera in cameras:
+        view = camera.viewmat.double().numpy()
+        seen = view[:3, :3] @ middle + view[:3, 3]
+        np.testing.assert_allclose(seen, [0, 0, 2 * reach], atol=1e-5)
+        np.testing.assert_allclose(view[:3, :3] @ view[:3, :3].T, np.eye(3), atol=1e-6)
+        assert view[1, 1] > 0.8  # y stays down
+        places.append(-view[:3, :3].T @ view[:3, 3] - middle)
+    assert np.linalg.norm(np.sum(places, 0)[[0, 2]]) < 0.2 * reach
+
+
+def test_a_candidate_is_what_its_bytes_hold(compressor: Compressor, tmp_path: Path) -> None:
+    """Oracle: the file, read and rendered here."""
+    candidate = compressor.at(RUNGS[-3])
+    (tmp_path / "x.nsvq").write_bytes(candidate.data)
+    decoded, original = load(tmp_path / "x.nsvq"), arrays().to_splats()
+    squares = []
+    for camera in cameras_around(arrays().means, 2, 96, 64):
+        with torch.no_grad():
+            pair = [render(splats, camera).image.clamp(0, 1).double() for splats in (decoded, original)]
+        squares.append(float((pair[0] - pair[1]).square().mean()))
+    assert candidate.error == pytest.approx(math.sqrt(np.mean(squares)), rel=1e-6)
+    assert candidate.psnr == pytest.approx(-10 * math.log10(np.mean(squares)), rel=1e-6)
+    assert compressor.at(RUNGS[-3]) is candidate
+
+
+def test_rungs_go_from_exact_to_small() -> None:
+    scene = arrays(4000)
+    ladder = Compressor(scene, cameras_around(scene.means, 2, 96, 64), Storage())
+    found = [
+        ladder.at(rung) for rung in RUNGS if rung.name in ("no codebooks", "4k", "1k", "0.5k") or rung is RUNGS[-1]
+    ]
+    sizes, errors = [len(c.data) for c in found], [c.error for c in found]
+    assert sizes == sorted(sizes, reverse=True)
+    assert errors == sorted(errors)
+
+
+def test_the_smallest_file_within_an_error_and_the_best_within_bytes(compressor: Compressor) -> None:
+    middle = compressor.at(RUNGS[8])
+    found = smallest_within(compressor, middle.error)
+    assert found.error <= middle.error
+    after = RUNGS[RUNGS.index(found.rung) + 1]
+    assert compressor.at(after).error > middle.error
+    found = finest_within(compressor, len(middle.data))
+    assert len(found.data) <= len(middle.data)
+    assert found.rung is RUNGS[0] or len(compressor.at(RUNGS[RUNGS.index(found.rung) - 1]).data) > len(middle.data)
+    assert finest_within(compressor, 10**9).rung is RUNGS[0]
+    assert smallest_within(compressor, 10.0).rung is RUNGS[-1]
+
+
+def test_what_cannot_be_reached_says_what_can(compressor: Compressor) -> None:
+    with pytest.raises(ValueError, match=r"the smallest file of this scene has \d+ bytes, more than 50"):
+        finest_within(compressor, 50)
+    with pytest.raises(ValueError, match="no setting has an error of at most 1e-09: the most exact one has"):
+        smallest_within(compressor, 1e-9)
+
+
+def test_scenes_that_cannot_be_seen_are_refused() -> None:
+    with pytest.raises(ValueError, match="cannot compress 5 splats seen by 0 cameras"):
+        Compressor(arrays(5), [], Storage())
+
+
+def test_the_command_compresses_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, output = tmp_path / "scene.ply", tmp_path / "new" / "scene.nsvq"
+    scene = arrays(700)
+    scene.sh0[3] = np.nan
+    write_ply(source, scene)
+    assert main(["compress", str(source), str(output), "--codebooks", "0.5k"]) == 0
+    assert f"699 splats in {output.stat().st_size:,} bytes" in capsys.readouterr().out
+    stored = read_nsvq(output)
+    assert isinstance(stored, CompressedScene)
+    assert {name: len(book) for name, book in stored.codebooks.items()}.keys() == {"quats", "scales", "sh0", "shN"}
+    first = output.read_bytes()
+    assert main(["compress", str(source), str(output), "--codebooks", "0.5k"]) == 0
+    assert output.read_bytes() == first
+    assert main(["compress", str(output), str(tmp_path / "again.nsvq"), "--codebooks", "none", "--level", "paper"]) == 0
+    assert read_header(tmp_path / "again.nsvq").level == "paper"
+    capsys.readouterr()
+    assert main(["compress", str(source), str(output), "--target-bytes", "100"]) == 1
+    assert "the smallest file of this scene has" in capsys.readouterr().err
+    assert output.read_bytes() == first
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["missing.ply", "x.nsvq"], "missing.ply"),
+        (["empty.ply", "x.nsvq"], "no splat with finite numbers"),
+    ],
+)
+def test_bad_files_are_one_line_and_status_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    write_ply(tmp_path / "empty.ply", arrays(0))
+    assert main(["compress", *(str(tmp_path / name) for name in arguments)]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("nsvq compress: ")
+    assert message in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["a.ply", "b.ply"], "is a .nsvq file"),
+        (["a.ply", "b.nsvq", "--max-steps", "5"], "--data.root"),
+        (["a.ply", "b.nsvq", "--max-error", "0"], "must be above 0"),
+        (["a.ply", "b.nsvq", "--max-error", "1", "--target-bytes", "5"], "not allowed with"),
+    ],
+)
+def test_wrong_options_end_with_status_2(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["compress", *arguments])
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_photos_train_the_codebooks(tmp_path: Path, demo_scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, output = tmp_path / "scene.ply", tmp_path / "out.nsvq"
+    write_ply(source, arrays(400, degree=0))
+    options = ["--codebooks", "0.5k", f"--data.root={demo_scene}", "--max-steps=4"]
+    assert main(["compress", str(source), str(output), *options]) == 0
+    stored = read_nsvq(output)
+    assert (len(stored), stored.sh_degree) == (400, 0)
+    assert stored.config["phase_ends"][:2] == [0, 0]
+    assert "PSNR" in capsys.readouterr().out
+
+
+def test_precision_of_a_rung_follows_that_of_the_user() -> None:
+    scene = arrays(200)
+    storage = Storage(precision=Precision(position=0.2, opacity=0.1))
+    found = Compressor(scene, cameras_around(scene.means, 1, 40, 30), storage).at(RUNGS[-1])
+    assert found.storage.precision.position == pytest.approx(0.8)
+    assert found.storage.precision.opacity == 0.25
