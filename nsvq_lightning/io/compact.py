@@ -100,7 +100,8 @@ def encode_compact(scene: CompressedScene, precision: Precision | None = None) -
     """
     precision = precision or Precision()
     _check_finite(scene)
-    stored = {name: _stored(scene, name, dim, precision) for name, dim in attribute_dims(scene.sh_degree).items()}
+    dims = attribute_dims(scene.sh_degree)
+    stored = _all_of({name: _bind(_stored, scene, name, dim, precision) for name, dim in dims.items()})
     stored["opacities"] = _levels(scene.opacities, precision.opacity_levels)
     size = stored["scales"].rows().sum(1) * (stored["scales"].entry.step / 3)
     grid = Grid.around(scene.means, 2 * precision.position * np.exp(size))
@@ -155,11 +156,12 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
     names = [name for name in _ORDER if name not in ("scales", "means")]
     stored |= _all_of({name: _bind(_decode, entries[name], streams, others) for name in names})
     levels = stored.pop("opacities")
-    shares = (levels.values + 0.5) / levels.entry.codes
+    shares = (np.arange(levels.entry.codes) + 0.5) / levels.entry.codes
+    logits = (np.log(shares) - np.log1p(-shares)).astype(np.float32)
     coded = {name: attribute for name, attribute in stored.items() if attribute.codebook is not None}
     return CompressedScene(
         means=means,
-        opacities=(np.log(shares) - np.log1p(-shares)).astype(np.float32),
+        opacities=logits[levels.values],
         codes={name: coded[name].values for name in QUANTIZABLE if name in coded},
         codebooks={name: _floats(coded[name].codebook, coded[name].entry) for name in QUANTIZABLE if name in coded},
         raw={name: _floats(stored[name].values, stored[name].entry) for name in QUANTIZABLE if name not in coded},
@@ -271,9 +273,10 @@ def _decode(entry: AttributeEntry, streams: Mapping[str, memoryview], neighbours
     if entry.storage == "steps":
         return _Stored(entry, decode_integers(streams[entry.name], len(neighbours), entry.dim))
     paths = decode_paths(streams[entry.name], entry.bits, neighbours)
-    leaves = leaf_paths(entry.codes)
-    values = np.searchsorted(leaves, paths)
-    if not np.array_equal(leaves[np.minimum(values, entry.codes - 1)], paths):
+    leaf_of = np.full(1 << entry.bits, -1)
+    leaf_of[leaf_paths(entry.codes)] = np.arange(entry.codes)
+    values = leaf_of[paths]
+    if (values < 0).any():
         raise FormatError(f"damaged: a code of {entry.name} is not one of {entry.codes}")
     codebook = None
     if entry.storage == "codes":

@@ -59,7 +59,7 @@ def encode_paths(paths: NDArray[np.int64], bits: int, neighbours: NDArray[np.int
         neighbours: Two earlier rows ``[N, 2]`` that are likely to be alike, -1 where there is none.
     """
     words = _room(len(paths) * bits)
-    used = _write_paths(paths, bits, neighbours, words, *new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
+    used = _write_paths(paths, bits, neighbours, words, new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
     return _bytes(words, used)
 
 
@@ -70,7 +70,7 @@ def decode_paths(data: bytes | memoryview, bits: int, neighbours: NDArray[np.int
         FormatError: There are more or fewer bytes than N paths have.
     """
     paths, words = np.empty(len(neighbours), np.int64), _words(data)
-    used = _read_paths(words, bits, neighbours, paths, *new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
+    used = _read_paths(words, bits, neighbours, paths, new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
     _check_used(words, used)
     return paths
 
@@ -83,7 +83,7 @@ def encode_keys(keys: NDArray[np.uint64], depths: NDArray[np.int64]) -> bytes:
     fewer than the keys as they are.
     """
     words = _room(int(depths.sum()) + 8 * len(keys))
-    return _bytes(words, _write_keys(keys, depths, words, *new_contexts(_KEY_CONTEXTS)))
+    return _bytes(words, _write_keys(keys, depths, words, new_contexts(_KEY_CONTEXTS)))
 
 
 def decode_keys(data: bytes | memoryview, depths: NDArray[np.int64]) -> NDArray[np.uint64]:
@@ -93,7 +93,7 @@ def decode_keys(data: bytes | memoryview, depths: NDArray[np.int64]) -> NDArray[
         FormatError: There are more or fewer bytes than N keys have.
     """
     keys, words = np.empty(len(depths), np.uint64), _words(data)
-    _check_used(words, _read_keys(words, depths, keys, *new_contexts(_KEY_CONTEXTS)))
+    _check_used(words, _read_keys(words, depths, keys, new_contexts(_KEY_CONTEXTS)))
     return keys
 
 
@@ -108,7 +108,7 @@ def encode_integers(values: NDArray[np.int64]) -> bytes:
     by_steps = _size(steps) < _size(values)
     chosen = np.where(by_steps, steps, values)
     words = _room(int(_bit_lengths(chosen).sum()) + 8 * chosen.size)
-    used = _write_integers(chosen, words, *new_contexts(_INTEGER_CONTEXTS * values.shape[1]))
+    used = _write_integers(chosen, words, new_contexts(_INTEGER_CONTEXTS * values.shape[1]))
     return by_steps.astype(np.uint8).tobytes() + _bytes(words, used)
 
 
@@ -122,7 +122,7 @@ def decode_integers(data: bytes | memoryview, rows: int, columns: int) -> NDArra
         raise FormatError(f"damaged: {len(data)} bytes for {columns} columns of integers")
     by_steps = np.frombuffer(data[:columns], np.uint8).astype(bool)
     values, words = np.empty((rows, columns), np.int64), _words(data[columns:])
-    _check_used(words, _read_integers(words, values, *new_contexts(_INTEGER_CONTEXTS * columns)))
+    _check_used(words, _read_integers(words, values, new_contexts(_INTEGER_CONTEXTS * columns)))
     return np.where(by_steps, np.cumsum(values, axis=0), values)
 
 
@@ -166,8 +166,8 @@ def _context(first, second, path, left, bits):  # type: ignore[no-untyped-def]
     return _RELATIONS * node + 3 * _way(first, path, left) + _way(second, path, left)
 
 
-@partial(kernel, parallel=False)
-def _write_paths(paths, bits, neighbours, words, chances, counts):  # type: ignore[no-untyped-def]
+@partial(kernel, parallel=False, allocates=False)
+def _write_paths(paths, bits, neighbours, words, contexts):  # type: ignore[no-untyped-def]
     low, width, used = uint64(0), _START, 0
     plain = max(0, bits - _MODELLED_BITS)
     for i in range(len(paths)):
@@ -178,14 +178,14 @@ def _write_paths(paths, bits, neighbours, words, chances, counts):  # type: igno
         for left in range(bits - 1, plain - 1, -1):
             bit = (paths[i] >> left) & 1
             context = _context(first, second, path, left, bits)
-            low, width, used = encode_bit(bit, context, chances, counts, low, width, words, used)
+            low, width, used = encode_bit(bit, context, contexts, low, width, words, used)
             path = 2 * path + bit
         low, width, used = encode_plain(paths[i] & ((1 << plain) - 1), plain, low, width, words, used)
     return encode_end(low, words, used)
 
 
-@partial(kernel, parallel=False)
-def _read_paths(words, bits, neighbours, paths, chances, counts):  # type: ignore[no-untyped-def]
+@partial(kernel, parallel=False, allocates=False)
+def _read_paths(words, bits, neighbours, paths, contexts):  # type: ignore[no-untyped-def]
     code, width, used = decode_start(words)
     plain = max(0, bits - _MODELLED_BITS)
     for i in range(len(paths)):
@@ -195,7 +195,7 @@ def _read_paths(words, bits, neighbours, paths, chances, counts):  # type: ignor
         path = np.int64(0)
         for left in range(bits - 1, plain - 1, -1):
             context = _context(first, second, path, left, bits)
-            bit, code, width, used = decode_bit(context, chances, counts, code, width, words, used)
+            bit, code, width, used = decode_bit(context, contexts, code, width, words, used)
             path = 2 * path + bit
         rest, code, width, used = decode_plain(plain, code, width, words, used)
         paths[i] = (path << plain) + np.int64(rest)
@@ -230,20 +230,20 @@ def _second_context(start, length):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _write_length(length, start, chances, counts, low, width, words, used):  # type: ignore[no-untyped-def]
+def _write_length(length, start, contexts, low, width, words, used):  # type: ignore[no-untyped-def]
     node = 1
     for left in range(_LENGTH_BITS - 1, -1, -1):
         bit = (length >> left) & 1
-        low, width, used = encode_bit(bit, start + node, chances, counts, low, width, words, used)
+        low, width, used = encode_bit(bit, start + node, contexts, low, width, words, used)
         node = 2 * node + bit
     return low, width, used
 
 
 @inline
-def _read_length(start, chances, counts, code, width, words, used):  # type: ignore[no-untyped-def]
+def _read_length(start, contexts, code, width, words, used):  # type: ignore[no-untyped-def]
     node = 1
     for _ in range(_LENGTH_BITS):
-        bit, code, width, used = decode_bit(start + node, chances, counts, code, width, words, used)
+        bit, code, width, used = decode_bit(start + node, contexts, code, width, words, used)
         node = 2 * node + bit
     return node - (1 << _LENGTH_BITS), code, width, used
 
@@ -261,8 +261,8 @@ def _key_context(depth, before):  # type: ignore[no-untyped-def]
     return (depth * _BEFORE + before // 6) << _LENGTH_BITS
 
 
-@partial(kernel, parallel=False)
-def _write_keys(keys, depths, words, chances, counts):  # type: ignore[no-untyped-def]
+@partial(kernel, parallel=False, allocates=False)
+def _write_keys(keys, depths, words, contexts):  # type: ignore[no-untyped-def]
     low, width, used = uint64(0), _START, 0
     last, before = uint64(0), 0
     for i in range(len(keys)):
@@ -270,20 +270,20 @@ def _write_keys(keys, depths, words, chances, counts):  # type: ignore[no-untype
         step = (keys[i] >> shift) - (last >> shift)
         length = _length(step)
         start = _key_context(depths[i], before)
-        low, width, used = _write_length(length, start, chances, counts, low, width, words, used)
+        low, width, used = _write_length(length, start, contexts, low, width, words, used)
         low, width, used = encode_plain(_below(step, length), length - 1, low, width, words, used)
         last, before = keys[i], (length + np.int64(shift) if length else 0)
     return encode_end(low, words, used)
 
 
-@partial(kernel, parallel=False)
-def _read_keys(words, depths, keys, chances, counts):  # type: ignore[no-untyped-def]
+@partial(kernel, parallel=False, allocates=False)
+def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
     code, width, used = decode_start(words)
     last, before = uint64(0), 0
     for i in range(len(keys)):
         shift = uint64(KEY_BITS - depths[i])
         start = _key_context(depths[i], before)
-        length, code, width, used = _read_length(start, chances, counts, code, width, words, used)
+        length, code, width, used = _read_length(start, contexts, code, width, words, used)
         # Only an altered stream has a step that is longer than its key.
         length = min(length, depths[i])
         rest, code, width, used = decode_plain(length - 1, code, width, words, used)
@@ -312,38 +312,38 @@ def _size(values: NDArray[np.int64]) -> NDArray[np.int64]:
     return total
 
 
-@partial(kernel, parallel=False)
-def _write_integers(values, words, chances, counts):  # type: ignore[no-untyped-def]
+@partial(kernel, parallel=False, allocates=False)
+def _write_integers(values, words, contexts):  # type: ignore[no-untyped-def]
     low, width, used = uint64(0), _START, 0
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
             size = uint64(abs(values[i, j]))
             length = _length(size)
             start = _INTEGER_CONTEXTS * j
-            low, width, used = _write_length(length, start, chances, counts, low, width, words, used)
+            low, width, used = _write_length(length, start, contexts, low, width, words, used)
             if length > 0:
                 low, width, used = encode_plain(values[i, j] < 0, 1, low, width, words, used)
             if length > 1:
                 second = np.int64(size >> uint64(length - 2)) & 1
                 context = _second_context(start, length)
-                low, width, used = encode_bit(second, context, chances, counts, low, width, words, used)
+                low, width, used = encode_bit(second, context, contexts, low, width, words, used)
                 low, width, used = encode_plain(_below(size, length - 1), length - 2, low, width, words, used)
     return encode_end(low, words, used)
 
 
-@partial(kernel, parallel=False)
-def _read_integers(words, values, chances, counts):  # type: ignore[no-untyped-def]
+@partial(kernel, parallel=False, allocates=False)
+def _read_integers(words, values, contexts):  # type: ignore[no-untyped-def]
     code, width, used = decode_start(words)
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
             start = _INTEGER_CONTEXTS * j
-            length, code, width, used = _read_length(start, chances, counts, code, width, words, used)
+            length, code, width, used = _read_length(start, contexts, code, width, words, used)
             sign, size = uint64(0), uint64(min(length, 1))
             if length > 0:
                 sign, code, width, used = decode_plain(1, code, width, words, used)
             if length > 1:
                 context = _second_context(start, length)
-                second, code, width, used = decode_bit(context, chances, counts, code, width, words, used)
+                second, code, width, used = decode_bit(context, contexts, code, width, words, used)
                 rest, code, width, used = decode_plain(length - 2, code, width, words, used)
                 size = ((uint64(2) | uint64(second)) << uint64(length - 2)) | rest
             values[i, j] = -np.int64(size) if sign else np.int64(size)

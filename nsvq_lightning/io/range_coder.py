@@ -10,7 +10,7 @@ n-th and by 1/128 at last: as exact as a count at the start, as quick as a runni
 from __future__ import annotations
 
 import numpy as np
-from numba import uint8, uint16, uint64
+from numba import uint32, uint64
 from numpy.typing import NDArray
 
 from nsvq_lightning.rendering.cpu.jit import inline
@@ -40,19 +40,24 @@ _FULL = uint64(0xFFFFFFFFFFFFFFFF)
 _LOW_WORD = uint64(0xFFFFFFFF)
 
 
-def new_contexts(count: int) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-    """Chances ``[count]`` of the bit 1, in 65536ths, and how many bits each has met."""
-    return np.full(count, 1 << 15, np.uint16), np.zeros(count, np.uint8)
+def new_contexts(count: int) -> NDArray[np.uint32]:
+    """States ``[count]``: the chance of the bit 1 in 65536ths times 256, plus how many bits were met."""
+    return np.full(count, 1 << 23, np.uint32)
 
 
 @inline
-def _learn(bit, context, chances, counts):
-    n = counts[context]
-    chance = np.int64(chances[context])
-    target = np.int64(65536 - _LEAST) if bit else np.int64(_LEAST)
-    chances[context] = uint16(chance + (((target - chance) * _RATES[n]) >> 16))
-    if n < COUNT_LIMIT:
-        counts[context] = uint8(n + 1)
+def _chance(context, contexts):
+    return uint64(contexts[context] >> uint32(8))
+
+
+@inline
+def _learn(bit, context, contexts):
+    """Move the chance towards the bit. Without branches: which way they go is what is not known."""
+    n = np.int64(contexts[context] & uint32(255))
+    chance = np.int64(contexts[context] >> uint32(8))
+    target = _LEAST + np.int64(bit) * (65536 - 2 * _LEAST)
+    chance += ((target - chance) * _RATES[n]) >> 16
+    contexts[context] = uint32((chance << 8) + n + (n < COUNT_LIMIT))
 
 
 @inline
@@ -77,18 +82,16 @@ def _shift_out(low, width, words, used):
 
 
 @inline
-def encode_bit(bit, context, chances, counts, low, width, words, used):
+def encode_bit(bit, context, contexts, low, width, words, used):
     """Write a bit; returns the new ``low, width, used``. Start with ``0, 2⁶⁴ − 1, 0``."""
-    part = (width >> uint64(16)) * uint64(chances[context])
-    if bit:
-        width = part
-    else:
-        before = low
-        low += part
-        width -= part
-        if low < before:
-            _carry(words, used)
-    _learn(bit, context, chances, counts)
+    part = (width >> uint64(16)) * _chance(context, contexts)
+    one = uint64(0) - uint64(bit)  # all bits set for 1, none for 0
+    before = low
+    low += part & ~one
+    width = (part & one) | ((width - part) & ~one)
+    if low < before:
+        _carry(words, used)
+    _learn(bit, context, contexts)
     return _shift_out(low, width, words, used)
 
 
@@ -140,17 +143,14 @@ def _shift_in(code, width, words, used):
 
 
 @inline
-def decode_bit(context, chances, counts, code, width, words, used):
+def decode_bit(context, contexts, code, width, words, used):
     """Read a bit; returns it and the new ``code, width, used``."""
-    part = (width >> uint64(16)) * uint64(chances[context])
-    if code < part:
-        bit = 1
-        width = part
-    else:
-        bit = 0
-        code -= part
-        width -= part
-    _learn(bit, context, chances, counts)
+    part = (width >> uint64(16)) * _chance(context, contexts)
+    bit = np.int64(code < part)
+    one = uint64(0) - uint64(bit)
+    code -= part & ~one
+    width = (part & one) | ((width - part) & ~one)
+    _learn(bit, context, contexts)
     code, width, used = _shift_in(code, width, words, used)
     return bit, code, width, used
 
