@@ -71,6 +71,9 @@ TRANSMITTANCE_MIN = F(constants.TRANSMITTANCE_MIN)
 BATCH = 128
 TINY = F(1e-20)
 """Where the transmittance of closed pixels is held: far below the threshold, far above denormal numbers."""
+REACH_MARGIN = F(2.0**-8)
+"""How far below the threshold, in log2 α, a block still counts as reached: what rounding can add to the exponent of a
+pixel, so that culling blocks changes no bit. It lets one in a thousand more through."""
 AHEAD = 24
 """How many entries ahead a record is asked for; its slot, whose number stands in the record, a little later."""
 SLOT_AHEAD = 10
@@ -138,7 +141,7 @@ def reachable_blocks(batch, o, x, y, grid):
         top,
         top + side,
     )
-    return mask_bits(peak >= splat(LOG2_ALPHA_MIN - get(batch, o + LOG2_OPACITY)))
+    return mask_bits(peak >= splat(LOG2_ALPHA_MIN - REACH_MARGIN - get(batch, o + LOG2_OPACITY)))
 
 
 @inline
