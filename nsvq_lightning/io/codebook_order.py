@@ -11,8 +11,8 @@ from nsvq_lightning.rendering.cpu.jit import kernel
 
 __all__ = ["leaf_paths", "sibling_distance", "tree_order"]
 
-_ITERATIONS = 12
-"""Steps of the power iteration for the direction of a cut. It need not be exact."""
+_ITERATIONS = 4
+"""Steps of the power iteration for the direction of a cut. It need not be exact: 12 save another 0.02 % of a file."""
 
 
 def tree_order(codebook: NDArray[np.float32]) -> NDArray[np.int64]:
