@@ -154,6 +154,12 @@ def _check_used(words: NDArray[np.uint32], used: int) -> None:
 
 
 @inline
+def _path_of(paths, row):  # type: ignore[no-untyped-def]
+    """The path of a row, or -1 without one, which agrees with no other."""
+    return paths[row] if row >= 0 else np.int64(-1)
+
+
+@inline
 def _way(neighbour, path, left):  # type: ignore[no-untyped-def]
     """What a neighbour's path did at a decision with ``left`` more to come: 1 or 2, or 0 if it had left ``path``."""
     return 1 + ((neighbour >> left) & 1) if neighbour >> (left + 1) == path else 0
@@ -171,9 +177,7 @@ def _write_paths(paths, bits, neighbours, words, contexts):  # type: ignore[no-u
     low, width, used = uint64(0), _START, 0
     plain = max(0, bits - _MODELLED_BITS)
     for i in range(len(paths)):
-        # A path of -1 never agrees with another.
-        first = paths[neighbours[i, 0]] if neighbours[i, 0] >= 0 else np.int64(-1)
-        second = paths[neighbours[i, 1]] if neighbours[i, 1] >= 0 else np.int64(-1)
+        first, second = _path_of(paths, neighbours[i, 0]), _path_of(paths, neighbours[i, 1])
         path = np.int64(0)
         for left in range(bits - 1, plain - 1, -1):
             bit = (paths[i] >> left) & 1
@@ -189,9 +193,7 @@ def _read_paths(words, bits, neighbours, paths, contexts):  # type: ignore[no-un
     code, width, used = decode_start(words)
     plain = max(0, bits - _MODELLED_BITS)
     for i in range(len(paths)):
-        # A path of -1 never agrees with another.
-        first = paths[neighbours[i, 0]] if neighbours[i, 0] >= 0 else np.int64(-1)
-        second = paths[neighbours[i, 1]] if neighbours[i, 1] >= 0 else np.int64(-1)
+        first, second = _path_of(paths, neighbours[i, 0]), _path_of(paths, neighbours[i, 1])
         path = np.int64(0)
         for left in range(bits - 1, plain - 1, -1):
             context = _context(first, second, path, left, bits)
