@@ -12,6 +12,7 @@ from torch.optim import Optimizer
 
 from nsvq_lightning.host import as_host, is_trial, output_folder
 from nsvq_lightning.io.atomic import atomic_path
+from nsvq_lightning.schedule import Schedule
 
 from .boundary import StepBoundary
 from .latch import StepLatch
@@ -23,7 +24,7 @@ log = logging.getLogger(__name__)
 
 
 class RunCheckpoint(Checkpoint):
-    """Saves the whole state of the run in ``checkpoints/last.ckpt``: now and then, at the end, and when it is stopped.
+    """Saves the whole state of the run in ``checkpoints/last.ckpt``: regularly, at ends of phases, and when it stops.
 
     ``fit --ckpt_path …/last.ckpt`` continues exactly where it was saved. Lightning calls checkpoint callbacks after all
     others, so a checkpoint holds the finished step. The time of saving is not training time. A file appears whole or
@@ -35,7 +36,7 @@ class RunCheckpoint(Checkpoint):
     processes, which cannot agree on an iteration any more, only the periodic ones are written.
 
     Args:
-        every: Iterations between two checkpoints; None is a tenth of the run, 0 saves at the end only.
+        every: Iterations between two checkpoints; None is a tenth of the run, 0 saves at the end of the run only.
         keep: Keep each checkpoint as ``step-<iteration>.ckpt`` too, instead of only the last.
         folder: Where; None is ``checkpoints`` in the trainer's log folder.
 
@@ -58,10 +59,13 @@ class RunCheckpoint(Checkpoint):
         self._training = False
         self._amending = False
 
-    def is_due(self, total: int, iteration: int) -> bool:
-        """Whether to save after this iteration of a run of ``total``; the end is saved by itself."""
-        every = max(1, total // 10) if self.every is None else self.every
-        return 0 < iteration < total and every > 0 and iteration % every == 0
+    def is_due(self, schedule: Schedule, iteration: int) -> bool:
+        """Whether to save after this iteration; the end of the run is saved by itself.
+
+        Ends of phases are, as what comes next (placing codebooks, freezing codes) takes longest and cannot be undone.
+        """
+        every = max(1, schedule.total // 10) if self.every is None else self.every
+        return 0 < iteration < schedule.total and every > 0 and (iteration % every == 0 or iteration in schedule.ends)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Begin to hold back signals."""
@@ -85,7 +89,7 @@ class RunCheckpoint(Checkpoint):
             return
         if trainer.world_size == 1:
             self._boundary.take(trainer, pl_module)
-        if self.is_due(as_host(pl_module).schedule.total, iteration):
+        if self.is_due(as_host(pl_module).schedule, iteration):
             self._save(trainer, pl_module)
         if iteration != trainer.max_steps:  # else what comes at the end belongs to the checkpoint, too
             self._signals.deliver()

@@ -208,7 +208,8 @@ class SplatCLI(LightningCLI):
 
 def continuation(arguments: Sequence[str], checkpoint: Path) -> str:
     """The command that goes on from a checkpoint with the arguments of the run that wrote it, for a shell."""
-    program = ["nsvq"] if Path(sys.argv[0]).name != "__main__.py" else ["python", "-m", "nsvq_lightning"]
+    as_module = Path(sys.argv[0]).parts[-2:] == ("nsvq_lightning", "__main__.py")
+    program = ["python", "-m", "nsvq_lightning"] if as_module else ["nsvq"]
     kept, skip = [], False
     for argument in arguments:
         if not (skip or argument.startswith("--ckpt_path=") or argument == "--ckpt_path"):

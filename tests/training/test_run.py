@@ -55,7 +55,7 @@ class CheckpointAt(RunCheckpoint):
         super().__init__(keep=True)
         self.iterations = iterations
 
-    def is_due(self, total: int, iteration: int) -> bool:
+    def is_due(self, schedule: Schedule, iteration: int) -> bool:
         return iteration in self.iterations
 
 
