@@ -36,6 +36,7 @@ DEFAULT_CALLBACKS: dict[str, type[Callback]] = {
     "codebook_init": callbacks.CodebookInit,
     "codebook_refit": callbacks.CodebookRefit,
     "codebook_replacement": callbacks.CodebookReplacement,
+    "codebook_finite": callbacks.FiniteCodes,
     "freeze": callbacks.FreezeCodes,
     "report": callbacks.MetricReport,
     "export": callbacks.ExportScene,
