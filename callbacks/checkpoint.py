@@ -108,7 +108,7 @@ class RunCheckpoint(Checkpoint):
         if not self._training or is_trial(trainer):
             return
         self._training = False
-        if self._boundary.iteration != self._saved and self._boundary.restore(pl_module):
+        if self._boundary.iteration != self._saved and self._boundary.restore(trainer, pl_module):
             self._amending = True
             try:
                 self._save(trainer, pl_module)
@@ -142,11 +142,11 @@ class RunCheckpoint(Checkpoint):
         self.last_path, self._saved = folder / "last.ckpt", trainer.global_step
 
     def state_dict(self) -> dict[str, Any]:
-        """The last iteration saved at."""
+        """The last complete iteration."""
         return {"last": self._latch.last}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Do not save again what was loaded."""
+        """Know the iteration that was loaded, so that a micro-batch of the next one is not taken for its end."""
         self._latch.last = state_dict["last"]
 
 

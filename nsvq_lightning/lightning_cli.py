@@ -82,13 +82,15 @@ class QuietParser(LightningArgumentParser):
 
 
 class SaveConfig(SaveConfigCallback):
-    """Writes ``config.yaml`` into the log folder, atomically."""
+    """Writes the settings of a run into ``config.yaml`` in its log folder, atomically."""
 
-    def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Write the settings of this run, on the first process."""
-        folder = output_folder(trainer)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / self.config_filename, self.parser.dump(self.config, skip_none=False))
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Write, on the first process."""
+        folder = output_folder(trainer)  # asks all processes
+        if trainer.is_global_zero and not self.already_saved:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_text(folder / self.config_filename, self.parser.dump(self.config, skip_none=False))
+        self.already_saved = True
 
 
 class SplatCLI(LightningCLI):
@@ -108,7 +110,6 @@ class SplatCLI(LightningCLI):
                 trainer_class=SplatTrainer,
                 trainer_defaults=TRAINER_DEFAULTS,
                 save_config_callback=SaveConfig,
-                save_config_kwargs={"save_to_log_dir": False},
                 seed_everything_default=False,  # every draw has its own generator
                 parser_class=QuietParser,
                 parser_kwargs=PARSER_TEXTS,

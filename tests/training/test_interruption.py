@@ -303,6 +303,16 @@ def test_lightnings_own_checkpoints_continue_to_the_same_bits(
     assert (with_both / "scene.nsvq").read_bytes() == (continued / "scene.nsvq").read_bytes()
 
 
+def test_a_run_continued_with_another_length_says_what_follows_from_it(
+    run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = Runner(run, recipe, "defaults", max_steps=8).stopped(Broken, Trouble(3, fail))
+    Runner(run, recipe, "defaults", max_steps=9).continued(path)
+    (message,) = [message for message in caplog.messages if message.startswith("the checkpoint is of a run of 8 ")]
+    assert "this one has 9" in message
+    assert "pass --trainer.max_steps=8" in message
+
+
 def arguments_of(scene: Path, folder: Path, *more: str) -> list[str]:
     return [
         *("fit", f"--data.root={scene}", "--data.factor=2", "--trainer.max_steps=12", "--model.sh_degree=1"),
