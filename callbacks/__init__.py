@@ -11,6 +11,7 @@ from .contribution import ContributionPruning
 from .density import DensityControl
 from .density_rules import DensityRules
 from .export import ExportScene
+from .finite import FiniteCodes
 from .freeze import FreezeCodes
 from .opacity import OpacityRegularization
 from .phases import PhaseSchedule
@@ -28,6 +29,7 @@ __all__ = [
     "DensityControl",
     "DensityRules",
     "ExportScene",
+    "FiniteCodes",
     "FreezeCodes",
     "MetricReport",
     "OpacityRegularization",

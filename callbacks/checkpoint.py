@@ -2,27 +2,41 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
+from torch.optim import Optimizer
 
 from nsvq_lightning.host import as_host, is_trial, output_folder
+from nsvq_lightning.io.atomic import atomic_path
+from nsvq_lightning.schedule import Schedule
 
+from .boundary import StepBoundary
 from .latch import StepLatch
+from .signals import HeldSignals
 
 __all__ = ["RunCheckpoint"]
 
+log = logging.getLogger(__name__)
+
 
 class RunCheckpoint(Checkpoint):
-    """Saves the whole state of the run in ``checkpoints/last.ckpt``, now and then and at the end.
+    """Saves the whole state of the run in ``checkpoints/last.ckpt``: regularly, at ends of phases, and when it stops.
 
     ``fit --ckpt_path …/last.ckpt`` continues exactly where it was saved. Lightning calls checkpoint callbacks after all
-    others, so a checkpoint holds the finished step. The time of saving is not training time.
+    others, so a checkpoint holds the finished step. The time of saving is not training time. A file appears whole or
+    not at all, and the one before stays until then.
+
+    Ctrl-C and SIGTERM stop the run after the iteration they come in, with a checkpoint of it; a second one stops it at
+    once. An exception leaves a checkpoint of the last complete iteration if it comes before the update of the next one
+    begins. After that the state is of no iteration, and the last checkpoint is the one to continue from. With several
+    processes, which cannot agree on an iteration any more, only the periodic ones are written.
 
     Args:
-        every: Iterations between two checkpoints; None is a tenth of the run, 0 saves at the end only.
+        every: Iterations between two checkpoints; None is a tenth of the run, 0 saves at the end of the run only.
         keep: Keep each checkpoint as ``step-<iteration>.ckpt`` too, instead of only the last.
         folder: Where; None is ``checkpoints`` in the trainer's log folder.
 
@@ -36,25 +50,85 @@ class RunCheckpoint(Checkpoint):
         self.every = every
         self.keep = keep
         self.folder = folder
+        self.last_path: Path | None = None
+        """Checkpoint to continue from: the last one written, at first the one this run was continued from."""
         self._latch = StepLatch()
+        self._boundary = StepBoundary()
+        self._signals = HeldSignals()
+        self._saved = -1
+        self._training = False
+        self._amending = False
 
-    def is_due(self, total: int, iteration: int) -> bool:
-        """Whether to save after this iteration of a run of ``total``; the end is saved by itself."""
-        every = max(1, total // 10) if self.every is None else self.every
-        return 0 < iteration < total and every > 0 and iteration % every == 0
+    def is_due(self, schedule: Schedule, iteration: int) -> bool:
+        """Whether to save after this iteration; the end of the run is saved by itself.
+
+        Ends of phases are, as what comes next (placing codebooks, freezing codes) takes longest and cannot be undone.
+        """
+        every = max(1, schedule.total // 10) if self.every is None else self.every
+        return 0 < iteration < schedule.total and every > 0 and (iteration % every == 0 or iteration in schedule.ends)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Begin to hold back signals."""
+        if trainer.ckpt_path is not None:
+            self.last_path, self._saved = Path(trainer.ckpt_path), trainer.global_step
+        self._training = True
+        if trainer.world_size == 1:
+            self._signals.hold()
+
+    def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
+        """The update begins: from here until the end of the iteration there is no state to save."""
+        self._boundary.drop()
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Save when it is time."""
+        """Save when it is time; stop here if a signal came."""
         iteration = trainer.global_step
-        if self.is_due(as_host(pl_module).schedule.total, iteration) and self._latch.first_time(iteration):
+        if iteration == 0 or not self._latch.first_time(iteration):
+            self._boundary.drop()  # of the next iteration some micro-batches are done
+            return
+        if trainer.world_size == 1:
+            self._boundary.take(trainer, pl_module)
+        if self.is_due(as_host(pl_module).schedule, iteration):
             self._save(trainer, pl_module)
+        if iteration != trainer.max_steps:  # else what comes at the end belongs to the checkpoint, too
+            self._signals.deliver()
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save the end of the run."""
         if trainer.global_step > 0:
             self._save(trainer, pl_module)
+        self._training = False
+        self._signals.deliver()
+        self._signals.release()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Save the last complete iteration if it is still there; say from where to continue."""
+        self._signals.release()
+        if not self._training or is_trial(trainer):
+            return
+        self._training = False
+        if self._boundary.iteration != self._saved and self._boundary.restore(trainer, pl_module):
+            self._amending = True
+            try:
+                self._save(trainer, pl_module)
+            except Exception as error:  # what stopped the run must be what the user sees
+                log.warning("the checkpoint of iteration %d could not be written: %s", self._boundary.iteration, error)
+            finally:
+                self._amending = False
+        if self.last_path is not None:
+            log.warning("stopped; the last checkpoint is of iteration %d: %s", self._saved, self.last_path)
+        else:
+            log.warning("stopped before the first checkpoint")
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Of a broken iteration, store the counters and callbacks as they were before it."""
+        if self._amending:
+            self._boundary.amend(checkpoint)
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Give the signals back, whatever happened."""
+        self._signals.release()
 
     def _save(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if is_trial(trainer):
@@ -63,14 +137,25 @@ class RunCheckpoint(Checkpoint):
         folder = output_folder(trainer) / "checkpoints" if self.folder is None else Path(self.folder)
         with host.stopwatch.paused(host.device):
             if self.keep:
-                trainer.save_checkpoint(folder / f"step-{trainer.global_step}.ckpt", weights_only=False)
-            # weights_only=False here: save the optimiser's state too. The file holds plain data all the same.
-            trainer.save_checkpoint(folder / "last.ckpt", weights_only=False)
+                _write(trainer, folder / f"step-{trainer.global_step}.ckpt")
+            _write(trainer, folder / "last.ckpt")
+        self.last_path, self._saved = folder / "last.ckpt", trainer.global_step
 
     def state_dict(self) -> dict[str, Any]:
-        """The last iteration saved at."""
+        """The last complete iteration."""
         return {"last": self._latch.last}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Do not save again what was loaded."""
+        """Know the iteration that was loaded, so that a micro-batch of the next one is not taken for its end."""
         self._latch.last = state_dict["last"]
+
+
+def _write(trainer: Trainer, path: Path) -> None:
+    """Write a checkpoint in one step; Lightning itself writes into the system's temporary folder and copies."""
+    # weights_only=False here: save the optimiser's state too. The file holds plain data all the same.
+    if not trainer.is_global_zero:
+        trainer.save_checkpoint(path, weights_only=False)
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary:
+        trainer.save_checkpoint(temporary, weights_only=False)

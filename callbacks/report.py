@@ -80,6 +80,12 @@ class MetricReport(Callback):
             with host.stopwatch.paused(host.device):
                 write_curve(output_folder(trainer) / "curve.png", host.history, host.schedule)
 
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Evaluate the end of a run that was stopped after its last iteration: continued, it trains no more."""
+        history = as_host(pl_module).history
+        if trainer.global_step and (not history or history[-1]["iteration"] < trainer.global_step):
+            self.on_train_end(trainer, pl_module)
+
     def _evaluate_if_due(self, trainer: Trainer, host: SplatHost, iteration: int, always: bool = False) -> None:
         done = host.history[-1]["iteration"] if host.history else 0
         if iteration <= done or not (always or self.is_due(host, iteration)) or is_trial(trainer):

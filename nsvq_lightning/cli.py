@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -51,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments; those of the process if None.
 
     Returns:
-        Exit status: 0, or 1 after an error in the user's files.
+        Exit status: 0, 1 after an error in the user's files or Ctrl-C, 143 after SIGTERM.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     for name, value in ENVIRONMENT.items():
@@ -65,11 +66,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run_lightning(arguments: list[str]) -> int:
     for message in NOT_ACTIONABLE:
         warnings.filterwarnings("ignore", f".*{message}.*")
+    from lightning.pytorch.utilities.exceptions import SIGTERMException
+
     from nsvq_lightning.lightning_cli import SplatCLI
 
     _quiet_lightning()
     try:
         SplatCLI(arguments)
+    except SIGTERMException:
+        return 128 + signal.SIGTERM  # Lightning's own exit status is that of success
     except (ValueError, FileNotFoundError) as error:
         if os.environ.get(TRACEBACK) or not (isinstance(error, FileNotFoundError) or _is_ours(error)):
             raise

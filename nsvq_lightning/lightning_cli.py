@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
-from lightning.pytorch import Callback, Trainer
-from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 import nsvq_lightning.callbacks as callbacks
 import nsvq_lightning.quantize  # noqa: F401  short class names resolve to what is imported
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
 from nsvq_lightning.host import is_trial, output_folder
+from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.progress import SplatProgressBar
 from nsvq_lightning.skips import SKIPS, switch, switched
@@ -33,6 +36,7 @@ DEFAULT_CALLBACKS: dict[str, type[Callback]] = {
     "codebook_init": callbacks.CodebookInit,
     "codebook_refit": callbacks.CodebookRefit,
     "codebook_replacement": callbacks.CodebookReplacement,
+    "codebook_finite": callbacks.FiniteCodes,
     "freeze": callbacks.FreezeCodes,
     "report": callbacks.MetricReport,
     "export": callbacks.ExportScene,
@@ -77,6 +81,18 @@ class QuietParser(LightningArgumentParser):
         self.exit(2)
 
 
+class SaveConfig(SaveConfigCallback):
+    """Writes the settings of a run into ``config.yaml`` in its log folder, atomically."""
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Write, on the first process."""
+        folder = output_folder(trainer)  # asks all processes
+        if trainer.is_global_zero and not self.already_saved:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_text(folder / self.config_filename, self.parser.dump(self.config, skip_none=False))
+        self.already_saved = True
+
+
 class SplatCLI(LightningCLI):
     """``nsvq fit | validate | test | predict | export``.
 
@@ -86,13 +102,14 @@ class SplatCLI(LightningCLI):
     """
 
     def __init__(self, args: list[str]) -> None:
+        self._arguments = args
         with switched():  # they hold for this command only
             super().__init__(
                 SplatModule,
                 ColmapDataModule,
                 trainer_class=SplatTrainer,
                 trainer_defaults=TRAINER_DEFAULTS,
-                save_config_kwargs={"overwrite": True},
+                save_config_callback=SaveConfig,
                 seed_everything_default=False,  # every draw has its own generator
                 parser_class=QuietParser,
                 parser_kwargs=PARSER_TEXTS,
@@ -158,6 +175,22 @@ class SplatCLI(LightningCLI):
         root = getattr(self.datamodule, "root", None)
         return Path(root).resolve().name if root is not None else "scene"
 
+    def _run_subcommand(self, subcommand: str) -> None:
+        """Run it; say how to continue a training that was stopped by whatever it was."""
+        try:
+            super()._run_subcommand(subcommand)
+        except BaseException:
+            path = self._last_checkpoint()
+            if subcommand == "fit" and path is not None and self.trainer.is_global_zero:
+                sys.stderr.write(f"continue with: {continuation(self._arguments, path)}\n")
+            raise
+
+    def _last_checkpoint(self) -> Path | None:
+        """The checkpoint to continue from."""
+        found: list[Callback] = self.trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
+        paths = [callback.last_path for callback in found if isinstance(callback, callbacks.RunCheckpoint)]
+        return next((path for path in paths if path is not None), None)
+
     def after_fit(self) -> None:
         """Test the decoded file, and say what came out."""
         if is_trial(self.trainer) or self.trainer.interrupted:
@@ -173,6 +206,18 @@ class SplatCLI(LightningCLI):
         path = output_folder(self.trainer) / "metrics.json"
         if self.trainer.is_global_zero and path.is_file():
             sys.stdout.write(summary(path.parent, json.loads(path.read_text())))
+
+
+def continuation(arguments: Sequence[str], checkpoint: Path) -> str:
+    """The command that goes on from a checkpoint with the arguments of the run that wrote it, for a shell."""
+    as_module = Path(sys.argv[0]).parts[-2:] == ("nsvq_lightning", "__main__.py")
+    program = ["python", "-m", "nsvq_lightning"] if as_module else ["nsvq"]
+    kept, skip = [], False
+    for argument in arguments:
+        if not (skip or argument.startswith("--ckpt_path=") or argument == "--ckpt_path"):
+            kept.append(argument)
+        skip = argument == "--ckpt_path"
+    return shlex.join([*program, *kept, f"--ckpt_path={checkpoint}"])
 
 
 def summary(folder: Path, metrics: dict[str, Any]) -> str:

@@ -4,7 +4,7 @@ Nothing here imports torch before a scene is turned into :class:`nsvq_lightning.
 """
 
 from nsvq_lightning.io.arrays import SplatArrays
-from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.atomic import atomic_path, atomic_write
 from nsvq_lightning.io.container import CompressedScene, read_header, read_nsvq, write_nsvq
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.formats import FORMATS, Format, load, save
@@ -16,6 +16,7 @@ __all__ = [
     "Format",
     "FormatError",
     "SplatArrays",
+    "atomic_path",
     "atomic_write",
     "load",
     "plain_ply_bytes",

@@ -9,23 +9,23 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-__all__ = ["atomic_write", "write_text"]
+__all__ = ["atomic_path", "atomic_write", "write_text"]
 
 
 @contextmanager
-def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """Open a binary file for writing that takes the name ``path`` only when the block ends without an error.
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Name of a temporary file to write, which takes the name ``path`` only when the block ends without an error.
 
-    The bytes go to a temporary file in the same folder, reach the disk (fsync), and are renamed over ``path`` in one
-    step (:func:`os.replace`). A block that raises, a full disk or a killed process leave the previous file as it was;
-    an exception also removes the temporary file. A symbolic link is followed: its target is replaced, the link stays.
+    The file lies in the same folder, reaches the disk (fsync), and is renamed over ``path`` in one step
+    (:func:`os.replace`). A block that raises, a full disk or a killed process leave the previous file as it was; an
+    exception also removes the temporary file. A symbolic link is followed: its target is replaced, the link stays.
 
     Args:
-        path: Final name; the folder must exist. A new file gets the permissions of any new file, a replaced one keeps
-            its own.
+        path: Final name; the folder must exist. A new file keeps the permissions it was written with, a replaced one
+            keeps its own.
 
     Yields:
-        The temporary file, opened for writing.
+        The temporary name; the block must write a file there.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -39,17 +39,30 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     # Not mkstemp: it makes files that only their owner can read, and rename would keep that.
     temporary = target.parent / f".{secrets.token_hex(8)}.tmp"
     try:
-        with open(temporary, "xb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
+        yield temporary
+        _sync(temporary)
         with suppress(FileNotFoundError):
             temporary.chmod(target.stat().st_mode & 0o7777)
         os.replace(temporary, target)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    _sync_folder(target.parent)
+    # Make the new name itself survive a power failure, where the system can open folders.
+    with suppress(OSError):
+        _sync(target.parent)
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Open a binary file for writing that takes the name ``path`` only when the block ends without an error.
+
+    Arguments and errors as of :func:`atomic_path`; a new file gets the permissions of any new file.
+
+    Yields:
+        The temporary file, opened for writing.
+    """
+    with atomic_path(path) as temporary, open(temporary, "xb") as file:
+        yield file
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
@@ -58,11 +71,10 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         file.write(text.encode())
 
 
-def _sync_folder(folder: Path) -> None:
-    """Make the new name itself survive a power failure, where the system can open folders."""
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+def _sync(path: Path) -> None:
+    """Bring a file or folder to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

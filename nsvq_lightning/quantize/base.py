@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-__all__ = ["Quantizer", "Refittable"]
+__all__ = ["Mendable", "Quantizer", "Refittable"]
 
 
 @runtime_checkable
@@ -70,3 +70,14 @@ class Refittable(Protocol):
 
     def refit(self, x: Tensor, steps: int) -> None:
         """Move the codebook to the rows ``x [N, D]`` by ``steps`` steps of k-means from where it is; K stays."""
+
+
+@runtime_checkable
+class Mendable(Protocol):
+    """Quantizer that can put codes back that have turned non-finite.
+
+    :class:`nsvq_lightning.callbacks.FiniteCodes` asks for it; for others it ends the run.
+    """
+
+    def mend(self, broken: Tensor, rows: Tensor, generator: torch.Generator) -> None:
+        """Give the codes ``broken [B]`` finite values again, where others are finite; the scene is ``rows [N, D]``."""

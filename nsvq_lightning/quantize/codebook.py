@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.quantize.replacement import copy_codes, inactive_codes, split_codes
-from nsvq_lightning.quantize.sums import count_hits, lookup
+from nsvq_lightning.quantize.sums import count_hits, lookup, sum_by_code
 from nsvq_lightning.quantize.tracking import NearestTracker
 from nsvq_lightning.random import generator as seeded
 from nsvq_lightning.skips import is_on
@@ -209,7 +209,8 @@ class CodebookQuantizer(nn.Module, ABC):
         Raises:
             ValueError: ``threshold`` is not in [0, 1].
         """
-        inactive = inactive_codes(self.usage, self.window, threshold)
+        # A code that is not finite attracts no row and must not be copied.
+        inactive = inactive_codes(self.usage, self.window, threshold) | ~torch.isfinite(self.codebook).all(1)
         replaced = inactive.nonzero()[:, 0]
         active = self.codebook[~inactive]
         if len(replaced) and not len(active):
@@ -225,6 +226,27 @@ class CodebookQuantizer(nn.Module, ABC):
             self.codebook[replaced] = new
         self.reset_usage()
         return replaced
+
+    @torch.no_grad()
+    def mend(self, broken: Tensor, rows: Tensor, generator: torch.Generator) -> None:
+        """Put codes back that have turned non-finite, at least one other is finite.
+
+        A frozen code takes the mean of the rows that have it; any other becomes a copy of a random finite code, as a
+        code that is out of use.
+
+        Args:
+            broken: The codes ``[B]`` int64.
+            rows: Rows of the scene ``[N, D]``.
+            generator: Source of the choice.
+        """
+        finite = self.codebook[torch.isfinite(self.codebook).all(1)]
+        self.codebook[broken] = copy_codes(finite, len(broken), generator)
+        if self.frozen:
+            sums = sum_by_code(rows, self.codes, self.num_codes, torch.float64)
+            counts = torch.bincount(self.codes, minlength=self.num_codes)
+            owned = broken[counts[broken] > 0]
+            self.codebook[owned] = (sums[owned] / counts[owned, None]).to(self.codebook)
+        self._tracker.forget()
 
     def freeze(self, codes: Tensor) -> None:
         """Fix the codes ``[N]`` int64; from now on only the codebook is trained.

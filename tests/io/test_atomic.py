@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import ast
 import os
 from pathlib import Path
 
 import pytest
 
-from nsvq_lightning.io import atomic_write
+import nsvq_lightning
+from nsvq_lightning.io import atomic_path, atomic_write
 
 
 def test_failure_keeps_the_old_file_and_leaves_no_litter(tmp_path: Path) -> None:
@@ -61,3 +63,53 @@ def test_missing_folder_is_named(tmp_path: Path) -> None:
         pass
     with pytest.raises(IsADirectoryError, match="folder"), atomic_write(tmp_path):
         pass
+
+
+def test_a_file_written_by_its_name_is_whole_or_not_there(tmp_path: Path) -> None:
+    path = tmp_path / "last.ckpt"
+    with atomic_path(path) as temporary:
+        assert temporary.parent == tmp_path
+        temporary.write_bytes(b"first")
+        assert not path.exists()
+    with pytest.raises(FileNotFoundError), atomic_path(path):
+        pass  # writes nothing
+
+    def broken_write() -> None:
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(b"half")
+            raise ValueError("disk")
+
+    with pytest.raises(ValueError, match="disk"):
+        broken_write()
+    assert path.read_bytes() == b"first"
+    assert os.listdir(tmp_path) == ["last.ckpt"]
+
+
+def test_no_file_of_the_package_is_written_in_place() -> None:
+    # Every call that writes a file, outside of what makes writing atomic. Those listed write into a temporary folder
+    # that takes its name when it is complete, or a log that grows.
+    allowed = {
+        ("io/atomic.py", "open"),
+        ("data/synthetic.py", "imwrite"),
+        ("data/synthetic.py", "write_binary"),
+        ("benchmark/views.py", "imwrite"),
+        ("benchmark/views.py", "write_binary"),
+        ("sweep/training.py", "open"),
+        ("figures.py", "savefig"),  # into memory
+    }
+    package = Path(nsvq_lightning.__file__).parent
+    writers = {"write_text", "write_bytes", "imwrite", "savefig", "savez", "tofile", "write_binary"}
+    found = set()
+    for path in [*package.rglob("*.py"), *(package / "callbacks").glob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.Call):
+                continue
+            function = node.func
+            name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
+            modes = [a.value for a in [*node.args, *(k.value for k in node.keywords)] if isinstance(a, ast.Constant)]
+            opens = name == "open" and any(isinstance(m, str) and set(m) & set("wax") and len(m) < 4 for m in modes)
+            writes = name in writers and isinstance(function, ast.Attribute)
+            saves = isinstance(function, ast.Attribute) and ast.unparse(function) in ("torch.save", "np.save")
+            if opens or writes or saves:
+                found.add((path.relative_to(package).as_posix(), name))
+    assert found == allowed

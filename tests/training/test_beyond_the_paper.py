@@ -25,6 +25,7 @@ from nsvq_lightning.cli import main
 from nsvq_lightning.covariance_error import covariances
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.quantize import NSVQ
+from nsvq_lightning.schedule import Schedule
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 Recipe = Callable[..., dict[str, Callback]]
@@ -54,7 +55,7 @@ class CheckpointAt(RunCheckpoint):
         super().__init__(keep=True)
         self.iterations = iterations
 
-    def is_due(self, total: int, iteration: int) -> bool:
+    def is_due(self, schedule: Schedule, iteration: int) -> bool:
         return iteration in self.iterations
 
 

@@ -18,7 +18,7 @@ from nsvq_lightning.io.precision import Storage
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.quantize import CodebookQuantizer, DiVeQ, PostHoc, StraightThrough, VectorQuantizeAdapter, kmeans
 from nsvq_lightning.random import generator
-from nsvq_lightning.schedule import Phase
+from nsvq_lightning.schedule import Phase, Schedule
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 Recipe = Callable[..., dict[str, Callback]]
@@ -48,7 +48,7 @@ class MiddleCheckpoint(RunCheckpoint):
     def __init__(self) -> None:
         super().__init__(keep=True)
 
-    def is_due(self, total: int, iteration: int) -> bool:
+    def is_due(self, schedule: Schedule, iteration: int) -> bool:
         return iteration == MIDDLE
 
 

@@ -16,7 +16,7 @@ import pytest
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from nsvq_lightning.callbacks import MetricReport, RunCheckpoint
+from nsvq_lightning.callbacks import FiniteCodes, MetricReport, RunCheckpoint
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io.container import read_header, read_nsvq, write_nsvq
 from nsvq_lightning.io.formats import load
@@ -55,7 +55,7 @@ class CheckpointAt(RunCheckpoint):
         super().__init__(keep=True)
         self.iterations = iterations
 
-    def is_due(self, total: int, iteration: int) -> bool:
+    def is_due(self, schedule: Schedule, iteration: int) -> bool:
         return iteration in self.iterations
 
 
@@ -245,3 +245,25 @@ def test_more_codes_than_splats_are_no_problem(run: RunFactory, recipe: Recipe) 
     trainer, module = run(recipe(density=Callback()).values(), module={"codebooks": "0.5k"}, max_steps=20)
     stored = read_nsvq(Path(trainer.default_root_dir) / "scene.nsvq")
     assert all(len(book) <= len(module.splats) for book in stored.codebooks.values())
+
+
+class Plant(Callback):
+    """Breaks a code of SH after an iteration."""
+
+    def __init__(self, *iterations: int) -> None:
+        self.iterations = iterations
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        assert isinstance(pl_module, SplatModule)
+        if trainer.global_step in self.iterations:
+            pl_module.quantizers["sh0"].codebook.data[3] = torch.nan
+
+
+def test_a_run_whose_codes_turn_non_finite_goes_on(
+    run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
+) -> None:
+    _, module = run([Plant(31, 58), *recipe(codebook_finite=FiniteCodes(every=4)).values()])
+    assert all(bool(quantizer.codebook.isfinite().all()) for quantizer in module.quantizers.values())
+    found = [message for message in caplog.messages if "codes of sh0 are non-finite" in message]
+    assert any("step 59: 1 of 16 codes" in message for message in found)
+    assert 10 < module.history[-1]["psnr"] < 100

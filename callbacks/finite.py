@@ -1,0 +1,82 @@
+"""Codes that turn non-finite are put back among the others."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from nsvq_lightning.edit import reset_moments
+from nsvq_lightning.host import SplatHost, as_host, raw_optimizer
+from nsvq_lightning.optim import codebook_group
+from nsvq_lightning.quantize.base import Mendable
+from nsvq_lightning.random import generator
+from nsvq_lightning.schedule import Phase
+
+from .latch import StepLatch
+
+__all__ = ["FiniteCodes"]
+
+log = logging.getLogger(__name__)
+
+
+class FiniteCodes(Callback):
+    """Searches codebooks for NaN and infinite numbers, from the quantize phase on, and mends such codes with a warning.
+
+    As with splats that turn non-finite (:class:`~nsvq_lightning.callbacks.DensityControl`), the run goes on. A code
+    cannot be dropped, as the others would change their numbers: the quantizer puts it back
+    (:class:`nsvq_lightning.quantize.base.Mendable`), and its Adam moments start anew.
+
+    Args:
+        every: Iterations between two searches; a step whose loss is not finite always causes one.
+
+    Raises:
+        ValueError: ``every`` is below 1.
+    """
+
+    def __init__(self, every: int = 100) -> None:
+        if every < 1:
+            raise ValueError(f"every must be at least 1, got {every}")
+        self.every = every
+        self._latch = StepLatch()
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Search when it is time.
+
+        Raises:
+            FloatingPointError: All codes of an attribute are non-finite, or its quantizer cannot mend them.
+        """
+        host, iteration = as_host(pl_module), trainer.global_step
+        if iteration == 0 or host.schedule.phase_at(iteration) < Phase.QUANTIZE:
+            return
+        if (not outputs or iteration % self.every == 0) and self._latch.first_time(iteration):
+            self._mend(trainer, host, iteration)
+
+    def _mend(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
+        for name, quantizer in host.quantizers.items():
+            broken = (~torch.isfinite(quantizer.codebook.detach()).all(1)).nonzero()[:, 0]
+            if len(broken) == 0:
+                continue
+            found = f"step {iteration}: {len(broken)} of {len(quantizer.codebook)} codes of {name} are non-finite"
+            if len(broken) == len(quantizer.codebook) or not isinstance(quantizer, Mendable):
+                raise FloatingPointError(f"{found}; lower the learning rates")
+            quantizer.mend(broken, host.rows(name), generator(host.seed, iteration, "mend", name))
+            reset_moments(raw_optimizer(trainer), codebook_group(name), broken)
+            log.warning("%s (%s); mended", found, _numbers(broken.tolist()))
+
+    def state_dict(self) -> dict[str, Any]:
+        """The last iteration searched at."""
+        return {"last": self._latch.last}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Do not repeat what was done before the checkpoint."""
+        self._latch.last = state_dict["last"]
+
+
+def _numbers(rows: list[int]) -> str:
+    shown = ", ".join(map(str, rows[:5]))
+    return f"rows {shown}{', …' * (len(rows) > 5)}"

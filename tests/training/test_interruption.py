@@ -1,0 +1,380 @@
+"""Runs that are stopped in any phase, in any way, and continued: every bit is that of the run not interrupted."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.utilities.exceptions import SIGTERMException
+from torch import Tensor
+
+from nsvq_lightning.callbacks import (
+    CanonicalCovariance,
+    CodebookInit,
+    CodebookRefit,
+    CodebookReplacement,
+    ContributionPruning,
+    MetricReport,
+    RunCheckpoint,
+)
+from nsvq_lightning.cli import main
+from nsvq_lightning.module import SplatModule
+from nsvq_lightning.quantize import StraightThrough
+
+RunFactory = Callable[..., tuple[Trainer, SplatModule]]
+Recipe = Callable[..., dict[str, Callback]]
+
+PHASES = {"warmup": 13, "prune": 24, "quantize": 41, "finetune": 59}
+"""An iteration of each phase, of the recipe's 60; none of them has a periodic checkpoint."""
+
+FIRST_OF_PHASE = {"prune": 21, "quantize": 28, "finetune": 58}
+
+
+class Broken(Exception):
+    """What goes wrong in the tests."""
+
+
+class Trouble(Callback):
+    """Calls ``act`` at one hook of one iteration."""
+
+    def __init__(self, iteration: int, act: Callable[[], object], hook: str = "on_after_backward") -> None:
+        self.iteration, self.act, self.struck = iteration, act, False
+        setattr(self, hook, self._strike)
+
+    def _strike(self, trainer: Trainer, pl_module: LightningModule, *args: Any) -> None:
+        iteration = trainer.global_step + (self.act is not fail_late)
+        if iteration == self.iteration and not self.struck:
+            self.struck = True
+            self.act()
+
+
+def fail() -> None:
+    raise Broken
+
+
+def fail_late() -> None:
+    """In a hook after the update, where the trainer has already counted the iteration."""
+    raise Broken
+
+
+def interrupt() -> None:
+    signal.raise_signal(signal.SIGINT)
+
+
+def terminate() -> None:
+    signal.raise_signal(signal.SIGTERM)
+
+
+KINDS: dict[str, tuple[Callable[[], None], type[BaseException], int]] = {
+    "exception": (fail, Broken, -1),
+    "SIGINT": (interrupt, SystemExit, 0),
+    "SIGTERM": (terminate, SIGTERMException, 0),
+}
+"""What happens between backward pass and update, what it ends with, and how many more iterations are complete then."""
+
+
+def every_option() -> dict[str, Callback]:
+    return {
+        "canonical": CanonicalCovariance("full"),
+        "contribution": ContributionPruning(share=0.02),
+        "codebook_init": CodebookInit(weights="contribution"),
+        "codebook_refit": CodebookRefit(),
+        "codebook_replacement": CodebookReplacement(jitter=0.5, reset_moments=True),
+    }
+
+
+SETTINGS: dict[str, tuple[Callable[[], dict[str, Callback]], dict[str, Any]]] = {
+    "defaults": (dict, {}),
+    "options": (every_option, {"quantizer": StraightThrough}),
+}
+
+
+class Runner:
+    """Runs with one of the ``SETTINGS``."""
+
+    def __init__(self, run: RunFactory, recipe: Recipe, name: str, **trainer: Any) -> None:
+        self.run, self.recipe, self.trainer = run, recipe, trainer
+        self.options, self.module = SETTINGS[name]
+
+    def __call__(self, *more: Callback, checkpoint: RunCheckpoint, ckpt_path: Path | None = None) -> Path:
+        callbacks = self.recipe(**self.options(), checkpoint=checkpoint).values()
+        trainer, _ = self.run([*callbacks, *more], ckpt_path, self.module, **self.trainer)
+        return Path(trainer.default_root_dir)
+
+    def whole(self) -> Path:
+        return self(checkpoint=RunCheckpoint(every=0))
+
+    def stopped(self, ends_with: type[BaseException], trouble: Callback, every: int = 0) -> Path:
+        """The checkpoint that a run leaves that gets into trouble."""
+        checkpoint = RunCheckpoint(every=every)
+        with pytest.raises(ends_with):
+            self(trouble, checkpoint=checkpoint)
+        assert checkpoint.last_path is not None
+        assert sorted(os.listdir(checkpoint.last_path.parent)) == ["last.ckpt"]
+        return checkpoint.last_path
+
+    def continued(self, path: Path) -> Path:
+        return self(checkpoint=RunCheckpoint(every=0), ckpt_path=path)
+
+
+@pytest.fixture(scope="module")
+def whole(run: RunFactory, recipe: Recipe) -> Callable[[str], Path]:
+    """Folder of the run that nothing interrupts, by the name of its settings."""
+    folders: dict[str, Path] = {}
+
+    def get(name: str) -> Path:
+        if name not in folders:
+            folders[name] = Runner(run, recipe, name).whole()
+        return folders[name]
+
+    return get
+
+
+def assert_same(first: Any, second: Any, where: str = "") -> None:
+    """Every tensor and number of two nested structures is the same, to the bit, but for the time they took."""
+    assert type(first) is type(second), where
+    if isinstance(first, dict):
+        assert first.keys() == second.keys(), where
+        for key in first:
+            if key not in ("seconds", "state._train_seconds"):
+                assert_same(first[key], second[key], f"{where}/{key}")
+    elif isinstance(first, list | tuple):
+        assert len(first) == len(second), where
+        for number, pair in enumerate(zip(first, second, strict=True)):
+            assert_same(*pair, f"{where}/{number}")
+    elif isinstance(first, Tensor):
+        assert torch.equal(first, second), where
+    else:
+        assert first == second, where
+
+
+def assert_same_end(first: Path, second: Path) -> None:
+    """Two runs have stored the same bytes, and their last checkpoints hold the same state in every part."""
+    assert (first / "scene.nsvq").read_bytes() == (second / "scene.nsvq").read_bytes()
+    ends = [torch.load(f / "checkpoints" / "last.ckpt", weights_only=True) for f in (first, second)]
+    assert ends[0]["global_step"] == 60
+    assert_same(*ends)
+
+
+def iteration_of(path: Path) -> int:
+    return int(torch.load(path, weights_only=True)["global_step"])
+
+
+def check(runner: Runner, whole: Path, kind: str, iteration: int) -> None:
+    act, ends_with, complete = KINDS[kind]
+    path = runner.stopped(ends_with, Trouble(iteration, act))
+    assert iteration_of(path) == iteration + complete
+    assert_same_end(runner.continued(path), whole)
+
+
+FAST = {("defaults", "SIGINT", "warmup"), ("options", "exception", "quantize"), ("options", "SIGTERM", "finetune")}
+CASES = [
+    pytest.param(*case, marks=[] if case in FAST else pytest.mark.slow)
+    for case in ((name, kind, phase) for name in SETTINGS for kind in KINDS for phase in PHASES)
+]
+
+
+@pytest.mark.parametrize(("name", "kind", "phase"), CASES)
+def test_a_stopped_run_continues_to_the_same_bits(
+    name: str, kind: str, phase: str, run: RunFactory, recipe: Recipe, whole: Callable[[str], Path]
+) -> None:
+    check(Runner(run, recipe, name), whole(name), kind, PHASES[phase])
+
+
+@pytest.mark.parametrize(
+    "phase", [pytest.param(phase, marks=[] if phase == "prune" else pytest.mark.slow) for phase in FIRST_OF_PHASE]
+)
+def test_an_exception_in_the_first_iteration_of_a_phase_leaves_a_checkpoint_of_the_phase_before(
+    phase: str, run: RunFactory, recipe: Recipe, whole: Callable[[str], Path]
+) -> None:
+    runner, iteration = Runner(run, recipe, "defaults"), FIRST_OF_PHASE[phase]
+    path = runner.stopped(Broken, Trouble(iteration, fail), every=100)
+    # Once codebooks are placed or codes frozen there is no way back; the checkpoint is that of the end of the phase.
+    assert iteration_of(path) == iteration - 1
+    assert_same_end(runner.continued(path), whole("defaults"))
+
+
+def test_an_exception_after_the_update_leaves_the_periodic_checkpoint(
+    run: RunFactory, recipe: Recipe, whole: Callable[[str], Path], caplog: pytest.LogCaptureFixture
+) -> None:
+    runner = Runner(run, recipe, "defaults")
+    path = runner.stopped(Broken, Trouble(47, fail_late, "on_train_batch_end"), every=20)
+    assert iteration_of(path) == 40
+    assert f"stopped; the last checkpoint is of iteration 40: {path}" in caplog.messages
+    assert_same_end(runner.continued(path), whole("defaults"))
+
+
+def test_a_callback_that_fails_half_way_acts_again(
+    run: RunFactory, recipe: Recipe, whole: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Contribution pruning notes that it has acted before it has; the checkpoint must not.
+    runner = Runner(run, recipe, "options")
+    with monkeypatch.context() as patch:
+        patch.setattr(ContributionPruning, "_prune", lambda *_: fail())
+        path = runner.stopped(Broken, Callback())
+    assert iteration_of(path) == 25
+    assert_same_end(runner.continued(path), whole("options"))
+
+
+def test_signals_wait_for_the_last_micro_batch(run: RunFactory, recipe: Recipe) -> None:
+    runner = Runner(run, recipe, "defaults", accumulate_grad_batches=3, max_steps=15)
+    reference = Runner(run, recipe, "defaults", accumulate_grad_batches=3, max_steps=15).whole()
+    path = runner.stopped(SIGTERMException, Trouble(8, terminate))  # in the first of three
+    assert iteration_of(path) == 8
+    assert (runner.continued(path) / "scene.nsvq").read_bytes() == (reference / "scene.nsvq").read_bytes()
+
+
+def test_a_second_signal_stops_at_once(run: RunFactory, recipe: Recipe) -> None:
+    def twice() -> None:
+        interrupt()
+        interrupt()
+
+    path = Runner(run, recipe, "defaults").stopped(SystemExit, Trouble(7, twice))
+    assert iteration_of(path) == 6
+
+
+def test_handlers_of_signals_are_given_back(run: RunFactory, recipe: Recipe) -> None:
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    runner = Runner(run, recipe, "defaults", max_steps=8)
+    runner.whole()
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+    runner.stopped(Broken, Trouble(3, fail))
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_a_signal_in_the_last_evaluation_waits_for_the_last_checkpoint(
+    run: RunFactory, recipe: Recipe, whole: Callable[[str], Path]
+) -> None:
+    path = Runner(run, recipe, "defaults").stopped(SystemExit, Trouble(61, interrupt, "on_train_end"))
+    last = whole("defaults") / "checkpoints" / "last.ckpt"
+    assert_same(*(torch.load(p, weights_only=True) for p in (path, last)))
+
+
+def test_a_run_that_broke_in_its_last_evaluation_makes_up_for_it(
+    run: RunFactory, recipe: Recipe, whole: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runner = Runner(run, recipe, "defaults")
+    with monkeypatch.context() as patch:
+        patch.setattr(MetricReport, "on_train_end", lambda *_: fail())
+        path = runner.stopped(Broken, Callback())
+    assert iteration_of(path) == 60
+    folder = runner.continued(path)
+    assert (folder / "scene.nsvq").read_bytes() == (whole("defaults") / "scene.nsvq").read_bytes()
+    assert [line.split(",")[0] for line in (folder / "curve.csv").read_text().splitlines()[1:]][-1] == "60"
+
+
+def test_a_checkpoint_that_cannot_be_written_hides_no_error_and_harms_no_other(
+    run: RunFactory, recipe: Recipe, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    save, good = Trainer.save_checkpoint, []
+
+    def full_disk(trainer: Trainer, path: Path, **kwargs: Any) -> None:
+        if trainer.global_step > 5:
+            Path(path).write_bytes(b"half of a chec")
+            raise OSError("No space left on device")
+        save(trainer, path, **kwargs)
+        good.append(trainer.global_step)
+
+    monkeypatch.setattr(Trainer, "save_checkpoint", full_disk)
+    path = Runner(run, recipe, "defaults").stopped(Broken, Trouble(8, fail), every=5)
+    assert (iteration_of(path), good) == (5, [5])
+    assert "the checkpoint of iteration 7 could not be written: No space left on device" in caplog.messages
+
+
+def test_lightnings_own_checkpoints_continue_to_the_same_bits(
+    run: RunFactory, recipe: Recipe, whole: Callable[[str], Path], tmp_path: Path
+) -> None:
+    own = ModelCheckpoint(tmp_path, "{step}", every_n_train_steps=25, save_top_k=-1)
+    runner = Runner(run, recipe, "defaults")
+    with_both = runner(own, checkpoint=RunCheckpoint(every=0))
+    assert sorted(os.listdir(tmp_path)) == ["step=25.ckpt", "step=50.ckpt"]
+    continued = runner.continued(tmp_path / "step=25.ckpt")
+    assert_same_end(continued, whole("defaults"))
+    assert (with_both / "scene.nsvq").read_bytes() == (continued / "scene.nsvq").read_bytes()
+
+
+def test_a_run_continued_with_another_length_says_what_follows_from_it(
+    run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = Runner(run, recipe, "defaults", max_steps=8).stopped(Broken, Trouble(3, fail))
+    Runner(run, recipe, "defaults", max_steps=9).continued(path)
+    (message,) = [message for message in caplog.messages if message.startswith("the checkpoint is of a run of 8 ")]
+    assert "this one has 9" in message
+    assert "pass --trainer.max_steps=8" in message
+
+
+def arguments_of(scene: Path, folder: Path, *more: str) -> list[str]:
+    return [
+        *("fit", f"--data.root={scene}", "--data.factor=2", "--trainer.max_steps=12", "--model.sh_degree=1"),
+        *(f"--trainer.default_root_dir={folder}", "--trainer.accelerator=cpu", "--trainer.enable_progress_bar=false"),
+        *("--callbacks.progress=null", "--model.codebooks.scales=16", *more),
+    ]
+
+
+def test_the_command_says_how_to_continue(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "with space"
+    step = SplatModule.training_step
+
+    def terminated(module: SplatModule, batch: Any, batch_idx: int) -> Any:
+        if module.global_step + 1 in (4, 8):
+            terminate()
+        return step(module, batch, batch_idx)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SplatModule, "training_step", terminated)
+        assert main(arguments_of(demo_scene, folder)) == 128 + signal.SIGTERM
+        for version in (0, 1):
+            (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("continue with: ")]
+            program, *arguments = shlex.split(line.removeprefix("continue with: "))
+            path = folder / demo_scene.name / f"version_{version}" / "checkpoints" / "last.ckpt"
+            assert (program, arguments) == ("nsvq", [*arguments_of(demo_scene, folder), f"--ckpt_path={path}"])
+            assert iteration_of(path) == 4 * (version + 1)
+            if version == 0:
+                assert main(arguments) == 128 + signal.SIGTERM
+    assert main(arguments) == 0
+    assert main(arguments_of(demo_scene, folder)) == 0
+    scenes = [folder / demo_scene.name / f"version_{version}" / "scene.nsvq" for version in (2, 3)]
+    assert scenes[0].read_bytes() == scenes[1].read_bytes()
+
+
+KILLED = """
+import os, signal, sys
+from nsvq_lightning.cli import main
+from nsvq_lightning.module import SplatModule
+step = SplatModule.training_step
+def killed(module, batch, batch_idx):
+    if module.global_step + 1 == {iteration}:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return step(module, batch, batch_idx)
+SplatModule.training_step = killed
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize(
+    "iteration", [pytest.param(i, marks=[] if i == 9 else pytest.mark.slow) for i in (4, 6, 9, 12)]
+)
+def test_a_killed_process_leaves_its_periodic_checkpoint(iteration: int, demo_scene: Path, tmp_path: Path) -> None:
+    arguments = arguments_of(demo_scene, tmp_path, "--callbacks.checkpoint.every=2")
+    script = [sys.executable, "-c", KILLED.format(iteration=iteration), *arguments]
+    killed = subprocess.run(script, capture_output=True, timeout=120, check=False)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
+    path = tmp_path / demo_scene.name / "version_0" / "checkpoints" / "last.ckpt"
+    assert os.listdir(path.parent) == ["last.ckpt"]
+    assert iteration_of(path) == (iteration - 1) // 2 * 2
+    assert main([*arguments, f"--ckpt_path={path}"]) == 0
+    assert main(arguments) == 0
+    scenes = [tmp_path / demo_scene.name / f"version_{version}" / "scene.nsvq" for version in (1, 2)]
+    assert scenes[0].read_bytes() == scenes[1].read_bytes()
