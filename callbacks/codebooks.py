@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
-from torch import Tensor
+from torch import Tensor, nn
 
 from nsvq_lightning.edit import reset_moments
 from nsvq_lightning.host import (
     SplatHost,
     as_host,
-    from_first_process,
     next_iteration,
     raw_optimizer,
     sum_over_processes,
@@ -25,6 +24,7 @@ from nsvq_lightning.optim import codebook_group
 from nsvq_lightning.quantize.attributes import QUANTIZED
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.random import generator
+from nsvq_lightning.replicas import check_replicas, follow_first
 from nsvq_lightning.schedule import Phase
 
 from .latch import StepLatch
@@ -79,7 +79,8 @@ class CodebookInit(Callback):
             if trainer.is_global_zero:
                 weight = weights if name in self.weighted else None
                 quantizer.fit(host.rows(name), weight, generator=generator(host.seed, iteration, "kmeans", name))
-            quantizer.codebook.data = from_first_process(trainer, quantizer.codebook.data)
+            if trainer.world_size > 1:  # a fit may leave fewer codes, so counters and all else must follow
+                follow_first(trainer.strategy, cast(nn.Module, quantizer))
         sizes = ", ".join(f"{name} {q.codebook.shape[0]}" for name, q in host.quantizers.items())
         if sizes:
             log.info("iteration %d: codebooks for %d splats: %s", iteration, len(host.splats), sizes)
@@ -151,15 +152,14 @@ class CodebookReplacement(Callback):
             return
         values: dict[str, float] = {}
         for name, quantizer in host.quantizers.items():
-            if trainer.world_size > 1:
-                quantizer.usage.copy_(sum_over_processes(trainer, quantizer.usage))
-                quantizer.window.copy_(sum_over_processes(trainer, quantizer.window))
+            _sum_usage(trainer, quantizer)
             values[f"codebook/{name}_perplexity"] = perplexity(quantizer.usage)
             replaced = self._replace(quantizer, host.rows(name), generator(host.seed, iteration, "replace", name))
             values[f"codebook/{name}_replaced"] = float(len(replaced))
             if self.reset_moments:
                 reset_moments(raw_optimizer(trainer), codebook_group(name), replaced)
             log.debug("iteration %d: replaced %d codes of %s", iteration, len(replaced), name)
+        check_replicas(trainer, "the replacement of codes")
         pl_module.log_dict(dict(values), batch_size=1)
 
     def _replace(self, quantizer: Quantizer, rows: Tensor, draws: torch.Generator) -> Tensor:
@@ -168,6 +168,21 @@ class CodebookReplacement(Callback):
             return quantizer.replace_unused(draws)
         return quantizer.replace_unused(draws, rows=rows, jitter=self.jitter)
 
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave what a checkpoint has counted to the first process: it is the count of all."""
+        if not trainer.is_global_zero:
+            _forget_usage(as_host(pl_module))
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Collect what all processes have counted in the buffers of the first one, which the checkpoint holds."""
+        if trainer.world_size == 1:
+            return
+        host = as_host(pl_module)
+        for quantizer in host.quantizers.values():
+            _sum_usage(trainer, quantizer)
+        if not trainer.is_global_zero:
+            _forget_usage(host)
+
     def state_dict(self) -> dict[str, Any]:
         """The last iteration codes were replaced at."""
         return {"last": self._latch.last}
@@ -175,3 +190,15 @@ class CodebookReplacement(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Do not replace again what was replaced before the checkpoint."""
         self._latch.last = state_dict["last"]
+
+
+def _sum_usage(trainer: Trainer, quantizer: Quantizer) -> None:
+    """Add up what the processes have counted, in the buffers of each."""
+    for counter in (quantizer.usage, quantizer.window):
+        counter.copy_(sum_over_processes(trainer, counter))
+
+
+def _forget_usage(host: SplatHost) -> None:
+    for quantizer in host.quantizers.values():
+        quantizer.usage.zero_()
+        quantizer.window.zero_()

@@ -14,6 +14,7 @@ from nsvq_lightning.edit import append_rows, drop_non_finite, keep_rows, replace
 from nsvq_lightning.host import SplatHost, as_host, next_iteration, raw_optimizer, sum_over_processes
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
+from nsvq_lightning.replicas import check_replicas
 from nsvq_lightning.schedule import Phase
 from nsvq_lightning.splats import RawSplats
 
@@ -81,7 +82,8 @@ class DensityControl(Callback):
         if stage == "fit" and isinstance(trainer.strategy, DDPStrategy) and not follows:
             raise ValueError(
                 "DistributedDataParallel binds gradient hooks to the parameters it finds at the start: after the first "
-                "clone it crashes or silently stops averaging. Train on one device (--trainer.devices=1)"
+                "clone it crashes or silently stops averaging. Train with --trainer.strategy=view_parallel, or on one "
+                "device (--trainer.devices=1)"
             )
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
@@ -120,10 +122,12 @@ class DensityControl(Callback):
         if trainer.world_size == 1:
             add_view(sums, views, render.means2d.grad, render.radii, *size)
             return
-        norms, seen = torch.zeros_like(sums), torch.zeros_like(views)
-        add_view(norms, seen, render.means2d.grad, render.radii, *size)
-        sums.add_(sum_over_processes(trainer, norms))
-        views.add_(sum_over_processes(trainer, seen))
+        observed = sums.new_zeros(2, len(sums))
+        add_view(observed[0], observed[1], render.means2d.grad, render.radii, *size)
+        # One process alone would skip a view whose loss is not finite; here it must not spoil the sum.
+        norms, seen = sum_over_processes(trainer, observed.nan_to_num_(0.0, 0.0, 0.0))
+        sums.add_(norms)
+        views.add_(seen)
 
     def _warmup_step(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
         rules, schedule = self.rules, host.schedule
@@ -131,10 +135,12 @@ class DensityControl(Callback):
             added = self._grow(trainer, host, iteration)
             huge = iteration > schedule.iteration(rules.huge_after)
             pruned = self._prune(trainer, host, iteration, huge)
+            check_replicas(trainer, "density control")
             log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(host.splats))
         white = host.background == "white" and rules.white_reset and iteration == schedule.iteration(rules.white_reset)
         if white or iteration in schedule.reset_times(rules.reset_last, rules.reset_every):
             self._reset_opacities(trainer, host)
+            check_replicas(trainer, "the opacity reset")
 
     def _prune_step(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
         rules = self.rules
@@ -142,6 +148,7 @@ class DensityControl(Callback):
             return
         if iteration in host.schedule.times(rules.prune_start, rules.prune_last, rules.prune_every):
             pruned = self._prune(trainer, host, iteration, huge=False)
+            check_replicas(trainer, "pruning")
             level = logging.INFO if pruned else logging.DEBUG
             log.log(level, "iteration %d: pruned %d splats, %d remain", iteration, pruned, len(host.splats))
 

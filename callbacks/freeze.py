@@ -7,6 +7,7 @@ from typing import Any
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.host import as_host, from_first_process, next_iteration
+from nsvq_lightning.replicas import check_replicas
 from nsvq_lightning.schedule import Phase
 
 from .latch import StepLatch
@@ -28,3 +29,4 @@ class FreezeCodes(Callback):
             return
         for name, quantizer in host.quantizers.items():
             quantizer.freeze(from_first_process(trainer, quantizer.encode(host.rows(name))))
+        check_replicas(trainer, "freezing the codes")

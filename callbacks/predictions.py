@@ -25,6 +25,12 @@ class RenderWriter(Callback):
 
     def __init__(self, folder: str | None = None) -> None:
         self.folder = folder
+        self._target = Path()
+
+    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Make the folder, while all processes are together: some have fewer views than others."""
+        self._target = output_folder(trainer) / "predictions" if self.folder is None else Path(self.folder)
+        self._target.mkdir(parents=True, exist_ok=True)
 
     def on_predict_batch_end(
         self,
@@ -36,13 +42,8 @@ class RenderWriter(Callback):
         dataloader_idx: int = 0,
     ) -> None:
         """Write one picture."""
-        folder = self._target(trainer)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_png(folder / f"{file_stem(outputs['name'])}.png", outputs["image"])
+        write_png(self._target / f"{file_stem(outputs['name'])}.png", outputs["image"])
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Say where the pictures are."""
-        log.info("rendered views are in %s", self._target(trainer))
-
-    def _target(self, trainer: Trainer) -> Path:
-        return output_folder(trainer) / "predictions" if self.folder is None else Path(self.folder)
+        log.info("rendered views are in %s", self._target)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -56,6 +57,7 @@ class MetricReport(Callback):
         self._scene: CompressedScene | None = None
         self._paper_level: dict[str, Any] = {}
         self._scores: list[ViewScore] = []
+        self._folder = Path()
         self._lpips: Metric | None = None
         self._lpips_reason: str | None = None
 
@@ -76,9 +78,10 @@ class MetricReport(Callback):
         """Evaluate the end of the run."""
         host = as_host(pl_module)
         self._evaluate_if_due(trainer, host, trainer.global_step, always=True)
+        folder = output_folder(trainer)
         if trainer.is_global_zero and host.history and not is_trial(trainer):
             with host.stopwatch.paused(host.device):
-                write_curve(output_folder(trainer) / "curve.png", host.history, host.schedule)
+                write_curve(folder / "curve.png", host.history, host.schedule)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Evaluate the end of a run that was stopped after its last iteration: continued, it trains no more."""
@@ -126,11 +129,12 @@ class MetricReport(Callback):
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write the file, read it back, and let the module test what was read."""
         host = as_host(pl_module)
-        folder = output_folder(trainer)
-        path = folder / "scene.nsvq"
+        # Here all processes are together; some have fewer views than others.
+        self._folder = output_folder(trainer)
+        path = self._folder / "scene.nsvq"
         if trainer.is_global_zero:
             scene = host.compressed()
-            export_scene(scene, folder, host.storage, ("nsvq",))
+            export_scene(scene, self._folder, host.storage, ("nsvq",))
             self._paper_level = paper_level(scene)
         trainer.strategy.barrier("scene.nsvq")
         self._scene = read_nsvq(path)
@@ -156,7 +160,7 @@ class MetricReport(Callback):
         score = ViewScore(batch.name, float(outputs["psnr"]), float(outputs["ssim"]))
         self._scores.append(replace(score, lpips=self._lpips_of(image, photo)))
         if self.pictures:
-            folder = output_folder(trainer) / "renders"
+            folder = self._folder / "renders"
             folder.mkdir(parents=True, exist_ok=True)
             write_png(folder / f"{file_stem(batch.name)}.png", comparison(image, photo))
 
@@ -171,8 +175,8 @@ class MetricReport(Callback):
         scores = _gathered(trainer, self._scores)
         if self._scene is None or not scores:
             return
-        folder = output_folder(trainer)
         if trainer.is_global_zero:
+            folder = self._folder
             lpips = (None, self._lpips_reason) if self._lpips is None else (_mean(scores, "lpips"), None)
             metrics = summarize(folder / "scene.nsvq", self._scene, scores, lpips, host, self._paper_level)
             write_metrics(folder / "metrics.json", metrics)

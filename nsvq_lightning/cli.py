@@ -92,9 +92,14 @@ def _is_ours(error: BaseException) -> bool:
 
 
 def _quiet_lightning() -> None:
-    """Show our log messages; of Lightning's only those that are not advertisements."""
+    """Show our log messages, once; of Lightning's only those that are not advertisements."""
+    from lightning.pytorch.utilities import rank_zero_only
+
     logging.basicConfig(format="%(message)s")
     logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
+    for handler in logging.getLogger().handlers:
+        # Of several processes the first one speaks; what goes wrong on another is said there.
+        handler.addFilter(lambda record: record.levelno >= logging.WARNING or getattr(rank_zero_only, "rank", 0) == 0)
 
     def keep(record: logging.LogRecord) -> bool:
         text = record.getMessage()

@@ -141,17 +141,21 @@ def log_interval(trainer: Trainer) -> int:
 
 
 def output_folder(trainer: Trainer) -> Path:
-    """Where a run writes its files: the logger's folder, without a logger the default root folder."""
+    """Where a run writes its files: the logger's folder, without a logger the default root folder.
+
+    The first process says where: a collective, which every process must call.
+    """
     return Path(trainer.log_dir or trainer.default_root_dir)
 
 
 def from_first_process(trainer: Trainer, tensor: Tensor) -> Tensor:
-    """The first process's value of a tensor, on every process."""
-    return tensor if trainer.world_size == 1 else trainer.strategy.broadcast(tensor)
+    """The first process's value of a tensor, on every process; its shape may differ before."""
+    # It travels pickled: from the CPU, or every process would load it onto the first one's device.
+    return tensor if trainer.world_size == 1 else trainer.strategy.broadcast(tensor.cpu()).to(tensor.device)
 
 
 def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:
-    """Sum of a tensor over all processes; the tensor itself where there is one."""
+    """Sum of a tensor over all processes, written into it; the tensor itself where there is one."""
     if trainer.world_size == 1:
         return tensor
     reduced = trainer.strategy.reduce(tensor, reduce_op="sum")

@@ -192,8 +192,13 @@ class SplatModel(LightningModule):
         return torch.rand(3, generator=self._generator("background")).to(self.device)
 
     def _generator(self, *salts: str) -> torch.Generator:
-        """Generator of this step, rank and micro-batch; quantizers draw a seed from it, so it lives on the CPU."""
-        return generator(self.seed, self.global_step, self.global_rank, *salts, self._micro_batch)
+        """Generator of one view of this step; quantizers draw a seed from it, so it lives on the CPU.
+
+        The view's number in the step decides, not who renders it: 2 processes with a view each draw what one process
+        with 2 micro-batches draws. The 0 keeps the draws of runs from before that.
+        """
+        processes = 1 if self._trainer is None else self._trainer.world_size
+        return generator(self.seed, self.global_step, 0, *salts, self._micro_batch * processes + self.global_rank)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add history and schedule; keep plain data only, so that ``weights_only=True`` can read it."""

@@ -159,7 +159,7 @@ class SplatModule(SplatModel):
             loss = loss + self.opacity_weight * self.splats.opacities.sigmoid().sum()
         if (self.global_step + 1) % log_interval(self.trainer) == 0 or not is_on("metrics"):
             self._log_step(loss, rendered.image, batch.image)
-        # Several processes must skip together, or their collectives would no longer match.
+        # Several processes must skip together: their strategy sees to it.
         if self.trainer.world_size == 1 and not math.isfinite(loss.item()):
             log.warning("step %d: the loss of %s is %s, no update", self.global_step + 1, batch.name, loss.item())
             return None

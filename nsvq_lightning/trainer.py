@@ -11,6 +11,7 @@ from lightning.pytorch import Trainer
 from nsvq_lightning.io.container import write_nsvq
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.module import SplatModule
+from nsvq_lightning.strategies import ViewParallelStrategy  # noqa: F401  registers its name
 
 __all__ = ["SplatTrainer"]
 

@@ -1,0 +1,152 @@
+"""Two processes with a view each are one process with two views, to the bit, from the first clone to the last code."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import torch.distributed
+
+from nsvq_lightning.cli import main
+from nsvq_lightning.schedule import Phase
+
+pytestmark = pytest.mark.skipif(
+    not (torch.distributed.is_available() and torch.distributed.is_gloo_available()),
+    reason="this torch has no gloo, which several processes on the CPU need",
+)
+
+HERE = Path(__file__).resolve().parent
+IN_QUANTIZE = 44
+"""Iteration of a checkpoint between two replacements of codes."""
+
+
+@dataclass
+class Finished:
+    """What a run from the command line left behind."""
+
+    folder: Path
+    notes: Path
+
+    def lines(self, rank: int = 0) -> list[str]:
+        return (self.notes / f"{rank}.txt").read_text().splitlines()
+
+    def metrics(self) -> dict[str, Any]:
+        read: dict[str, Any] = json.loads((self.folder / "metrics.json").read_text())
+        return read
+
+    def checkpoint(self) -> dict[str, Any]:
+        path = self.folder / "checkpoints" / f"step-{IN_QUANTIZE}.ckpt"
+        loaded: dict[str, Any] = torch.load(path, weights_only=True)
+        return loaded
+
+
+def arguments(scene: Path, root: Path, *more: str) -> list[str]:
+    """A fit of 60 steps through all phases, with 3 test views, which two processes cannot share evenly."""
+    return [
+        *("fit", f"--data.root={scene}", "--data.factor=2", "--data.test_every=3"),
+        *("--trainer.max_steps=60", "--trainer.accelerator=cpu", f"--trainer.default_root_dir={root}"),
+        *("--trainer.enable_progress_bar=false", "--callbacks.progress=null"),
+        *("--model.sh_degree=1", "--model.codebooks.scales=24", "--model.codebooks.quats=2000"),
+        *("--model.codebooks.sh0=16", "--model.codebooks.shN=16", "--model.background=random"),
+        *("--callbacks.phases.min_density_interval=4", "--callbacks.phases.min_reset_interval=11"),
+        *("--callbacks.phases.min_replacement_interval=5", "--callbacks.density.rules.grad_threshold=5e-5"),
+        *("--callbacks.density.rules.min_opacity=0.009", "--callbacks.density.max_splats=1500"),
+        *("--callbacks.report.every=20", f"--callbacks.checkpoint.every={IN_QUANTIZE}"),
+        *("--callbacks.checkpoint.keep=true", "--trainer.callbacks+=replica_witness.ReplicaWitness"),
+        *(f"--trainer.callbacks.folder={root / 'notes'}", *more),
+    ]
+
+
+def run_command(arguments: list[str]) -> str:
+    """Run the command in processes of its own; what it printed."""
+    package = HERE.parents[1]
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(HERE), str(package)]),
+        "OMP_NUM_THREADS": "1",
+        "NUMBA_NUM_THREADS": "1",
+    }
+    command = [sys.executable, "-m", "nsvq_lightning", *arguments]
+    with subprocess.Popen(
+        command,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        try:
+            printed, _ = process.communicate(timeout=300)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)  # the processes it started, too
+            raise
+    assert process.returncode == 0, printed
+    return printed
+
+
+@pytest.fixture(scope="module")
+def one(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """One process, two views a step."""
+    root = tmp_path_factory.mktemp("one")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(HERE)
+        assert main(arguments(demo_scene, root, "--trainer.devices=1", "--trainer.accumulate_grad_batches=2")) == 0
+    return Finished(root / demo_scene.name / "version_0", root / "notes")
+
+
+@pytest.fixture(scope="module")
+def two(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """Two processes, a view each."""
+    root = tmp_path_factory.mktemp("two")
+    printed = run_command(arguments(demo_scene, root, "--trainer.devices=2", "--trainer.strategy=view_parallel"))
+    assert printed.count("rendered from the decoded file") == 1  # the first process speaks for both
+    assert printed.count("codebooks for") == 1
+    return Finished(root / demo_scene.name / "version_0", root / "notes")
+
+
+def test_replicas_stay_equal_to_the_bit(two: Finished) -> None:
+    lines = two.lines()
+    assert len(lines) == 61
+    assert len(set(lines)) == 61
+    assert two.lines(1) == lines
+
+
+def test_two_processes_train_what_one_process_with_two_views_trains(one: Finished, two: Finished) -> None:
+    assert two.lines() == one.lines()
+    phases, counts = zip(*(line.split()[1:3] for line in two.lines()), strict=True)
+    assert set(phases) == {phase.name for phase in Phase}
+    changes = [int(after) - int(before) for before, after in pairwise(counts)]
+    assert min(changes) < 0 < max(changes)  # it cloned or split, and pruned
+    assert (two.folder / "scene.nsvq").read_bytes() == (one.folder / "scene.nsvq").read_bytes()
+
+
+def test_test_views_that_cannot_be_shared_evenly_score_the_same(one: Finished, two: Finished) -> None:
+    assert (two.folder / "views.csv").read_text() == (one.folder / "views.csv").read_text()
+    ours, theirs = two.metrics(), one.metrics()
+    assert ours["views"] == 3
+    for name in ("psnr", "ssim", "file_bytes", "num_splats"):
+        assert ours[name] == theirs[name]
+    for end, other in zip(ours["phases"], theirs["phases"], strict=True):
+        assert (end["psnr"], end["ssim"]) == pytest.approx((other["psnr"], other["ssim"]), rel=1e-6)
+    assert len(list((two.folder / "renders").iterdir())) == 3
+
+
+def test_a_checkpoint_of_two_processes_is_that_of_one(one: Finished, two: Finished) -> None:
+    # So a run can go on with another number of processes; usage counters are local between two replacements.
+    ours, theirs = two.checkpoint(), one.checkpoint()
+    state = ours["state_dict"]
+    assert int(state["codebooks.scales.window"]) > 0
+    assert len(state["codebooks.quats.codebook"]) == len(state["codebooks.quats.usage"]) < 2000  # fewer rows than codes
+    assert state.keys() == theirs["state_dict"].keys()
+    different = [name for name, tensor in state.items() if not torch.equal(tensor, theirs["state_dict"][name])]
+    assert set(different) <= {"state._train_seconds", "splats.gradient_sum"}  # sums in another order
+    torch.testing.assert_close(state["splats.gradient_sum"], theirs["state_dict"]["splats.gradient_sum"])
+    torch.testing.assert_close(ours["optimizer_states"], theirs["optimizer_states"], rtol=0, atol=0)
