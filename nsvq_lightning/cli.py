@@ -19,6 +19,7 @@ OWN_COMMANDS = {
     "benchmark": "nsvq_lightning.benchmark.cli",
     "compress": "nsvq_lightning.compress_command",
     "sweep": "nsvq_lightning.sweep.cli",
+    "doctor": "nsvq_lightning.doctor.cli",
 }
 """Commands without a trainer: modules with a ``main(argv)``, which must not pay for Lightning's start."""
 

@@ -13,7 +13,7 @@ from importlib.metadata import EntryPoint, entry_points
 
 __all__ = ["COMMANDS", "main"]
 
-COMMANDS = ("fit", "validate", "test", "predict", "export", "info", "compress", "benchmark", "sweep")
+COMMANDS = ("fit", "validate", "test", "predict", "export", "info", "compress", "benchmark", "sweep", "doctor")
 """Subcommands of ``nsvq``, named here so that foreign words do not import torch."""
 
 _OURS = "nsvq-lightning"

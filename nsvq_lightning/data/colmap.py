@@ -43,12 +43,14 @@ class ColmapModel:
         cameras: ``pycolmap.Camera`` by id.
         points: Sparse points ``[P, 3]`` float64, scene units, sorted by COLMAP's point id.
         colors: Their colours ``[P, 3]`` uint8 RGB.
+        observations: Row of the point and row of the image of each sighting ``[O, 2]`` int64; None unless asked for.
     """
 
     images: tuple[ColmapImage, ...]
     cameras: dict[int, Any]
     points: NDArray[np.float64]
     colors: NDArray[np.uint8]
+    observations: NDArray[np.int64] | None = None
 
 
 def import_pycolmap() -> Any:
@@ -63,8 +65,12 @@ def import_pycolmap() -> Any:
     return pycolmap
 
 
-def read_model(root: Path) -> ColmapModel:
+def read_model(root: Path, observations: bool = False) -> ColmapModel:
     """Read the model of a scene folder, see :func:`nsvq_lightning.data.model_files.find_model` for where it may stand.
+
+    Args:
+        root: Scene folder.
+        observations: Say which image saw which point, too; training does not need it.
 
     Raises:
         SceneError: There is no model, a file is damaged, or the model has no registered image or no point.
@@ -87,7 +93,7 @@ def read_model(root: Path) -> ColmapModel:
         ) from error
     if files.suffix == ".txt":
         _check_rows(files, reconstruction)
-    return _plain_model(files, reconstruction)
+    return _plain_model(files, reconstruction, observations)
 
 
 def _parameter_counts(pycolmap: Any) -> dict[int, int]:
@@ -107,12 +113,11 @@ def _check_rows(files: ModelFiles, reconstruction: Any) -> None:
             )
 
 
-def _plain_model(files: ModelFiles, reconstruction: Any) -> ColmapModel:
-    images = tuple(
-        ColmapImage(image.name, image.camera_id, _viewmat(image))
-        for image in sorted(reconstruction.images.values(), key=lambda image: image.name)
-        if image.has_pose
+def _plain_model(files: ModelFiles, reconstruction: Any, observations: bool) -> ColmapModel:
+    registered = sorted(
+        (image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.name
     )
+    images = tuple(ColmapImage(image.name, image.camera_id, _viewmat(image)) for image in registered)
     if not images:
         raise SceneError(f"{files.path('images')} lists no registered image: run COLMAP's mapper again")
     points = sorted(reconstruction.points3D.items())
@@ -131,7 +136,20 @@ def _plain_model(files: ModelFiles, reconstruction: Any) -> ColmapModel:
         cameras=dict(reconstruction.cameras.items()),
         points=np.array([point.xyz for _, point in points], np.float64),
         colors=np.array([point.color for _, point in points], np.uint8),
+        observations=_observations(registered, points) if observations else None,
     )
+
+
+def _observations(registered: list[Any], points: list[tuple[int, Any]]) -> NDArray[np.int64]:
+    """Pairs of a point's and an image's row, each once: a track may have two features of one image."""
+    row_of = {image.image_id: row for row, image in enumerate(registered)}
+    pairs = [
+        (row, row_of[element.image_id])
+        for row, (_, point) in enumerate(points)
+        for element in point.track.elements
+        if element.image_id in row_of
+    ]
+    return np.unique(np.array(pairs, np.int64).reshape(-1, 2), axis=0)
 
 
 def _viewmat(image: Any) -> NDArray[np.float64]:
