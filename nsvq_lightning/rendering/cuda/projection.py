@@ -27,14 +27,10 @@ from nsvq_lightning.rendering.cuda.records import (
     LOG2_OPACITY,
     RECORD,
     RED,
-    SUM_BLUE,
     SUM_DEPTH,
-    SUM_GREEN,
     SUM_H,
     SUM_RED,
     SUM_UU,
-    SUM_UV,
-    SUM_VV,
     TILE,
     A,
     B,
@@ -222,9 +218,12 @@ def quaternion_gradient(q, inverse, r0, r1, r2):
     gy = 2 * (x * (r0[1] + r1[0]) + z * (r1[2] + r2[1]) + w * (r0[2] - r2[0]) - 2 * y * (r0[0] + r2[2]))
     gz = 2 * (x * (r0[2] + r2[0]) + y * (r1[2] + r2[1]) + w * (r1[0] - r0[1]) - 2 * z * (r0[0] + r1[1]))
     radial = gw * w + gx * x + gy * y + gz * z
-    return (gw - radial * w) * inverse, (gx - radial * x) * inverse, (gy - radial * y) * inverse, (
-        gz - radial * z
-    ) * inverse
+    return (
+        (gw - radial * w) * inverse,
+        (gx - radial * x) * inverse,
+        (gy - radial * y) * inverse,
+        (gz - radial * z) * inverse,
+    )
 
 
 @triton.jit
@@ -308,9 +307,7 @@ def project_backward_kernel(
         tl.where(rgb[2] > 0, g_rgb[2], 0.0),
     )
     dx, dy, dz, d_inverse = unit_direction(view, mean)
-    cx_, cy_, cz_ = color_backward(
-        g_sh0, g_shN, shN, row, row * stride, dx, dy, dz, red, green, blue, seen, DEGREE
-    )
+    cx_, cy_, cz_ = color_backward(g_sh0, g_shN, shN, row, row * stride, dx, dy, dz, red, green, blue, seen, DEGREE)
     radial = cx_ * dx + cy_ * dy + cz_ * dz
     store3(
         g_means + 3 * row,

@@ -30,10 +30,10 @@ class _Project(torch.autograd.Function):
     def forward(
         ctx: Any, lens: Lens, degree: int, *attributes: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        means2d, radii, ids, records, boxes = projected = project(lens, attributes, degree)
+        projected = project(lens, attributes, degree)
         ctx.lens, ctx.degree = lens, degree
-        ctx.save_for_backward(ids, records, *attributes)
-        ctx.mark_non_differentiable(radii, ids, boxes)
+        ctx.save_for_backward(projected.ids, projected.records, *attributes)
+        ctx.mark_non_differentiable(projected.radii, projected.ids, projected.boxes)
         ctx.set_materialize_grads(False)
         return projected
 
