@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.cuda.support import obstacle
 from nsvq_lightning.rendering.reference import render_reference, visible_rows
 from nsvq_lightning.splats import SplatTensors, sh_degree_of
 
@@ -17,7 +18,7 @@ __all__ = ["BACKENDS", "Render", "render", "resolve_backend", "visible"]
 
 _Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
-BACKENDS = ("auto", "reference", "cpu")
+BACKENDS = ("auto", "reference", "cpu", "cuda")
 """Names that ``render(backend=...)`` takes; ``auto`` is the fastest one for the device of the splats."""
 
 
@@ -88,11 +89,11 @@ def visible(splats: SplatTensors, camera: Camera, *, backend: str = "auto") -> T
         camera: Where to look from.
         backend: One of :data:`BACKENDS`.
     """
-    if resolve_backend(backend, splats.means) == "cpu":
-        from nsvq_lightning.rendering.cpu.rasterizer import visible_cpu
-
-        return visible_cpu(splats, camera)
-    return visible_rows(splats, camera)
+    name = resolve_backend(backend, splats.means)
+    if name == "reference":
+        return visible_rows(splats, camera)
+    rows: Tensor = _fast_function("visible", name)(splats, camera)
+    return rows
 
 
 def resolve_backend(backend: str, like: Tensor) -> str:
@@ -104,8 +105,13 @@ def resolve_backend(backend: str, like: Tensor) -> str:
     if backend not in BACKENDS:
         raise ValueError(f"unknown render backend {backend!r}; choose one of {', '.join(BACKENDS)}")
     fits_cpu = like.device.type == "cpu" and like.dtype == torch.float32
+    problem = obstacle(like)
     if backend == "auto":
-        return "cpu" if fits_cpu else "reference"
+        if fits_cpu:
+            return "cpu"
+        return "cuda" if problem is None else "reference"
+    if backend == "cuda" and problem is not None:
+        raise ValueError(f"backend 'cuda' cannot be used: {problem}, or use backend='reference'")
     if backend == "cpu" and not fits_cpu:
         raise ValueError(
             f"backend 'cpu' renders float32 tensors on the CPU, got {like.dtype} on {like.device}; "
@@ -115,8 +121,11 @@ def resolve_backend(backend: str, like: Tensor) -> str:
 
 
 def _rasterizer(backend: str) -> Callable[[SplatTensors, Camera, int, Tensor], _Outputs]:
-    if backend == "reference":
-        return render_reference
-    module = importlib.import_module("nsvq_lightning.rendering.cpu.rasterizer")
-    rasterizer: Callable[[SplatTensors, Camera, int, Tensor], _Outputs] = module.render_cpu
-    return rasterizer
+    return render_reference if backend == "reference" else _fast_function("render", backend)
+
+
+def _fast_function(name: str, backend: str) -> Callable[..., Any]:
+    """``name`` of a fast back-end, whose kernels' compiler is imported only now."""
+    module = importlib.import_module(f"nsvq_lightning.rendering.{backend}.rasterizer")
+    function: Callable[..., Any] = getattr(module, f"{name}_{backend}")
+    return function

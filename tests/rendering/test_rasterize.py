@@ -3,60 +3,24 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import numba
 import pytest
 import torch
 
-from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu import rasterizer
-from nsvq_lightning.rendering.rasterize import Render, render, resolve_backend, visible
+from nsvq_lightning.rendering.rasterize import render, resolve_backend, visible
 from nsvq_lightning.skips import switched
-from nsvq_lightning.splats import ATTRIBUTES, RawSplats, Splats
+from nsvq_lightning.splats import RawSplats, Splats
 
 sys.path.insert(0, str(Path(__file__).parent))
+import oracle
+from oracle import run
 from scenes import front_camera, random_splats
 
-Gradients = dict[str, torch.Tensor]
-
-
-def run(
-    splats: RawSplats,
-    camera: Camera,
-    backend: str,
-    dtype: torch.dtype,
-    background: torch.Tensor | None = None,
-    **options: int,
-) -> tuple[Render, Gradients]:
-    """Render, and differentiate a random combination of image, alpha and depth."""
-    leaves = RawSplats(*(tensor.to(dtype).clone().requires_grad_() for tensor in splats))
-    background = None if background is None else background.to(dtype)
-    result = render(leaves, camera, backend=backend, background=background, **options)  # type: ignore[arg-type]
-    result.means2d.retain_grad()
-    generator = torch.Generator().manual_seed(99)
-    weights = [torch.randn(camera.height, camera.width, k, generator=generator).to(dtype) for k in (3, 1, 1)]
-    outputs = (result.image, result.alpha[..., None], result.depth[..., None])
-    torch.stack([(weight * output).sum() for weight, output in zip(weights, outputs, strict=True)]).sum().backward()
-    gradients = {name: leaf.grad for name, leaf in zip(ATTRIBUTES, leaves, strict=True) if leaf.grad is not None}
-    assert result.means2d.grad is not None
-    return result, {**gradients, "means2d": result.means2d.grad}
-
-
-def assert_same(splats: RawSplats, camera: Camera, tolerance: float = 1e-4, **options: object) -> None:
-    """Images within 1e-4, gradients within a relative L2 error of 1e-4 of the float64 oracle."""
-    fast, fast_gradients = run(splats, camera, "cpu", torch.float32, **options)  # type: ignore[arg-type]
-    oracle, gradients = run(splats, camera, "reference", torch.float64, **options)  # type: ignore[arg-type]
-    torch.testing.assert_close(fast.image.double(), oracle.image, atol=tolerance, rtol=0)
-    torch.testing.assert_close(fast.alpha.double(), oracle.alpha, atol=tolerance, rtol=0)
-    torch.testing.assert_close(fast.depth.double(), oracle.depth, atol=10 * tolerance, rtol=tolerance)
-    torch.testing.assert_close(fast.means2d.double(), oracle.means2d, atol=1e-3, rtol=1e-5)
-    torch.testing.assert_close(fast.radii, oracle.radii, atol=1, rtol=0)
-    for name, expected in gradients.items():
-        norm = expected.norm().item()
-        assert torch.isfinite(fast_gradients[name]).all(), name
-        error = (fast_gradients[name].double() - expected).norm().item()
-        assert error <= tolerance * max(norm, 1e-12), f"{name}: relative error {error / max(norm, 1e-12):.1e}"
+assert_same = partial(oracle.assert_same, "cpu")
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])

@@ -1,0 +1,261 @@
+"""Front-to-back blending of sorted splats and its backward pass, one tile of 16x16 pixels a program.
+
+Forward: a pixel that is closed goes on losing transmittance, and a splat counts only where the transmittance after it
+would still be open; so nothing branches on a single pixel. After each batch of splats the program looks whether a
+pixel is still open.
+
+Backward: the splats are gone through once more from front to back. With d = g·colour and ``rest`` = what all splats
+from here on (and the background) add to g·image, α·dL/dα = α/(1 - α)·(T·d - rest). Every pair of splat and tile writes
+its own slot and a second kernel adds up the slots of each splat: no atomics, the same bits every time.
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from nsvq_lightning.rendering.cuda.binning import Tiles
+from nsvq_lightning.rendering.cuda.projection import Lens
+from nsvq_lightning.rendering.cuda.records import (
+    ALPHA_MAX,
+    BLUE,
+    DEPTH,
+    FIELDS,
+    GREEN,
+    LN2,
+    LOG2_ALPHA_MIN,
+    LOG2_OPACITY,
+    RECORD,
+    RED,
+    SUM_BLUE,
+    SUM_DEPTH,
+    SUM_GREEN,
+    SUM_H,
+    SUM_RED,
+    SUM_U,
+    SUM_UU,
+    SUM_UV,
+    SUM_V,
+    SUM_VV,
+    TILE,
+    TRANSMITTANCE_MIN,
+    A,
+    B,
+    C,
+    X,
+    Y,
+)
+
+__all__ = ["blend", "blend_backward", "tile_grid"]
+
+BATCH = 32
+"""Splats between two looks at whether a tile is finished."""
+WARPS = 1
+"""Warps a tile: one keeps every reduction inside the warp."""
+SLOTS = 8
+"""Slots of one splat that are added up at a time."""
+LANES = 16
+"""Power of two that holds the fields of a slot."""
+
+
+@triton.jit
+def tile_pixels(tile, columns, width, height):
+    """Corner of a tile, pixel centres in it, their numbers in the image and which of them there are."""
+    left, top = (tile % columns) * TILE, (tile // columns) * TILE
+    lane = tl.arange(0, TILE * TILE)
+    x, y = lane % TILE, lane // TILE
+    inside = (left + x < width) & (top + y < height)
+    return left, top, x + 0.5, y + 0.5, (top + y) * width + left + x, inside
+
+
+@triton.jit
+def alpha_at(record, left, top, x, y):
+    """α of a splat before the cap, 0 below 1/255, and the two factors of its exponent, at pixels of a tile."""
+    a, b, c = tl.load(record + A), tl.load(record + B), tl.load(record + C)
+    px, py = tl.load(record + X) - left, tl.load(record + Y) - top
+    u = tl.fma(a, x, tl.fma(b, y, -(a * px + b * py)))
+    v = tl.fma(c, y, -(c * py))
+    power = tl.fma(-u, u, tl.fma(-v, v, tl.load(record + LOG2_OPACITY)))
+    return tl.where(power >= LOG2_ALPHA_MIN, tl.exp2(power), 0.0), u, v
+
+
+@triton.jit
+def blend_kernel(
+    records, ranks, offsets, ends, background, image, transmittance, depth, columns, width, height,
+    TILE: tl.constexpr, BATCH: tl.constexpr,
+):  # fmt: skip
+    """Image, transmittance and depth of a tile, and the end of the part of its list that was looked at."""
+    tile = tl.program_id(0)
+    left, top, x, y, pixel, inside = tile_pixels(tile, columns, width, height)
+    t = tl.where(inside, 1.0, 0.0)
+    kept = t
+    red, green, blue, far = tl.zeros_like(t), tl.zeros_like(t), tl.zeros_like(t), tl.zeros_like(t)
+    i, end = tl.load(offsets + tile), tl.load(offsets + tile + 1)
+    looked = i
+    while i < end:
+        looked = tl.minimum(i + BATCH, end)
+        for j in range(i, looked):
+            record = records + tl.load(ranks + j).to(tl.int64) * RECORD
+            raw, _, _ = alpha_at(record, left, top, x, y)
+            alpha = tl.minimum(raw, ALPHA_MAX)
+            after = tl.fma(-alpha, t, t)
+            is_open = after >= TRANSMITTANCE_MIN
+            weight = tl.where(is_open, alpha * t, 0.0)
+            kept = tl.where(is_open, after, kept)
+            t = after
+            red += weight * tl.load(record + RED)
+            green += weight * tl.load(record + GREEN)
+            blue += weight * tl.load(record + BLUE)
+            far += weight * tl.load(record + DEPTH)
+        i = tl.where(tl.max(t, 0) >= TRANSMITTANCE_MIN, looked, end)
+    tl.store(ends + tile, looked)
+    tl.store(image + 3 * pixel, red + kept * tl.load(background), mask=inside)
+    tl.store(image + 3 * pixel + 1, green + kept * tl.load(background + 1), mask=inside)
+    tl.store(image + 3 * pixel + 2, blue + kept * tl.load(background + 2), mask=inside)
+    tl.store(transmittance + pixel, kept, mask=inside)
+    tl.store(depth + pixel, far, mask=inside)
+
+
+@triton.jit
+def blend_backward_kernel(
+    records, ranks, slots, offsets, ends, image, transmittance, depth, g_image, g_alpha, g_depth, sums,
+    columns, width, height, TILE: tl.constexpr, WITH_ALPHA: tl.constexpr, WITH_DEPTH: tl.constexpr,
+):  # fmt: skip
+    """Sums of every splat of a tile into its slot."""
+    tile = tl.program_id(0)
+    left, top, x, y, pixel, inside = tile_pixels(tile, columns, width, height)
+    g_red = tl.load(g_image + 3 * pixel, mask=inside, other=0.0)
+    g_green = tl.load(g_image + 3 * pixel + 1, mask=inside, other=0.0)
+    g_blue = tl.load(g_image + 3 * pixel + 2, mask=inside, other=0.0)
+    rest = g_red * tl.load(image + 3 * pixel, mask=inside, other=0.0)
+    rest += g_green * tl.load(image + 3 * pixel + 1, mask=inside, other=0.0)
+    rest += g_blue * tl.load(image + 3 * pixel + 2, mask=inside, other=0.0)
+    if WITH_ALPHA:
+        # Alpha is 1 - T, so its gradient enters as -g_alpha·T at the far end.
+        kept = tl.load(transmittance + pixel, mask=inside, other=0.0)
+        rest -= tl.load(g_alpha + pixel, mask=inside, other=0.0) * kept
+    g_far = tl.zeros_like(rest)
+    if WITH_DEPTH:
+        g_far = tl.load(g_depth + pixel, mask=inside, other=0.0)
+        rest += g_far * tl.load(depth + pixel, mask=inside, other=0.0)
+    t = tl.where(inside, 1.0, 0.0)
+    for j in range(tl.load(offsets + tile), tl.load(ends + tile)):
+        record = records + tl.load(ranks + j).to(tl.int64) * RECORD
+        raw, u, v = alpha_at(record, left, top, x, y)
+        alpha = tl.minimum(raw, ALPHA_MAX)
+        after = tl.fma(-alpha, t, t)
+        is_open = after >= TRANSMITTANCE_MIN
+        weight = tl.where(is_open, alpha * t, 0.0)
+        if tl.max(weight, 0) > 0:
+            d = g_red * tl.load(record + RED) + g_green * tl.load(record + GREEN) + g_blue * tl.load(record + BLUE)
+            if WITH_DEPTH:
+                d += g_far * tl.load(record + DEPTH)
+            # The cap of α has no gradient.
+            h = tl.where(is_open & (raw <= ALPHA_MAX), alpha / (1 - alpha) * (t * d - rest), 0.0)
+            rest = tl.fma(-weight, d, rest)
+            hu, hv = h * u, h * v
+            slot = sums + tl.load(slots + j).to(tl.int64) * RECORD
+            tl.store(slot + SUM_RED, tl.sum(weight * g_red, 0))
+            tl.store(slot + SUM_GREEN, tl.sum(weight * g_green, 0))
+            tl.store(slot + SUM_BLUE, tl.sum(weight * g_blue, 0))
+            tl.store(slot + SUM_H, tl.sum(h, 0))
+            tl.store(slot + SUM_U, tl.sum(hu, 0))
+            tl.store(slot + SUM_V, tl.sum(hv, 0))
+            tl.store(slot + SUM_UU, tl.sum(hu * u, 0))
+            tl.store(slot + SUM_UV, tl.sum(hu * v, 0))
+            tl.store(slot + SUM_VV, tl.sum(hv * v, 0))
+            if WITH_DEPTH:
+                tl.store(slot + SUM_DEPTH, tl.sum(weight * g_far, 0))
+        t = after
+
+
+@triton.jit
+def total_kernel(sums, slot_ends, ids, records, totals, g_means2d, SLOTS: tl.constexpr, LANES: tl.constexpr):
+    """Add up the slots of a splat, and derive the gradient of its projected centre."""
+    rank = tl.program_id(0).to(tl.int64)
+    end = tl.load(slot_ends + rank)
+    begin = tl.load(slot_ends + rank - 1, mask=rank > 0, other=0)
+    field = tl.arange(0, LANES)[None, :]
+    acc = tl.zeros([SLOTS, LANES], tl.float32)
+    for start in range(begin, end, SLOTS):
+        slot = start + tl.arange(0, SLOTS)[:, None]
+        mask = (slot < end) & (field < FIELDS)
+        acc += tl.load(sums + slot.to(tl.int64) * RECORD + field, mask=mask, other=0.0)
+    total = tl.sum(acc, 0)
+    lane = tl.arange(0, LANES)
+    tl.store(totals + rank * RECORD + lane, total, mask=lane < FIELDS)
+    u, v = tl.sum(tl.where(lane == SUM_U, total, 0.0), 0), tl.sum(tl.where(lane == SUM_V, total, 0.0), 0)
+    record = records + rank * RECORD
+    a, b, c = tl.load(record + A), tl.load(record + B), tl.load(record + C)
+    centre = g_means2d + 2 * tl.load(ids + rank)
+    tl.store(centre, a * u * (2 * LN2))
+    tl.store(centre + 1, (b * u + c * v) * (2 * LN2))
+
+
+def tile_grid(width: int, height: int) -> tuple[int, int]:
+    """Columns and rows of tiles that cover an image."""
+    return triton.cdiv(width, TILE.value), triton.cdiv(height, TILE.value)
+
+
+def blend(lens: Lens, records: Tensor, tiles: Tiles, background: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Image ``[H, W, 3]``, transmittance ``[H, W]``, depth ``[H, W]``, and how far each list was gone through.
+
+    Args:
+        lens: Gives the size of the image.
+        records: Splats front to back ``[V, RECORD]``.
+        tiles: Their lists by tile.
+        background: RGB ``[3]``.
+    """
+    columns, rows = tile_grid(lens.width, lens.height)
+    image = records.new_empty(lens.height, lens.width, 3)
+    transmittance, depth = (records.new_empty(lens.height, lens.width) for _ in range(2))
+    ends = torch.empty(columns * rows, dtype=torch.int32, device=records.device)
+    blend_kernel[(columns * rows,)](
+        records, tiles.ranks, tiles.offsets, ends, background, image, transmittance, depth,
+        columns, lens.width, lens.height, TILE=TILE.value, BATCH=BATCH, num_warps=WARPS,
+    )  # fmt: skip
+    return image, transmittance, depth, ends
+
+
+def blend_backward(
+    lens: Lens,
+    records: Tensor,
+    ids: Tensor,
+    n: int,
+    tiles: Tiles,
+    ends: Tensor,
+    outputs: tuple[Tensor, Tensor, Tensor],
+    gradients: tuple[Tensor | None, Tensor | None, Tensor | None],
+) -> tuple[Tensor, Tensor]:
+    """Moments ``[V, RECORD]`` of the splats in view, and the gradient of all projected centres ``[n, 2]``.
+
+    Args:
+        lens: As in :func:`blend`.
+        records: As in :func:`blend`.
+        ids: Rows of the splats in view ``[V]``.
+        n: Number of all splats.
+        tiles: As in :func:`blend`.
+        ends: What :func:`blend` returned, as are ``outputs``: image, transmittance and depth.
+        outputs: See ``ends``.
+        gradients: Of image, alpha and depth, contiguous; None where nothing depends on one.
+    """
+    columns, rows = tile_grid(lens.width, lens.height)
+    image, transmittance, depth = outputs
+    g_image, g_alpha, g_depth = gradients
+    totals, g_means2d = torch.zeros_like(records), records.new_zeros(n, 2)
+    if len(ids):
+        sums = records.new_zeros(len(tiles.slots), RECORD.value)
+        blend_backward_kernel[(columns * rows,)](
+            records, tiles.ranks, tiles.slots, tiles.offsets, ends, image, transmittance, depth,
+            torch.zeros_like(image) if g_image is None else g_image,
+            # Arguments that are not read stand in for gradients that do not exist.
+            depth if g_alpha is None else g_alpha, depth if g_depth is None else g_depth,
+            sums, columns, lens.width, lens.height,
+            TILE=TILE.value, WITH_ALPHA=g_alpha is not None, WITH_DEPTH=g_depth is not None, num_warps=WARPS,
+        )  # fmt: skip
+        total_kernel[(len(ids),)](
+            sums, tiles.ends, ids, records, totals, g_means2d, SLOTS=SLOTS, LANES=LANES, num_warps=1
+        )
+    return totals, g_means2d

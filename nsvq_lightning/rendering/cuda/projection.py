@@ -1,0 +1,437 @@
+"""Projection, spherical harmonics and their backward pass, one splat a lane.
+
+Equations: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting (Kerbl et al. 2023, sec. 4).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from nsvq_lightning.rendering import constants
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.cuda.harmonics import color, color_backward
+from nsvq_lightning.rendering.cuda.records import (
+    BLUE,
+    COVARIANCE_SCALE,
+    DEPTH,
+    FACTOR_SCALE,
+    GREEN,
+    LN2,
+    LOG2_ALPHA_MIN,
+    LOG2_E,
+    LOG2_OPACITY,
+    RECORD,
+    RED,
+    SUM_DEPTH,
+    SUM_H,
+    SUM_RED,
+    SUM_UU,
+    TILE,
+    A,
+    B,
+    C,
+    X,
+    Y,
+)
+
+__all__ = ["Lens", "Projected", "project", "project_backward", "project_radii"]
+
+NEAR = tl.constexpr(constants.NEAR)
+BLUR = tl.constexpr(constants.BLUR)
+BLUR_SQUARED = tl.constexpr(constants.BLUR**2)
+FRUSTUM_MARGIN = tl.constexpr(constants.FRUSTUM_MARGIN)
+MIN_SQUARED_NORM = tl.constexpr(constants.MIN_SQUARED_NORM)
+FINITE = tl.constexpr(1e30)
+"""Anything beyond this on the image plane comes from broken attributes; the splat is culled."""
+
+BLOCK = 128
+"""Splats a program."""
+RADIUS_ONLY = -1
+"""Stands for the SH degree where no record is wanted."""
+
+
+@triton.jit
+def dot3(a, b):
+    """Dot product of two triples."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@triton.jit
+def load3(pointer, mask):
+    """Three consecutive floats at each of the pointers."""
+    a = tl.load(pointer, mask=mask, other=0.0)
+    b = tl.load(pointer + 1, mask=mask, other=0.0)
+    c = tl.load(pointer + 2, mask=mask, other=0.0)
+    return a, b, c
+
+
+@triton.jit
+def store3(pointer, a, b, c, mask):
+    """The inverse of :func:`load3`."""
+    tl.store(pointer, a, mask=mask)
+    tl.store(pointer + 1, b, mask=mask)
+    tl.store(pointer + 2, c, mask=mask)
+
+
+@triton.jit
+def row_of(view, k):
+    """Three numbers of the packed view: rows 0 to 2 of the rotation, then translation and camera position."""
+    return tl.load(view + 3 * k), tl.load(view + 3 * k + 1), tl.load(view + 3 * k + 2)
+
+
+@triton.jit
+def axes_of(quat, log_scales):
+    """Unit quaternion and its inverse norm, axis lengths, and the rows of M = R·diag(lengths)."""
+    w, x, y, z = quat
+    inverse = 1 / tl.sqrt(tl.maximum(w * w + x * x + y * y + z * z, MIN_SQUARED_NORM))
+    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
+    s0, s1, s2 = tl.exp2(log_scales[0] * LOG2_E), tl.exp2(log_scales[1] * LOG2_E), tl.exp2(log_scales[2] * LOG2_E)
+    m0 = ((1 - 2 * (y * y + z * z)) * s0, 2 * (x * y - w * z) * s1, 2 * (x * z + w * y) * s2)
+    m1 = (2 * (x * y + w * z) * s0, (1 - 2 * (x * x + z * z)) * s1, 2 * (y * z - w * x) * s2)
+    m2 = (2 * (x * z - w * y) * s0, 2 * (y * z + w * x) * s1, (1 - 2 * (x * x + y * y)) * s2)
+    return (w, x, y, z), inverse, (s0, s1, s2), m0, m1, m2
+
+
+@triton.jit
+def view_point(view, mean):
+    """View-space x, y, z."""
+    t = row_of(view, 3)
+    return dot3(row_of(view, 0), mean) + t[0], dot3(row_of(view, 1), mean) + t[1], dot3(row_of(view, 2), mean) + t[2]
+
+
+@triton.jit
+def limited_slope(tangent, focal, centre, size):
+    """The slope at which the Jacobian is taken: not far outside the image."""
+    margin = size * (0.5 * FRUSTUM_MARGIN)
+    return tl.minimum(tl.maximum(tangent, (-centre - margin) / focal), (size - centre + margin) / focal)
+
+
+@triton.jit
+def affine_row(view, k, scale, slope):
+    """Row k of T = J·W: ``scale`` is focal/z, W the rotation."""
+    near, far = row_of(view, k), row_of(view, 2)
+    j = -(scale * slope)
+    return scale * near[0] + j * far[0], scale * near[1] + j * far[1], scale * near[2] + j * far[2]
+
+
+@triton.jit
+def image_axes(t, m0, m1, m2):
+    """One row of U = T·M: the splat's axes along one image axis."""
+    return (
+        t[0] * m0[0] + t[1] * m1[0] + t[2] * m2[0],
+        t[0] * m0[1] + t[1] * m1[1] + t[2] * m2[1],
+        t[0] * m0[2] + t[1] * m1[2] + t[2] * m2[2],
+    )
+
+
+@triton.jit
+def unit_direction(view, mean):
+    """Unit vector from the camera to the splat and the inverse distance."""
+    p = row_of(view, 4)
+    x, y, z = mean[0] - p[0], mean[1] - p[1], mean[2] - p[2]
+    inverse = 1 / tl.sqrt(tl.maximum(x * x + y * y + z * z, 1e-20))
+    return x * inverse, y * inverse, z * inverse, inverse
+
+
+@triton.jit
+def load_geometry(means, quats, scales, row, mask):
+    """Mean, quaternion and log-scales of the rows."""
+    q = quats + 4 * row
+    w, (x, y, z) = tl.load(q, mask=mask, other=0.0), load3(q + 1, mask)
+    return load3(means + 3 * row, mask), (w, x, y, z), load3(scales + 3 * row, mask)
+
+
+@triton.jit
+def project_kernel(
+    means, quats, scales, logits, sh0, shN, view, fx, fy, cx, cy, width, height, n, stride,
+    records, boxes, means2d, radii, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Records, tile boxes and centres of the splats in view at their own rows; radii, 0 for the rest."""
+    row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    inside = row < n
+    mean, quat, scale = load_geometry(means, quats, scales, row, inside)
+    logit = tl.load(logits + row, mask=inside, other=0.0)
+    x, y, z = view_point(view, mean)
+    inverse = 1 / z
+    t0 = affine_row(view, 0, fx * inverse, limited_slope(x * inverse, fx, cx, width))
+    t1 = affine_row(view, 1, fy * inverse, limited_slope(y * inverse, fy, cy, height))
+    _, _, _, m0, m1, m2 = axes_of(quat, scale)
+    u, v = image_axes(t0, m0, m1, m2), image_axes(t1, m0, m1, m2)
+    xx, xy, yy = dot3(u, u), dot3(u, v), dot3(v, v)
+    # |u|²|v|² - (u·v)² = |u × v|² (Lagrange): no cancellation for large splats.
+    normal = (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
+    determinant = dot3(normal, normal) + (xx + yy) * BLUR + BLUR_SQUARED
+    xx, yy = xx + BLUR, yy + BLUR
+
+    px, py = fx * (x * inverse) + cx, fy * (y * inverse) + cy
+    log2_opacity = -tl.log2(1 + tl.exp2(-(logit * LOG2_E)))
+    # α reaches 1/255 where u² + v² ≤ log2(255 o): a box of half sizes √(2 ln(255 o)·Σ_ii).
+    reach = (log2_opacity - LOG2_ALPHA_MIN) * (2 * LN2)
+    half_x, half_y = tl.sqrt(tl.maximum(reach, 0.0) * xx), tl.sqrt(tl.maximum(reach, 0.0) * yy)
+    left, right = tl.maximum(tl.ceil(px - half_x - 0.5), 0.0), tl.floor(px + half_x - 0.5)
+    top, bottom = tl.maximum(tl.ceil(py - half_y - 0.5), 0.0), tl.floor(py + half_y - 0.5)
+    right, bottom = tl.minimum(right, width - 1.0), tl.minimum(bottom, height - 1.0)
+    seen = inside & (z > NEAR) & (reach > 0) & (left <= right) & (top <= bottom)
+    seen = seen & (determinant < FINITE) & (tl.abs(px) < FINITE) & (tl.abs(py) < FINITE) & (logit >= -FINITE)
+    # A scale of -inf is a splat without extent, one of +inf or NaN is broken.
+    seen = seen & (scale[0] + scale[1] + scale[2] < FINITE)
+
+    radius = tl.minimum(tl.ceil(tl.maximum(half_x, half_y)), 1e9)
+    tl.store(radii + row, tl.where(seen, radius, 0.0).to(tl.int32), mask=inside)
+    if DEGREE >= 0:
+        tl.store(means2d + 2 * row, px, mask=seen)
+        tl.store(means2d + 2 * row + 1, py, mask=seen)
+        x0, y0 = tl.where(seen, left, 0.0).to(tl.int32) // TILE, tl.where(seen, top, 0.0).to(tl.int32) // TILE
+        x1, y1 = tl.where(seen, right, 0.0).to(tl.int32) // TILE, tl.where(seen, bottom, 0.0).to(tl.int32) // TILE
+        box = boxes + 4 * row
+        tl.store(box, x0, mask=seen)
+        tl.store(box + 1, y0, mask=seen)
+        tl.store(box + 2, x1 - x0 + 1, mask=seen)
+        tl.store(box + 3, y1 - y0 + 1, mask=seen)
+        dx, dy, dz, _ = unit_direction(view, mean)
+        red, green, blue = color(sh0, shN, row, row * stride, dx, dy, dz, seen, DEGREE)
+        a = tl.sqrt(yy / determinant) * FACTOR_SCALE
+        record = records + row * RECORD
+        tl.store(record + X, px, mask=seen)
+        tl.store(record + Y, py, mask=seen)
+        tl.store(record + A, a, mask=seen)
+        tl.store(record + B, -(a * (xy / yy)), mask=seen)
+        tl.store(record + C, 1 / tl.sqrt(yy) * FACTOR_SCALE, mask=seen)
+        tl.store(record + LOG2_OPACITY, log2_opacity, mask=seen)
+        tl.store(record + RED, tl.maximum(red, 0.0), mask=seen)
+        tl.store(record + GREEN, tl.maximum(green, 0.0), mask=seen)
+        tl.store(record + BLUE, tl.maximum(blue, 0.0), mask=seen)
+        tl.store(record + DEPTH, z, mask=seen)
+
+
+@triton.jit
+def quaternion_gradient(q, inverse, r0, r1, r2):
+    """dL/dq of an unnormalised quaternion from the rows of dL/dR."""
+    w, x, y, z = q
+    gw = 2 * (x * (r2[1] - r1[2]) + y * (r0[2] - r2[0]) + z * (r1[0] - r0[1]))
+    gx = 2 * (y * (r0[1] + r1[0]) + z * (r0[2] + r2[0]) + w * (r2[1] - r1[2]) - 2 * x * (r1[1] + r2[2]))
+    gy = 2 * (x * (r0[1] + r1[0]) + z * (r1[2] + r2[1]) + w * (r0[2] - r2[0]) - 2 * y * (r0[0] + r2[2]))
+    gz = 2 * (x * (r0[2] + r2[0]) + y * (r1[2] + r2[1]) + w * (r1[0] - r0[1]) - 2 * z * (r0[0] + r1[1]))
+    radial = gw * w + gx * x + gy * y + gz * z
+    return (
+        (gw - radial * w) * inverse,
+        (gx - radial * x) * inverse,
+        (gy - radial * y) * inverse,
+        (gz - radial * z) * inverse,
+    )
+
+
+@triton.jit
+def scaled_row(t0, t1, gu, gv):
+    """One row of dL/dM = Tᵀ·dL/dU."""
+    return t0 * gu[0] + t1 * gv[0], t0 * gu[1] + t1 * gv[1], t0 * gu[2] + t1 * gv[2]
+
+
+@triton.jit
+def project_backward_kernel(
+    means, quats, scales, logits, shN, view, fx, fy, cx, cy, width, height, count, stride, ids, records, totals,
+    g_means2d, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Gradients of the attributes of the splats ``ids`` from their moments (``totals``, a slot each)."""
+    rank = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    seen = rank < count
+    row = tl.load(ids + rank, mask=seen, other=0)
+    mean, quat, scale = load_geometry(means, quats, scales, row, seen)
+    x, y, z = view_point(view, mean)
+    inverse = 1 / tl.where(seen, z, 1.0)
+    tx, ty = x * inverse, y * inverse
+    slope_x, slope_y = limited_slope(tx, fx, cx, width), limited_slope(ty, fy, cy, height)
+    fx_z, fy_z = fx * inverse, fy * inverse
+    t0, t1 = affine_row(view, 0, fx_z, slope_x), affine_row(view, 1, fy_z, slope_y)
+    q, q_inverse, s, m0, m1, m2 = axes_of(quat, scale)
+    u, v = image_axes(t0, m0, m1, m2), image_axes(t1, m0, m1, m2)
+
+    # dL/dΣ = ½ Fᵀ (Σ h uuᵀ) F, symmetric, F the factor of the exponent; doubled for both orders of U·Uᵀ.
+    total, record = totals + rank * RECORD, records + rank * RECORD
+    a, b, c = load3(record + A, seen)
+    uu, uv, vv = load3(total + SUM_UU, seen)
+    uu, uv, vv = uu * COVARIANCE_SCALE, uv * COVARIANCE_SCALE, vv * COVARIANCE_SCALE
+    p0, p1, p2 = a * uu, b * uu + c * uv, b * uv + c * vv
+    gxx, gxy, gyy = 2 * (p0 * a), 2 * (p1 * a), 2 * (p1 * b + p2 * c)
+    gu = (gxx * u[0] + gxy * v[0], gxx * u[1] + gxy * v[1], gxx * u[2] + gxy * v[2])
+    gv = (gxy * u[0] + gyy * v[0], gxy * u[1] + gyy * v[1], gxy * u[2] + gyy * v[2])
+
+    gm0, gm1, gm2 = (
+        scaled_row(t0[0], t1[0], gu, gv),
+        scaled_row(t0[1], t1[1], gu, gv),
+        scaled_row(t0[2], t1[2], gu, gv),
+    )
+    store3(
+        g_scales + 3 * row,
+        m0[0] * gm0[0] + m1[0] * gm1[0] + m2[0] * gm2[0],
+        m0[1] * gm0[1] + m1[1] * gm1[1] + m2[1] * gm2[1],
+        m0[2] * gm0[2] + m1[2] * gm1[2] + m2[2] * gm2[2],
+        seen,
+    )
+    gw, gx, gy, gz = quaternion_gradient(
+        q,
+        q_inverse,
+        (gm0[0] * s[0], gm0[1] * s[1], gm0[2] * s[2]),
+        (gm1[0] * s[0], gm1[1] * s[1], gm1[2] * s[2]),
+        (gm2[0] * s[0], gm2[1] * s[1], gm2[2] * s[2]),
+    )
+    tl.store(g_quats + 4 * row, gw, mask=seen)
+    store3(g_quats + 4 * row + 1, gx, gy, gz, seen)
+
+    # J = [[fx/z, 0, -fx·sx/z], [0, fy/z, -fy·sy/z]]; sx = x/z except where it is limited.
+    w0, w1, w2 = row_of(view, 0), row_of(view, 1), row_of(view, 2)
+    g0 = (dot3(gu, m0), dot3(gu, m1), dot3(gu, m2))
+    g1 = (dot3(gv, m0), dot3(gv, m1), dot3(gv, m2))
+    j00, j02 = dot3(w0, g0), dot3(w2, g0)
+    j11, j12 = dot3(w1, g1), dot3(w2, g1)
+    g2x = tl.load(g_means2d + 2 * row, mask=seen, other=0.0)
+    g2y = tl.load(g_means2d + 2 * row + 1, mask=seen, other=0.0)
+    fx_zz, fy_zz = fx_z * inverse, fy_z * inverse
+    free_x, free_y = tl.where(slope_x == tx, 1.0, 0.0), tl.where(slope_y == ty, 1.0, 0.0)
+    vx = fx_z * g2x - free_x * fx_zz * j02
+    vy = fy_z * g2y - free_y * fy_zz * j12
+    vz = (1 + free_x) * fx_zz * slope_x * j02 + (1 + free_y) * fy_zz * slope_y * j12
+    vz -= fx_zz * (x * g2x + j00) + fy_zz * (y * g2y + j11)
+    vz += tl.load(total + SUM_DEPTH, mask=seen, other=0.0)
+
+    # A colour below 0 was cut off.
+    rgb, g_rgb = load3(record + RED, seen), load3(total + SUM_RED, seen)
+    red, green, blue = (
+        tl.where(rgb[0] > 0, g_rgb[0], 0.0),
+        tl.where(rgb[1] > 0, g_rgb[1], 0.0),
+        tl.where(rgb[2] > 0, g_rgb[2], 0.0),
+    )
+    dx, dy, dz, d_inverse = unit_direction(view, mean)
+    cx_, cy_, cz_ = color_backward(g_sh0, g_shN, shN, row, row * stride, dx, dy, dz, red, green, blue, seen, DEGREE)
+    radial = cx_ * dx + cy_ * dy + cz_ * dz
+    store3(
+        g_means + 3 * row,
+        w0[0] * vx + w1[0] * vy + w2[0] * vz + (cx_ - radial * dx) * d_inverse,
+        w0[1] * vx + w1[1] * vy + w2[1] * vz + (cy_ - radial * dy) * d_inverse,
+        w0[2] * vx + w1[2] * vy + w2[2] * vz + (cz_ - radial * dz) * d_inverse,
+        seen,
+    )
+    logit = tl.load(logits + row, mask=seen, other=0.0)
+    h = tl.load(total + SUM_H, mask=seen, other=0.0)
+    tl.store(g_logits + row, h / (1 + tl.exp2(logit * LOG2_E)), mask=seen)
+
+
+class Lens(NamedTuple):
+    """A camera as the kernels take it.
+
+    Attributes:
+        view: Rotation row by row, translation and camera position ``[15]`` float32 on the device of the splats.
+        fx: Focal length in x, pixels; then the one in y and the principal point.
+        fy: .
+        cx: .
+        cy: .
+        width: Image width in pixels.
+        height: Image height in pixels.
+    """
+
+    view: Tensor
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, camera: Camera, device: torch.device) -> Lens:
+        """Pack a camera; nothing is read back from its device."""
+        view = camera.viewmat.detach().to(torch.float64)
+        rotation, translation = view[:3, :3], view[:3, 3]
+        packed = torch.cat([rotation.flatten(), translation, -rotation.T @ translation])
+        return cls(packed.to(device, torch.float32), *camera.intrinsics, camera.width, camera.height)
+
+
+class Projected(NamedTuple):
+    """The splats of a view.
+
+    Attributes:
+        means2d: Projected centres of all splats ``[N, 2]``, 0 for those not in view.
+        radii: Their radii ``[N]`` int32.
+        ids: Rows of the splats in view, front to back; the first row first where depths are equal ``[V]`` int64.
+        records: Their records ``[V, RECORD]``.
+        boxes: The tiles they touch: first column and row, columns and rows ``[V, 4]`` int32.
+    """
+
+    means2d: Tensor
+    radii: Tensor
+    ids: Tensor
+    records: Tensor
+    boxes: Tensor
+
+
+def _launch_projection(
+    lens: Lens, attributes: tuple[Tensor, ...], degree: int, records: Tensor, boxes: Tensor, means2d: Tensor
+) -> Tensor:
+    n, shN = attributes[0].shape[0], attributes[-1]
+    radii = torch.zeros(n, dtype=torch.int32, device=shN.device)
+    if n:
+        project_kernel[(triton.cdiv(n, BLOCK),)](
+            *attributes, *lens, n, 3 * shN.shape[1], records, boxes, means2d, radii, DEGREE=degree, BLOCK=BLOCK
+        )
+    return radii
+
+
+def project_radii(lens: Lens, attributes: tuple[Tensor, ...]) -> Tensor:
+    """Radii ``[N]`` int32 of all splats, 0 where not in view; the colours in ``attributes`` are not read."""
+    unused = attributes[0]
+    return _launch_projection(lens, attributes, RADIUS_ONLY, unused, unused, unused)
+
+
+def project(lens: Lens, attributes: tuple[Tensor, ...], degree: int) -> Projected:
+    """Project all splats and list those in view.
+
+    Args:
+        lens: Where to look from.
+        attributes: The six raw attributes, contiguous float32, in the order of :class:`~nsvq_lightning.RawSplats`.
+        degree: Highest degree of the spherical harmonics that is evaluated.
+    """
+    means = attributes[0]
+    n = means.shape[0]
+    records = means.new_empty(n, RECORD.value)
+    boxes = torch.empty(n, 4, dtype=torch.int32, device=means.device)
+    means2d = means.new_zeros(n, 2)
+    radii = _launch_projection(lens, attributes, degree, records, boxes, means2d)
+    ids = radii.nonzero()[:, 0]
+    ids = ids[records[ids, DEPTH.value].sort(stable=True).indices]
+    return Projected(means2d, radii, ids, records[ids], boxes[ids])
+
+
+def project_backward(
+    lens: Lens,
+    attributes: tuple[Tensor, ...],
+    degree: int,
+    ids: Tensor,
+    records: Tensor,
+    totals: Tensor,
+    g_means2d: Tensor,
+) -> list[Tensor]:
+    """Gradients of the six attributes, 0 for splats not in view.
+
+    Args:
+        lens: As in :func:`project`.
+        attributes: As in :func:`project`.
+        degree: As in :func:`project`.
+        ids: Rows of the splats in view ``[V]``.
+        records: Their records ``[V, RECORD]``.
+        totals: Their summed moments ``[V, RECORD]``.
+        g_means2d: Gradient of the projected centres ``[N, 2]``.
+    """
+    gradients = [torch.zeros_like(attribute) for attribute in attributes]
+    means, quats, scales, logits, _, shN = attributes
+    count = ids.shape[0]
+    if count:
+        project_backward_kernel[(triton.cdiv(count, BLOCK),)](
+            means, quats, scales, logits, shN, *lens, count, 3 * shN.shape[1], ids, records, totals, g_means2d,
+            *gradients, DEGREE=degree, BLOCK=BLOCK,
+        )  # fmt: skip
+    return gradients

@@ -1,0 +1,98 @@
+"""The CUDA back-end as differentiable functions: projection, then binning and blend."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.cuda.binning import Tiles, list_tiles
+from nsvq_lightning.rendering.cuda.blend import blend, blend_backward, tile_grid
+from nsvq_lightning.rendering.cuda.projection import Lens, project, project_backward, project_radii
+from nsvq_lightning.splats import SplatTensors
+
+__all__ = ["render_cuda", "visible_cuda"]
+
+
+def _attributes(splats: SplatTensors) -> tuple[Tensor, ...]:
+    """The six raw attributes, contiguous."""
+    six = splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN
+    return tuple(tensor.contiguous() for tensor in six)
+
+
+class _Project(torch.autograd.Function):
+    """Raw attributes to centres, radii and records; the gradient of a record is its moments, see ``records``."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, lens: Lens, degree: int, *attributes: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        projected = project(lens, attributes, degree)
+        ctx.lens, ctx.degree = lens, degree
+        ctx.save_for_backward(projected.ids, projected.records, *attributes)
+        ctx.mark_non_differentiable(projected.radii, projected.ids, projected.boxes)
+        ctx.set_materialize_grads(False)
+        return projected
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_means2d: Tensor | None, _r: None, _i: None, moments: Tensor | None, _b: None) -> Any:
+        ids, records, *attributes = ctx.saved_tensors
+        moments = torch.zeros_like(records) if moments is None else moments.contiguous()
+        g_means2d = records.new_zeros(len(attributes[0]), 2) if g_means2d is None else g_means2d.contiguous()
+        gradients = project_backward(ctx.lens, tuple(attributes), ctx.degree, ids, records, moments, g_means2d)
+        return None, None, *gradients
+
+
+class _Blend(torch.autograd.Function):
+    """Projected splats to image, alpha and depth."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, lens: Lens, means2d: Tensor, ids: Tensor, records: Tensor, boxes: Tensor, background: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        tiles = list_tiles(boxes, *tile_grid(lens.width, lens.height))
+        image, transmittance, depth, ends = blend(lens, records, tiles, background.contiguous())
+        ctx.lens, ctx.n = lens, len(means2d)
+        ctx.save_for_backward(ids, records, ends, image, transmittance, depth, *tiles)
+        ctx.set_materialize_grads(False)
+        return image, 1 - transmittance, depth
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> Any:
+        ids, records, ends, image, transmittance, depth, *tiles = ctx.saved_tensors
+        from_image, from_alpha, from_depth = (None if g is None else g.contiguous() for g in gradients)
+        moments, g_means2d = blend_backward(
+            ctx.lens, records, ids, ctx.n, Tiles(*tiles), ends, (image, transmittance, depth),
+            (from_image, from_alpha, from_depth),
+        )  # fmt: skip
+        g_background = None
+        if ctx.needs_input_grad[5] and from_image is not None:
+            g_background = (from_image * transmittance[..., None]).sum((0, 1))
+        return None, g_means2d, None, moments, None, g_background
+
+
+def render_cuda(
+    splats: SplatTensors, camera: Camera, sh_degree: int, background: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
+
+    See :func:`nsvq_lightning.render` for the meaning of arguments and results.
+    """
+    attributes = _attributes(splats)
+    with torch.cuda.device_of(attributes[0]):
+        lens = Lens.of(camera, attributes[0].device)
+        means2d, radii, ids, records, boxes = _Project.apply(lens, sh_degree, *attributes)
+        image, alpha, depth = _Blend.apply(lens, means2d, ids, records, boxes, background)
+    return image, alpha, radii, means2d, depth
+
+
+def visible_cuda(splats: SplatTensors, camera: Camera) -> Tensor:
+    """Rows ``[V]`` int64, ascending, of the splats that can change the image."""
+    attributes = _attributes(splats)
+    with torch.cuda.device_of(attributes[0]):
+        return project_radii(Lens.of(camera, attributes[0].device), attributes).nonzero()[:, 0]

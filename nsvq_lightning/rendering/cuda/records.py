@@ -1,0 +1,79 @@
+"""What the kernels hand to one another.
+
+A constant stands to the right of what it multiplies: on the left, the interpreter takes the product for a constant.
+
+A *record* is one visible splat on the image plane; records lie front to back. Its exponent is kept as a sum of
+squares, ``log2 α = LOG2_OPACITY - u² - v²`` with ``u = A·dx + B·dy`` and ``v = C·dy``: (A, B; 0, C) is the Cholesky
+factor of the inverse covariance times √(½·log2 e).
+
+A *slot* holds the gradients that one tile sums for one splat, as moments in (u, v). The slots of a splat are
+consecutive, so that its total is taken in one fixed order and no kernel needs an atomic: a render gives the same bits
+every time.
+"""
+
+from __future__ import annotations
+
+import math
+
+import triton.language as tl
+
+from nsvq_lightning.rendering import constants
+
+__all__ = [
+    "ALPHA_MAX",
+    "BLUE",
+    "COVARIANCE_SCALE",
+    "DEPTH",
+    "FACTOR_SCALE",
+    "FIELDS",
+    "GREEN",
+    "LN2",
+    "LOG2_ALPHA_MIN",
+    "LOG2_E",
+    "LOG2_OPACITY",
+    "RECORD",
+    "RED",
+    "SUM_BLUE",
+    "SUM_DEPTH",
+    "SUM_GREEN",
+    "SUM_H",
+    "SUM_RED",
+    "SUM_U",
+    "SUM_UU",
+    "SUM_UV",
+    "SUM_V",
+    "SUM_VV",
+    "TILE",
+    "TRANSMITTANCE_MIN",
+    "A",
+    "B",
+    "C",
+    "X",
+    "Y",
+]
+
+RECORD = tl.constexpr(12)
+"""Floats from one record, or slot, to the next: whole 16-byte words."""
+FIELDS = tl.constexpr(10)
+"""Floats of a record, or slot, that are used."""
+
+# Fields of a record.
+X, Y, A, B, C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH = (tl.constexpr(field) for field in range(10))
+
+# Fields of a slot: with h = α·dL/dα, sums over pixels of w·g (colour), h, h·u, h·v, h·u², h·u·v, h·v², w·g (depth).
+SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_DEPTH = (
+    tl.constexpr(field) for field in range(10)
+)
+
+TILE = tl.constexpr(16)
+"""Side of a tile in pixels."""
+
+LN2 = tl.constexpr(math.log(2.0))
+LOG2_E = tl.constexpr(math.log2(math.e))
+LOG2_ALPHA_MIN = tl.constexpr(math.log2(constants.ALPHA_MIN))
+ALPHA_MAX = tl.constexpr(constants.ALPHA_MAX)
+TRANSMITTANCE_MIN = tl.constexpr(constants.TRANSMITTANCE_MIN)
+FACTOR_SCALE = tl.constexpr(math.sqrt(0.5 * math.log2(math.e)))
+"""√(½·log2 e): turns the Cholesky factor of the inverse covariance into that of the binary exponent."""
+COVARIANCE_SCALE = tl.constexpr(2 * math.log(2.0) ** 2)
+"""From moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)²."""

@@ -1,0 +1,167 @@
+"""The Triton kernels against the float64 oracle: on a GPU, or on the CPU under Triton's interpreter.
+
+``test_triton.py`` runs this file in a process of its own, because Triton decides when it is imported whether it
+interprets. Alone: ``TRITON_INTERPRET=1 pytest tests/rendering/triton_cases.py``. The interpreter takes some
+milliseconds for a splat in a tile, so scenes are tiny.
+"""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import torch
+
+from nsvq_lightning.rendering.cuda.binning import list_tiles
+from nsvq_lightning.rendering.cuda.blend import blend, tile_grid
+from nsvq_lightning.rendering.cuda.projection import Lens, project
+from nsvq_lightning.rendering.rasterize import render, resolve_backend, visible
+from nsvq_lightning.splats import RawSplats
+
+sys.path.insert(0, str(Path(__file__).parent))
+import oracle
+from oracle import run
+from scenes import front_camera, random_splats
+
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+assert_same = partial(oracle.assert_same, "cuda")
+
+
+def on_device(splats: RawSplats) -> RawSplats:
+    """Leaves on the device of the kernels."""
+    return RawSplats(*(tensor.to(DEVICE, copy=True).requires_grad_() for tensor in splats))
+
+
+@pytest.mark.parametrize(("sh_degree", "stored"), [(0, 0), (0, 3), (1, 1), (2, 3), (3, 3)])
+def test_sh_degrees(sh_degree: int, stored: int) -> None:
+    assert_same(random_splats(12, sh_degree=stored), front_camera(16, 12), sh_degree=sh_degree)
+
+
+@pytest.mark.parametrize(("width", "height"), [(40, 28), (16, 16), (17, 3), (1, 1)])
+def test_image_sizes(width: int, height: int) -> None:
+    assert_same(random_splats(24, seed=2), front_camera(width, height, cx=0.4 * width))
+
+
+def test_background_and_its_gradient() -> None:
+    splats, camera, background = random_splats(12, seed=3), front_camera(16, 12), torch.tensor([0.2, 0.5, 0.9])
+    assert_same(splats, camera, background=background)
+    colour = background.to(DEVICE).requires_grad_()
+    result = render(on_device(splats), camera, background=colour, backend="cuda")
+    result.image.sum().backward()
+    torch.testing.assert_close(colour.grad, (1 - result.alpha.detach()).sum().expand(3))
+
+
+def test_saturated_pixels_stop_early() -> None:
+    splats, camera = random_splats(80, seed=5, log_scale=0.5), front_camera(16, 12)
+    splats = splats._replace(opacities=splats.opacities + 5)
+    assert_same(splats, camera)
+    lens = Lens.of(camera, torch.device(DEVICE))
+    projected = project(lens, tuple(tensor.to(DEVICE) for tensor in splats), 3)
+    tiles = list_tiles(projected.boxes, *tile_grid(16, 12))
+    *_, ends = blend(lens, projected.records, tiles, torch.zeros(3, device=DEVICE))
+    assert 0 < int(ends[0]) < int(tiles.offsets[1])
+
+
+def test_tiny_and_huge_splats() -> None:
+    splats = random_splats(40, seed=6)
+    scales = splats.scales.clone()
+    scales[:8], scales[8:10], scales[10:16, 0] = -12.0, 1.0, 0.5
+    assert_same(splats._replace(scales=scales), front_camera(20, 16))
+
+
+@pytest.mark.parametrize("count", [1, 129])
+def test_counts_around_the_size_of_a_program(count: int) -> None:
+    assert_same(random_splats(count, seed=7, log_scale=-4.0), front_camera(12, 9))
+
+
+def test_splats_behind_and_beside_the_camera() -> None:
+    splats = random_splats(40, seed=8)
+    means = splats.means.clone()
+    means[:10, 2] -= 8
+    means[10:20, 0] += 3
+    means[20:24, 2] -= 3.2
+    assert_same(splats._replace(means=means), front_camera(20, 16))
+
+
+def test_equal_depths_keep_their_order() -> None:
+    splats = random_splats(12, seed=4, log_scale=-1.0)
+    assert_same(splats._replace(means=splats.means[:1].repeat(12, 1)), front_camera(16, 12))
+
+
+def test_no_splat_in_view_is_background() -> None:
+    splats, camera = random_splats(20), front_camera(20, 9)
+    behind = splats._replace(means=splats.means - torch.tensor([0.0, 0.0, 50.0]))
+    background = torch.tensor([0.1, 0.2, 0.3])
+    result, gradients = run(behind, camera, "cuda", torch.float32, background=background)
+    assert torch.equal(result.image, background.expand_as(result.image))
+    assert all((gradient == 0).all() for gradient in gradients.values())
+    nothing, gradients = run(RawSplats(*(tensor[:0] for tensor in splats)), camera, "cuda", torch.float32)
+    assert not nothing.image.any()
+    assert gradients["shN"].shape == (0, 15, 3)
+
+
+@pytest.mark.parametrize("attribute", ["means", "quats", "scales", "opacities"])
+def test_broken_splats_leave_the_rest_alone(attribute: str) -> None:
+    splats, camera = random_splats(16, seed=10), front_camera(16, 12)
+    broken = splats._replace(**{attribute: splats._asdict()[attribute].clone()})
+    values = getattr(broken, attribute)
+    values[0], values[1] = float("nan"), -float("inf") if attribute == "opacities" else float("inf")
+    result, gradients = run(broken, camera, "cuda", torch.float32)
+    assert all(torch.isfinite(gradient).all() for gradient in gradients.values())
+    rest, _ = run(RawSplats(*(tensor[2:] for tensor in splats)), camera, "cuda", torch.float32)
+    assert torch.equal(result.image, rest.image)
+    assert not result.radii[:2].any()
+
+
+def test_visible_is_radii() -> None:
+    splats, camera = random_splats(200, seed=11, log_scale=-4.0), front_camera(8, 6, cx=3.0)
+    with torch.no_grad():
+        rows = visible(on_device(splats), camera, backend="cuda").cpu()
+        radii = render(on_device(splats), camera, backend="cuda").radii.cpu()
+    assert torch.equal(rows, radii.nonzero()[:, 0])
+    assert torch.equal(rows, visible(splats, camera, backend="reference"))
+    assert 0 < len(rows) < 200
+
+
+def test_backward_twice_gives_the_same_bits() -> None:
+    leaves = on_device(random_splats(12))
+    loss = render(leaves, front_camera(20, 12), backend="cuda").image.square().sum()
+    first = torch.autograd.grad(loss, leaves, retain_graph=True)
+    second = torch.autograd.grad(loss, leaves)
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize("output", ["means2d", "image", "alpha", "depth"])
+def test_one_output_alone_can_be_differentiated(output: str) -> None:
+    splats, camera = random_splats(8, seed=14), front_camera(12, 9)
+    double = RawSplats(*(tensor.double().requires_grad_() for tensor in splats))
+    gradients = []
+    for leaves, backend in ((on_device(splats), "cuda"), (double, "reference")):
+        value = getattr(render(leaves, camera, backend=backend), output)
+        weights = torch.randn(value.shape, generator=torch.Generator().manual_seed(0)).to(value)
+        (means,) = torch.autograd.grad((value * weights).sum(), leaves.means)
+        gradients.append(means.cpu().double())
+    torch.testing.assert_close(*gradients, atol=1e-4 * gradients[1].abs().max().item(), rtol=0)
+
+
+def test_tiles_list_their_splats_front_to_back() -> None:
+    boxes = torch.tensor([[1, 0, 2, 2], [0, 0, 1, 1], [0, 0, 3, 2], [2, 1, 1, 1]], dtype=torch.int32)
+    tiles = list_tiles(boxes.to(DEVICE), 3, 2)
+    offsets, ranks, slots = tiles.offsets.tolist(), tiles.ranks.tolist(), tiles.slots.tolist()
+    lists = [ranks[begin:end] for begin, end in pairwise(offsets)]
+    assert lists == [[1, 2], [0, 2], [0, 2], [2], [0, 2], [0, 2, 3]]
+    assert tiles.ends.tolist() == [4, 5, 11, 12]
+    assert sorted(slots) == list(range(12))
+    owners = [0] * 4 + [1] + [2] * 6 + [3]
+    assert [owners[slot] for slot in slots] == ranks
+
+
+def test_backend_is_chosen_by_device_and_type() -> None:
+    like = torch.zeros(1, device=DEVICE)
+    assert resolve_backend("cuda", like) == "cuda"
+    assert resolve_backend("auto", like) == ("cuda" if DEVICE == "cuda" else "cpu")
+    with pytest.raises(ValueError, match="float32 tensors on a CUDA device"):
+        resolve_backend("cuda", like.double())
