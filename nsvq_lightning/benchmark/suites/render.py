@@ -212,19 +212,28 @@ def _pairs(workload: Workload) -> float:
     return float(tiles.clamp_min(0).prod(1).sum()) * TILE**2
 
 
-def method_errors(crop: Workload, methods: Sequence[AnyPainter]) -> dict[tuple[AnyPainter, str], dict[str, float]]:
-    """Errors by method and operation; pixels are left out by what the back-end does with everything asked for."""
-    truth = trace(crop, Method(REFERENCE), torch.float64)
-    usual, expected = {}, {}
-    for name in dict.fromkeys(method.backend for method in methods):
-        usual[name] = _usual(trace(crop, Method(name), torch.float32).image, truth.image)
-        expected[name] = gradients_of(truth, crop.image_gradient.double() * usual[name][..., None])
+def method_errors(
+    crop: Workload, methods: Sequence[AnyPainter], oracle: Painter | None = None
+) -> dict[tuple[AnyPainter, str], dict[str, float]]:
+    """Errors by method and operation; pixels are left out by what the first method of a back-end does.
+
+    Args:
+        crop: What is rendered.
+        methods: In float32; the first one of each back-end should have everything asked for.
+        oracle: In float64; the oracle of the package by default.
+    """
+    truth = trace(crop, oracle or Method(REFERENCE), torch.float64)
+    usual: dict[str, Tensor] = {}
+    expected: dict[str, dict[str, Tensor]] = {}
     errors = {}
     for method in methods:
-        result, counted = trace(crop, method, torch.float32), usual[method.backend]
-        errors[method, FORWARD] = image_errors(result.image, truth.image, counted)
-        gradients = gradients_of(result, crop.image_gradient * counted[..., None])
-        by_name = {name: relative_l2(gradients[name], g) for name, g in expected[method.backend].items()}
+        name, result = method.backend, trace(crop, method, torch.float32)
+        if name not in usual:
+            usual[name] = _usual(result.image, truth.image)
+            expected[name] = gradients_of(truth, crop.image_gradient.double() * usual[name][..., None])
+        errors[method, FORWARD] = image_errors(result.image, truth.image, usual[name])
+        gradients = gradients_of(result, crop.image_gradient * usual[name][..., None])
+        by_name = {key: relative_l2(gradients[key], gradient) for key, gradient in expected[name].items()}
         errors[method, BOTH] = worst_first("gradient error", by_name)
     return errors
 

@@ -200,7 +200,7 @@ def image_axes(t, m):
 
 @inline
 def cross(u, v):
-    """u × v."""
+    """The vector product u × v."""
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
@@ -235,7 +235,14 @@ def footprint(camera, means, quats, scales, logits):
 
     finite = splat(FINITE)
     seen = (z > splat(NEAR)) & (reach > zero) & (left <= right) & (top <= bottom)
-    seen = seen & (size < splat(LARGEST_FOOTPRINT)) & (determinant < finite) & (vfabs(px) < finite) & (vfabs(py) < finite) & (logits >= -finite)
+    seen = (
+        seen
+        & (size < splat(LARGEST_FOOTPRINT))
+        & (determinant < finite)
+        & (vfabs(px) < finite)
+        & (vfabs(py) < finite)
+        & (logits >= -finite)
+    )
     # exp2_clamped gives a broken scale a value again; the raw one still shows it.
     seen = seen & (scales[0] + scales[1] + scales[2] < finite)
 
