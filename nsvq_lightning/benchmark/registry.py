@@ -30,6 +30,9 @@ SUITES = {
     "render": Suite(
         "rasterizer back-ends and their accuracy settings, forward and backward", drawn=("max error", "gradient error")
     ),
+    "stability": Suite(
+        "extreme scenes and quantizers: finite, refused or wrong?", drawn=("max error", "gradient error")
+    ),
     "nearest": Suite("nearest-code searches", drawn=("added distance", "wrong codes")),
     "loss": Suite("L1 + D-SSIM, fused and in plain torch"),
     "optimizer": Suite("implementations of Adam"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, read_model
@@ -20,11 +22,15 @@ from nsvq_lightning.rendering.camera import Camera
 
 __all__ = ["Factor", "Scene", "SceneError", "View", "load_scene"]
 
+log = logging.getLogger(__name__)
+
 Factor = Literal[1, 2, 4, 8]
 
 _FACTORS = (1, 2, 4, 8)
 _CAMERAS_WITH_KEPT_MAPS = 8
 """With more distorted cameras than this (each photo its own, say) the undistortion maps would outweigh the images."""
+_FARTHEST = 1e4
+"""Distance of the cameras from the origin, in extents, beyond which rounding moves splats by a good part of a pixel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +127,9 @@ def load_scene(
     train, test = split_views([image.name for image in model.images], test_every)
     folder, divisor = _image_folder(root, images_folder, factor)
     sources = _image_sources(model, _locate(model.images, folder), divisor, max_width if factor is None else None)
+    centres = np.stack([-model.images[i].viewmat[:3, :3].T @ model.images[i].viewmat[:3, 3] for i in train])
+    extent = _extent(centres)
+    _warn_if_far(centres, extent)
     return Scene(
         root=root,
         names=tuple(image.name for image in model.images),
@@ -130,7 +139,7 @@ def load_scene(
         colors=torch.from_numpy(model.colors).float() / 255,
         train=train,
         test=test,
-        extent=_extent([model.images[i] for i in train]),
+        extent=extent,
     )
 
 
@@ -226,6 +235,18 @@ def _camera(image: ColmapImage, pinhole: Pinhole) -> Camera:
         raise SceneError(f"camera {image.camera_id} of image {image.name}: {error}; run COLMAP again") from error
 
 
-def _extent(train: Sequence[ColmapImage]) -> float:
-    centres = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in train])
+def _extent(centres: NDArray[np.float64]) -> float:
     return float(1.1 * np.linalg.norm(centres - centres.mean(0), axis=1).max())
+
+
+def _warn_if_far(centres: NDArray[np.float64], extent: float) -> None:
+    """Warn where float32 positions are too coarse for the scene, as in geographic coordinates."""
+    distance = float(np.linalg.norm(centres.mean(0)))
+    if extent > 0 and distance > _FARTHEST * extent:
+        log.warning(
+            "the cameras are %.3g scene units from the origin, %.0f times the extent of the scene: float32 positions "
+            "there are %.1g apart; move the origin near the cameras (colmap model_transformer)",
+            distance,
+            distance / extent,
+            float(np.spacing(np.float32(distance))),
+        )

@@ -2,7 +2,18 @@
 
 from __future__ import annotations
 
-__all__ = ["ALPHA_MAX", "ALPHA_MIN", "BLUR", "FRUSTUM_MARGIN", "MIN_SQUARED_NORM", "NEAR", "TRANSMITTANCE_MIN"]
+__all__ = [
+    "ALPHA_MAX",
+    "ALPHA_MIN",
+    "BLUR",
+    "FRUSTUM_MARGIN",
+    "HUGE_FOOTPRINT",
+    "HUGE_QUATERNION",
+    "MIN_SQUARED_NORM",
+    "NEAR",
+    "SHRINK",
+    "TRANSMITTANCE_MIN",
+]
 
 NEAR = 0.2
 """Splats whose centre is nearer than this along the viewing axis are culled, scene units."""
@@ -24,3 +35,10 @@ FRUSTUM_MARGIN = 0.3
 
 MIN_SQUARED_NORM = 1e-24
 """Squared quaternion norms are floored here, so that a zero quaternion is the identity and has no gradient."""
+
+HUGE_QUATERNION, SHRINK = 1e18, 2.0**-66
+"""Quaternions with a larger number are made smaller by this factor first: their squares would overflow in float32."""
+
+HUGE_FOOTPRINT = 1e10
+"""Where the sum of both variances is larger, square pixels, the determinant is taken in units of that sum: its terms
+would overflow in float32."""

@@ -17,8 +17,11 @@ from nsvq_lightning.rendering.constants import (
     ALPHA_MIN,
     BLUR,
     FRUSTUM_MARGIN,
+    HUGE_FOOTPRINT,
+    HUGE_QUATERNION,
     MIN_SQUARED_NORM,
     NEAR,
+    SHRINK,
     TRANSMITTANCE_MIN,
 )
 from nsvq_lightning.rendering.sh import sh_colors
@@ -35,22 +38,22 @@ class Projection(NamedTuple):
 
     Attributes:
         means2d: Projected centres ``[N, 2]``, pixels.
-        covariances: Variances and covariance with the blur ``[N, 3]``: xx, xy, yy, square pixels.
-        determinants: Their determinants ``[N]``.
+        conics: Inverse covariances with the blur ``[N, 3]``: xx, xy, yy, 1 / square pixels.
         depths: View-space z ``[N]``.
         half_sizes: Half width and height ``[N, 2]`` in pixels of the box outside which α stays below 1/255; 0 for a
             splat that never reaches it.
     """
 
     means2d: Tensor
-    covariances: Tensor
-    determinants: Tensor
+    conics: Tensor
     depths: Tensor
     half_sizes: Tensor
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotations ``[N, 3, 3]`` of quaternions ``[N, 4]`` (wxyz, any norm; zero is the identity)."""
+    # Squares of a huge quaternion would overflow.
+    quats = quats * torch.where(quats.detach().abs().amax(-1, keepdim=True) > HUGE_QUATERNION, SHRINK, 1.0)
     norm = quats.square().sum(-1, keepdim=True).clamp_min(MIN_SQUARED_NORM).sqrt()
     w, x, y, z = (quats / norm).unbind(-1)
     rows = [
@@ -65,7 +68,7 @@ def project(splats: SplatTensors, camera: Camera) -> Projection:
     """Project splats through the local affine approximation of the camera (EWA splatting).
 
     The determinant uses Lagrange's identity, |u|²|v|² - (u·v)² = |u × v|²: the naive difference loses every digit for
-    splats of thousands of pixels.
+    splats of thousands of pixels. That of a huge splat is taken in units of its own size, or it would overflow.
     """
     means = splats.means
     viewmat = camera.viewmat.to(means)
@@ -80,11 +83,14 @@ def project(splats: SplatTensors, camera: Camera) -> Projection:
     axes = rotation_matrices(splats.quats) * splats.scales.exp()[:, None, :]
     u, v = (jacobian @ rotation @ axes).unbind(1)
     xx, xy, yy = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
-    determinant = torch.linalg.cross(u, v).square().sum(-1) + BLUR * (xx + yy) + BLUR * BLUR
-    covariance = torch.stack([xx + BLUR, xy, yy + BLUR], -1)
+    size = (xx + yy).detach()
+    unit = torch.where(size > HUGE_FOOTPRINT, 1 / size, torch.ones_like(size))
+    determinant = (torch.linalg.cross(u, v) * unit[:, None]).square().sum(-1)
+    determinant = determinant + (BLUR * (xx + yy) + BLUR * BLUR) * unit * unit
+    conics = torch.stack([yy + BLUR, -xy, xx + BLUR], -1) * (unit / determinant * unit)[:, None]
     reach = 2 * (torch.sigmoid(splats.opacities.detach()) / ALPHA_MIN).log().clamp_min(0)
-    half = (reach[:, None] * covariance.detach()[:, [0, 2]]).sqrt()
-    return Projection(torch.stack([fx * x / z + cx, fy * y / z + cy], -1), covariance, determinant, z, half)
+    half = (reach[:, None] * (torch.stack([xx, yy], -1).detach() + BLUR)).sqrt()
+    return Projection(torch.stack([fx * x / z + cx, fy * y / z + cy], -1), conics, z, half)
 
 
 def _on_image(projection: Projection, camera: Camera) -> Tensor:
@@ -93,7 +99,7 @@ def _on_image(projection: Projection, camera: Camera) -> Tensor:
     size = projection.means2d.new_tensor([camera.width - 1, camera.height - 1])
     high = torch.minimum((projection.means2d + projection.half_sizes - 0.5).floor(), size)
     reached = (projection.half_sizes > 0).all(-1) & (low <= high).all(-1)
-    return (projection.depths > NEAR) & reached & torch.isfinite(projection.determinants)
+    return (projection.depths > NEAR) & reached & torch.isfinite(projection.conics).all(-1)
 
 
 @torch.no_grad()
@@ -121,8 +127,6 @@ def render_reference(
     direction = direction / direction.square().sum(-1, keepdim=True).clamp_min(1e-20).sqrt()
     colors = sh_colors(direction, seen.sh0, seen.shN, sh_degree)
     features = torch.cat([colors, projection.depths[:, None]], -1)
-    xx, xy, yy = projection.covariances.unbind(-1)
-    conics = torch.stack([yy, -xy, xx], -1) / projection.determinants[:, None]
     opacities = torch.sigmoid(seen.opacities)
     centres = means2d[rows]
 
@@ -141,7 +145,7 @@ def render_reference(
                 torch.arange(top, bottom).to(centres), torch.arange(left, right).to(centres), indexing="ij"
             )
             pixels = torch.stack([xs, ys], -1).reshape(-1, 2) + 0.5
-            inputs = (pixels, centres[near], conics[near], opacities[near], features[near])
+            inputs = (pixels, centres[near], projection.conics[near], opacities[near], features[near])
             blended = checkpoint(_blend, *inputs, use_reentrant=False) if torch.is_grad_enabled() else _blend(*inputs)
             tiles.append(blended.view(bottom - top, right - left, 5))
         strips.append(torch.cat(tiles, 1))
@@ -153,8 +157,6 @@ def render_reference(
 
 def _blend(pixels: Tensor, centres: Tensor, conics: Tensor, opacities: Tensor, features: Tensor) -> Tensor:
     """Front-to-back blend of sorted splats at ``pixels [P, 2]``: Σ w·feature and the transmittance left ``[P, 5]``."""
-    if centres.shape[0] == 0:
-        return torch.cat([pixels.new_zeros(pixels.shape[0], 4), pixels.new_ones(pixels.shape[0], 1)], 1)
     dx, dy = (pixels[:, None] - centres[None]).unbind(-1)
     power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy
     alpha = (opacities * power.clamp_max(0).exp()).clamp_max(ALPHA_MAX)
@@ -162,6 +164,5 @@ def _blend(pixels: Tensor, centres: Tensor, conics: Tensor, opacities: Tensor, f
     with torch.no_grad():
         running = (1 - alpha).cumprod(1) >= TRANSMITTANCE_MIN
     alpha = torch.where(running, alpha, torch.zeros_like(alpha))
-    transmittance = (1 - alpha).cumprod(1)
-    before = torch.cat([torch.ones_like(transmittance[:, :1]), transmittance[:, :-1]], 1)
-    return torch.cat([(alpha * before) @ features, transmittance[:, -1:]], 1)
+    transmittance = torch.cat([pixels.new_ones(pixels.shape[0], 1), (1 - alpha).cumprod(1)], 1)
+    return torch.cat([(alpha * transmittance[:, :-1]) @ features, transmittance[:, -1:]], 1)

@@ -12,8 +12,9 @@ errors: they say nothing about the quality of the arithmetic.
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -29,7 +30,21 @@ from nsvq_lightning.rendering.rasterize import BACKENDS, render, resolve_backend
 from nsvq_lightning.rendering.reference import TILE
 from nsvq_lightning.splats import RawSplats, sh_degree_of
 
-__all__ = ["Accuracy", "Method", "accuracies", "image_errors", "run"]
+__all__ = [
+    "BOTH",
+    "FORWARD",
+    "REFERENCE",
+    "Accuracy",
+    "Method",
+    "Painter",
+    "accuracies",
+    "fast_backends",
+    "gradients_of",
+    "image_errors",
+    "method_errors",
+    "run",
+    "trace",
+]
 
 REFERENCE = "reference"
 FORWARD, BOTH = "forward", "forward + backward"
@@ -84,7 +99,21 @@ class Method(NamedTuple):
         return functional.interpolate(image.movedim(-1, 0)[None], size, mode="bilinear")[0].movedim(0, -1)
 
 
-class _Traced(NamedTuple):
+class Painter(Protocol):
+    """What renders a workload with one of the back-ends, as :class:`Method` does."""
+
+    @property
+    def backend(self) -> str:
+        """Name of the back-end."""
+
+    def picture(self, splats: RawSplats, workload: Workload) -> Tensor:
+        """Image ``[H, W, 3]`` of the workload's view."""
+
+
+AnyPainter = TypeVar("AnyPainter", bound=Painter)
+
+
+class Traced(NamedTuple):
     """A crop rendered with a graph behind it."""
 
     splats: RawSplats
@@ -115,14 +144,14 @@ def _rows(workload: Workload, settings: Settings) -> list[Row]:
     small = len(workload.splats.means) <= REFERENCE_SPLATS
     crop = _crop(workload, ORACLE_PAIRS[settings.quick])
     asked = accuracies(sh_degree_of(workload.splats.shN))
-    fast = [Method(name, accuracy) for name in _fast_backends(workload.splats.means) for accuracy in asked]
+    fast = [Method(name, accuracy) for name in fast_backends(workload.splats.means) for accuracy in asked]
     plain = Method(REFERENCE)
     # In a quick run even 20k splats are too much for plain torch: it is compared on the crop.
     jobs = [(workload, [*fast, plain] if small and not settings.quick else fast)]
     if small and settings.quick:
         jobs.append((crop, [fast[0], plain]))
     with use_threads(max(settings.threads)):
-        errors = _errors(crop, list(dict.fromkeys(method for _, methods in jobs for method in methods)))
+        errors = method_errors(crop, list(dict.fromkeys(method for _, methods in jobs for method in methods)))
     size = f"{crop.camera.width}x{crop.camera.height}"
     whole = crop.camera.height == workload.camera.height
     note = "errors on all pixels" if whole else f"errors on the middle {size} pixels"
@@ -137,7 +166,7 @@ def _rows(workload: Workload, settings: Settings) -> list[Row]:
     return rows
 
 
-def _fast_backends(like: Tensor) -> list[str]:
+def fast_backends(like: Tensor) -> list[str]:
     """Back-ends other than the oracle that take tensors such as ``like``."""
     usable = []
     for name in BACKENDS:
@@ -183,19 +212,28 @@ def _pairs(workload: Workload) -> float:
     return float(tiles.clamp_min(0).prod(1).sum()) * TILE**2
 
 
-def _errors(crop: Workload, methods: list[Method]) -> dict[tuple[Method, str], dict[str, float]]:
-    """Errors by method and operation; pixels are left out by what the back-end does with everything asked for."""
-    truth = _trace(crop, Method(REFERENCE), torch.float64)
-    usual, expected = {}, {}
-    for name in dict.fromkeys(method.backend for method in methods):
-        usual[name] = _usual(_trace(crop, Method(name), torch.float32).image, truth.image)
-        expected[name] = _gradients(truth, crop.image_gradient.double() * usual[name][..., None])
+def method_errors(
+    crop: Workload, methods: Sequence[AnyPainter], oracle: Painter | None = None
+) -> dict[tuple[AnyPainter, str], dict[str, float]]:
+    """Errors by method and operation; pixels are left out by what the first method of a back-end does.
+
+    Args:
+        crop: What is rendered.
+        methods: In float32; the first one of each back-end should have everything asked for.
+        oracle: In float64; the oracle of the package by default.
+    """
+    truth = trace(crop, oracle or Method(REFERENCE), torch.float64)
+    usual: dict[str, Tensor] = {}
+    expected: dict[str, dict[str, Tensor]] = {}
     errors = {}
     for method in methods:
-        result, counted = _trace(crop, method, torch.float32), usual[method.backend]
-        errors[method, FORWARD] = image_errors(result.image, truth.image, counted)
-        gradients = _gradients(result, crop.image_gradient * counted[..., None])
-        by_name = {name: relative_l2(gradients[name], g) for name, g in expected[method.backend].items()}
+        name, result = method.backend, trace(crop, method, torch.float32)
+        if name not in usual:
+            usual[name] = _usual(result.image, truth.image)
+            expected[name] = gradients_of(truth, crop.image_gradient.double() * usual[name][..., None])
+        errors[method, FORWARD] = image_errors(result.image, truth.image, usual[name])
+        gradients = gradients_of(result, crop.image_gradient * usual[name][..., None])
+        by_name = {key: relative_l2(gradients[key], gradient) for key, gradient in expected[name].items()}
         errors[method, BOTH] = worst_first("gradient error", by_name)
     return errors
 
@@ -229,11 +267,13 @@ def image_errors(image: Tensor, truth: Tensor, usual: Tensor | None = None) -> d
     }
 
 
-def _trace(crop: Workload, method: Method, dtype: torch.dtype) -> _Traced:
+def trace(crop: Workload, method: Painter, dtype: torch.dtype) -> Traced:
+    """Render copies of the splats in a type, to be differentiated."""
     splats = RawSplats(*(tensor.to(dtype, copy=True).requires_grad_() for tensor in crop.splats))
-    return _Traced(splats, method.picture(splats, crop))
+    return Traced(splats, method.picture(splats, crop))
 
 
-def _gradients(traced: _Traced, weights: Tensor) -> dict[str, Tensor]:
+def gradients_of(traced: Traced, weights: Tensor) -> dict[str, Tensor]:
+    """Gradient by attribute of Σ weights · image."""
     gradients = torch.autograd.grad(traced.image, traced.splats, weights, retain_graph=True)
     return dict(zip(RawSplats._fields, gradients, strict=True))

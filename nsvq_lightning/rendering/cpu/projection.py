@@ -91,6 +91,10 @@ BLUR_SQUARED = F(constants.BLUR**2)
 MIN_SQUARED_NORM = F(constants.MIN_SQUARED_NORM)
 FINITE = F(1e30)
 """Anything beyond this on the image plane comes from broken attributes; the splat is culled."""
+HUGE_FOOTPRINT = F(constants.HUGE_FOOTPRINT)
+LARGEST_FOOTPRINT = F(1e36)
+"""Splats whose sum of both variances is larger, square pixels, are culled: not even that is safe from overflow."""
+HUGE_QUATERNION, SHRINK = F(constants.HUGE_QUATERNION), F(constants.SHRINK)
 LN2 = F(np.log(2.0))
 COVARIANCE_SCALE = F(2 * np.log(2.0) ** 2)
 """From moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)²."""
@@ -136,6 +140,9 @@ def axes_of(quat, log_scales):
     """Unit quaternion and its inverse norm, axis lengths, and the matrix M = R·diag(lengths), row by row."""
     one, two = splat(F(1)), splat(F(2))
     w, x, y, z = quat
+    largest = vmax(vmax(vfabs(w), vfabs(x)), vmax(vfabs(y), vfabs(z)))
+    shrink = select(largest > splat(HUGE_QUATERNION), splat(SHRINK), one)
+    w, x, y, z = w * shrink, x * shrink, y * shrink, z * shrink
     squared = fma(w, w, fma(x, x, fma(y, y, z * z)))
     inverse = one / vsqrt(vmax(squared, splat(MIN_SQUARED_NORM)))
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
@@ -153,7 +160,7 @@ def axes_of(quat, log_scales):
         two * (y * z + w * x) * s1,
         fnma(two, fma(x, x, y * y), one) * s2,
     )
-    return (w, x, y, z), inverse, (s0, s1, s2), m
+    return (w, x, y, z), inverse * shrink, (s0, s1, s2), m
 
 
 @inline
@@ -192,6 +199,12 @@ def image_axes(t, m):
 
 
 @inline
+def cross(u, v):
+    """The vector product u × v."""
+    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+
+
+@inline
 def footprint(camera, means, quats, scales, logits):
     """Everything of a record but the colour, the tile rectangle, and which of 16 splats can change the image."""
     zero, one, half = splat(F(0)), splat(F(1)), splat(F(0.5))
@@ -202,8 +215,11 @@ def footprint(camera, means, quats, scales, logits):
     yy = dot3(v[0], v[1], v[2], v[0], v[1], v[2])
     xy = dot3(u[0], u[1], u[2], v[0], v[1], v[2])
     # |u|²|v|² - (u·v)² = |u × v|² (Lagrange): no cancellation for large splats.
-    n0, n1, n2 = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
-    determinant = dot3(n0, n1, n2, n0, n1, n2) + fma(splat(BLUR), xx + yy, splat(BLUR_SQUARED))
+    n0, n1, n2 = cross(u, v)
+    size = xx + yy
+    unit = select(size > splat(HUGE_FOOTPRINT), one / size, one)
+    n0, n1, n2 = n0 * unit, n1 * unit, n2 * unit
+    determinant = dot3(n0, n1, n2, n0, n1, n2) + fma(splat(BLUR), size, splat(BLUR_SQUARED)) * unit * unit
     xx, yy = xx + splat(BLUR), yy + splat(BLUR)
 
     px = fma(splat(get(camera, FX)), x * inverse, splat(get(camera, CX)))
@@ -219,13 +235,20 @@ def footprint(camera, means, quats, scales, logits):
 
     finite = splat(FINITE)
     seen = (z > splat(NEAR)) & (reach > zero) & (left <= right) & (top <= bottom)
-    seen = seen & (determinant < finite) & (vfabs(px) < finite) & (vfabs(py) < finite) & (logits >= -finite)
+    seen = (
+        seen
+        & (size < splat(LARGEST_FOOTPRINT))
+        & (determinant < finite)
+        & (vfabs(px) < finite)
+        & (vfabs(py) < finite)
+        & (logits >= -finite)
+    )
     # exp2_clamped gives a broken scale a value again; the raw one still shows it.
     seen = seen & (scales[0] + scales[1] + scales[2] < finite)
 
     factor = splat(FACTOR_SCALE)
     slope_y = xy / yy
-    a = factor * vsqrt(yy / determinant)
+    a = factor * vsqrt(yy * unit / determinant * unit)
     record = (px, py, a, -(a * slope_y), factor / vsqrt(yy), log2_opacity, z, xy / xx, slope_y)
     tile = splat(F(1.0 / (1 << TILE_SHIFT)))
     tiles = (vfloor(left * tile), vfloor(top * tile), vfloor(right * tile), vfloor(bottom * tile))
@@ -432,9 +455,10 @@ def color_range(camera, means, sh0, shN, stride, degree, evaluated, ids, first, 
             gather_sh(shN, ids, start, stride, coefficients, scratch)
             clear_bands(scratch, degree, evaluated)
         r, g, b = color(evaluated, direction, gather_rows3(sh0, ids, start), scratch)
-        store(scratch, 0, vmax(r, zero))
-        store(scratch, 16, vmax(g, zero))
-        store(scratch, 32, vmax(b, zero))
+        # In this order NaN stays: the loss must show it.
+        store(scratch, 0, vmax(zero, r))
+        store(scratch, 16, vmax(zero, g))
+        store(scratch, 32, vmax(zero, b))
         for lane in range(min(16, last - start)):
             o = RECORD * np.int64(get(ids, start + lane)) + RED
             put(records, o, get(scratch, lane))
@@ -673,32 +697,35 @@ def geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y):
     """
     two = splat(F(2))
     (x, y, _), inverse, (slope_x, slope_y), t0, t1 = affine(camera, mean)
-    q, q_inverse, s, m = axes_of(quat, scale)
+    q, q_inverse, lengths, m = axes_of(quat, scale)
     u, v = image_axes(t0, m), image_axes(t1, m)
 
-    # dL/dΣ = ½ Fᵀ (Σ h uuᵀ) F, symmetric.
+    # dL/dΣ = ½ Fᵀ S F with S = Σ h uuᵀ, so dL/dU = Fᵀ S (F U). The rows of F U are a·u + b·v and c·v; by Lagrange's
+    # identity the first is a·(v × (u × v) + blur·u)/|v|², which keeps its digits on needles.
     a, b, c = record[A], record[B], record[C]
-    k = splat(COVARIANCE_SCALE)
+    k = two * splat(COVARIANCE_SCALE)
     uu, uv, vv = k * total[SUM_UU], k * total[SUM_UV], k * total[SUM_VV]
-    p0, p1, p2 = a * uu, fma(b, uu, c * uv), fma(b, uv, c * vv)
-    gxx, gxy, gyy = two * (p0 * a), two * (p1 * a), two * fma(p1, b, p2 * c)
-    gu = (fma(gxx, u[0], gxy * v[0]), fma(gxx, u[1], gxy * v[1]), fma(gxx, u[2], gxy * v[2]))
-    gv = (fma(gxy, u[0], gyy * v[0]), fma(gxy, u[1], gyy * v[1]), fma(gxy, u[2], gyy * v[2]))
+    per_yy = splat(F(1)) / (dot3(v[0], v[1], v[2], v[0], v[1], v[2]) + splat(BLUR))
+    n = cross(u, v)
+    n = cross(v, (n[0] * per_yy, n[1] * per_yy, n[2] * per_yy))
+    blur = splat(BLUR) * per_yy
+    r = a * fma(blur, u[0], n[0]), a * fma(blur, u[1], n[1]), a * fma(blur, u[2], n[2])
+    s = c * v[0], c * v[1], c * v[2]
+    e = fma(uu, r[0], uv * s[0]), fma(uu, r[1], uv * s[1]), fma(uu, r[2], uv * s[2])
+    f = fma(uv, r[0], vv * s[0]), fma(uv, r[1], vv * s[1]), fma(uv, r[2], vv * s[2])
+    gu = a * e[0], a * e[1], a * e[2]
+    gv = fma(b, e[0], c * f[0]), fma(b, e[1], c * f[1]), fma(b, e[2], c * f[2])
+    g_scale = fma(r[0], e[0], s[0] * f[0]), fma(r[1], e[1], s[1] * f[1]), fma(r[2], e[2], s[2] * f[2])
 
     gm = (
         fma(t0[0], gu[0], t1[0] * gv[0]), fma(t0[0], gu[1], t1[0] * gv[1]), fma(t0[0], gu[2], t1[0] * gv[2]),
         fma(t0[1], gu[0], t1[1] * gv[0]), fma(t0[1], gu[1], t1[1] * gv[1]), fma(t0[1], gu[2], t1[1] * gv[2]),
         fma(t0[2], gu[0], t1[2] * gv[0]), fma(t0[2], gu[1], t1[2] * gv[1]), fma(t0[2], gu[2], t1[2] * gv[2]),
     )  # fmt: skip
-    g_scale = (
-        dot3(m[0], m[3], m[6], gm[0], gm[3], gm[6]),
-        dot3(m[1], m[4], m[7], gm[1], gm[4], gm[7]),
-        dot3(m[2], m[5], m[8], gm[2], gm[5], gm[8]),
-    )
     g_rotation = (
-        gm[0] * s[0], gm[1] * s[1], gm[2] * s[2],
-        gm[3] * s[0], gm[4] * s[1], gm[5] * s[2],
-        gm[6] * s[0], gm[7] * s[1], gm[8] * s[2],
+        gm[0] * lengths[0], gm[1] * lengths[1], gm[2] * lengths[2],
+        gm[3] * lengths[0], gm[4] * lengths[1], gm[5] * lengths[2],
+        gm[6] * lengths[0], gm[7] * lengths[1], gm[8] * lengths[2],
     )  # fmt: skip
     g_quat = quaternion_gradient(q, q_inverse, g_rotation)
 
