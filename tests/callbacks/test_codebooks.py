@@ -12,6 +12,7 @@ import torch
 from nsvq_lightning.callbacks import CodebookReplacement, OpacityRegularization, PhaseSchedule, ShDegreeSchedule
 from nsvq_lightning.callbacks.codebooks import perplexity
 from nsvq_lightning.callbacks.latch import StepLatch
+from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.schedule import Phase, Schedule
 
 
@@ -101,3 +102,26 @@ def test_ends_in_iterations_of_the_run_do_not_scale() -> None:
     callback = PhaseSchedule(reference_total=None, warmup_end=100, prune_end=150, quantize_end=300)
     schedule = callback.schedule(400)
     assert (schedule.ends, schedule.scale) == ((100, 150, 300, 400), 1.0)
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_usage_of_several_processes_is_saved_and_resumed_once(rank: int) -> None:
+    # Of two processes that counted the same; the checkpoint holds the buffers of the first.
+    quantizer = NSVQ(4, 3)
+    module: Any = host(quantizers={"scales": quantizer})
+    trainer: Any = SimpleNamespace(
+        world_size=2,
+        is_global_zero=rank == 0,
+        strategy=SimpleNamespace(reduce=lambda tensor, reduce_op: tensor.mul_(2)),
+    )
+    quantizer.usage.copy_(torch.tensor([3, 0, 1, 0]))
+    quantizer.window.fill_(5)
+    CodebookReplacement().on_save_checkpoint(trainer, module, {})
+    assert quantizer.usage.tolist() == ([0, 0, 0, 0] if rank else [6, 0, 2, 0])
+    assert int(quantizer.window) == (0 if rank else 10)
+    # A resumed process starts from the checkpoint, whichever it is.
+    quantizer.usage.copy_(torch.tensor([6, 0, 2, 0]))
+    quantizer.window.fill_(10)
+    CodebookReplacement().on_train_start(trainer, module)
+    assert quantizer.usage.tolist() == ([0, 0, 0, 0] if rank else [6, 0, 2, 0])
+    assert int(quantizer.window) == (0 if rank else 10)

@@ -16,6 +16,7 @@ from nsvq_lightning.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.schedule import Schedule
 from nsvq_lightning.splats import Splats
+from nsvq_lightning.strategies import ViewParallelStrategy
 
 EXTENT = 2.0
 SMALL, LARGE = 0.01, 0.05  # below and above 0.01 · extent
@@ -177,14 +178,10 @@ def test_resuming_right_after_an_edit_does_not_repeat_it() -> None:
 
 def test_ddp_is_refused_with_the_reason() -> None:
     control, host = DensityControl(), SimpleNamespace()
-    with pytest.raises(ValueError, match="silently stops averaging"):
+    with pytest.raises(ValueError, match=r"silently stops averaging.*strategy=view_parallel"):
         control.setup(SimpleNamespace(strategy=DDPStrategy()), host, "fit")  # type: ignore[arg-type]
     control.setup(SimpleNamespace(strategy=SingleDeviceStrategy()), host, "fit")  # type: ignore[arg-type]
-
-    class Following(DDPStrategy):
-        follows_replaced_parameters = True
-
-    control.setup(SimpleNamespace(strategy=Following()), host, "fit")  # type: ignore[arg-type]
+    control.setup(SimpleNamespace(strategy=ViewParallelStrategy()), host, "fit")  # type: ignore[arg-type]
 
 
 def test_impossible_arguments_are_refused() -> None:

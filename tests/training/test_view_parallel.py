@@ -149,4 +149,6 @@ def test_a_checkpoint_of_two_processes_is_that_of_one(one: Finished, two: Finish
     different = [name for name, tensor in state.items() if not torch.equal(tensor, theirs["state_dict"][name])]
     assert set(different) <= {"state._train_seconds", "splats.gradient_sum"}  # sums in another order
     torch.testing.assert_close(state["splats.gradient_sum"], theirs["state_dict"]["splats.gradient_sum"])
-    torch.testing.assert_close(ours["optimizer_states"], theirs["optimizer_states"], rtol=0, atol=0)
+    (adam,), (other,) = ours["optimizer_states"], theirs["optimizer_states"]
+    assert adam["param_groups"] == other["param_groups"]
+    torch.testing.assert_close(adam["state"], other["state"], rtol=0, atol=0)
