@@ -59,9 +59,9 @@ TRAINER_DEFAULTS: dict[str, Any] = {
 
 PARSER_TEXTS: dict[str, Any] = {
     "prog": "nsvq",
-    "description": "Train 3D Gaussian splatting scenes and store them small. Four more commands have their own "
+    "description": "Train 3D Gaussian splatting scenes and store them small. Five more commands have their own "
     "options: 'nsvq info FILE' describes a scene file, 'nsvq compress' makes one small, 'nsvq sweep' trains many runs "
-    "and compares them, 'nsvq benchmark' measures this machine.",
+    "and compares them, 'nsvq benchmark' measures this machine, 'nsvq doctor' says whether it and a folder are fit.",
     "fit": {"description": "Train a scene, compress it, and measure the decoded file."},
     "validate": {"description": "Measure the scene of a checkpoint."},
     "test": {"description": "Write the compressed file of a checkpoint, read it back and measure it."},

@@ -4,18 +4,39 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import torch
 from lightning.pytorch import Trainer
 
 from nsvq_lightning.io.container import write_nsvq
+from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.strategies import ViewParallelStrategy  # noqa: F401  registers its name
 
-__all__ = ["SplatTrainer"]
+__all__ = ["SplatTrainer", "read_checkpoint"]
 
 log = logging.getLogger(__name__)
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """Read a checkpoint without running anything that it holds.
+
+    Raises:
+        FileNotFoundError: No such checkpoint.
+        FormatError: The file is damaged or no checkpoint of Lightning.
+    """
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError:
+        raise
+    except Exception as error:  # torch's readers of zip archives and pickles raise whatever damage leads them to
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise FormatError(f"{path}: damaged, or not a checkpoint ({reason})") from error
+    if not isinstance(checkpoint, dict) or not isinstance(checkpoint.get("state_dict"), dict):
+        raise FormatError(f"{path}: not a checkpoint of Lightning: it has no state_dict")
+    return checkpoint
 
 
 class SplatTrainer(Trainer):
@@ -32,8 +53,9 @@ class SplatTrainer(Trainer):
 
         Raises:
             FileNotFoundError: No such checkpoint.
+            FormatError: It is damaged.
         """
-        checkpoint = torch.load(ckpt_path, map_location="cpu", weights_only=True)
+        checkpoint = read_checkpoint(ckpt_path)
         model.on_load_checkpoint(checkpoint)
         model.load_state_dict(checkpoint["state_dict"])
         path = Path(output)

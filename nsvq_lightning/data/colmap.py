@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,19 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
-from nsvq_lightning.data.model_files import ModelFiles, SceneError, announced_rows, check_binary_files, find_model
+from nsvq_lightning.data.model_files import (
+    LARGEST_SIDE,
+    ModelFiles,
+    SceneError,
+    announced_rows,
+    check_binary_files,
+    find_model,
+)
 
 __all__ = ["ColmapImage", "ColmapModel", "import_pycolmap", "read_model"]
+
+_LARGEST = 1e18
+"""What poses and intrinsics may reach: their squares, which rendering takes in float32, stay finite."""
 
 # What pycolmap throws at a file it cannot read: its own checks arrive as ValueError, those of the C++ library as these.
 _READ_ERRORS = (ValueError, RuntimeError, IndexError, KeyError, OSError, MemoryError)
@@ -114,9 +125,14 @@ def _check_rows(files: ModelFiles, reconstruction: Any) -> None:
 
 
 def _plain_model(files: ModelFiles, reconstruction: Any, observations: bool) -> ColmapModel:
-    registered = sorted(
-        (image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.name
-    )
+    registered = [image for image in reconstruction.images.values() if image.has_pose]
+    try:
+        registered.sort(key=lambda image: image.name)
+    except UnicodeDecodeError as error:
+        raise SceneError(
+            f"{files.path('images')}: the name of a photo is not UTF-8 ({error}): rename the photo and run COLMAP "
+            "again, or copy the model again if it is damaged"
+        ) from error
     images = tuple(ColmapImage(image.name, image.camera_id, _viewmat(image)) for image in registered)
     if not images:
         raise SceneError(f"{files.path('images')} lists no registered image: run COLMAP's mapper again")
@@ -126,11 +142,12 @@ def _plain_model(files: ModelFiles, reconstruction: Any, observations: bool) -> 
             f"{files.path('points3D')} has no points, and training starts from them: triangulate with COLMAP "
             "(`colmap point_triangulator`) or run its mapper again"
         )
-    broken = [image.name for image in images if not np.isfinite(image.viewmat).all()]
+    broken = [image.name for image in images if not (np.abs(image.viewmat) <= _LARGEST).all()]
     if broken:
         raise SceneError(
             f"{files.path('images')}: {len(broken)} poses are not finite, first {broken[0]}: run COLMAP again"
         )
+    _check_cameras(files, {image.camera_id: reconstruction.cameras[image.camera_id] for image in images})
     return ColmapModel(
         images=images,
         cameras=dict(reconstruction.cameras.items()),
@@ -138,6 +155,18 @@ def _plain_model(files: ModelFiles, reconstruction: Any, observations: bool) -> 
         colors=np.array([point.color for _, point in points], np.uint8),
         observations=_observations(registered, points) if observations else None,
     )
+
+
+def _check_cameras(files: ModelFiles, cameras: Mapping[int, Any]) -> None:
+    """Text tables, which nothing has walked before, may hold any number."""
+    for number, camera in cameras.items():
+        size = camera.width, camera.height
+        if not 0 < min(size) <= max(size) <= LARGEST_SIDE or not (np.abs(camera.params) <= _LARGEST).all():
+            raise SceneError(
+                f"{files.path('cameras')}: camera {number} has size {size[0]}x{size[1]} and parameters "
+                f"{camera.params_to_string()}; needed are sizes from 1 to {LARGEST_SIDE} and finite numbers: copy the "
+                "model again or run COLMAP again"
+            )
 
 
 def _observations(registered: list[Any], points: list[tuple[int, Any]]) -> NDArray[np.int64]:

@@ -17,6 +17,9 @@ FOLDERS = ("sparse/0", "sparse", ".")
 TABLES = ("cameras", "images", "points3D")
 """The three tables every COLMAP model has."""
 
+LARGEST_SIDE = (1 << 20) - 1
+"""Pixels; a camera with more is a damaged one."""
+
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height
 _REMEDY = "copy the model again or export it anew with `colmap model_converter`"
@@ -120,10 +123,10 @@ def _check_table(path: Path, record_end: RecordEnd) -> None:
 
 def _camera_end(params_of_model: Mapping[int, int], data: Buffer, start: int) -> int:
     camera_id, model, width, height = _CAMERA.unpack_from(data, start)
-    if model not in params_of_model or not 0 < width < 1 << 20 or not 0 < height < 1 << 20:
+    if model not in params_of_model or not 0 < min(width, height) <= max(width, height) <= LARGEST_SIDE:
         raise struct.error(
             f"camera {camera_id} has model id {model} and size {width}x{height}; this pycolmap knows the ids 0 to "
-            f"{max(params_of_model)}, sizes go from 1 to {(1 << 20) - 1}"
+            f"{max(params_of_model)}, sizes go from 1 to {LARGEST_SIDE}"
         )
     return start + _CAMERA.size + 8 * params_of_model[model]
 

@@ -120,6 +120,35 @@ def test_damaged_text_table(make_scene: SceneFactory, table: str) -> None:
         read_model(root)
 
 
+def test_names_in_another_encoding_are_refused_by_file(make_scene: SceneFactory) -> None:
+    for root in (make_scene("a"), _as_text(make_scene("b"))):
+        path = next((root / "sparse" / "0").glob("images.*"))
+        path.write_bytes(path.read_bytes().replace(b"003.png", b"caf\xe9png"))
+        with pytest.raises(SceneError, match=r"images\.(bin|txt): the name of a photo is not UTF-8"):
+            read_model(root)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("PINHOLE 40 32", "PINHOLE 0 32"), ("PINHOLE 40 32 30", "PINHOLE 40 32 1e300")]
+)
+def test_cameras_that_cannot_be(make_scene: SceneFactory, old: str, new: str) -> None:
+    path = _as_text(make_scene()) / "sparse" / "0" / "cameras.txt"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(SceneError, match=r"cameras\.txt: camera 1 has size .* sizes from 1 to .* finite numbers"):
+        read_model(path.parents[2])
+
+
+def test_poses_that_float32_cannot_hold(make_scene: SceneFactory) -> None:
+    path = make_scene() / "sparse" / "0" / "frames.bin"
+    data = bytearray(path.read_bytes())
+    data[48:56] = struct.pack("<d", 1e300)  # x of the first frame: after the count, two ids, four doubles
+    path.write_bytes(data)
+    with pytest.raises(SceneError, match=r"images\.bin: 1 poses are not finite"):
+        read_model(path.parents[2])
+
+
 def test_text_table_cut_between_two_lines(make_scene: SceneFactory) -> None:
     root = _as_text(make_scene())
     path = root / "sparse" / "0" / "points3D.txt"

@@ -1,0 +1,284 @@
+"""Random damage to small valid files, and what readers may do with it: read it, or raise one clear error.
+
+Runs as a program, so that a reader that aborts, hangs or allocates without end takes only itself along:
+``python tests/fuzzing.py NAME FOLDER CASES [SEED]``. A case that fails stays in FOLDER, and its number is shown.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import io
+import re
+import resource
+import sys
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from hashlib import blake2b
+from pathlib import Path
+
+import numpy as np
+
+SECONDS = 20
+"""A case that takes longer hangs."""
+MEMORY = 3 << 30
+"""Bytes of address space that a case may add to what the process has before."""
+NUMBERS = (0, 1, 2, 127, 128, 255, 256, 65535, 65536, 1 << 31, (1 << 32) - 1, 1 << 60, (1 << 64) - 1)
+TOKENS = (b"0", b"-1", b"1", b"7", b"99", b"65536", b"4294967296", b"1e400", b"nan", b"-inf", b"", b"x", b"\xff", b"[]")
+
+
+@dataclass(frozen=True)
+class Target:
+    """One kind of file.
+
+    Attributes:
+        build: Writes valid files into a folder and returns those to be damaged.
+        read: Reads the damaged one; gets its path.
+        errors: What it may raise.
+        mend: Makes what guards the whole file fit its content again, so that damage gets further.
+    """
+
+    build: Callable[[Path], list[Path]]
+    read: Callable[[Path], object]
+    errors: tuple[type[Exception], ...]
+    mend: Callable[[bytes], bytes] = bytes
+
+
+def damaged(data: bytes, rng: np.random.Generator) -> bytes:
+    """One to three random changes: bytes, numbers, words, cuts, moved pieces."""
+    changes = (_bytes, _bytes, _number, _word, _word, _cut, _move, _drop)
+    for _ in range(int(rng.integers(1, 4))):
+        data = changes[int(rng.integers(len(changes)))](data, rng)
+    return data
+
+
+def _span(data: bytes, rng: np.random.Generator, longest: int = 64) -> tuple[int, int]:
+    # Half of the time near the start, where headers and counts are.
+    start = int(rng.integers(max(1, min(len(data), 64 if rng.random() < 0.5 else len(data)))))
+    return start, min(len(data), start + int(rng.integers(1, longest + 1)))
+
+
+def _bytes(data: bytes, rng: np.random.Generator) -> bytes:
+    start, end = _span(data, rng, 4)
+    return data[:start] + rng.bytes(end - start) + data[end:]
+
+
+def _number(data: bytes, rng: np.random.Generator) -> bytes:
+    start, _ = _span(data, rng)
+    size, value = int(rng.choice((1, 2, 4, 8))), NUMBERS[int(rng.integers(len(NUMBERS)))]
+    return data[:start] + (value % (1 << 8 * size)).to_bytes(size, "little") + data[start + size :]
+
+
+def _word(data: bytes, rng: np.random.Generator) -> bytes:
+    words = [found.span() for found in re.finditer(rb"[0-9A-Za-z_.+-]+", data[:100_000])]
+    if not words:
+        return data
+    start, end = words[int(rng.integers(len(words)))]
+    if rng.random() < 0.7:
+        word = TOKENS[int(rng.integers(len(TOKENS)))]
+    else:
+        other = words[int(rng.integers(len(words)))]
+        word = data[other[0] : other[1]]
+    return data[:start] + word + data[end:]
+
+
+def _cut(data: bytes, rng: np.random.Generator) -> bytes:
+    return data[: int(rng.integers(len(data) + 1))]
+
+
+def _move(data: bytes, rng: np.random.Generator) -> bytes:
+    start, end = _span(data, rng)
+    place, _ = _span(data, rng)
+    return data[:place] + data[start:end] + data[place:]
+
+
+def _drop(data: bytes, rng: np.random.Generator) -> bytes:
+    start, end = _span(data, rng)
+    return data[:start] + data[end:]
+
+
+def run(target: Target, folder: Path, cases: int, seed: int = 0) -> tuple[int, int]:
+    """Damage files and read them.
+
+    Returns:
+        Number of cases that were read, and that were refused.
+
+    Raises:
+        AssertionError: A reader raised something else; the file stays in the folder.
+    """
+    files = target.build(folder)
+    originals = {path: path.read_bytes() for path in files}
+    for path in files:
+        target.read(path)  # valid as it is; and whatever is compiled or imported at first is there
+    _limit_memory()
+    refused = 0
+    for case in range(cases):
+        rng = np.random.default_rng([seed, case])
+        path = files[int(rng.integers(len(files)))]
+        path.write_bytes(target.mend(damaged(originals[path], rng)))
+        sys.stderr.write(f"\rcase {case} of seed {seed}: {path}\n")
+        faulthandler.dump_traceback_later(SECONDS, exit=True)
+        try:
+            target.read(path)
+        except target.errors:
+            refused += 1
+        except BaseException as error:
+            raise AssertionError(f"case {case} of seed {seed}, {path}: {type(error).__name__}: {error}") from error
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+        path.write_bytes(originals[path])
+    return cases - refused, refused
+
+
+def _limit_memory() -> None:
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY,) * 2)
+
+
+def _scene(n: int) -> object:
+    from nsvq_lightning.io.compressed import CompressedScene, attribute_dims
+
+    rng = np.random.default_rng(0)
+    sizes, dims = {"quats": 8, "scales": 5, "shN": 3}, attribute_dims(1)
+    return CompressedScene(
+        means=rng.standard_normal((n, 3)).astype(np.float32),
+        opacities=rng.standard_normal(n).astype(np.float32),
+        codes={name: rng.integers(0, k, n) for name, k in sizes.items()},
+        codebooks={name: rng.standard_normal((k, dims[name])).astype(np.float32) for name, k in sizes.items()},
+        raw={"sh0": rng.standard_normal((n, 3)).astype(np.float32)},
+        sh_degree=1,
+        config={"seed": 1},
+    )
+
+
+def _build_ply(folder: Path) -> list[Path]:
+    from nsvq_lightning.io.ply import write_ply
+
+    binary, ascii_ = folder / "binary.ply", folder / "ascii.ply"
+    arrays = _scene(5).arrays()  # type: ignore[attr-defined]
+    write_ply(binary, arrays)
+    data = binary.read_bytes()
+    head, body = data.split(b"end_header\n", 1)
+    rows = np.frombuffer(body, "<f4").reshape(len(arrays), -1)
+    text = "".join(" ".join(f"{value:.6g}" for value in row) + "\n" for row in rows)
+    ascii_.write_bytes(head.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + text.encode())
+    return [binary, ascii_]
+
+
+def _read_ply(path: Path) -> object:
+    from nsvq_lightning.io.ply import read_ply
+
+    return read_ply(path)
+
+
+def _build_nsvq(folder: Path) -> list[Path]:
+    from nsvq_lightning.io.container import write_nsvq
+
+    files = [folder / "compact.nsvq", folder / "paper.nsvq"]
+    for path in files:
+        write_nsvq(path, _scene(40), path.stem)  # type: ignore[arg-type]
+    return files
+
+
+def _read_nsvq(path: Path) -> object:
+    from nsvq_lightning.io.container import read_nsvq
+
+    return read_nsvq(path).arrays()
+
+
+def _mend_nsvq(data: bytes) -> bytes:
+    """Make magic, version and checksum fit, and mostly the length of the JSON, too."""
+    rest = data[24:]
+    end = rest.rfind(b"}]}")
+    if len(rest) > 8 and end > 0:
+        rest = (1).to_bytes(4, "little") + (end + 3 - 8).to_bytes(4, "little") + rest[8:]
+    return b"\x89NSVQ\r\n\x1a" + blake2b(rest, digest_size=16).digest() + rest
+
+
+def _build_colmap(folder: Path, suffix: str) -> list[Path]:
+    from nsvq_lightning.data.colmap import import_pycolmap
+    from nsvq_lightning.data.synthetic import write_synthetic_scene
+
+    model = write_synthetic_scene(folder / "scene", views=3, width=16, height=12, points=8) / "sparse" / "0"
+    if suffix == ".txt":
+        reconstruction = import_pycolmap().Reconstruction(str(model))
+        for path in model.iterdir():
+            path.unlink()
+        reconstruction.write_text(str(model))
+    return sorted(model.iterdir())
+
+
+def _read_colmap(path: Path) -> object:
+    from nsvq_lightning.data.colmap import read_model
+    from nsvq_lightning.data.scene import load_scene
+
+    root = path.parents[2]
+    read_model(root, observations=True)
+    scene = load_scene(root)
+    for camera in scene.cameras:
+        assert np.isfinite([*camera.intrinsics, *camera.viewmat.flatten().tolist()]).all()
+    assert np.isfinite(scene.extent)
+    return scene
+
+
+def _build_checkpoint(folder: Path) -> list[Path]:
+    import torch
+
+    from nsvq_lightning.module import SplatModule
+
+    path = folder / "small.ckpt"
+    torch.save({"state_dict": SplatModule(codebooks={}).state_dict(), "global_step": 3}, path)
+    return [path]
+
+
+def _read_checkpoint(path: Path) -> object:
+    from nsvq_lightning.trainer import read_checkpoint
+
+    return read_checkpoint(path)
+
+
+def _build_config(folder: Path) -> list[Path]:
+    from nsvq_lightning.cli import find_config
+
+    files = []
+    for name in ("nsvq_4k", "better_4k", "demo"):
+        files.append(folder / f"{name}.yaml")
+        files[-1].write_bytes(Path(find_config(name)).read_bytes())
+    return files
+
+
+def _read_config(path: Path) -> object:
+    """Parse it as ``nsvq fit`` would; what is wrong ends the command with status 2 and a message."""
+    from nsvq_lightning.cli import main
+
+    status: object = 0
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()) as said:
+        try:
+            main(["fit", "--config", str(path), "--data.root=scene", "--print_config"])
+        except SystemExit as end:
+            status = end.code
+    if status == 2 and said.getvalue().startswith("error: "):
+        raise ValueError(said.getvalue())
+    assert status == 0, said.getvalue()
+    return path
+
+
+def targets() -> dict[str, Target]:
+    """Kinds of files by name."""
+    from nsvq_lightning.data.model_files import SceneError
+    from nsvq_lightning.io.errors import FormatError
+
+    return {
+        "ply": Target(_build_ply, _read_ply, (FormatError,)),
+        "nsvq": Target(_build_nsvq, _read_nsvq, (FormatError,), _mend_nsvq),
+        "colmap-bin": Target(lambda folder: _build_colmap(folder, ".bin"), _read_colmap, (SceneError,)),
+        "colmap-txt": Target(lambda folder: _build_colmap(folder, ".txt"), _read_colmap, (SceneError,)),
+        "config": Target(_build_config, _read_config, (ValueError,)),
+        "checkpoint": Target(_build_checkpoint, _read_checkpoint, (FormatError,)),
+    }
+
+
+if __name__ == "__main__":
+    name, place, count, *rest = sys.argv[1:]
+    read, refused_ = run(targets()[name], Path(place), int(count), int(rest[0]) if rest else 0)
+    sys.stdout.write(f"{read} read, {refused_} refused\n")

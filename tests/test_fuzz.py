@@ -1,0 +1,28 @@
+"""Readers of damaged files, see tests/fuzzing.py; ``NSVQ_FUZZ_CASES=10000 pytest tests/test_fuzz.py`` looks deeper."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+CASES = {"ply": 300, "nsvq": 200, "colmap-bin": 200, "colmap-txt": 150, "config": 10, "checkpoint": 40}
+
+
+@pytest.mark.parametrize("kind", CASES)
+def test_damaged_files_are_read_or_refused_with_one_clear_error(kind: str, tmp_path: Path) -> None:
+    cases = int(os.environ.get("NSVQ_FUZZ_CASES", CASES[kind]))
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(ROOT / "tests" / "fuzzing.py"), kind, str(tmp_path), str(cases)]
+    run = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", env=environment)
+    assert run.returncode == 0, f"status {run.returncode}, damaged file kept in {tmp_path}: ...{run.stderr[-3000:]}"
+    found = re.fullmatch(r"(\d+) read, (\d+) refused\n", run.stdout)
+    assert found is not None, run.stdout
+    assert int(found[1]) + int(found[2]) == cases
+    assert int(found[1]) > 0
+    assert int(found[2]) > cases / 5
