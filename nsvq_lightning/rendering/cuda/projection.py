@@ -328,10 +328,10 @@ class Lens(NamedTuple):
 
     Attributes:
         view: Rotation row by row, translation and camera position ``[15]`` float32 on the device of the splats.
-        fx: Focal length in x, pixels; then the one in y and the principal point.
-        fy: .
-        cx: .
-        cy: .
+        fx: Focal length in x, pixels.
+        fy: Focal length in y, pixels.
+        cx: Principal point, x in pixels.
+        cy: Principal point, y in pixels.
         width: Image width in pixels.
         height: Image height in pixels.
     """
