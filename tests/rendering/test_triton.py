@@ -23,19 +23,17 @@ def test_against_the_oracle() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("kernel", ["blend", "blend_backward", "total"])
-def test_blend_kernels_compile_for_a_gpu(kernel: str) -> None:
-    compile_kernel("blend", kernel)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kernel", ["project", "project_backward"])
-def test_projection_kernels_compile_for_a_gpu(kernel: str) -> None:
-    compile_kernel("projection", kernel)
-
-
-def compile_kernel(module: str, kernel: str) -> None:
-    """Compile to machine code of compute capability 9.0; no GPU is needed."""
+@pytest.mark.parametrize(
+    ("module", "kernel"),
+    [
+        ("blend", "blend_backward"),
+        pytest.param("blend", "blend", marks=pytest.mark.slow),
+        pytest.param("blend", "total", marks=pytest.mark.slow),
+        pytest.param("projection", "project", marks=pytest.mark.slow),
+        pytest.param("projection", "project_backward", marks=pytest.mark.slow),
+    ],
+)
+def test_kernels_compile_for_a_gpu(module: str, kernel: str) -> None:
     pytest.importorskip("triton", reason="the CUDA back-end needs Triton")
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
     command = [sys.executable, str(HERE / "triton_compile.py"), module, f"{kernel}_kernel"]
@@ -51,6 +49,6 @@ def test_error_without_gpu_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_error_without_triton_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TRITON_INTERPRET", "1")
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("nsvq_lightning.rendering.cuda.support.has_triton", lambda: False)
     with pytest.raises(ValueError, match="pip install triton"):
         resolve_backend("cuda", torch.zeros(1))

@@ -9,7 +9,7 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-CONSTANTS = {"DEGREE": 3, "BLOCK": 128, "TILE": 16, "BATCH": 32, "SLOTS": 8, "LANES": 16}
+CONSTANTS = {"DEGREE": 3, "BLOCK": 128, "BATCH": 32, "SLOTS": 8, "LANES": 16}
 CONSTANTS |= {"WITH_ALPHA": True, "WITH_DEPTH": True}
 TYPES = dict.fromkeys(("fx", "fy", "cx", "cy"), "fp32")
 TYPES |= dict.fromkeys(("width", "height", "columns", "n", "count", "stride"), "i32")

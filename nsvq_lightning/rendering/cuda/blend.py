@@ -21,6 +21,7 @@ from nsvq_lightning.rendering.cuda.projection import Lens
 from nsvq_lightning.rendering.cuda.records import (
     ALPHA_MAX,
     BLUE,
+    COMPILE,
     DEPTH,
     FIELDS,
     GREEN,
@@ -84,7 +85,7 @@ def alpha_at(record, left, top, x, y):
 @triton.jit
 def blend_kernel(
     records, ranks, offsets, ends, background, image, transmittance, depth, columns, width, height,
-    TILE: tl.constexpr, BATCH: tl.constexpr,
+    BATCH: tl.constexpr,
 ):  # fmt: skip
     """Image, transmittance and depth of a tile, and the end of the part of its list that was looked at."""
     tile = tl.program_id(0)
@@ -121,7 +122,7 @@ def blend_kernel(
 @triton.jit
 def blend_backward_kernel(
     records, ranks, slots, offsets, ends, image, transmittance, depth, g_image, g_alpha, g_depth, sums,
-    columns, width, height, TILE: tl.constexpr, WITH_ALPHA: tl.constexpr, WITH_DEPTH: tl.constexpr,
+    columns, width, height, WITH_ALPHA: tl.constexpr, WITH_DEPTH: tl.constexpr,
 ):  # fmt: skip
     """Sums of every splat of a tile into its slot."""
     tile = tl.program_id(0)
@@ -214,7 +215,7 @@ def blend(lens: Lens, records: Tensor, tiles: Tiles, background: Tensor) -> tupl
     ends = torch.empty(columns * rows, dtype=torch.int32, device=records.device)
     blend_kernel[(columns * rows,)](
         records, tiles.ranks, tiles.offsets, ends, background, image, transmittance, depth,
-        columns, lens.width, lens.height, TILE=TILE.value, BATCH=BATCH, num_warps=WARPS,
+        columns, lens.width, lens.height, BATCH=BATCH, num_warps=WARPS, **COMPILE,
     )  # fmt: skip
     return image, transmittance, depth, ends
 
@@ -253,9 +254,9 @@ def blend_backward(
             # Arguments that are not read stand in for gradients that do not exist.
             depth if g_alpha is None else g_alpha, depth if g_depth is None else g_depth,
             sums, columns, lens.width, lens.height,
-            TILE=TILE.value, WITH_ALPHA=g_alpha is not None, WITH_DEPTH=g_depth is not None, num_warps=WARPS,
+            WITH_ALPHA=g_alpha is not None, WITH_DEPTH=g_depth is not None, num_warps=WARPS, **COMPILE,
         )  # fmt: skip
         total_kernel[(len(ids),)](
-            sums, tiles.ends, ids, records, totals, g_means2d, SLOTS=SLOTS, LANES=LANES, num_warps=1
+            sums, tiles.ends, ids, records, totals, g_means2d, SLOTS=SLOTS, LANES=LANES, num_warps=1, **COMPILE
         )
     return totals, g_means2d

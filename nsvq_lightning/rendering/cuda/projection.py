@@ -17,6 +17,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda.harmonics import color, color_backward
 from nsvq_lightning.rendering.cuda.records import (
     BLUE,
+    COMPILE,
     COVARIANCE_SCALE,
     DEPTH,
     FACTOR_SCALE,
@@ -142,7 +143,8 @@ def unit_direction(view, mean):
 def load_geometry(means, quats, scales, row, mask):
     """Mean, quaternion and log-scales of the rows."""
     q = quats + 4 * row
-    w, (x, y, z) = tl.load(q, mask=mask, other=0.0), load3(q + 1, mask)
+    w = tl.load(q, mask=mask, other=0.0)
+    x, y, z = load3(q + 1, mask)
     return load3(means + 3 * row, mask), (w, x, y, z), load3(scales + 3 * row, mask)
 
 
@@ -326,10 +328,10 @@ class Lens(NamedTuple):
 
     Attributes:
         view: Rotation row by row, translation and camera position ``[15]`` float32 on the device of the splats.
-        fx: Focal length in x, pixels; then the one in y and the principal point.
-        fy: .
-        cx: .
-        cy: .
+        fx: Focal length in x, pixels.
+        fy: Focal length in y, pixels.
+        cx: Principal point, x in pixels.
+        cy: Principal point, y in pixels.
         width: Image width in pixels.
         height: Image height in pixels.
     """
@@ -376,8 +378,9 @@ def _launch_projection(
     radii = torch.zeros(n, dtype=torch.int32, device=shN.device)
     if n:
         project_kernel[(triton.cdiv(n, BLOCK),)](
-            *attributes, *lens, n, 3 * shN.shape[1], records, boxes, means2d, radii, DEGREE=degree, BLOCK=BLOCK
-        )
+            *attributes, *lens, n, 3 * shN.shape[1], records, boxes, means2d, radii,
+            DEGREE=degree, BLOCK=BLOCK, **COMPILE,
+        )  # fmt: skip
     return radii
 
 
@@ -432,6 +435,6 @@ def project_backward(
     if count:
         project_backward_kernel[(triton.cdiv(count, BLOCK),)](
             means, quats, scales, logits, shN, *lens, count, 3 * shN.shape[1], ids, records, totals, g_means2d,
-            *gradients, DEGREE=degree, BLOCK=BLOCK,
+            *gradients, DEGREE=degree, BLOCK=BLOCK, **COMPILE,
         )  # fmt: skip
     return gradients
