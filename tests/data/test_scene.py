@@ -17,6 +17,18 @@ from nsvq_lightning.data.scene import SceneError, load_scene, split_views
 SceneFactory = Callable[..., Path]
 
 
+def test_a_scene_far_from_the_origin_is_warned_of(
+    make_scene: SceneFactory, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = make_scene()
+    load_scene(root)
+    assert "from the origin" not in caplog.text
+    monkeypatch.setattr("nsvq_lightning.data.scene._FARTHEST", 0.01)
+    load_scene(root)
+    assert "times the extent of the scene: float32 positions there are" in caplog.text
+    assert "move the origin near the cameras" in caplog.text
+
+
 def test_every_eighth_name_is_a_test_view(make_scene: SceneFactory) -> None:
     scene = load_scene(make_scene(views=18))
     assert scene.names == tuple(f"{i:03d}.png" for i in range(18))

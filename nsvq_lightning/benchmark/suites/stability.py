@@ -26,7 +26,7 @@ from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats import RawSplats, Splats
 
-__all__ = ["Beside", "Outcome", "cases", "errors", "quantizers", "run", "step"]
+__all__ = ["Beside", "Outcome", "cases", "errors", "quantizer_errors", "quantizers", "run", "step"]
 
 SIZES = {True: (60, 1000), False: (200, 10_000)}
 """Splats of a scene, and of the one that has all on one pixel, quick and full."""
@@ -69,7 +69,7 @@ def run(settings: Settings) -> list[Row]:
         values = {(scene.name, m): errors(scene, backend) for scene in scenes for m, backend in methods.items()}
         prepared = quantizers()
         for name, attribute in prepared.items():
-            values |= {(name, m): _quantizer_errors({name: attribute}, m) for m in QUANTIZE_STEPS}
+            values |= {(name, m): quantizer_errors({name: attribute}, m) for m in QUANTIZE_STEPS}
     kinds = {scene.name: scene.kind for scene in scenes} | dict.fromkeys(prepared, "quantizers")
     timed = [_case(scene, m, backend) for scene in scenes for m, backend in methods.items()]
     timed += [_quantizer_case(name, prepared[name], m) for name in prepared for m in QUANTIZE_STEPS]
@@ -143,7 +143,8 @@ def _attribute(x: Tensor, codes: int) -> quantize.Attribute:
     return quantize.Attribute(quantizer.train(), x.clone().requires_grad_(), torch.arange(len(x)), upstream, 5e-3)
 
 
-def _quantizer_errors(attributes: Mapping[str, quantize.Attribute], method: str) -> dict[str, float]:
+def quantizer_errors(attributes: Mapping[str, quantize.Attribute], method: str) -> dict[str, float]:
+    """Errors of a step of some quantizers by one of :data:`QUANTIZE_STEPS`."""
     results = QUANTIZE_STEPS[method](attributes, 0)
     broken = _not_finite(tensor for result in results.values() for tensor in result[:2])
     values = {} if broken else quantize.step_errors(attributes, results)

@@ -1,0 +1,136 @@
+"""Scenes and quantizers at the limits of float32: finite and right, or refused with the culprit's name."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from nsvq_lightning.benchmark.extremes import BROKEN, BROKEN_ROWS
+from nsvq_lightning.benchmark.settings import Settings
+from nsvq_lightning.benchmark.suites import quantize, stability
+from nsvq_lightning.benchmark.suites.render import Method, trace
+from nsvq_lightning.edit import drop_non_finite
+from nsvq_lightning.optim import LearningRates, build_adam, param_groups
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.splats import ATTRIBUTES, RawSplats, Splats
+
+SCENES = {scene.name: scene for scene in stability.cases(Settings((1,), quick=True))}
+BACKENDS = ("cpu", "reference")
+COARSE = {"scene at 1e+03": 1e-3, "scene at 1e+06": 1.0}
+"""Largest relative errors where float32 does not know the positions themselves."""
+MEANS_SOMETHING = {"scales -inf", "opacities inf", "sh0 -inf"}
+"""A point, an opaque splat and a black one."""
+
+
+@pytest.mark.parametrize("name", [name for name, scene in SCENES.items() if scene.kind != BROKEN])
+def test_an_extreme_scene_is_rendered_and_trained_as_in_float64(name: str) -> None:
+    scene, tolerance = SCENES[name], COARSE.get(name, 1e-4)
+    ours = stability.errors(scene, "cpu")
+    assert ours["not finite"] == ours["step refused"] == ours["rows named"] == ours["other rows lost"] == 0
+    assert ours["max error"] <= tolerance * max(1.0, ours["largest value"])
+    # Rotations of a splat 1e12 long have gradients of 1e-16 of the others'.
+    assert ours["gradient error"] <= (1e-3 if name == "scales 1e+12" else tolerance)
+    assert ours["pixels left out"] <= 0.2 * scene.workload.camera.width * scene.workload.camera.height
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", [name for name, scene in SCENES.items() if scene.kind == BROKEN])
+def test_a_number_that_is_none_hurts_no_other_splat_and_is_named(name: str, backend: str) -> None:
+    scene = SCENES[name]
+    values, outcome = stability.errors(scene, backend), stability.step(scene, backend)
+    assert outcome.lost == 0
+    assert outcome.named == {scene.culprit: BROKEN_ROWS}
+    if values["not finite"]:
+        assert outcome.refused
+        assert scene.culprit in ("sh0", "shN")
+    else:
+        assert values["max error"] < 1e-5
+        assert values["gradient error"] < 1e-4
+
+
+@pytest.mark.parametrize("name", [n for n, s in SCENES.items() if s.culprit not in ("", "sh0", "shN")])
+def test_splats_without_a_place_or_shape_change_nothing(name: str) -> None:
+    scene = SCENES[name]
+    beside = trace(scene.workload, stability.Beside("reference", scene.planted), torch.float64).image
+    alone = trace(scene.workload, Method("reference"), torch.float64).image
+    assert torch.equal(beside, alone) == (name not in MEANS_SOMETHING)
+
+
+@pytest.mark.parametrize("attribute", ATTRIBUTES)
+def test_culprits_are_dropped_with_a_message(attribute: str, caplog: pytest.LogCaptureFixture) -> None:
+    scene = SCENES[f"{attribute} nan"]
+    splats = Splats.from_tensors(*map(torch.cat, zip(scene.planted, scene.workload.splats, strict=True)))
+    healthy, total = len(scene.workload.splats.means), len(splats)
+    optimizer = build_adam(param_groups(splats, {}, LearningRates(), extent=1.0))
+    with caplog.at_level(logging.WARNING):
+        assert drop_non_finite(splats, optimizer, 12) == BROKEN_ROWS
+    assert f"step 12: dropped {BROKEN_ROWS} of {total} splats" in caplog.text
+    assert f"{attribute} in {BROKEN_ROWS} rows" in caplog.text
+    assert torch.equal(splats.means, scene.workload.splats.means)
+    assert len(splats) == healthy
+
+
+@pytest.mark.parametrize("name", stability.quantizers())
+def test_a_quantizer_with_nothing_to_do_or_to_choose(name: str) -> None:
+    attribute = stability.quantizers()[name]
+    values = stability.quantizer_errors({name: attribute}, "NSVQ")
+    assert values["not finite"] == values["wrong codes"] == 0
+    assert values["gradient error"] < 1e-5
+    assert values["length error"] < 1e-4
+    quantized, gradient, _ = quantize.step({name: attribute}, 0)[name]
+    if name in ("every row on a code", "more codes than rows", "all rows equal"):
+        # Without a residual there is no noise, and the gradient passes as it is.
+        assert torch.equal(quantized, attribute.x)
+        assert torch.equal(gradient, attribute.upstream)
+    codes = {"every row on a code": 5, "more codes than rows": 200, "all rows equal": 1, "one code": 1}
+    assert len(attribute.quantizer.codebook) == codes.get(name, 16)
+
+
+def test_inf_scale_and_determinant_that_under_or_overflows() -> None:
+    """One splat far larger than the picture covers it evenly: α is its opacity everywhere."""
+    for scale in (1e3, 1e6, 1e9, 1e12):
+        one = RawSplats(
+            torch.zeros(1, 3),
+            torch.tensor([[1.0, 0.5, 0.2, 0.1]]),
+            torch.full((1, 3), math.log(scale)),
+            torch.zeros(1),
+            torch.ones(1, 1, 3),
+            torch.zeros(1, 0, 3),
+        )
+        for backend in BACKENDS:
+            image = render(one, SCENES["one splat"].workload.camera, backend=backend).alpha
+            torch.testing.assert_close(image, torch.full_like(image, 0.5), atol=1e-5, rtol=0)
+
+
+def test_sfm_point_at_a_camera_centre_or_duplicated() -> None:
+    camera: Camera = SCENES["one splat"].workload.camera
+    points = torch.cat([camera.position[None].repeat(3, 1), torch.zeros(2, 3), torch.eye(3)])
+    splats = Splats.from_points(points, torch.full_like(points, 0.5), sh_degree=1)
+    assert len(splats) == 5
+    assert all(bool(torch.isfinite(value).all()) for value in splats.raw())
+    leaves = splats.raw()
+    image = render(leaves, camera).image
+    # The one at the centre has no direction: this camera does not see it.
+    assert torch.equal(image, render(RawSplats(*(value[1:] for value in leaves)), camera).image)
+    gradients = torch.autograd.grad(image.sum(), leaves)
+    assert all(bool(torch.isfinite(gradient).all()) for gradient in gradients)
+    assert not any(bool(gradient[0].any()) for gradient in gradients)
+
+
+def test_two_points_a_hair_apart_get_the_smallest_scale() -> None:
+    points = torch.tensor([[0.0, 0.0, 0.0], [1e-30, 0.0, 0.0]])
+    splats = Splats.from_points(points, torch.zeros(2, 3))
+    np.testing.assert_allclose(splats.scales.detach().exp().numpy(), math.sqrt(1e-7), rtol=1e-5)
+
+
+def test_scenes_are_the_same_at_every_call() -> None:
+    again = {scene.name: scene for scene in stability.cases(Settings((1,), quick=True))}
+    assert again.keys() == SCENES.keys()
+    for name, scene in again.items():
+        pairs = zip(scene.workload.splats, SCENES[name].workload.splats, strict=True)
+        assert all(torch.equal(first, second) for first, second in pairs)
