@@ -57,8 +57,8 @@ __all__ = ["decode_compact", "encode_compact"]
 _T = TypeVar("_T")
 
 _GRID = struct.Struct("<qqqd")
-_MOST_BYTES = 4096
-"""Splats a byte of the streams at most: chances have a floor, so no honest file comes near."""
+_MOST_A_BYTE = 4096
+"""Splats, or rows of a codebook, a byte of their streams: chances have a floor, so no honest file comes near."""
 
 _STREAMS = {"grid": ("means.grid", "means", "means.far"), "codes": ("{}.codebook", "{}"), "steps": ("{}",)}
 _ENCODINGS = {"means.grid": "grid", "means": "keys", "means.far": "float32"}
@@ -336,7 +336,7 @@ def _checked_tables(header: Header) -> dict[str, AttributeEntry]:
         raise FormatError("damaged: the stream table does not fit the attribute table")
     if lengths["means.grid"] != _GRID.size or lengths["means.far"] % 12 or lengths["means.far"] // 12 > header.splats:
         raise FormatError("damaged: the streams of the positions do not have their sizes")
-    if header.splats > _MOST_BYTES * sum(lengths.values()):
+    if header.splats > _MOST_A_BYTE * sum(lengths.values()):
         raise FormatError(f"damaged: {header.splats} splats in {sum(lengths.values())} bytes")
     return {entry.name: entry for entry in header.attributes}
 
@@ -350,5 +350,5 @@ def _possible(entry: AttributeEntry, lengths: Mapping[str, int]) -> bool:
         return False
     if entry.name == "opacities":
         return entry.storage == "levels" and entry.codes <= 1 << 20 and entry.step == 0
-    enough = entry.codes <= _MOST_BYTES * lengths.get(f"{entry.name}.codebook", 0)
+    enough = entry.codes <= _MOST_A_BYTE * lengths.get(f"{entry.name}.codebook", 0)
     return entry.storage == "codes" and entry.step > 0 and enough and entry.dim > 0
