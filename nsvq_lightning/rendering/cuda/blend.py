@@ -83,6 +83,20 @@ def alpha_at(record, left, top, x, y):
 
 
 @triton.jit
+def blend_step(record, left, top, x, y, t):
+    """What one splat does to pixels with transmittance ``t``, the same to the bit in both directions.
+
+    α before the cap, the two factors of its exponent, α, the transmittance after it, whether that leaves the pixel
+    open, and the weight of the splat's colour.
+    """
+    raw, u, v = alpha_at(record, left, top, x, y)
+    alpha = tl.minimum(raw, ALPHA_MAX)
+    after = tl.fma(-alpha, t, t)
+    is_open = after >= TRANSMITTANCE_MIN
+    return raw, u, v, alpha, after, is_open, tl.where(is_open, alpha * t, 0.0)
+
+
+@triton.jit
 def blend_kernel(
     records, ranks, offsets, ends, background, image, transmittance, depth, columns, width, height,
     BATCH: tl.constexpr,
@@ -99,11 +113,7 @@ def blend_kernel(
         looked = tl.minimum(i + BATCH, end)
         for j in range(i, looked):
             record = records + tl.load(ranks + j).to(tl.int64) * RECORD
-            raw, _, _ = alpha_at(record, left, top, x, y)
-            alpha = tl.minimum(raw, ALPHA_MAX)
-            after = tl.fma(-alpha, t, t)
-            is_open = after >= TRANSMITTANCE_MIN
-            weight = tl.where(is_open, alpha * t, 0.0)
+            _, _, _, _, after, is_open, weight = blend_step(record, left, top, x, y, t)
             kept = tl.where(is_open, after, kept)
             t = after
             red += weight * tl.load(record + RED)
@@ -144,11 +154,7 @@ def blend_backward_kernel(
     t = tl.where(inside, 1.0, 0.0)
     for j in range(tl.load(offsets + tile), tl.load(ends + tile)):
         record = records + tl.load(ranks + j).to(tl.int64) * RECORD
-        raw, u, v = alpha_at(record, left, top, x, y)
-        alpha = tl.minimum(raw, ALPHA_MAX)
-        after = tl.fma(-alpha, t, t)
-        is_open = after >= TRANSMITTANCE_MIN
-        weight = tl.where(is_open, alpha * t, 0.0)
+        raw, u, v, alpha, after, is_open, weight = blend_step(record, left, top, x, y, t)
         if tl.max(weight, 0) > 0:
             d = g_red * tl.load(record + RED) + g_green * tl.load(record + GREEN) + g_blue * tl.load(record + BLUE)
             if WITH_DEPTH:
