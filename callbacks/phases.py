@@ -30,6 +30,7 @@ class PhaseSchedule(Callback):
         min_density_interval: Lower limit of the interval of density control in this run.
         min_reset_interval: Lower limit of the interval of opacity resets in this run.
         min_replacement_interval: Lower limit of the window of code replacement and of the interval of refits.
+        min_finetune: Lower limit of the length of the fine-tune phase, up to half of what follows the prune phase.
 
     Raises:
         ValueError: See :class:`~nsvq_lightning.schedule.Schedule`.
@@ -45,6 +46,7 @@ class PhaseSchedule(Callback):
         min_density_interval: int = Schedule.min_density_interval,
         min_reset_interval: int = Schedule.min_reset_interval,
         min_replacement_interval: int = Schedule.min_replacement_interval,
+        min_finetune: int = Schedule.min_finetune,
     ) -> None:
         self.total = total
         self.reference_total = reference_total
@@ -55,6 +57,7 @@ class PhaseSchedule(Callback):
             "min_density_interval": min_density_interval,
             "min_reset_interval": min_reset_interval,
             "min_replacement_interval": min_replacement_interval,
+            "min_finetune": min_finetune,
         }
         if total is not None or reference_total is not None:
             # Says at once what is wrong with the numbers, not after the scene is loaded.

@@ -7,6 +7,9 @@ run of 45 000 iterations) and asks the :class:`Schedule` for the numbers of this
 what                             how it scales with ``total / reference_total``
 ===============================  ==========================================================================
 ends of the phases               proportionally; a phase that exists in the reference never vanishes
+length of the fine-tune phase    proportionally, not below ``min_finetune`` unless that is more than half of what
+                                 follows the prune phase: it brings back what the codes cost, which takes its time.
+                                 Test PSNR after 1500 iterations with 67 / 300 of them: 28.04 / 28.21 dB
 steps of the SH degree           proportionally
 density control: start, stop     proportionally
 density control: interval        proportionally, not below ``min_density_interval`` (its statistic is a mean over
@@ -68,6 +71,8 @@ class Schedule:
         min_reset_interval: Lower limit of the interval of opacity resets, in iterations of this run.
         min_replacement_interval: Lower limit of the window of code replacement and of the interval of refits, in
             iterations of this run.
+        min_finetune: Lower limit of the length of the fine-tune phase, in iterations of this run; it never takes more
+            than half of the iterations after the prune phase.
 
     To give ends in iterations of this run, set ``reference_total`` to ``total``: then nothing scales.
 
@@ -83,6 +88,7 @@ class Schedule:
     min_density_interval: int = 50
     min_reset_interval: int = 300
     min_replacement_interval: int = 50
+    min_finetune: int = 300
 
     def __post_init__(self) -> None:
         if self.total < 1 or self.reference_total < 1:
@@ -101,7 +107,7 @@ class Schedule:
                 f"fine-tuning needs a quantize phase of at least one iteration to place its codebooks in, got "
                 f"prune_end = quantize_end = {self.prune_end}; raise quantize_end or set it to reference_total"
             )
-        for name in ("min_density_interval", "min_reset_interval", "min_replacement_interval"):
+        for name in ("min_density_interval", "min_reset_interval", "min_replacement_interval", "min_finetune"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1 iteration, got {getattr(self, name)}")
 
@@ -120,9 +126,16 @@ class Schedule:
             before = ends[-1] if ends else 0
             # Rounding must not swallow a phase: one iteration for this one, one for each that follows.
             latest = self.total - sum(exists[phase + 1 :])
-            ends.append(min(max(round(end * self.scale), before + 1), latest) if exists[phase] else before)
+            ends.append(min(max(self._end(phase, end, before), before + 1), latest) if exists[phase] else before)
         warmup, prune, quantize, finetune = (max(end, 0) for end in ends)
         return warmup, prune, quantize, finetune
+
+    def _end(self, phase: int, reference: int, before: int) -> int:
+        """Where a phase after iteration ``before`` ends in this run, but for the rounding of tiny runs."""
+        end = round(reference * self.scale)
+        if self.scale < 1 and phase == Phase.QUANTIZE and reference < self.reference_total:
+            end = min(end, self.total - min(self.min_finetune, (self.total - before) // 2))
+        return end
 
     def phase_at(self, iteration: int) -> Phase:
         """Phase of a 1-based iteration; iterations past the end belong to the last phase that exists."""

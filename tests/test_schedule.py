@@ -45,7 +45,10 @@ def test_the_papers_run_has_the_papers_milestones() -> None:
 
 
 def test_a_shorter_run_is_the_same_run_scaled() -> None:
-    schedule = Schedule(total=4500, min_density_interval=1, min_reset_interval=1, min_replacement_interval=1)
+    limits = dict.fromkeys(
+        ("min_density_interval", "min_reset_interval", "min_replacement_interval", "min_finetune"), 1
+    )
+    schedule = Schedule(total=4500, **limits)
     assert schedule.ends == (1500, 2000, 4300, 4500)
     assert list(schedule.density_times(600, 14_900, 100))[:2] == [60, 70]
     assert list(schedule.reset_times(12_000, 3000)) == [300, 600, 900, 1200]
@@ -60,6 +63,14 @@ def test_intervals_of_short_runs_have_a_lower_limit_and_paper_runs_have_none() -
     assert times.step == 40
     assert times[0] == 40  # 600 / 15
     assert Schedule(min_density_interval=400).density_times(600, 14_900, 100).step == 100
+
+
+def test_fine_tuning_of_short_runs_has_a_lower_limit_up_to_half_of_what_follows_pruning() -> None:
+    assert Schedule(total=9000).ends == (3000, 4000, 8600, 9000)  # 400 are enough
+    assert Schedule(total=1500).ends == (500, 667, 1200, 1500)
+    assert Schedule(total=600).ends == (200, 267, 434, 600)
+    assert Schedule(total=1500, reference_total=1500, warmup_end=500, prune_end=600, quantize_end=1400).ends[2] == 1400
+    assert Schedule(total=1500, quantize_end=45_000).ends == (500, 667, 1500, 1500)
 
 
 @pytest.mark.parametrize("total", range(4, 60))

@@ -20,8 +20,11 @@ __all__ = ["BRANCH_CALLBACKS", "Settings", "digest", "resolve", "trunk_of"]
 Settings = dict[str, Any]
 """What ``--print_config`` shows, as JSON values."""
 
-BRANCH_CALLBACKS = ("codebook_init", "codebook_replacement", "freeze", "refit")
-"""Callbacks that do nothing before the quantize phase."""
+BRANCH_CALLBACKS = ("canonical", "codebook_init", "codebook_replacement", "freeze", "refit")
+"""Callbacks that do nothing before the iterations of the prune phase are done."""
+
+BRANCH_PHASES = ("min_finetune", "min_replacement_interval")
+"""Settings of the phases that mean nothing before the quantize phase; its end is another."""
 
 IN_ONE_PIECE: dict[str, Any] = {
     "callbacks": (None, []),
@@ -81,7 +84,7 @@ def trunk_of(settings: Settings) -> Settings | None:
     """Settings of the run up to the end of the prune phase, where quantizer and codebooks do not matter yet.
 
     Runs with the same trunk are the same, bit for bit, until the quantize phase starts. Left out of the trunk are the
-    quantizer, the codebooks, and the callbacks that drive them; everything else counts.
+    quantizer, the codebooks, the callbacks that drive them, and where the quantize phase ends; everything else counts.
 
     Returns:
         None where that is not certain, or there is nothing to share: no phase before or after that point, callbacks
@@ -94,12 +97,18 @@ def trunk_of(settings: Settings) -> Settings | None:
         return None
     phases = PhaseSchedule(**callbacks["phases"]["init_args"])
     total = phases.total or trainer["max_steps"]
-    end = phases.schedule(total).ends[Phase.PRUNE] if total > 0 else 0
+    if total < 1:
+        return None
+    schedule = phases.schedule(total)
+    end = schedule.ends[Phase.PRUNE]
     if not 0 < end < trainer["max_steps"]:
         return None
     trunk = deepcopy(settings)
     trunk["trainer"]["max_steps"] = end
-    trunk["callbacks"]["phases"]["init_args"]["total"] = total
+    trunk_phases = trunk["callbacks"]["phases"]["init_args"]
+    trunk_phases |= {"total": total, "quantize_end": schedule.reference_total}
+    for name in BRANCH_PHASES:
+        trunk_phases.pop(name, None)
     trunk["callbacks"] |= {name: None for name in (*BRANCH_CALLBACKS, "export") if name in callbacks}
     # What all branches start from, whatever they keep of themselves.
     del trunk["callbacks"]["checkpoint"]

@@ -28,7 +28,7 @@ def test_codes_are_replaced_at_the_papers_iterations() -> None:
 
 def test_a_short_run_replaces_over_windows_of_several_views() -> None:
     callback = CodebookReplacement()
-    short: Any = SimpleNamespace(schedule=Schedule(total=4500, min_replacement_interval=40))
+    short: Any = SimpleNamespace(schedule=Schedule(total=4500, min_replacement_interval=40, min_finetune=1))
     due = [i for i in range(1, 4501) if callback.is_due(short, i)]
     assert due[0] == 2010
     assert {b - a for a, b in pairwise(due) if b < 2250} == {40}

@@ -51,11 +51,13 @@ class InProcess:
 
 @pytest.fixture(scope="module")
 def configs(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
-    """Two sizes, none at all, and one whose quantizer cannot work."""
+    """Two sizes (the larger with options that only matter once quantized), none, and a quantizer that cannot work."""
     folder = tmp_path_factory.mktemp("configs")
     codebooks = {"small": "{scales: 8, sh0: 8}", "large": "{scales: 32, quats: 24, sh0: 16, shN: 16}", "none": "null"}
     for name, sizes in codebooks.items():
         (folder / f"{name}.yaml").write_text(f"model: {{codebooks: {sizes}}}\n")
+    with open(folder / "large.yaml", "a") as file:
+        file.write("callbacks: {canonical: {mode: full}, phases: {quantize_end: 40000}}\n")
     (folder / "wrong.yaml").write_text("model: {codebooks: {sh1: 8}}\n")
     return tuple(str(folder / f"{name}.yaml") for name in (*codebooks, "wrong"))
 

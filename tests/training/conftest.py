@@ -40,7 +40,9 @@ def recipe() -> Recipe:
 
     def build(**replaced: Callback) -> dict[str, Callback]:
         standard: dict[str, Callback] = {
-            "phases": PhaseSchedule(min_density_interval=4, min_reset_interval=11, min_replacement_interval=5),
+            "phases": PhaseSchedule(
+                min_density_interval=4, min_reset_interval=11, min_replacement_interval=5, min_finetune=1
+            ),
             "sh_degree": ShDegreeSchedule(),
             "density": DensityControl(DensityRules(grad_threshold=5e-6)),
             "opacity": OpacityRegularization(),

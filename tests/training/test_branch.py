@@ -19,7 +19,7 @@ from nsvq_lightning.schedule import Phase, Schedule
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 Recipe = Callable[..., dict[str, Callback]]
 
-INTERVALS = {"min_density_interval": 4, "min_reset_interval": 11, "min_replacement_interval": 5}
+INTERVALS = {"min_density_interval": 4, "min_reset_interval": 11, "min_replacement_interval": 5, "min_finetune": 1}
 PRUNE_END = Schedule(total=60, **INTERVALS).ends[Phase.PRUNE]
 
 

@@ -72,7 +72,7 @@ class Whole:
         return Path(self.trainer.default_root_dir)
 
 
-SCHEDULE = Schedule(total=60, min_density_interval=4, min_reset_interval=11, min_replacement_interval=5)
+SCHEDULE = Schedule(total=60, min_density_interval=4, min_reset_interval=11, min_replacement_interval=5, min_finetune=1)
 
 
 @pytest.fixture(scope="module")
