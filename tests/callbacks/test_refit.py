@@ -42,8 +42,8 @@ def test_refits_scale_like_replacement() -> None:
         return [i for i in range(1, total + 1) if CodebookRefit(every=every).is_due(host, i)]
 
     assert due(45_000) == list(range(20_100, 43_001, 100))
-    assert due(4500) == list(range(2010, 4301, 50))
-    assert due(4500, 1000) == list(range(2100, 4301, 100))
+    assert due(4500) == list(range(2010, 4201, 50))
+    assert due(4500, 1000) == list(range(2100, 4201, 100))
 
 
 def test_only_quantizers_that_offer_it_are_refitted() -> None:
