@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import signal
 
 # Before torch loads OpenMP: threads that wait by spinning slow everything down where cores are shared.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -16,6 +17,13 @@ from nsvq_lightning.data.colmap import import_pycolmap
 from nsvq_lightning.data.synthetic import write_synthetic_scene
 
 SceneFactory = Callable[..., Path]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def ctrl_c() -> None:
+    """A shell starts what it puts into the background (``pytest &``) with SIGINT ignored; tests of Ctrl-C need it."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
