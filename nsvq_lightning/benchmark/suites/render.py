@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import NamedTuple, Protocol, TypeVar
 
 import torch
@@ -26,7 +25,7 @@ from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.timing import Case, measure, use_threads
 from nsvq_lightning.benchmark.workloads import Workload, workloads
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.rasterize import BACKENDS, render, resolve_backend
+from nsvq_lightning.rendering.rasterize import fast_backends, render
 from nsvq_lightning.rendering.reference import TILE
 from nsvq_lightning.splats import RawSplats, sh_degree_of
 
@@ -38,7 +37,6 @@ __all__ = [
     "Method",
     "Painter",
     "accuracies",
-    "fast_backends",
     "gradients_of",
     "image_errors",
     "method_errors",
@@ -164,15 +162,6 @@ def _rows(workload: Workload, settings: Settings) -> list[Row]:
                 method, operation = key
                 rows.append(Row("render", str(where), str(method), operation, threads, timing, errors[key], note))
     return rows
-
-
-def fast_backends(like: Tensor) -> list[str]:
-    """Back-ends other than the oracle that take tensors such as ``like``."""
-    usable = []
-    for name in BACKENDS:
-        with suppress(ValueError):
-            usable.append(resolve_backend(name, like))
-    return [name for name in dict.fromkeys(usable) if name != REFERENCE]
 
 
 def _case(workload: Workload, method: Method, operation: str) -> Case:
