@@ -112,7 +112,7 @@ def _by_the_clock(run: Callable[[], object]) -> float:
 
 def _between_events(run: Callable[[], object]) -> float:
     """From when the GPU begins the first work to when it ends the last, its waits for the host included."""
-    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))  # type: ignore[no-untyped-call]
     start.record()
     run()
     end.record()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import textwrap
 from functools import cache
 
 from torch import Tensor
@@ -36,7 +37,8 @@ def missing_kernels() -> str | None:
         # Its functions import this at their first call, and fail with an AttributeError of None where nvcc is missing.
         backend = importlib.import_module("gsplat.cuda._backend")
     except (ImportError, OSError, RuntimeError) as error:
-        return f"gsplat could not compile or load its CUDA code ({' '.join(str(error).split())}); {COMPILING}"
+        said = textwrap.shorten(str(error), 300)  # a compiler says pages
+        return f"gsplat could not compile or load its CUDA code ({said}); {COMPILING}"
     if getattr(backend, "_C", None) is None:
         return f"gsplat is installed without its CUDA code and found no CUDA toolkit to compile it with; {COMPILING}"
     return None
