@@ -118,7 +118,7 @@ def rasterize_to_pixels(
         passed, done = colors.new_ones(len(ys), xs.shape[1]), torch.zeros(len(ys), xs.shape[1], dtype=torch.bool)
         total = colors.new_zeros(*passed.shape, colors.shape[-1])
         for row in flatten_ids[begin:end].tolist():
-            dx, dy = means2d[0, row, 0] - (xs + 0.5), means2d[0, row, 1] - (ys + 0.5)
+            dx, dy = means2d[0, row, 0] - (xs.to(means2d) + 0.5), means2d[0, row, 1] - (ys.to(means2d) + 0.5)
             xx, xy, yy = conics[0, row]
             sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
             alpha = (opacities[0, row] * (-sigma).exp()).clamp_max(ALPHA_MAX)
