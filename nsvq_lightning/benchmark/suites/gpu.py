@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -89,10 +89,11 @@ def run_on(device: torch.device, settings: Settings) -> list[Row]:
         return [*rows, *_step_rows(device, names, settings)]
 
 
-def _workloads(settings: Settings) -> list[Workload]:
-    """What the user names; the standard scenes are followed by those that are too much for a CPU."""
-    large = LARGE if settings.scene is None and settings.workloads == STANDARD else ()
-    return [*workloads(settings), *map(synthetic_workload, large)]
+def _workloads(settings: Settings) -> Iterator[Workload]:
+    """What the user names; the standard scenes are followed, one at a time, by those that are too much for a CPU."""
+    yield from workloads(settings)
+    if settings.scene is None and settings.workloads == STANDARD:
+        yield from map(synthetic_workload, LARGE)
 
 
 # Renders

@@ -208,7 +208,9 @@ def crop_note(crop: Workload, workload: Workload) -> str:
 @torch.no_grad()
 def _pairs(workload: Workload) -> float:
     """About how many pairs of a splat and a pixel the oracle blends: the pixels of all tiles a splat touches."""
-    seen = render(workload.splats, workload.camera)
+    # Without Triton `auto` would be plain torch on a GPU.
+    backend = next(iter(fast_backends(workload.splats.means)), "auto")
+    seen = render(workload.splats, workload.camera, backend=backend)
     centres, radii = seen.means2d[seen.radii > 0], seen.radii[seen.radii > 0, None]
     last = torch.tensor([workload.camera.width, workload.camera.height]).to(radii) - 1
     first_tile = ((centres - radii).clamp_min(0) / TILE).floor()
