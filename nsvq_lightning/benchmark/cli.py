@@ -12,11 +12,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from nsvq_lightning.benchmark.registry import ALL, SUITES, load_suite, suite_names
+from nsvq_lightning.benchmark.registry import ALL, SUITES, Unavailable, load_suite, suite_names
 from nsvq_lightning.benchmark.report import as_json, as_markdown, fill_in, has_place, results_line, suite_tables
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
-from nsvq_lightning.benchmark.sizes import SIZES
+from nsvq_lightning.benchmark.sizes import LARGE, STANDARD
 from nsvq_lightning.benchmark.switch_table import PLACE as SWITCHES
 from nsvq_lightning.benchmark.switch_table import fill_switches, scene_name, shares_saved
 from nsvq_lightning.io.atomic import write_text
@@ -104,7 +104,7 @@ def _parser() -> argparse.ArgumentParser:
         "--workloads",
         type=_names,
         metavar="NAME,NAME",
-        help=f"synthetic scenes of render and codec ({','.join(SIZES)}; quick A20k)",
+        help=f"synthetic scenes of render, codec, gpu ({','.join(STANDARD)}; gpu also {','.join(LARGE)}; quick A20k)",
     )
     what.add_argument(
         "--scene", type=Path, metavar="PATH", help="scene file (.ply, .nsvq) or COLMAP folder instead of synthetic ones"
@@ -197,7 +197,11 @@ def _measure(suites: Sequence[str], settings: Settings) -> _Results:
     rows: list[Row] = []
     for name in suites:
         start = time.perf_counter()
-        rows += load_suite(name)(settings)
+        try:
+            rows += load_suite(name)(settings)
+        except Unavailable as reason:
+            log.info("%s (%s): skipped, %s", name, SUITES[name].about, reason)
+            continue
         log.info("%s (%s): %.1f s", name, SUITES[name].about, time.perf_counter() - start)
     return _Results(machine, settings, rows)
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from lightning.pytorch import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.profilers import Profiler
 
+from nsvq_lightning.benchmark.timing import finish
 from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.host import as_host
@@ -54,6 +55,7 @@ class StepClock(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: View, batch_idx: int
     ) -> None:
         """End a step and start the next."""
+        finish()
         seconds = time.perf_counter() - self._since
         phase = getattr(as_host(pl_module), "phase", Phase.WARMUP)
         self.steps.append(Step(trainer.global_step, phase, 1000 * seconds))
@@ -87,12 +89,19 @@ def fit(
     callbacks: Sequence[Callback],
     steps: int,
     profiler: Profiler | None = None,
+    accelerator: str = "cpu",
 ) -> None:
-    """Train on the CPU without a word, with loggers that write into a folder that is removed afterwards."""
+    """Train without a word, with loggers that write into a folder that is removed afterwards."""
     with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder, quiet():
         loggers = default_loggers(folder, "benchmark")
         trainer = quiet_trainer(
-            folder, steps, limit_val_batches=0, logger=loggers, callbacks=list(callbacks), profiler=profiler
+            folder,
+            steps,
+            limit_val_batches=0,
+            logger=loggers,
+            callbacks=list(callbacks),
+            profiler=profiler,
+            accelerator=accelerator,
         )
         trainer.fit(module, datamodule=data)
 

@@ -9,7 +9,11 @@ from typing import Literal, NamedTuple, cast
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
 
-__all__ = ["ALL", "SUITES", "Suite", "load_suite", "suite_names"]
+__all__ = ["ALL", "SUITES", "Suite", "Unavailable", "load_suite", "suite_names"]
+
+
+class Unavailable(Exception):
+    """This machine has not got what a suite measures; the message says what, and the other suites go on."""
 
 
 class Suite(NamedTuple):
@@ -29,6 +33,10 @@ class Suite(NamedTuple):
 SUITES = {
     "render": Suite(
         "rasterizer back-ends and their accuracy settings, forward and backward", drawn=("max error", "gradient error")
+    ),
+    "gpu": Suite(
+        "back-ends of a GPU side by side, and a training step of each phase on it",
+        drawn=("max error", "gradient error"),
     ),
     "stability": Suite(
         "extreme scenes and quantizers: finite, refused or wrong?", drawn=("max error", "gradient error")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.benchmark.sizes import SIZES
+from nsvq_lightning.benchmark.sizes import SIZES, STANDARD
 from nsvq_lightning.skips import SKIPS
 
 __all__ = ["Settings", "usable_cores"]
@@ -46,7 +46,7 @@ class Settings:
     quick: bool = False
     repeats: int = 15
     seconds: float = 5.0
-    workloads: tuple[str, ...] = tuple(SIZES)
+    workloads: tuple[str, ...] = STANDARD
     scene: Path | None = None
     init_from: Path | None = None
     steps: int = 1000

@@ -14,7 +14,7 @@ from nsvq_lightning.benchmark.row import Timing
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.random import generator
 
-__all__ = ["Case", "measure", "milliseconds", "sgemm", "use_threads"]
+__all__ = ["Case", "finish", "measure", "milliseconds", "sgemm", "use_threads"]
 
 SGEMM_SIDE = 2048
 
@@ -34,7 +34,9 @@ class Case:
     prepare: Callable[[], object] | None = None
 
 
-def measure(cases: Sequence[Case], settings: Settings, threads: int) -> dict[str, Timing]:
+def measure(
+    cases: Sequence[Case], settings: Settings, threads: int, device: torch.device | str = "cpu"
+) -> dict[str, Timing]:
     """Time cases in turns, in an order that rotates from round to round, after one call each that is not counted.
 
     The first call compiles kernels and grows buffers. A case that has used up ``settings.seconds`` sits out the
@@ -44,6 +46,7 @@ def measure(cases: Sequence[Case], settings: Settings, threads: int) -> dict[str
         cases: What to time, by different names.
         settings: Number of rounds and time limit.
         threads: Threads of torch and of the kernels.
+        device: Where the work is done, and the matrix product.
 
     Returns:
         Times by name of the case.
@@ -54,17 +57,17 @@ def measure(cases: Sequence[Case], settings: Settings, threads: int) -> dict[str
     names = [case.name for case in cases]
     if len(set(names)) != len(names):
         raise ValueError(f"cases need different names, got {names}")
-    product = sgemm()
+    product = sgemm(device)
     players = [product, *cases]
     samples: dict[str, list[float]] = {case.name: [] for case in players}
     with use_threads(threads), _no_collection():
         for case in players:
-            milliseconds(case)
+            milliseconds(case, device)
         for turn in range(settings.repeats):
             shift = turn % len(players)
             for case in players[shift:] + players[:shift]:
                 if case is product or sum(samples[case.name]) < 1000 * settings.seconds:
-                    samples[case.name].append(milliseconds(case))
+                    samples[case.name].append(milliseconds(case, device))
     return {name: Timing(tuple(samples[name]), tuple(samples[product.name])) for name in names}
 
 
@@ -92,26 +95,40 @@ def _no_collection() -> Iterator[None]:
             gc.enable()
 
 
-def milliseconds(case: Case) -> float:
-    """Time one call, its preparation left out."""
+def milliseconds(case: Case, device: torch.device | str = "cpu") -> float:
+    """Time one call, its preparation left out: by the clock, or by events in the stream of a GPU."""
     if case.prepare is not None:
         case.prepare()
-    _finish()
+    finish()
+    return _between_events(case.run) if torch.device(device).type == "cuda" else _by_the_clock(case.run)
+
+
+def _by_the_clock(run: Callable[[], object]) -> float:
     start = time.perf_counter_ns()
-    case.run()
-    _finish()
+    run()
+    finish()
     return (time.perf_counter_ns() - start) / 1e6
 
 
-def _finish() -> None:
+def _between_events(run: Callable[[], object]) -> float:
+    """From when the GPU begins the first work to when it ends the last, its waits for the host included."""
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))  # type: ignore[no-untyped-call]
+    start.record()
+    run()
+    end.record()
+    end.synchronize()
+    return float(start.elapsed_time(end))
+
+
+def finish() -> None:
     """Wait for kernels of a GPU that are still running."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
 
 
-def sgemm() -> Case:
+def sgemm(device: torch.device | str = "cpu") -> Case:
     """The matrix product that all times are compared with."""
     draw = generator(0, 0, "sgemm")
-    left, right = (torch.randn(SGEMM_SIDE, SGEMM_SIDE, generator=draw) for _ in range(2))
+    left, right = (torch.randn(SGEMM_SIDE, SGEMM_SIDE, generator=draw).to(device) for _ in range(2))
     out = torch.empty_like(left)
     return Case("2048³ float32 matrix product", lambda: torch.mm(left, right, out=out))

@@ -65,6 +65,12 @@ class Workload:
         gradient = self.image_gradient[top : top + height, left : left + width].contiguous()
         return replace(self, camera=Camera(K, self.camera.viewmat, width, height), image_gradient=gradient)
 
+    def to(self, device: torch.device | str) -> Workload:
+        """The workload with its splats, background and gradient on a device; the camera stays where it is."""
+        splats = RawSplats(*(tensor.to(device) for tensor in self.splats))
+        background, image_gradient = self.background.to(device), self.image_gradient.to(device)
+        return replace(self, splats=splats, background=background, image_gradient=image_gradient)
+
     def __str__(self) -> str:
         return f"{self.name} {self.camera.width}x{self.camera.height}"
 

@@ -11,12 +11,9 @@ import torch
 from nsvq_lightning.benchmark.machine import describe_machine
 from nsvq_lightning.doctor.finding import Finding, good, note
 from nsvq_lightning.rendering.cpu import lanes  # this way this file is not taken for one with kernels
-from nsvq_lightning.rendering.rasterize import BACKENDS
+from nsvq_lightning.rendering.rasterize import fast_backends
 
 __all__ = ["check_backends", "check_extras", "usable_backends"]
-
-PLAIN = ("auto", "reference")
-"""Names of back-ends that need nothing."""
 
 WIDE = 256
 """Bits of a vector register below which the kernels take about twice the time."""
@@ -24,19 +21,16 @@ WIDE = 256
 
 def usable_backends() -> dict[str, str]:
     """Device by name of each fast back-end that this machine has."""
-    found = {"cpu": "cpu"}
-    if torch.cuda.is_available():
-        installed = (name for name in BACKENDS if name not in (*PLAIN, "cpu"))
-        found.update((name, "cuda") for name in installed if name != "gsplat" or find_spec(name) is not None)
-    return found
+    devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+    return {name: device for device in devices for name in fast_backends(torch.zeros(1, device=device))}
 
 
 def check_backends() -> Iterator[Finding]:
     """The renderers: Numba on the CPU, those of a GPU."""
     yield _cpu()
     yield _gpu()
-    if "gsplat" in BACKENDS and find_spec("gsplat") is None:
-        yield note("gsplat", "not installed, and not needed; with a GPU: pip install gsplat")
+    if find_spec("gsplat") is None:
+        yield note("gsplat", "not installed, and not needed; with a GPU: pip install 'nsvq-lightning[gsplat]'")
 
 
 def _cpu() -> Finding:

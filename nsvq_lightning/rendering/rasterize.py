@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import importlib
+import logging
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.cuda.support import obstacle
+from nsvq_lightning.rendering.cuda import support as cuda_support
+from nsvq_lightning.rendering.gsplat import support as gsplat_support
 from nsvq_lightning.rendering.reference import render_reference, visible_rows
 from nsvq_lightning.splats import SplatTensors, sh_degree_of
 
-__all__ = ["BACKENDS", "Render", "render", "resolve_backend", "visible"]
+__all__ = ["BACKENDS", "Render", "fast_backends", "render", "resolve_backend", "visible"]
+
+log = logging.getLogger(__name__)
 
 _Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
-BACKENDS = ("auto", "reference", "cpu", "cuda")
-"""Names that ``render(backend=...)`` takes; ``auto`` is the fastest one for the device of the splats."""
+BACKENDS = ("auto", "reference", "cpu", "cuda", "gsplat")
+"""Names that ``render(backend=...)`` takes; ``auto`` is the package's own fastest one for the device of the splats."""
 
 
 class Render(NamedTuple):
@@ -99,25 +104,56 @@ def visible(splats: SplatTensors, camera: Camera, *, backend: str = "auto") -> T
 def resolve_backend(backend: str, like: Tensor) -> str:
     """The back-end that ``backend`` means for tensors such as ``like``.
 
+    ``auto`` is ``cpu`` for float32 on the CPU, ``cuda`` for float32 on a CUDA device where Triton is installed, and
+    else ``reference``: plain torch, in any type, on any device that torch has, and slow. It is never ``gsplat``.
+
     Raises:
         ValueError: It is unknown, or cannot take this device or floating-point type.
     """
     if backend not in BACKENDS:
         raise ValueError(f"unknown render backend {backend!r}; choose one of {', '.join(BACKENDS)}")
-    fits_cpu = like.device.type == "cpu" and like.dtype == torch.float32
-    problem = obstacle(like)
     if backend == "auto":
-        if fits_cpu:
-            return "cpu"
-        return "cuda" if problem is None else "reference"
-    if backend == "cuda" and problem is not None:
-        raise ValueError(f"backend 'cuda' cannot be used: {problem}, or use backend='reference'")
-    if backend == "cpu" and not fits_cpu:
-        raise ValueError(
-            f"backend 'cpu' renders float32 tensors on the CPU, got {like.dtype} on {like.device}; "
-            "use backend='reference' or move the splats"
-        )
+        return _automatic(like)
+    problem = _obstacle(backend, like)
+    if problem is not None:
+        raise ValueError(f"backend {backend!r} cannot be used: {problem}, or use backend='auto'")
     return backend
+
+
+def fast_backends(like: Tensor) -> list[str]:
+    """Back-ends other than plain torch that take tensors such as ``like``; asks gsplat to load itself where it may."""
+    return [name for name in BACKENDS if name not in ("auto", "reference") and _obstacle(name, like) is None]
+
+
+def _automatic(like: Tensor) -> str:
+    if _obstacle("cpu", like) is None:
+        return "cpu"
+    problem = _obstacle("cuda", like)
+    if problem is None:
+        return "cuda"
+    if like.dtype == torch.float32:  # who asks for another type wants the oracle
+        _warn_of_plain_torch(like.device.type, problem)
+    return "reference"
+
+
+@cache
+def _warn_of_plain_torch(device: str, problem: str) -> None:
+    """Say once that a device has no kernels of its own; a run of hours would else become one of weeks in silence."""
+    log.warning(
+        "rendering on %s in plain torch, much slower than on the CPU (--trainer.accelerator=cpu); "
+        "backend 'cuda' cannot be used: %s",
+        device,
+        problem,
+    )
+
+
+def _obstacle(backend: str, like: Tensor) -> str | None:
+    """Why a back-end cannot take tensors such as ``like``, with a way out; None where it can."""
+    if backend == "cpu" and not (like.device.type == "cpu" and like.dtype == torch.float32):
+        return f"it renders float32 tensors on the CPU, got {like.dtype} on {like.device}; move the splats"
+    if backend == "cuda":
+        return cuda_support.obstacle(like)
+    return gsplat_support.obstacle(like) if backend == "gsplat" else None
 
 
 def _rasterizer(backend: str) -> Callable[[SplatTensors, Camera, int, Tensor], _Outputs]:

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import json
+import logging
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from nsvq_lightning import cli as front_end
 from nsvq_lightning import lightning_script
@@ -125,3 +127,17 @@ def test_help_does_not_load_torch() -> None:
 def test_a_place_is_a_line_of_its_own() -> None:
     document = f"text about `{cli.SWITCHES}`\n<!-- results: train -->\n<!-- end -->\n"
     assert cli._filled(document, {"train": "table"}) == document.replace("<!-- end -->", "\ntable\n\n<!-- end -->")
+
+
+def test_suite_that_cannot_run_here_is_left_out_with_its_reason(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with caplog.at_level(logging.INFO, logger=cli.__name__):
+        assert cli.main(["gpu", "--quick", "--output", str(tmp_path)]) == 0
+    assert "skipped, torch finds no CUDA device" in caplog.messages[-1]
+    assert "## gpu" not in capsys.readouterr().out
+    assert {path.name for path in tmp_path.iterdir()} == {"benchmark.json", "benchmark.md"}

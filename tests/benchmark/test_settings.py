@@ -35,7 +35,7 @@ def test_what_is_given_wins() -> None:
         ({"threads": (1,), "repeats": 0}, "repeats must be at least 1, got 0"),
         ({"threads": (1,), "seconds": math.nan}, "seconds must be finite"),
         ({"threads": (1,), "seconds": 0.0}, "above 0"),
-        ({"threads": (1,), "workloads": ("A20k", "Z")}, "some of A20k, B100k, C500k, got Z"),
+        ({"threads": (1,), "workloads": ("A20k", "Z")}, "some of A20k, B100k, C500k, D1M, E3M, got Z"),
         ({"threads": (1,), "workloads": ()}, "got none"),
         ({"threads": (1,), "steps": 3}, "steps must be at least 4, one for each phase, got 3"),
         ({"threads": (1,), "switches": ("blocks", "blokcs")}, "some of blocks, .*, got blokcs"),

@@ -12,18 +12,30 @@ import torch
 from nsvq_lightning import save
 from nsvq_lightning.benchmark import suites, timing
 from nsvq_lightning.benchmark.errors import relative_l2, worst_first
-from nsvq_lightning.benchmark.registry import SUITES, load_suite, suite_names
+from nsvq_lightning.benchmark.registry import SUITES, Unavailable, load_suite, suite_names
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.stopwatches import Own
-from nsvq_lightning.benchmark.suites import codec, kmeans, loss, nearest, optimizer, profile, quantize, render, train
+from nsvq_lightning.benchmark.suites import (
+    codec,
+    gpu,
+    kmeans,
+    loss,
+    nearest,
+    optimizer,
+    profile,
+    quantize,
+    render,
+    train,
+)
 from nsvq_lightning.benchmark.workloads import synthetic_workload
 from nsvq_lightning.io.arrays import SplatArrays
+from nsvq_lightning.schedule import Phase
 from nsvq_lightning.splats import RawSplats
 
 TINY = Settings((1,), quick=True, repeats=2, seconds=0.01, workloads=("A20k",), steps=8)
-BY_STEP = ("train", "profile")
-"""Suites that time steps instead of repeated calls."""
+BY_STEP = ("train", "profile", "gpu")
+"""Suites that time steps instead of repeated calls, or besides."""
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +58,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kmeans, "CHECKED_ROWS", 500)
     monkeypatch.setattr(kmeans, "CHECKED_CODES", 20)
     monkeypatch.setattr(train, "DEMO", {True: {"views": 9, "width": 48, "height": 36}})
-    for module in (train, profile):
+    monkeypatch.setattr(gpu, "COPIED", 2**16)
+    for module in (train, profile, gpu):
         monkeypatch.setattr(module, "WARM_STEPS", {True: 2})
         monkeypatch.setattr(module, "STEPS", {True: 4})
 
@@ -64,9 +77,12 @@ def test_every_suite_is_a_file_and_every_file_a_suite() -> None:
         suite_names("train,lose")
 
 
-@pytest.mark.parametrize("name", SUITES)
+@pytest.mark.parametrize("name", [name for name in SUITES if name != "gpu"])
 def test_rows_are_complete(name: str, scene: Path) -> None:
-    rows = _run(name, scene)
+    _check_rows(name, _run(name, scene))
+
+
+def _check_rows(name: str, rows: list[Row]) -> None:
     assert {row.suite for row in rows} == {name}
     keys = [(row.workload, row.method, row.operation, row.threads) for row in rows]
     assert len(set(keys)) == len(keys) >= 2
@@ -85,6 +101,40 @@ def test_rasterizer_is_as_exact_as_plain_torch(scene: Path) -> None:
         assert rows[method, "forward"].values["max error"] < 1e-5
         assert rows[method, "forward + backward"].values["gradient error"] < 1e-4
     assert rows["cpu", "forward"].note.startswith("errors on the middle")
+
+
+def test_backends_of_a_device_are_compared_with_the_oracle_and_with_its_memory(scene: Path) -> None:
+    # All of the suite but the events of a GPU's stream runs on a CPU, too.
+    rows = gpu.run_on(torch.device("cpu"), dataclasses.replace(TINY, scene=scene))
+    _check_rows("gpu", rows)
+    assert [row.operation for row in rows[:2]] == ["forward", "forward + backward"]
+    assert [row.operation for row in rows[2:]] == [f"{phase.name.lower()} step" for phase in Phase]
+    assert {row.method for row in rows} == {"cpu"}
+    assert rows[0].values["max error"] < 1e-5
+    assert rows[1].values["gradient error"] < 1e-4
+    assert rows[1].values["share of memory limit %"] > 0
+
+
+def test_least_bytes_of_a_render() -> None:
+    workload = synthetic_workload("A20k").crop(30, 20)
+    few = dataclasses.replace(workload, splats=RawSplats(*(tensor[:10] for tensor in workload.splats)))
+    # 11 numbers of geometry and 48 of colour a splat; 3 of colour, 1 of alpha and 1 of depth a pixel.
+    forward = 4 * (10 * 11 + 7 * 48 + 600 * 5)
+    assert gpu.least_bytes(few, 7, backward=False) == forward
+    assert gpu.least_bytes(few, 7, backward=True) == forward + 4 * (7 * 59 + 10 * 59 + 600 * 3)
+
+
+def test_a_gpu_is_measured_on_the_large_scenes_besides(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu, "workloads", lambda settings: list(settings.workloads))
+    monkeypatch.setattr(gpu, "synthetic_workload", str)
+    assert [*map(str, gpu._workloads(Settings((1,))))] == ["A20k", "B100k", "C500k", "D1M", "E3M"]
+    assert [*map(str, gpu._workloads(Settings((1,), workloads=("D1M",))))] == ["D1M"]
+
+
+def test_suite_of_a_gpu_says_that_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(Unavailable, match="torch finds no CUDA device"):
+        gpu.run(TINY)
 
 
 def test_searches_find_the_codes(scene: Path) -> None:
@@ -123,7 +173,7 @@ def test_crop_is_the_largest_that_the_oracle_can_do() -> None:
     pairs = {crop.camera.height: render._pairs(crop) for crop in (workload.crop(36, 24), workload.crop(48, 32))}
     assert pairs[24] < pairs[32]
     for most, size in ((pairs[24], (36, 24)), (pairs[32] - 1, (36, 24)), (0, (24, 16)), (1e30, (400, 300))):
-        camera = render._crop(workload, most).camera
+        camera = render.crop_for_oracle(workload, most).camera
         assert (camera.width, camera.height) == size
 
 

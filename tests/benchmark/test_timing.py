@@ -33,6 +33,28 @@ def test_times_are_milliseconds_without_the_preparation() -> None:
     assert 20 <= result["nap"].minimum < 200
 
 
+def test_gpu_is_timed_by_events_around_the_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+
+    class Event:
+        def __init__(self, enable_timing: bool) -> None:
+            assert enable_timing
+
+        def record(self) -> None:
+            said.append("record")
+
+        def synchronize(self) -> None:
+            said.append("synchronize")
+
+        def elapsed_time(self, end: Event) -> float:
+            return 7.0 if end is not self else 0.0
+
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    case = Case("a", lambda: said.append("run"), lambda: said.append("prepare"))
+    assert timing.milliseconds(case, "cuda:0") == 7.0
+    assert said == ["prepare", "record", "run", "record", "synchronize"]
+
+
 def test_slow_case_sits_out_once_its_time_is_used_up() -> None:
     cases = [Case("slow", lambda: time.sleep(0.03)), Case("fast", lambda: None)]
     timings = measure(cases, Settings((1,), repeats=6, seconds=0.05), 1)

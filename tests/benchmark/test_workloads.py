@@ -10,7 +10,7 @@ import torch
 
 from nsvq_lightning import save
 from nsvq_lightning.benchmark.settings import Settings
-from nsvq_lightning.benchmark.sizes import SIZES
+from nsvq_lightning.benchmark.sizes import STANDARD
 from nsvq_lightning.benchmark.views import FADING, write_views
 from nsvq_lightning.benchmark.workloads import scene_workload, single_workload, synthetic_workload, workloads
 from nsvq_lightning.data.scene import load_scene
@@ -32,7 +32,7 @@ def definition() -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("name", SIZES)
+@pytest.mark.parametrize("name", STANDARD)
 def test_scene_has_the_bits_of_its_definition(name: str, definition: ModuleType) -> None:
     expected = definition.scene(name)
     workload = synthetic_workload(name)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from nsvq_lightning.rendering.cpu import rasterizer
-from nsvq_lightning.rendering.rasterize import render, resolve_backend, visible
+from nsvq_lightning.rendering.rasterize import _warn_of_plain_torch, render, resolve_backend, visible
 from nsvq_lightning.skips import switched
 from nsvq_lightning.splats import RawSplats, Splats
 
@@ -190,6 +190,17 @@ def test_oracle_against_finite_differences() -> None:
 def test_auto_takes_the_fast_backend() -> None:
     assert resolve_backend("auto", torch.zeros(1)) == "cpu"
     assert resolve_backend("auto", torch.zeros(1, dtype=torch.float64)) == "reference"
+
+
+def test_auto_says_once_that_a_device_has_no_kernels(caplog: pytest.LogCaptureFixture) -> None:
+    like = torch.zeros(1, device="meta")
+    _warn_of_plain_torch.cache_clear()
+    assert resolve_backend("auto", like.double()) == "reference"
+    assert caplog.messages == []
+    assert [resolve_backend("auto", like) for _ in range(2)] == ["reference", "reference"]
+    (message,) = caplog.messages
+    assert message.startswith("rendering on meta in plain torch")
+    assert "got torch.float32 on meta" in message
 
 
 def test_bad_arguments_say_what_to_do() -> None:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import NamedTuple, Protocol, TypeVar
 
 import torch
@@ -26,7 +25,7 @@ from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.timing import Case, measure, use_threads
 from nsvq_lightning.benchmark.workloads import Workload, workloads
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.rasterize import BACKENDS, render, resolve_backend
+from nsvq_lightning.rendering.rasterize import fast_backends, render
 from nsvq_lightning.rendering.reference import TILE
 from nsvq_lightning.splats import RawSplats, sh_degree_of
 
@@ -38,9 +37,12 @@ __all__ = [
     "Method",
     "Painter",
     "accuracies",
-    "fast_backends",
+    "case_of",
+    "crop_for_oracle",
+    "crop_note",
     "gradients_of",
     "image_errors",
+    "leaves_of",
     "method_errors",
     "run",
     "trace",
@@ -88,7 +90,7 @@ class Method(NamedTuple):
 
     def picture(self, splats: RawSplats, workload: Workload) -> Tensor:
         """Image ``[H, W, 3]`` of the workload's view."""
-        camera, background = workload.camera, workload.background.to(splats.means.dtype)
+        camera, background = workload.camera, workload.background.to(splats.means)
         view = _smaller(camera, self.accuracy.shrink)
         image = render(
             splats, view, sh_degree=self.accuracy.sh_degree, background=background, backend=self.backend
@@ -142,7 +144,7 @@ def _smaller(camera: Camera, shrink: int) -> Camera:
 
 def _rows(workload: Workload, settings: Settings) -> list[Row]:
     small = len(workload.splats.means) <= REFERENCE_SPLATS
-    crop = _crop(workload, ORACLE_PAIRS[settings.quick])
+    crop = crop_for_oracle(workload, ORACLE_PAIRS[settings.quick])
     asked = accuracies(sh_degree_of(workload.splats.shN))
     fast = [Method(name, accuracy) for name in fast_backends(workload.splats.means) for accuracy in asked]
     plain = Method(REFERENCE)
@@ -152,31 +154,26 @@ def _rows(workload: Workload, settings: Settings) -> list[Row]:
         jobs.append((crop, [fast[0], plain]))
     with use_threads(max(settings.threads)):
         errors = method_errors(crop, list(dict.fromkeys(method for _, methods in jobs for method in methods)))
-    size = f"{crop.camera.width}x{crop.camera.height}"
-    whole = crop.camera.height == workload.camera.height
-    note = "errors on all pixels" if whole else f"errors on the middle {size} pixels"
+    note = crop_note(crop, workload)
     rows = []
     for threads in settings.threads:
         for where, methods in jobs:
             keys = [(method, operation) for method in methods for operation in (FORWARD, BOTH)]
-            cases = [_case(where, *key) for key in keys]
+            leaves = leaves_of(where)
+            cases = [case_of(where, leaves, *key) for key in keys]
             for key, timing in zip(keys, measure(cases, settings, threads).values(), strict=True):
                 method, operation = key
                 rows.append(Row("render", str(where), str(method), operation, threads, timing, errors[key], note))
     return rows
 
 
-def fast_backends(like: Tensor) -> list[str]:
-    """Back-ends other than the oracle that take tensors such as ``like``."""
-    usable = []
-    for name in BACKENDS:
-        with suppress(ValueError):
-            usable.append(resolve_backend(name, like))
-    return [name for name in dict.fromkeys(usable) if name != REFERENCE]
+def leaves_of(workload: Workload) -> RawSplats:
+    """Copies of the splats, to be differentiated."""
+    return RawSplats(*(tensor.clone().requires_grad_() for tensor in workload.splats))
 
 
-def _case(workload: Workload, method: Method, operation: str) -> Case:
-    leaves = RawSplats(*(tensor.clone().requires_grad_() for tensor in workload.splats))
+def case_of(workload: Workload, leaves: RawSplats, method: Method, operation: str) -> Case:
+    """One of the two operations on splats that cases may share."""
 
     def forward() -> None:
         with torch.no_grad():
@@ -188,8 +185,8 @@ def _case(workload: Workload, method: Method, operation: str) -> Case:
     return Case(f"{method} {operation}", forward if operation == FORWARD else both)
 
 
-def _crop(workload: Workload, most_pairs: float) -> Workload:
-    """The largest middle of the view, 3:2 or all of it, that is not too much for the oracle."""
+def crop_for_oracle(workload: Workload, most_pairs: float) -> Workload:
+    """The largest middle of the view, 3:2 or all of it, that is not too much for the oracle (``ORACLE_PAIRS``)."""
     tallest = -(-workload.camera.height // CROP_STEP)
 
     def of(steps: int) -> Workload:
@@ -201,12 +198,21 @@ def _crop(workload: Workload, most_pairs: float) -> Workload:
     return of(min(2, tallest) if too_tall == 0 else 1 + too_tall)
 
 
+def crop_note(crop: Workload, workload: Workload) -> str:
+    """Where the errors of a workload were measured."""
+    if crop.camera.height == workload.camera.height:
+        return "errors on all pixels"
+    return f"errors on the middle {crop.camera.width}x{crop.camera.height} pixels"
+
+
 @torch.no_grad()
 def _pairs(workload: Workload) -> float:
     """About how many pairs of a splat and a pixel the oracle blends: the pixels of all tiles a splat touches."""
-    seen = render(workload.splats, workload.camera)
+    # Without Triton `auto` would be plain torch on a GPU.
+    backend = next(iter(fast_backends(workload.splats.means)), "auto")
+    seen = render(workload.splats, workload.camera, backend=backend)
     centres, radii = seen.means2d[seen.radii > 0], seen.radii[seen.radii > 0, None]
-    last = torch.tensor([workload.camera.width, workload.camera.height]) - 1
+    last = torch.tensor([workload.camera.width, workload.camera.height]).to(radii) - 1
     first_tile = ((centres - radii).clamp_min(0) / TILE).floor()
     tiles = (torch.minimum(centres + radii, last) / TILE).floor() - first_tile + 1
     return float(tiles.clamp_min(0).prod(1).sum()) * TILE**2

@@ -24,6 +24,7 @@ from nsvq_lightning.losses import photometric_loss
 from nsvq_lightning.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
+from nsvq_lightning.rendering.rasterize import fast_backends
 from nsvq_lightning.splats import RawSplats, Splats
 
 __all__ = ["Beside", "Outcome", "cases", "errors", "quantizer_errors", "quantizers", "run", "step"]
@@ -64,7 +65,7 @@ class Outcome(NamedTuple):
 def run(settings: Settings) -> list[Row]:
     """Time every scene with every number of threads; errors once a scene."""
     scenes = cases(settings)
-    methods = {str(render.Method(name)): name for name in (*render.fast_backends(torch.zeros(1)), render.REFERENCE)}
+    methods = {str(render.Method(name)): name for name in (*fast_backends(torch.zeros(1)), render.REFERENCE)}
     with use_threads(max(settings.threads)):
         values = {(scene.name, m): errors(scene, backend) for scene in scenes for m, backend in methods.items()}
         prepared = quantizers()

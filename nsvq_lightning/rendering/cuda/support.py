@@ -9,6 +9,8 @@ from functools import cache
 import torch
 from torch import Tensor
 
+from nsvq_lightning.rendering.device import not_on_cuda
+
 __all__ = ["has_triton", "interpreted", "obstacle"]
 
 
@@ -25,8 +27,9 @@ def has_triton() -> bool:
 
 def obstacle(like: Tensor) -> str | None:
     """Why the kernels cannot take tensors such as ``like``, with a way out; None where they can."""
-    if like.dtype != torch.float32 or not (like.is_cuda or interpreted()):
-        return f"it renders float32 tensors on a CUDA device, got {like.dtype} on {like.device}; move the splats"
+    problem = None if interpreted() and like.dtype == torch.float32 else not_on_cuda(like)
+    if problem is not None:
+        return problem
     if not has_triton():
         return "it needs Triton, which a CUDA build of PyTorch for Linux brings along (pip install triton)"
     return None
