@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda.support import obstacle
+from nsvq_lightning.rendering.kernels import kernels_for
 from nsvq_lightning.rendering.reference import render_reference, visible_rows
 from nsvq_lightning.splats import SplatTensors, sh_degree_of
 
@@ -104,15 +105,13 @@ def resolve_backend(backend: str, like: Tensor) -> str:
     """
     if backend not in BACKENDS:
         raise ValueError(f"unknown render backend {backend!r}; choose one of {', '.join(BACKENDS)}")
-    fits_cpu = like.device.type == "cpu" and like.dtype == torch.float32
-    problem = obstacle(like)
+    kernels = kernels_for(like)
     if backend == "auto":
-        if fits_cpu:
-            return "cpu"
-        return "cuda" if problem is None else "reference"
+        return kernels or "reference"
+    problem = obstacle(like)
     if backend == "cuda" and problem is not None:
         raise ValueError(f"backend 'cuda' cannot be used: {problem}, or use backend='reference'")
-    if backend == "cpu" and not fits_cpu:
+    if backend == "cpu" and kernels != "cpu":
         raise ValueError(
             f"backend 'cpu' renders float32 tensors on the CPU, got {like.dtype} on {like.device}; "
             "use backend='reference' or move the splats"
