@@ -24,28 +24,28 @@ CODES = 128
 
 @triton.jit
 def nearest_kernel(
-    x, codebook, result, count, codes, DIM: tl.constexpr, ROWS: tl.constexpr, CODES: tl.constexpr
+    x, codebook, result, count, num_codes, DIM: tl.constexpr, ROWS: tl.constexpr, CODES: tl.constexpr
 ):  # fmt: skip
-    """Nearest of the codes, whose numbers lie column by column (``[DIM, codes]``), of each row."""
+    """Nearest of the codes, whose numbers lie column by column (``[DIM, num_codes]``), of each row."""
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     inside = row < count
     lane = tl.arange(0, CODES)
     smallest = tl.full([ROWS, CODES], float("inf"), tl.float32)
     chosen = tl.zeros([ROWS, CODES], tl.int32) + lane[None, :]
-    for first in range(0, codes, CODES):
+    for first in range(0, num_codes, CODES):
         code = first + lane
         distance = tl.zeros([ROWS, CODES], tl.float32)
         for j in range(DIM):
             value = tl.load(x + row * DIM + j, mask=inside, other=0.0)
-            column = codebook + tl.cast(codes, tl.int64) * j
-            difference = tl.load(column + code, mask=code < codes, other=float("inf"))[None, :] - value[:, None]
+            column = codebook + tl.cast(num_codes, tl.int64) * j
+            difference = tl.load(column + code, mask=code < num_codes, other=float("inf"))[None, :] - value[:, None]
             distance = tl.fma(difference, difference, distance)
         # Of equal ones the first stays, and what is not a number is no nearer.
         nearer = distance < smallest
         smallest = tl.where(nearer, distance, smallest)
         chosen = tl.where(nearer, code[None, :], chosen)
     least = tl.min(smallest, 1)
-    candidates = tl.where(smallest == least[:, None], chosen, codes)
+    candidates = tl.where(smallest == least[:, None], chosen, num_codes)
     tl.store(result + row, tl.min(candidates, 1).to(tl.int64), mask=inside)
 
 

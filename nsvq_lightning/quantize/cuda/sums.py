@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nsvq_lightning.rendering.cuda.records import COMPILE
 
-__all__ = ["sum_rows"]
+__all__ = ["sorted_by_code", "sum_rows"]
 
 ROWS = 16
 """Rows of a code that are added up side by side."""
@@ -33,6 +33,15 @@ def sum_kernel(values, order, offsets, sums, dim, ROWS: tl.constexpr, WIDTH: tl.
     tl.store(sums + code * dim + lane, tl.sum(total, 0), mask=lane < dim)
 
 
+def sorted_by_code(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:
+    """Rows ``[N]`` int64 in the order of their codes, then of their numbers, and where each code begins, ``[K + 1]`` int32."""
+    # Sixteen bits sort in a quarter of the passes of sixty-four.
+    key = torch.int16 if num_codes < 2**15 else torch.int32
+    keys, order = codes.to(key).sort(stable=True)
+    starts = torch.searchsorted(keys, torch.arange(num_codes + 1, dtype=key, device=codes.device), out_int32=True)
+    return order, starts
+
+
 def sum_rows(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype) -> Tensor:
     """Sums ``[K, D]`` of the rows of each code, 0 for a code without rows; nothing is read back from the device.
 
@@ -42,10 +51,7 @@ def sum_rows(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype) 
         num_codes: K.
         dtype: Dtype of the sums, in which they are taken.
     """
-    # Sixteen bits sort in a quarter of the passes of sixty-four.
-    key = torch.int16 if num_codes < 2**15 else torch.int32
-    keys, order = codes.to(key).sort(stable=True)
-    offsets = torch.searchsorted(keys, torch.arange(num_codes + 1, dtype=key, device=codes.device))
+    order, offsets = sorted_by_code(codes, num_codes)
     dim = values.shape[1]
     width = min(WIDTH, triton.next_power_of_2(dim))
     sums = torch.empty(num_codes, dim, dtype=dtype, device=values.device)

@@ -52,13 +52,13 @@ def update_columns_kernel(
 
 @triton.jit
 def update_rows_kernel(
-    weights, gradients, firsts, seconds, rows, stride, step, gain, decay, fresh, root, eps, ROWS: tl.constexpr,
+    weights, gradients, firsts, seconds, count, stride, step, gain, decay, fresh, root, eps, ROWS: tl.constexpr,
     WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """The rows that have a gradient; what is not a number counts as one."""
+    """Those of ``count`` rows that have a gradient; what is not a number counts as one."""
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)[:, None]
     column = tl.arange(0, WIDTH)[None, :]
-    inside = (row < rows) & (column < stride)
+    inside = (row < count) & (column < stride)
     at = row * stride + column
     gradient = tl.load(gradients + at, mask=inside, other=0.0)
     has_gradient = tl.max((gradient != 0).to(tl.int32), 1)[:, None] > 0
