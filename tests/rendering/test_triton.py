@@ -25,9 +25,7 @@ def test_against_the_oracle(cases: str) -> None:
 
 
 BLEND, PROJECTION, LOSS, ADAM = (f"rendering.cuda.{name}" for name in ("blend", "projection", "dssim", "adam"))
-NEAREST, NOISE, SUMS, SUBSTITUTION = (
-    f"quantize.cuda.{name}" for name in ("nearest", "noise", "sums", "substitution")
-)
+NEAREST, NOISE, SUMS, SUBSTITUTION = (f"quantize.cuda.{name}" for name in ("nearest", "noise", "sums", "substitution"))
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ def sum_kernel(values, order, offsets, sums, dim, ROWS: tl.constexpr, WIDTH: tl.
 
 
 def sorted_by_code(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:
-    """Rows ``[N]`` int64 in the order of their codes, then of their numbers, and where each code begins, ``[K + 1]`` int32."""
+    """Rows ``[N]`` int64, in the order of codes and their own, and where each code begins ``[K + 1]`` int32."""
     # Sixteen bits sort in a quarter of the passes of sixty-four.
     key = torch.int16 if num_codes < 2**15 else torch.int32
     keys, order = codes.to(key).sort(stable=True)

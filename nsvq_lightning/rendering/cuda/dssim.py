@@ -236,9 +236,7 @@ def l1_dssim(
     planes = image.new_empty(DERIVATIVES, height, width, 3) if derived else moments
     sums, loss = image.new_empty(programs, 2), image.new_empty(())
     with torch.cuda.device_of(image):
-        moments_kernel[grid](
-            image, target, moments, sums, height, length, BYTES=target.dtype == torch.uint8, **tile
-        )
+        moments_kernel[grid](image, target, moments, sums, height, length, BYTES=target.dtype == torch.uint8, **tile)
         similarity_kernel[grid](moments, planes, sums, height, length, DERIVED=derived, **tile)
         loss_kernel[(1,)](sums, loss, programs, height * length, dssim_weight, BLOCK=BLOCK, **COMPILE)
     return loss, Derivatives(planes, dssim_weight) if derived else None
