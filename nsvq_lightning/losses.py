@@ -121,4 +121,5 @@ class _CudaLoss(torch.autograd.Function):
     def backward(ctx: Any, scale: Tensor) -> tuple[Tensor, None, None]:
         from nsvq_lightning.rendering.cuda.dssim import l1_dssim_backward
 
-        return l1_dssim_backward(*ctx.saved_tensors, ctx.derivatives, scale), None, None
+        image, target = ctx.saved_tensors
+        return l1_dssim_backward(image, target, ctx.derivatives, scale), None, None

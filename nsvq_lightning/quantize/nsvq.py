@@ -70,14 +70,15 @@ class _Substitution(torch.autograd.Function):
     ) -> Tensor:
         ctx.mix, ctx.kernels = mix, kernels_for(x)
         seed, aim, spread = mix
-        if ctx.kernels is not None and rows is None:
-            rows = torch.arange(x.shape[0], device=x.device)
+        if ctx.kernels is not None:
+            rows = torch.arange(x.shape[0], device=x.device) if rows is None else rows
+            inputs = x, rows, codebook, codes
         if ctx.kernels == "cpu":
-            out = torch.from_numpy(substitute(seed, *_arrays(x, rows, codebook, codes), aim=aim, spread=spread))
+            out = torch.from_numpy(substitute(seed, *_arrays(*inputs), aim=aim, spread=spread))
         elif ctx.kernels == "cuda":
             from nsvq_lightning.quantize.cuda.substitution import substitute as substitute_cuda
 
-            out = substitute_cuda(seed, *_contiguous(x, rows, codebook, codes), aim=aim, spread=spread)
+            out = substitute_cuda(seed, *_contiguous(*inputs), aim=aim, spread=spread)
         else:
             chosen = x if rows is None else x.index_select(0, rows)
             residual = chosen - codebook[codes]
