@@ -28,8 +28,8 @@ WHITE = tl.constexpr(255.0)
 
 MOMENTS = 4
 DERIVATIVES = 3
-ROWS = 8
-"""Rows of an image a program does."""
+ROWS = 4
+"""Rows of an image a program does: four numbers a thread, so that registers suffice for all taps."""
 COLUMNS = 128
 """Numbers of each row it does; three are a pixel."""
 BLOCK = 1024
