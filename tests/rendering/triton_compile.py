@@ -1,4 +1,4 @@
-"""Compile Triton kernels of the package for a GPU that need not be there: ``module:kernel[:name=type…] …``."""
+"""Compile Triton kernels for a GPU that need not be there: ``module:kernel[:name=type…] …`` on the command line."""
 
 from __future__ import annotations
 
