@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from nsvq_lightning.rendering.kernels import kernels_for
 from nsvq_lightning.splats import RawSplats
 
 __all__ = [
@@ -112,7 +113,7 @@ def add_view(sums: Tensor, views: Tensor, grad: Tensor, radii: Tensor, width: in
         width: Image width in pixels.
         height: Image height in pixels.
     """
-    if grad.device.type == "cpu" and grad.dtype == torch.float32:
+    if kernels_for(grad) == "cpu":
         from nsvq_lightning.rendering.cpu.statistics import add_view as add_view_cpu
 
         add_view_cpu(sums, views, grad, radii, (0.5 * width, 0.5 * height))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
+
+from nsvq_lightning.rendering.kernels import kernels_for
 
 __all__ = ["SSIM_C1", "SSIM_C2", "SSIM_RADIUS", "photometric_loss", "ssim", "ssim_window"]
 
@@ -32,10 +35,15 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     Returns:
         Scalar, 1 for equal images (Wang et al. 2004, eq. 13; beyond the border the images count as 0).
     """
-    if _is_fusible(image, target) and not (torch.is_grad_enabled() and image.requires_grad):
+    kernels = None if torch.is_grad_enabled() and image.requires_grad else _kernels(image, target)
+    if kernels == "cpu":
         from nsvq_lightning.rendering.cpu.dssim import l1_dssim
 
         return image.new_tensor(1 - l1_dssim(image.contiguous(), target.contiguous(), 1.0)[0])
+    if kernels == "cuda":
+        from nsvq_lightning.rendering.cuda.dssim import l1_dssim as l1_dssim_cuda
+
+        return 1 - l1_dssim_cuda(image.contiguous(), target.contiguous(), 1.0, derived=False)[0]
     planes = torch.cat([image, target, image * image, target * target, image * target], -1).movedim(-1, 0)[None]
     channels = planes.shape[1]
     taps = ssim_window().to(image).expand(channels, 1, -1)
@@ -52,7 +60,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2) -> Tensor:
     """(1 - λ)·mean |image - target| + λ·(1 - SSIM), differentiable in ``image``, which is clamped to [0, 1] first.
 
-    float32 images on the CPU take one fused sweep for clamping, loss and gradient; everything else is plain torch.
+    float32 images take fused kernels for clamping, loss and gradient; everything else is plain torch.
 
     Args:
         image: Rendered ``[H, W, 3]``; values outside [0, 1] get no gradient.
@@ -64,21 +72,25 @@ def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2) -
     """
     if image.shape != target.shape or image.dim() != 3 or image.shape[-1] != 3:
         raise ValueError(f"image and target must both be [H, W, 3], got {list(image.shape)} and {list(target.shape)}")
-    if _is_fusible(image, target):
-        loss: Tensor = _FusedLoss.apply(image, target, dssim_weight)  # type: ignore[no-untyped-call]
+    kernels = _kernels(image, target)
+    if kernels is not None:
+        function = _CpuLoss if kernels == "cpu" else _CudaLoss
+        loss: Tensor = function.apply(image, target, dssim_weight)  # type: ignore[no-untyped-call]
         return loss
     image = image.clamp(0.0, 1.0)
     target = target.to(image.dtype) / 255 if target.dtype == torch.uint8 else target
     return (1 - dssim_weight) * (image - target).abs().mean() + dssim_weight * (1 - ssim(image, target))
 
 
-def _is_fusible(image: Tensor, target: Tensor) -> bool:
-    """Whether the fused sweep can take the images: on the CPU, float32, and rows of at least one vector."""
-    fits = image.device.type == "cpu" and image.dtype == torch.float32 and 3 * image.shape[1] >= 16
-    return fits and target.dtype in (torch.float32, torch.uint8) and not target.requires_grad
+def _kernels(image: Tensor, target: Tensor) -> Literal["cpu", "cuda"] | None:
+    """Whose fused kernels can take the images; those of the CPU need rows of at least one vector."""
+    kernels = kernels_for(image)
+    fits = target.dtype in (torch.float32, torch.uint8) and not target.requires_grad and target.device == image.device
+    wide = 3 * image.shape[1] >= 16 if kernels == "cpu" else image.numel() > 0
+    return kernels if fits and wide else None
 
 
-class _FusedLoss(torch.autograd.Function):
+class _CpuLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, dssim_weight: float) -> Tensor:
         from nsvq_lightning.rendering.cpu.dssim import l1_dssim
@@ -92,3 +104,22 @@ class _FusedLoss(torch.autograd.Function):
         (gradient,) = ctx.saved_tensors
         # One view a step leaves the loss as it is, and a pass over the image is worth sparing.
         return gradient if scale == 1 else gradient * scale, None, None
+
+
+class _CudaLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor, dssim_weight: float) -> Tensor:
+        from nsvq_lightning.rendering.cuda.dssim import l1_dssim
+
+        image, target = image.contiguous(), target.contiguous()
+        loss, ctx.derivatives = l1_dssim(image, target, dssim_weight, derived=ctx.needs_input_grad[0])
+        ctx.save_for_backward(image, target)
+        return loss
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, scale: Tensor) -> tuple[Tensor, None, None]:
+        from nsvq_lightning.rendering.cuda.dssim import l1_dssim_backward
+
+        image, target = ctx.saved_tensors
+        return l1_dssim_backward(image, target, ctx.derivatives, scale), None, None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
@@ -10,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from nsvq_lightning.rendering.kernels import kernels_for
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats import Splats
 
@@ -126,9 +128,10 @@ def apply_rates(optimizer: torch.optim.Optimizer, rates: LearningRates, extent: 
 
 
 class SplatAdam(torch.optim.Adam):
-    """:class:`torch.optim.Adam` for contiguous float32 parameters on the CPU, in one pass over the memory.
+    """:class:`torch.optim.Adam` for contiguous float32 parameters, in one pass over the memory.
 
-    The same bits for any number of threads; the state is that of torch's, so checkpoints fit both. A group may name
+    On the CPU and on CUDA devices, where nothing waits for the device. The same bits for any number of threads; the
+    state is that of torch's, the count of steps on the CPU, so checkpoints fit both. A group may name
     ``columns`` (:func:`set_columns`): the leading numbers of a row that can have a gradient or ever had one; Adam
     leaves the others as they are, so they are not looked at (switch ``adam_bands``). With the switch ``adam_rows``
     splats without a gradient keep weights and moments; the count of steps, which corrects the bias, goes on for all.
@@ -165,14 +168,13 @@ class SplatAdam(torch.optim.Adam):
 
     def _update_of(self, group: dict[str, Any], parameter: Tensor, gradient: Tensor) -> Callable[[], None]:
         """Count one more step of a parameter; the function that does it."""
-        from nsvq_lightning.rendering.cpu.adam import adam_update
-
         state = self.state[parameter]
         if not state:
             state["step"] = torch.zeros(())
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        state["step"] += 1
-        return adam_update(
+        # A checkpoint of torch's fused Adam has it on the device, where reading it would wait.
+        state["step"] = state["step"].cpu() + 1
+        return _adam_of(parameter)(
             parameter,
             gradient.contiguous(),
             state["exp_avg"],
@@ -186,6 +188,13 @@ class SplatAdam(torch.optim.Adam):
         )
 
 
+def _adam_of(parameter: Tensor) -> Callable[..., Callable[[], None]]:
+    """The function that prepares Adam on the device of a parameter, whose kernels' compiler is imported only now."""
+    adam = importlib.import_module(f"nsvq_lightning.rendering.{kernels_for(parameter)}.adam")
+    prepare: Callable[..., Callable[[], None]] = adam.adam_update
+    return prepare
+
+
 def build_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
     """Adam of the paper over ``groups``: default betas, epsilon 1e-15, no weight decay.
 
@@ -196,10 +205,13 @@ def build_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
         ValueError: ``adam_rows`` is on, and only torch's can take the parameters.
     """
     parameters: list[Tensor] = [parameter for group in groups for parameter in group["params"]]
-    if all(p.device.type == "cpu" and p.dtype == torch.float32 and p.is_contiguous() for p in parameters):
+    if all(kernels_for(p) is not None and p.is_contiguous() for p in parameters):
         return SplatAdam(groups)
     if is_on("adam_rows"):
-        raise ValueError("the switch adam_rows needs float32 parameters on the CPU; train there, or leave it off")
+        raise ValueError(
+            "the switch adam_rows needs float32 parameters on the CPU, or on a CUDA device with Triton (pip install "
+            "triton); train there, or leave it off"
+        )
     fused = all(p.device.type in FUSED_DEVICES and p.is_floating_point() for p in parameters)
     return torch.optim.Adam(groups, eps=EPS, fused=True if fused else None)
 

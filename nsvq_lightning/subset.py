@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.rendering.cpu.rows import gather_rows, spread_rows
+from nsvq_lightning.rendering.kernels import kernels_for
 
 __all__ = ["take_rows"]
 
@@ -19,19 +20,15 @@ class _TakeRows(torch.autograd.Function):
     def forward(ctx: Any, tensor: Tensor, rows: Tensor) -> Tensor:
         ctx.save_for_backward(rows)
         ctx.count = tensor.shape[0]
-        return gather_rows(tensor, rows) if _has_kernel(tensor) else tensor.index_select(0, rows)
+        return gather_rows(tensor, rows) if kernels_for(tensor) == "cpu" else tensor.index_select(0, rows)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
         (rows,) = ctx.saved_tensors
         grad = grads[0]
-        if _has_kernel(grad):
+        if kernels_for(grad) == "cpu":
             return spread_rows(grad, rows, ctx.count), None
         return grad.new_zeros(ctx.count, *grad.shape[1:]).index_copy_(0, rows, grad), None
-
-
-def _has_kernel(tensor: Tensor) -> bool:
-    return tensor.device.type == "cpu" and tensor.dtype == torch.float32
 
 
 def take_rows(tensor: Tensor, rows: Tensor) -> Tensor:

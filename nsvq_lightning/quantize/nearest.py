@@ -14,6 +14,7 @@ from torch import Tensor
 from nsvq_lightning.quantize.box_search import MAX_DIM, box_search
 from nsvq_lightning.quantize.boxes import build_boxes
 from nsvq_lightning.quantize.scores import centre_codes, score_search
+from nsvq_lightning.rendering.kernels import kernels_for
 
 __all__ = ["check_rows", "nearest", "nearest_reference"]
 
@@ -75,8 +76,13 @@ def nearest(x: Tensor, codebook: Tensor) -> Tensor:
     """
     check_rows(x, codebook)
     x, codebook = x.detach().contiguous(), codebook.detach().contiguous()
-    if x.device.type == "cpu" and x.dtype == torch.float32:
+    kernels = kernels_for(x)
+    if kernels == "cpu":
         return torch.from_numpy(_search(x.numpy(), codebook.numpy()))
+    if kernels == "cuda":
+        from nsvq_lightning.quantize.cuda.nearest import nearest_codes
+
+        return nearest_codes(x, codebook)
     return nearest_reference(x, codebook)
 
 

@@ -14,17 +14,18 @@ from numpy.typing import NDArray
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
 from nsvq_lightning.rendering.cpu.lanes import fma, load, log2, splat, store, vsqrt
 
-__all__ = ["draw_seed", "fill_normal", "normal_vectors"]
+__all__ = ["COS", "MULTIPLIERS", "SIN", "draw_seed", "fill_normal", "normal_vectors"]
 
-_GOLDEN, _FIRST, _SECOND = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+MULTIPLIERS = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
+_GOLDEN, _FIRST, _SECOND = (np.uint64(value) for value in MULTIPLIERS)
 _S27, _S30, _S31, _S40, _LOW24 = np.uint64(27), np.uint64(30), np.uint64(31), np.uint64(40), np.uint64(0xFFFFFF)
 _UNIT = np.float32(2.0**-24)
 _MINUS_TWO_LN2 = np.float32(-2 * np.log(2))
 # cos 2πt and (sin 2πt)/t as polynomials of t² on |t| ≤ 1/2 (Chebyshev fits), highest power first; errors 1e-6.
-_COS = (-21.071106, 58.790493, -85.271622, 64.928658, -19.738981, 0.99999923)
-_SIN = (-12.471244, 41.342884, -76.614471, 81.599945, -41.341591, 6.283185)
-_C0, _C1, _C2, _C3, _C4, _C5 = (np.float32(value) for value in _COS)
-_S0, _S1, _S2, _S3, _S4, _S5 = (np.float32(value) for value in _SIN)
+COS = (-21.071106, 58.790493, -85.271622, 64.928658, -19.738981, 0.99999923)
+SIN = (-12.471244, 41.342884, -76.614471, 81.599945, -41.341591, 6.283185)
+_C0, _C1, _C2, _C3, _C4, _C5 = (np.float32(value) for value in COS)
+_S0, _S1, _S2, _S3, _S4, _S5 = (np.float32(value) for value in SIN)
 
 
 def draw_seed(generator: torch.Generator) -> int:

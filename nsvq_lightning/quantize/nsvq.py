@@ -12,6 +12,7 @@ from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize.noise import draw_seed
 from nsvq_lightning.quantize.substitution import substitute, substitute_backward
 from nsvq_lightning.quantize.sums import sum_by_code
+from nsvq_lightning.rendering.kernels import kernels_for
 
 __all__ = ["NSVQ", "noise_substitution"]
 
@@ -67,11 +68,17 @@ class _Substitution(torch.autograd.Function):
     def forward(
         ctx: Any, x: Tensor, codebook: Tensor, codes: Tensor, rows: Tensor | None, mix: tuple[int, float, float]
     ) -> Tensor:
-        ctx.mix = mix
-        if _has_kernel(x):
-            seed, aim, spread = mix
-            rows = torch.arange(x.shape[0]) if rows is None else rows
-            out = torch.from_numpy(substitute(seed, *_arrays(x, rows, codebook, codes), aim=aim, spread=spread))
+        ctx.mix, ctx.kernels = mix, kernels_for(x)
+        seed, aim, spread = mix
+        if ctx.kernels is not None:
+            rows = torch.arange(x.shape[0], device=x.device) if rows is None else rows
+            inputs = x, rows, codebook, codes
+        if ctx.kernels == "cpu":
+            out = torch.from_numpy(substitute(seed, *_arrays(*inputs), aim=aim, spread=spread))
+        elif ctx.kernels == "cuda":
+            from nsvq_lightning.quantize.cuda.substitution import substitute as substitute_cuda
+
+            out = substitute_cuda(seed, *_contiguous(*inputs), aim=aim, spread=spread)
         else:
             chosen = x if rows is None else x.index_select(0, rows)
             residual = chosen - codebook[codes]
@@ -83,9 +90,13 @@ class _Substitution(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None, None, None]:
         x, codebook, codes, rows, out = ctx.saved_tensors
-        if _has_kernel(x):
+        if ctx.kernels == "cpu":
             grads = substitute_backward(*_arrays(grad, x, rows, codebook, codes, out))
             return torch.from_numpy(grads[0]), torch.from_numpy(grads[1]), None, None, None
+        if ctx.kernels == "cuda":
+            from nsvq_lightning.quantize.cuda.substitution import substitute_backward as backward_cuda
+
+            return *backward_cuda(*_contiguous(grad, x, rows, codebook, codes, out)), None, None, None
         chosen = x if rows is None else x.index_select(0, rows)
         residual = chosen - codebook[codes]
         radial = (grad * _directions(residual, *ctx.mix)).sum(1, keepdim=True) * _unit(residual)
@@ -96,11 +107,11 @@ class _Substitution(torch.autograd.Function):
 
 
 def _arrays(*tensors: Tensor) -> list[Any]:
-    return [tensor.detach().contiguous().numpy() for tensor in tensors]
+    return [tensor.numpy() for tensor in _contiguous(*tensors)]
 
 
-def _has_kernel(x: Tensor) -> bool:
-    return x.device.type == "cpu" and x.dtype == torch.float32
+def _contiguous(*tensors: Tensor) -> list[Tensor]:
+    return [tensor.detach().contiguous() for tensor in tensors]
 
 
 def _directions(residual: Tensor, seed: int, aim: float, spread: float) -> Tensor:

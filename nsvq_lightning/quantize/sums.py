@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.rendering.cpu.jit import kernel, thread_count
+from nsvq_lightning.rendering.kernels import kernels_for
 
 __all__ = ["count_hits", "lookup", "sum_by_code"]
 
@@ -45,6 +46,10 @@ def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtyp
         sums = torch.zeros(num_codes, values.shape[1], dtype=dtype)
         _sum_rows(values.contiguous().numpy(), codes.contiguous().numpy(), sums.numpy(), thread_count())
         return sums
+    if kernels_for(values) == "cuda":
+        from nsvq_lightning.quantize.cuda.sums import sum_rows
+
+        return sum_rows(values.contiguous(), codes, num_codes, dtype)
     return _sum_segments(values.to(dtype), codes, num_codes)
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda import support as cuda_support
 from nsvq_lightning.rendering.gsplat import support as gsplat_support
+from nsvq_lightning.rendering.kernels import kernels_for
 from nsvq_lightning.rendering.reference import render_reference, visible_rows
 from nsvq_lightning.splats import SplatTensors, sh_degree_of
 
@@ -126,12 +127,11 @@ def fast_backends(like: Tensor) -> list[str]:
 
 
 def _automatic(like: Tensor) -> str:
-    if _obstacle("cpu", like) is None:
-        return "cpu"
+    kernels = kernels_for(like)
+    if kernels is not None:
+        return kernels
     problem = _obstacle("cuda", like)
-    if problem is None:
-        return "cuda"
-    if like.dtype == torch.float32:  # who asks for another type wants the oracle
+    if problem is not None and like.dtype == torch.float32:  # who asks for another type wants the oracle
         _warn_of_plain_torch(like.device.type, problem)
     return "reference"
 

@@ -15,28 +15,38 @@ from nsvq_lightning.rendering.rasterize import resolve_backend
 HERE = Path(__file__).parent
 
 
-def test_against_the_oracle() -> None:
+@pytest.mark.parametrize("cases", ["triton_cases.py", "triton_step_cases.py", "../quantize/triton_cases.py"])
+def test_against_the_oracle(cases: str) -> None:
     pytest.importorskip("triton", reason="the CUDA back-end needs Triton")
     environment = dict(os.environ, **({} if torch.cuda.is_available() else {"TRITON_INTERPRET": "1"}))
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(HERE / "triton_cases.py")]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(HERE / cases)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+BLEND, PROJECTION, LOSS, ADAM = (f"rendering.cuda.{name}" for name in ("blend", "projection", "dssim", "adam"))
+NEAREST, NOISE, SUMS, SUBSTITUTION = (f"quantize.cuda.{name}" for name in ("nearest", "noise", "sums", "substitution"))
+
+
 @pytest.mark.parametrize(
-    ("module", "kernel"),
+    "kernels",
     [
-        ("blend", "blend_backward"),
-        pytest.param("blend", "blend", marks=pytest.mark.slow),
-        pytest.param("blend", "total", marks=pytest.mark.slow),
-        pytest.param("projection", "project", marks=pytest.mark.slow),
-        pytest.param("projection", "project_backward", marks=pytest.mark.slow),
+        [f"{BLEND}:blend_backward_kernel"],
+        pytest.param([f"{BLEND}:blend_kernel", f"{BLEND}:total_kernel"], marks=pytest.mark.slow),
+        pytest.param([f"{PROJECTION}:project_kernel"], marks=pytest.mark.slow),
+        pytest.param([f"{PROJECTION}:project_backward_kernel"], marks=pytest.mark.slow),
+        # Some with an argument that is 1, of which Triton makes a constant.
+        [f"{LOSS}:similarity_kernel:height=1", f"{LOSS}:loss_kernel:programs=1", f"{ADAM}:update_rows_kernel:stride=1"],
+        [f"{NEAREST}:nearest_kernel:num_codes=1", f"{SUBSTITUTION}:substitute_kernel", f"{SUMS}:sum_kernel:sums=*fp64"],
+        pytest.param([f"{LOSS}:moments_kernel:height=1", f"{LOSS}:spread_kernel:height=1"], marks=pytest.mark.slow),
+        pytest.param([f"{LOSS}:gradient_kernel:height=1", f"{ADAM}:update_columns_kernel"], marks=pytest.mark.slow),
+        pytest.param([f"{SUBSTITUTION}:radial_kernel:count=1", f"{NOISE}:normal_kernel"], marks=pytest.mark.slow),
     ],
 )
-def test_kernels_compile_for_a_gpu(module: str, kernel: str) -> None:
+def test_kernels_compile_for_a_gpu(kernels: list[str]) -> None:
     pytest.importorskip("triton", reason="the CUDA back-end needs Triton")
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
-    command = [sys.executable, str(HERE / "triton_compile.py"), module, f"{kernel}_kernel"]
+    command = [sys.executable, str(HERE / "triton_compile.py"), *kernels]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
 

@@ -1,0 +1,122 @@
+"""Substitution of the error on a GPU: gather, residual, noise and result of a row in one pass, gradients in another.
+
+As on the CPU the backward pass takes the direction from the result, not from a second draw: with x̃ - x = ‖r‖ d̂ the
+radial term (g·d̂) r/‖r‖ is (g·(x̃ - x)) r/‖r‖². The noise of a row is that of the CPU's kernel.
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from nsvq_lightning.quantize.cuda.noise import normal
+from nsvq_lightning.quantize.cuda.sums import sum_rows
+from nsvq_lightning.rendering.cuda.records import COMPILE
+
+__all__ = ["substitute", "substitute_backward"]
+
+BLOCK = 1024
+"""Numbers a program holds."""
+TINY = tl.constexpr(torch.finfo(torch.float32).tiny)
+
+
+@triton.jit
+def chosen_rows(x, rows, codebook, codes, count, DIM: tl.constexpr, ROWS: tl.constexpr, WIDTH: tl.constexpr):
+    """Number of each row in the table, place among the chosen ones, which numbers there are, rows and their codes."""
+    i = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)[:, None]
+    column = tl.arange(0, WIDTH)[None, :]
+    inside = (i < count) & (column < DIM)
+    row = tl.load(rows + i, mask=i < count, other=0)
+    code = tl.load(codes + i, mask=i < count, other=0)
+    value = tl.load(x + row * DIM + column, mask=inside, other=0.0)
+    centre = tl.load(codebook + code * DIM + column, mask=inside, other=0.0)
+    return i, column, row, inside, value, centre
+
+
+@triton.jit
+def inverses(squared):
+    """1/s, and 0 where s is 0 (or its inverse too large): a vector without length has no direction."""
+    return tl.where(squared > TINY, 1 / tl.where(squared > TINY, squared, 1.0), 0.0)
+
+
+@triton.jit(do_not_specialize=["seed"])
+def substitute_kernel(
+    seed, aim, spread, x, rows, codebook, codes, out, count, DIM: tl.constexpr, ROWS: tl.constexpr,
+    WIDTH: tl.constexpr,
+):  # fmt: skip
+    """``x + ‖x − c‖·d/‖d‖`` with ``d = aim·(c − x) + spread·v`` of some rows."""
+    i, column, _, inside, value, centre = chosen_rows(x, rows, codebook, codes, count, DIM, ROWS, WIDTH)
+    # The order of the CPU's vectors of 16: short rows one a lane, long ones along the vectors.
+    if DIM < 16:
+        noise = normal(seed, i // 16 * DIM + column, (i % 16).to(tl.int32))
+    else:
+        noise = normal(seed, i * ((DIM + 15) // 16) + column // 16, column % 16)
+    residual = tl.where(inside, centre - value, 0.0)
+    direction = tl.where(inside, residual * aim + noise * spread, 0.0)
+    error, squared = tl.sum(residual * residual, 1)[:, None], tl.sum(direction * direction, 1)[:, None]
+    length = tl.sqrt_rn(error * inverses(squared))
+    tl.store(out + i * DIM + column, value + direction * length, mask=inside)
+
+
+@triton.jit
+def radial_kernel(
+    grad, x, rows, codebook, codes, out, grad_x, radials, count, DIM: tl.constexpr, ROWS: tl.constexpr,
+    WIDTH: tl.constexpr,
+):  # fmt: skip
+    """Gradient of the rows into the table of all rows, and minus its radial term into ``radials``."""
+    i, column, row, inside, value, centre = chosen_rows(x, rows, codebook, codes, count, DIM, ROWS, WIDTH)
+    slope = tl.load(grad + i * DIM + column, mask=inside, other=0.0)
+    moved = tl.load(out + i * DIM + column, mask=inside, other=0.0) - value
+    residual = value - centre
+    scale = tl.sum(slope * moved, 1)[:, None] * inverses(tl.sum(residual * residual, 1)[:, None])
+    radial = residual * scale
+    tl.store(grad_x + row * DIM + column, slope + radial, mask=inside)
+    tl.store(radials + i * DIM + column, -radial, mask=inside)
+
+
+def _tile(dim: int) -> dict[str, int]:
+    width = triton.next_power_of_2(dim)
+    return {"DIM": dim, "WIDTH": width, "ROWS": max(1, BLOCK // width)}
+
+
+def substitute(
+    seed: int, x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor, *, aim: float = 0.0, spread: float = 1.0
+) -> Tensor:
+    """``x + ‖x − c‖·d/‖d‖`` with ``d = aim·(c − x) + spread·v``, v ~ N(0, I), for some rows of a table, ``[V, D]``.
+
+    Args:
+        seed: 63 random bits; v is a function of them and of the position in ``rows``.
+        x: Contiguous float32 table ``[N, D]`` on a CUDA device, as all else here.
+        rows: Which rows of it, ``[V]`` int64.
+        codebook: Codes ``[K, D]``.
+        codes: Code of each chosen row, ``[V]`` int64.
+        aim: Weight of the way to the code in the direction d.
+        spread: Weight of the noise in it.
+    """
+    out = x.new_empty(len(rows), x.shape[1])
+    tile = _tile(x.shape[1])
+    if len(rows):
+        with torch.cuda.device_of(x):
+            substitute_kernel[(triton.cdiv(len(rows), tile["ROWS"]),)](
+                seed, float(aim), float(spread), x, rows, codebook, codes, out, len(rows), **tile, **COMPILE
+            )
+    return out
+
+
+def substitute_backward(
+    grad: Tensor, x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor, out: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Gradients of ``x [N, D]`` and ``codebook [K, D]`` from that of the result, ``grad [V, D]``.
+
+    ``out [V, D]`` is the result of :func:`substitute`; the ``rows [V]`` must all be different here.
+    """
+    grad_x, radials = torch.zeros_like(x), torch.empty_like(out)
+    tile = _tile(x.shape[1])
+    if len(rows):
+        with torch.cuda.device_of(x):
+            radial_kernel[(triton.cdiv(len(rows), tile["ROWS"]),)](
+                grad, x, rows, codebook, codes, out, grad_x, radials, len(rows), **tile, **COMPILE
+            )
+    return grad_x, sum_rows(radials, codes, len(codebook), x.dtype)
