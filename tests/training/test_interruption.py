@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
+from checkpoints import assert_same, assert_same_end, iteration_of, read
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import SIGTERMException
-from torch import Tensor
 
 from nsvq_lightning.callbacks import (
     CanonicalCovariance,
@@ -141,36 +140,6 @@ def whole(run: RunFactory, recipe: Recipe) -> Callable[[str], Path]:
     return get
 
 
-def assert_same(first: Any, second: Any, where: str = "") -> None:
-    """Every tensor and number of two nested structures is the same, to the bit, but for the time they took."""
-    assert type(first) is type(second), where
-    if isinstance(first, dict):
-        assert first.keys() == second.keys(), where
-        for key in first:
-            if key not in ("seconds", "state._train_seconds"):
-                assert_same(first[key], second[key], f"{where}/{key}")
-    elif isinstance(first, list | tuple):
-        assert len(first) == len(second), where
-        for number, pair in enumerate(zip(first, second, strict=True)):
-            assert_same(*pair, f"{where}/{number}")
-    elif isinstance(first, Tensor):
-        assert torch.equal(first, second), where
-    else:
-        assert first == second, where
-
-
-def assert_same_end(first: Path, second: Path) -> None:
-    """Two runs have stored the same bytes, and their last checkpoints hold the same state in every part."""
-    assert (first / "scene.nsvq").read_bytes() == (second / "scene.nsvq").read_bytes()
-    ends = [torch.load(f / "checkpoints" / "last.ckpt", weights_only=True) for f in (first, second)]
-    assert ends[0]["global_step"] == 60
-    assert_same(*ends)
-
-
-def iteration_of(path: Path) -> int:
-    return int(torch.load(path, weights_only=True)["global_step"])
-
-
 def check(runner: Runner, whole: Path, kind: str, iteration: int) -> None:
     act, ends_with, complete = KINDS[kind]
     path = runner.stopped(ends_with, Trouble(iteration, act))
@@ -258,7 +227,7 @@ def test_a_signal_in_the_last_evaluation_waits_for_the_last_checkpoint(
 ) -> None:
     path = Runner(run, recipe, "defaults").stopped(SystemExit, Trouble(61, interrupt, "on_train_end"))
     last = whole("defaults") / "checkpoints" / "last.ckpt"
-    assert_same(*(torch.load(p, weights_only=True) for p in (path, last)))
+    assert_same(read(path), read(last))
 
 
 def test_a_run_that_broke_in_its_last_evaluation_makes_up_for_it(

@@ -14,6 +14,7 @@ from unittest.mock import ANY
 import numpy as np
 import pytest
 import torch
+from checkpoints import CheckpointAt, read
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.callbacks import FiniteCodes, MetricReport, RunCheckpoint
@@ -46,17 +47,6 @@ class Witness(Callback):
         self.splats.append(len(pl_module.splats))
         self.opacity_weights.append(pl_module.opacity_weight)
         self.scales[trainer.global_step] = pl_module.splats.scales.detach().clone()
-
-
-class CheckpointAt(RunCheckpoint):
-    """Checkpoints at given iterations."""
-
-    def __init__(self, *iterations: int) -> None:
-        super().__init__(keep=True)
-        self.iterations = iterations
-
-    def is_due(self, schedule: Schedule, iteration: int) -> bool:
-        return iteration in self.iterations
 
 
 @dataclass
@@ -188,7 +178,7 @@ def test_a_resumed_run_is_the_run_not_interrupted(
     assert resumed.global_step == 60
     assert scene_bytes(resumed) == scene_bytes(whole.trainer)
     assert measured(module) == measured(whole.module)
-    stored = torch.load(path, weights_only=True)  # no code in a checkpoint
+    stored = read(path)  # no code in a checkpoint
     assert 0.0 < float(stored["state_dict"]["state._train_seconds"]) < module.train_seconds
 
 
