@@ -87,6 +87,7 @@ class SplatModule(SplatModel):
         self.save_hyperparameters(ignore=["splats"])
         self.init_from = init_from
         self.view_metrics = image_metrics()
+        self._step_rates = rates
         self._updates = True
 
     def setup(self, stage: str) -> None:
@@ -140,7 +141,9 @@ class SplatModule(SplatModel):
 
     def on_train_start(self) -> None:
         """Take the learning rates of this run, not those of a checkpoint; start counting the training time."""
-        apply_rates(self.trainer.optimizers[0], self.rates, self.extent)
+        views = self.trainer.world_size * self.trainer.accumulate_grad_batches
+        apply_rates(self.trainer.optimizers[0], self.rates, self.extent, views)
+        self._step_rates = self.rates.of_step(views)
         self.stopwatch.start()
 
     def on_train_batch_start(self, batch: View, batch_idx: int) -> None:
@@ -149,7 +152,7 @@ class SplatModule(SplatModel):
         if self._micro_batch == 0:
             self._updates = True
         optimizer = self.trainer.optimizers[0]
-        rate = position_lr(self.global_step + 1, self.extent, self.rates, self.schedule.position_decay_end)
+        rate = position_lr(self.global_step + 1, self.extent, self._step_rates, self.schedule.position_decay_end)
         set_lr(optimizer, "means", rate)
         # Noise substitution scales a whole row, so from there on every coefficient has a gradient.
         degree = self.active_sh_degree if self.phase < Phase.QUANTIZE else self.splats.sh_degree

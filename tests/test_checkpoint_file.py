@@ -73,9 +73,7 @@ def test_code_is_not_run(tmp_path: Path) -> None:
 def test_what_is_no_checkpoint_of_this_package_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.ckpt"
     write(path, nn.Linear(2, 3).state_dict())
-    with pytest.raises(
-        FormatError, match=rf"^{path}: a checkpoint of another model, which has weight, bias but"
-    ):
+    with pytest.raises(FormatError, match=rf"^{path}: a checkpoint of another model, which has weight, bias but"):
         read_checkpoint(path)
     torch.save({"weights": torch.ones(2)}, path)
     with pytest.raises(FormatError, match=rf"^{path}: not a checkpoint of Lightning"):

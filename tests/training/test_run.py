@@ -23,6 +23,7 @@ from nsvq_lightning.io.container import read_header, read_nsvq, write_nsvq
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.precision import Storage
 from nsvq_lightning.module import SplatModule
+from nsvq_lightning.optim import LearningRates, position_lr
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.schedule import Phase, Schedule
 
@@ -208,6 +209,16 @@ def test_gradient_accumulation_acts_once_a_step(
     assert len(placed) == 1
     # Within a step the splats stand still: rows of the three micro-batches match.
     assert all(len(set(witness.splats[i : i + 3])) == 1 for i in range(2, 180 - 3, 3))
+
+
+def test_learning_rates_can_follow_the_views_of_a_step(run: RunFactory, recipe: Recipe) -> None:
+    for scale, factor in ((False, 1.0), (True, 2.0)):
+        rates = LearningRates(scale_with_views=scale)
+        trainer, module = run(recipe().values(), module={"rates": rates}, accumulate_grad_batches=4, max_steps=2)
+        groups = {group["name"]: group["lr"] for group in trainer.optimizers[0].param_groups}
+        assert groups["opacities"] == factor * rates.opacities
+        positions = position_lr(2, module.extent, rates, module.schedule.position_decay_end)
+        assert groups["means"] == pytest.approx(factor * positions)
 
 
 def test_a_run_without_codebooks_is_plain_splatting(run: RunFactory, recipe: Recipe, demo_scene: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -33,8 +34,9 @@ HERE = Path(__file__).resolve().parent
 IN_QUANTIZE = 44
 """Iteration of a checkpoint between two replacements of codes."""
 
-LOSSES, GRADIENTS = (9, 33), (12, 46)
-"""Iterations in which the second view has a loss or a gradient that is not finite: in warm-up and quantize phase."""
+LOSSES, GRADIENTS = (7, 33), (12, 46)
+"""Iterations in which the second view has a loss or a gradient that is not finite: in warm-up and quantize phase, where
+nothing else changes the splats."""
 
 
 @dataclass
@@ -171,15 +173,12 @@ def test_what_one_process_meets_both_decide_alike(two: Finished) -> None:
         before, after = (two.lines()[number].split()[-1] for number in (iteration - 1, iteration))
         assert before == after  # no process has updated
     assert two.printed.count("the loss of 1 of 2 processes is not finite, no update") == len(LOSSES)
-    for iteration in GRADIENTS:  # it reaches all replicas, and the next search finds it
-        found = next(i for i in range(iteration, 60) if i % 7 == 0)
-        assert two.printed.count(f"step {found}: dropped 1 of ") == 2
-    assert all(torch.isfinite(value).all() for value in read_splats(two).values())
-
-
-def read_splats(run: Finished) -> dict[str, torch.Tensor]:
-    state = read(run.folder / "checkpoints" / "last.ckpt")["state_dict"]
-    return {name: value for name, value in state.items() if name.startswith("splats.")}
+    # A gradient reaches all replicas; every seventh iteration they search, and drop the same splat.
+    dropped = re.findall(r"step (\d+): dropped 1 of (\d+) splats with non-finite values: means in 1 rows", two.printed)
+    assert sorted(int(step) for step, _ in dropped) == [14, 14, 49, 49]
+    assert len(set(dropped)) == 2
+    state = read(two.folder / "checkpoints" / "last.ckpt")["state_dict"]
+    assert all(bool(value.isfinite().all()) for value in state.values())
 
 
 @pytest.mark.parametrize(
