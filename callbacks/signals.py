@@ -17,7 +17,6 @@ __all__ = ["HeldSignals"]
 
 log = logging.getLogger(__name__)
 
-
 HELD = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -50,6 +49,8 @@ class HeldSignals:
 
     def received(self, trainer: Trainer) -> list[int]:
         """Signals that came meanwhile, to whichever process: a collective, which every process must call."""
+        if trainer.world_size == 1:
+            return list(self._pending)
         own = torch.tensor([number in self._pending for number in HELD], dtype=torch.float32)
         counts = sum_over_processes(trainer, own.to(trainer.strategy.root_device)).tolist()
         return [number for number, count in zip(HELD, counts, strict=True) if count]

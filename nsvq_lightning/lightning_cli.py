@@ -57,7 +57,6 @@ TRAINER_DEFAULTS: dict[str, Any] = {
     "default_root_dir": "runs",
 }
 
-
 NAMED_CHECKPOINTS = frozenset({"last", "best", "hpc", "registry"})
 """What Lightning takes in place of the path of a checkpoint."""
 
