@@ -7,7 +7,7 @@ from dataclasses import is_dataclass
 from typing import Any, NamedTuple
 
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.loops import _Loop
+from lightning.pytorch.loops.loop import _Loop
 from torch import Tensor
 
 from nsvq_lightning.host import SplatHost, as_host, raw_optimizer
