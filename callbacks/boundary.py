@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import is_dataclass
+from typing import Any, NamedTuple
 
 from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.loops.loop import _Loop
 from torch import Tensor
 
-from nsvq_lightning.host import as_host, raw_optimizer
-from nsvq_lightning.quantize.base import Quantizer
+from nsvq_lightning.host import SplatHost, as_host, raw_optimizer
 from nsvq_lightning.schedule import Phase
 from nsvq_lightning.state import RunState
 
 __all__ = ["StepBoundary"]
 
-Fingerprint = list[tuple[str, int, int, int]]
+Fingerprint = list[tuple[int, int, int]]
+
+
+class _Count(NamedTuple):
+    """A counter of codes, its version when it was copied, and the copy."""
+
+    tensor: Tensor
+    version: int
+    copy: Tensor
+
+    @property
+    def is_current(self) -> bool:
+        return self.tensor._version == self.version
 
 
 class StepBoundary:
@@ -29,58 +43,74 @@ class StepBoundary:
     def __init__(self) -> None:
         self.iteration = -1
         self._kept: Fingerprint | None = None
-        self._loops: dict[str, Any] = {}
+        self._loop: object = None
+        self._places: list[dict[str, Any]] = []
+        self._progress: list[dict[str, int]] = []
         self._callbacks: dict[str, Any] = {}
         self._scalars = Phase.WARMUP, 0
-        self._counts: dict[str, list[Tensor]] = {}
+        self._counts: list[_Count] = []
 
     def take(self, trainer: Trainer, module: LightningModule) -> None:
         """Remember the state now, at the end of an iteration."""
         host = as_host(module)
         self.iteration = trainer.global_step
         self._kept = _fingerprint(trainer, module)
-        self._loops = trainer.fit_loop.state_dict()
+        if self._loop is not trainer.fit_loop:
+            self._loop, self._places = trainer.fit_loop, list(_places(trainer.fit_loop))
+        self._progress = [{k: v for k, v in place.items() if type(v) in (int, bool)} for place in self._places]
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
         states = {callback.state_key: callback.state_dict() for callback in callbacks}
         self._callbacks = {key: state for key, state in states.items() if state}
         self._scalars = host.phase, host.active_sh_degree
-        self._counts = {name: [count.clone() for count in _counts(q)] for name, q in host.quantizers.items()}
+        before = {id(count.tensor): count for count in self._counts if count.is_current}
+        self._counts = [
+            before.get(id(tensor)) or _Count(tensor, tensor._version, tensor.clone()) for tensor in _counters(host)
+        ]
 
     def drop(self) -> None:
         """Forget the state: it can no longer be put back."""
         self._kept = None
 
     def restore(self, trainer: Trainer, module: LightningModule) -> bool:
-        """Put the module back into the state; returns whether that was possible."""
+        """Put module and trainer back into the state; returns whether that was possible."""
         host = as_host(module)
         if self._kept is None or self._kept != _fingerprint(trainer, module):
             return False
         host.phase, host.active_sh_degree = self._scalars
-        for name, quantizer in host.quantizers.items():
-            for count, before in zip(_counts(quantizer), self._counts[name], strict=True):
-                count.copy_(before)
+        for count in self._counts:
+            count.tensor.copy_(count.copy)
+        for place, numbers in zip(self._places, self._progress, strict=True):
+            place.update(numbers)
         return True
 
     def amend(self, checkpoint: dict[str, Any]) -> None:
-        """Put the trainer's counters and the states of callbacks back in a checkpoint that is about to be written."""
-        checkpoint["loops"]["fit_loop"] = self._loops
+        """Put the states of callbacks back in a checkpoint that is about to be written."""
         checkpoint["callbacks"] = self._callbacks
 
 
 def _fingerprint(trainer: Trainer, module: LightningModule) -> Fingerprint:
-    """Name, identity, address and version of every tensor that an iteration leaves alone until its update."""
-    changing = [tensor for quantizer in as_host(module).quantizers.values() for tensor in _counts(quantizer)]
+    """Identity, address and version of every tensor that an iteration leaves alone until its update."""
+    changing = list(_counters(as_host(module)))
     for part in module.modules():
         if isinstance(part, RunState):
             changing += part.buffers()
     left_out = {id(tensor) for tensor in changing}
-    moments = [(key, value) for state in raw_optimizer(trainer).state.values() for key, value in state.items()]
+    moments = [value for state in raw_optimizer(trainer).state.values() for value in state.values()]
     return [
-        (name, id(tensor), tensor.data_ptr(), tensor._version)
-        for name, tensor in (*module.named_parameters(), *module.named_buffers(), *moments)
+        (id(tensor), tensor.data_ptr(), tensor._version)
+        for tensor in (*module.parameters(), *module.buffers(), *moments)
         if isinstance(tensor, Tensor) and id(tensor) not in left_out
     ]
 
 
-def _counts(quantizer: Quantizer) -> tuple[Tensor, Tensor]:
-    return quantizer.usage, quantizer.window
+def _counters(host: SplatHost) -> Iterator[Tensor]:
+    for quantizer in host.quantizers.values():
+        yield from (quantizer.usage, quantizer.window)
+
+
+def _places(loop: object) -> Iterator[dict[str, Any]]:
+    """The attributes of one of Lightning's loops and of all that it counts with, as the dictionaries they live in."""
+    yield vars(loop)
+    for value in vars(loop).values():
+        if isinstance(value, _Loop) or is_dataclass(value):
+            yield from _places(value)

@@ -32,8 +32,10 @@ class RunCheckpoint(Checkpoint):
 
     Ctrl-C and SIGTERM stop the run after the iteration they come in, with a checkpoint of it; a second one stops it at
     once. An exception leaves a checkpoint of the last complete iteration if it comes before the update of the next one
-    begins. After that the state is of no iteration, and the last checkpoint is the one to continue from. With several
-    processes, which cannot agree on an iteration any more, only the periodic ones are written.
+    begins. After that the state is of no iteration, and the last checkpoint is the one to continue from.
+
+    Several processes stop together after the iteration in which a signal has come to any of them. After an exception
+    in one they cannot agree on an iteration any more, and the last periodic checkpoint is the one to continue from.
 
     Args:
         every: Iterations between two checkpoints; None is a tenth of the run, 0 saves at the end of the run only.
@@ -72,8 +74,7 @@ class RunCheckpoint(Checkpoint):
         if trainer.ckpt_path is not None:
             self.last_path, self._saved = Path(trainer.ckpt_path), trainer.global_step
         self._training = True
-        if trainer.world_size == 1:
-            self._signals.hold()
+        self._signals.hold(trainer)
 
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
         """The update begins: from here until the end of the iteration there is no state to save."""
@@ -89,17 +90,19 @@ class RunCheckpoint(Checkpoint):
             return
         if trainer.world_size == 1:
             self._boundary.take(trainer, pl_module)
-        if self.is_due(as_host(pl_module).schedule, iteration):
+        # At the last iteration signals wait: what comes at the end belongs to the checkpoint, too.
+        received = self._signals.received(trainer) if iteration != trainer.max_steps else []
+        # One process writes its checkpoint when it has stopped; several are together now, but not any more then.
+        if self.is_due(as_host(pl_module).schedule, iteration) or (received and trainer.world_size > 1):
             self._save(trainer, pl_module)
-        if iteration != trainer.max_steps:  # else what comes at the end belongs to the checkpoint, too
-            self._signals.deliver()
+        self._signals.deliver(received)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save the end of the run."""
         if trainer.global_step > 0:
             self._save(trainer, pl_module)
         self._training = False
-        self._signals.deliver()
+        self._signals.deliver(self._signals.received(trainer))
         self._signals.release()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:

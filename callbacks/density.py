@@ -28,6 +28,7 @@ from .density_rules import (
     split,
     split_mask,
 )
+from .finite_search import FiniteSearch
 from .latch import StepLatch
 
 __all__ = ["DensityControl"]
@@ -64,11 +65,9 @@ class DensityControl(Callback):
     ) -> None:
         if max_splats is not None and max_splats < rules.min_splats:
             raise ValueError(f"max_splats must be at least min_splats={rules.min_splats}, got {max_splats}")
-        if finite_every < 1:
-            raise ValueError(f"finite_every must be at least 1, got {finite_every}")
         self.rules = rules
         self.max_splats = max_splats
-        self.finite_every = finite_every
+        self._search = FiniteSearch(finite_every, "finite_every")
         self._latch = StepLatch()
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -98,34 +97,31 @@ class DensityControl(Callback):
     ) -> None:
         """Add the statistics of this view; after a complete step do what is due."""
         host = as_host(pl_module)
-        render = outputs.get("render") if outputs else None
-        if host.wants_screen_gradients and render is not None and render.means2d.grad is not None:
-            self._observe(trainer, host, render)
+        if host.wants_screen_gradients:
+            self._observe(trainer, host, outputs.get("render") if outputs else None)
         iteration = trainer.global_step
-        phase = host.schedule.phase_at(max(iteration, 1))
-        if phase is Phase.FINETUNE or not self._latch.first_time(iteration):
+        if iteration == 0 or not self._latch.first_time(iteration):
             return
-        if render is None or iteration % self.finite_every == 0:
+        phase = host.schedule.phase_at(iteration)
+        if phase is Phase.FINETUNE:
+            return
+        if self._search.is_due(trainer):
             drop_non_finite(host.splats, raw_optimizer(trainer), iteration)
         if phase is Phase.WARMUP:
             self._warmup_step(trainer, host, iteration)
         elif phase is Phase.PRUNE:
             self._prune_step(trainer, host, iteration)
 
-    def _observe(self, trainer: Trainer, host: SplatHost, render: Render) -> None:
-        """Add one view (of each process) to the statistics."""
-        assert render.means2d.grad is not None
+    def _observe(self, trainer: Trainer, host: SplatHost, render: Render | None) -> None:
+        """Add one view (of each process) to the statistics; None, a view without a loss, adds nothing."""
         sums, views = host.splats.add_table(GRADIENTS), host.splats.add_table(VIEWS)
-        height, width = render.alpha.shape
-        # Gradient accumulation divides the loss by the number of micro-batches; each is a view of its own here.
-        size = width * trainer.accumulate_grad_batches, height * trainer.accumulate_grad_batches
         if trainer.world_size == 1:
-            add_view(sums, views, render.means2d.grad, render.radii, *size)
+            _add(sums, views, render, trainer.accumulate_grad_batches)
             return
         observed = sums.new_zeros(2, len(sums))
-        add_view(observed[0], observed[1], render.means2d.grad, render.radii, *size)
-        # One process alone would skip a view whose loss is not finite; here it must not spoil the sum.
-        norms, seen = sum_over_processes(trainer, observed.nan_to_num_(0.0, 0.0, 0.0))
+        _add(observed[0], observed[1], render, trainer.accumulate_grad_batches)
+        # What one process has to add or not, all must come by here.
+        norms, seen = sum_over_processes(trainer, observed)
         sums.add_(norms)
         views.add_(seen)
 
@@ -206,6 +202,15 @@ class DensityControl(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Do not repeat what was done before the checkpoint."""
         self._latch.last = state_dict["last"]
+
+
+def _add(sums: Tensor, views: Tensor, render: Render | None, micro_batches: int) -> None:
+    """Add a view to statistics, as :func:`~nsvq_lightning.callbacks.density_rules.add_view`; nothing without one."""
+    if render is None or render.means2d.grad is None:
+        return
+    height, width = render.alpha.shape
+    # Gradient accumulation divides the loss by the number of micro-batches; each is a view of its own here.
+    add_view(sums, views, render.means2d.grad, render.radii, width * micro_batches, height * micro_batches)
 
 
 def _rows(splats: RawSplats, mask: Tensor) -> RawSplats:

@@ -15,6 +15,7 @@ from nsvq_lightning.quantize.base import Mendable
 from nsvq_lightning.random import generator
 from nsvq_lightning.schedule import Phase
 
+from .finite_search import FiniteSearch
 from .latch import StepLatch
 
 __all__ = ["FiniteCodes"]
@@ -37,9 +38,7 @@ class FiniteCodes(Callback):
     """
 
     def __init__(self, every: int = 100) -> None:
-        if every < 1:
-            raise ValueError(f"every must be at least 1, got {every}")
-        self.every = every
+        self._search = FiniteSearch(every)
         self._latch = StepLatch()
 
     def on_train_batch_end(
@@ -53,7 +52,7 @@ class FiniteCodes(Callback):
         host, iteration = as_host(pl_module), trainer.global_step
         if iteration == 0 or host.schedule.phase_at(iteration) < Phase.QUANTIZE:
             return
-        if (not outputs or iteration % self.every == 0) and self._latch.first_time(iteration):
+        if self._latch.first_time(iteration) and self._search.is_due(trainer):
             self._mend(trainer, host, iteration)
 
     def _mend(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
@@ -69,7 +68,7 @@ class FiniteCodes(Callback):
             log.warning("%s (%s); mended", found, _numbers(broken.tolist()))
 
     def state_dict(self) -> dict[str, Any]:
-        """The last iteration searched at."""
+        """The last iteration seen."""
         return {"last": self._latch.last}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

@@ -8,13 +8,23 @@ import threading
 from types import FrameType
 from typing import Any
 
+import torch
+from lightning.pytorch import Trainer
+
+from nsvq_lightning.host import sum_over_processes
+
 __all__ = ["HeldSignals"]
 
 log = logging.getLogger(__name__)
 
+HELD = (signal.SIGINT, signal.SIGTERM)
+
 
 class HeldSignals:
     """Holds back the first SIGINT and the first SIGTERM until :meth:`deliver`; a second one acts at once.
+
+    With several processes a second one does nothing: launchers pass on what a process has received already, and a
+    process that stopped in the middle of an iteration would leave the others waiting.
 
     Delivering calls the handler that was there before, so what a signal means stays with the trainer and the
     interpreter. Signals that were ignored stay so; outside the main thread, where Python allows no handlers, nothing
@@ -24,22 +34,34 @@ class HeldSignals:
     def __init__(self) -> None:
         self._handlers: dict[int, Any] = {}
         self._pending: list[int] = []
+        self._several = False
 
-    def hold(self) -> None:
+    def hold(self, trainer: Trainer) -> None:
         """Begin to hold signals back."""
+        self._several = trainer.world_size > 1
         if self._handlers or threading.current_thread() is not threading.main_thread():
             return
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in HELD:
             handler = signal.getsignal(number)
             if callable(handler):
                 self._handlers[number] = handler
                 signal.signal(number, self._receive)
 
-    def deliver(self) -> None:
-        """Let the signals that came meanwhile do what they do."""
-        while self._pending:
-            number = self._pending.pop(0)
-            self._handlers[number](number, None)
+    def received(self, trainer: Trainer) -> list[int]:
+        """Signals that came meanwhile, to whichever process: a collective, which every process must call."""
+        if trainer.world_size == 1:
+            return list(self._pending)
+        own = torch.tensor([number in self._pending for number in HELD], dtype=torch.float32)
+        counts = sum_over_processes(trainer, own.to(trainer.strategy.root_device)).tolist()
+        return [number for number, count in zip(HELD, counts, strict=True) if count]
+
+    def deliver(self, received: list[int]) -> None:
+        """Let signals do what they do."""
+        for number in received:
+            if number in self._pending:
+                self._pending.remove(number)
+            if number in self._handlers:
+                self._handlers[number](number, None)
 
     def release(self) -> None:
         """Give the signals back to the handlers from before."""
@@ -49,10 +71,10 @@ class HeldSignals:
         self._handlers, self._pending = {}, []
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
-        if number in self._pending:
+        if number not in self._pending:
+            self._pending.append(number)
+            more = "" if self._several else "; once more stops at once, without a checkpoint"
+            log.warning("%s: stopping after this iteration%s", signal.Signals(number).name, more)
+        elif not self._several:
             self._pending.remove(number)
             self._handlers[number](number, frame)
-            return
-        self._pending.append(number)
-        name = signal.Signals(number).name
-        log.warning("%s: stopping after this iteration; once more stops at once, without a checkpoint", name)

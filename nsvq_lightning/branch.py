@@ -1,4 +1,4 @@
-"""Go on from a checkpoint with other codebooks: before the quantize phase they have learned nothing."""
+"""Go on from a checkpoint, also with other codebooks: before the quantize phase they have learned nothing."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from nsvq_lightning.schedule import Phase
-from nsvq_lightning.splats import ATTRIBUTES
+from nsvq_lightning.splats import ATTRIBUTES, sh_degree_of
 
-__all__ = ["branch_checkpoint", "branch_optimizer_state", "can_branch"]
+__all__ = ["branch_checkpoint", "branch_optimizer_state", "can_branch", "check_continuation"]
 
 CODEBOOKS = "codebooks."
 """Prefix of the codebooks in a module's state."""
+
+SPLATS = "splats."
+"""Prefix of the splats in a module's state."""
 
 PHASE = "state._phase"
 """The phase of the last trained iteration in a module's state."""
@@ -68,6 +71,42 @@ def branch_optimizer_state(stored: Mapping[str, Any], fresh: Mapping[str, Any]) 
             if old_place in stored["state"]:
                 merged["state"][place] = stored["state"][old_place]
     return merged
+
+
+def check_continuation(checkpoint: Mapping[str, Any], module: nn.Module) -> None:
+    """Check that a module can be trained on from a checkpoint.
+
+    Args:
+        checkpoint: The checkpoint, codebooks exchanged where they may be (:func:`branch_checkpoint`).
+        module: The module; numbers of splats and codes may differ.
+
+    Raises:
+        ValueError: It holds weights only, or is of a module with other settings.
+    """
+    if not checkpoint.get("optimizer_states"):
+        raise ValueError(
+            "the checkpoint holds weights without the state of the optimiser, so that training cannot go on from it; "
+            "export its scene and start from that (--model.init_from=scene.ply)"
+        )
+    state, own = checkpoint["state_dict"], module.state_dict()
+    degrees = [sh_degree_of(values[f"{SPLATS}shN"]) for values in (state, own)]
+    if degrees[0] != degrees[1]:
+        raise ValueError(
+            f"the checkpoint is of a run with SH degree {degrees[0]}, this one has {degrees[1]}; pass "
+            f"--model.sh_degree={degrees[0]}"
+        )
+    # Side tables of the splats come and go.
+    stored, wanted = ({name for name in values if not name.startswith(SPLATS)} for values in (state, own))
+    if stored != wanted:
+        raise ValueError(
+            f"the checkpoint is of a run with other codebooks or another quantizer: it has {_some(stored - wanted)} "
+            f"that this run has not, and lacks {_some(wanted - stored)}; pass the --model.codebooks and "
+            "--model.quantizer that it was trained with"
+        )
+
+
+def _some(names: set[str]) -> str:
+    return ", ".join(sorted(names)[:3]) + ", …" * (len(names) > 3) or "nothing"
 
 
 def _prefixed(codebooks: nn.ModuleDict) -> dict[str, Tensor]:

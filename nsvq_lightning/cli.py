@@ -76,8 +76,8 @@ def _run_lightning(arguments: list[str]) -> int:
         SplatCLI(arguments)
     except SIGTERMException:
         return 128 + signal.SIGTERM  # Lightning's own exit status is that of success
-    except (ValueError, FileNotFoundError) as error:
-        if os.environ.get(TRACEBACK) or not (isinstance(error, FileNotFoundError) or _is_ours(error)):
+    except (ValueError, FileNotFoundError, PermissionError) as error:
+        if os.environ.get(TRACEBACK) or not (isinstance(error, OSError) or _is_ours(error)):
             raise
         sys.stderr.write(f"error: {error}\n({TRACEBACK}=1 shows where)\n")
         return 1

@@ -16,6 +16,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 import nsvq_lightning.callbacks as callbacks
 import nsvq_lightning.quantize  # noqa: F401  short class names resolve to what is imported
+from nsvq_lightning.checkpoint_file import read_checkpoint
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
 from nsvq_lightning.host import is_trial, output_folder
 from nsvq_lightning.io.atomic import write_text
@@ -56,6 +57,8 @@ TRAINER_DEFAULTS: dict[str, Any] = {
     "default_root_dir": "runs",
 }
 
+NAMED_CHECKPOINTS = frozenset({"last", "best", "hpc", "registry"})
+"""What Lightning takes in place of the path of a checkpoint."""
 
 PARSER_TEXTS: dict[str, Any] = {
     "prog": "nsvq",
@@ -152,7 +155,15 @@ class SplatCLI(LightningCLI):
         switch(**self._get(self.config, "skips").as_dict())
 
     def _parse_ckpt_path(self) -> None:
-        """Take the model's settings from the checkpoint, except in ``fit``: there the user's options must win."""
+        """Take the model's settings from the checkpoint, except in ``fit``: there the user's options must win.
+
+        Raises:
+            FormatError: The checkpoint cannot be used; better said now than after the scene has been loaded.
+            FileNotFoundError: There is none.
+        """
+        path = self.config[self.config.subcommand].get("ckpt_path")
+        if path is not None and path.partition(":")[0] not in NAMED_CHECKPOINTS and "://" not in path:
+            read_checkpoint(path)
         if self.config.subcommand != "fit":
             super()._parse_ckpt_path()
 

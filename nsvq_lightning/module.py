@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torchmetrics import Metric
 
-from nsvq_lightning.branch import branch_checkpoint, can_branch
+from nsvq_lightning.branch import branch_checkpoint, can_branch, check_continuation
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.host import log_interval
 from nsvq_lightning.io.arrays import sh_coefficients
@@ -87,6 +87,8 @@ class SplatModule(SplatModel):
         self.save_hyperparameters(ignore=["splats"])
         self.init_from = init_from
         self.view_metrics = image_metrics()
+        self._step_rates = rates
+        self._updates = True
 
     def setup(self, stage: str) -> None:
         """Fill empty splats from ``init_from`` or the scene's points; take over the extent of the scene.
@@ -125,21 +127,32 @@ class SplatModule(SplatModel):
         return build_adam(param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take over history and schedule; a fit from before the quantize phase goes on with this module's codebooks."""
+        """Take over history and schedule; a fit from before the quantize phase goes on with this module's codebooks.
+
+        Raises:
+            ValueError: A fit cannot go on from the checkpoint.
+        """
         super().on_load_checkpoint(checkpoint)
-        if self.is_fitting and can_branch(checkpoint, self.codebooks):
+        if not self.is_fitting:
+            return
+        if can_branch(checkpoint, self.codebooks):
             branch_checkpoint(checkpoint, self.codebooks, self.configure_optimizers())
+        check_continuation(checkpoint, self)
 
     def on_train_start(self) -> None:
         """Take the learning rates of this run, not those of a checkpoint; start counting the training time."""
-        apply_rates(self.trainer.optimizers[0], self.rates, self.extent)
+        views = self.trainer.world_size * self.trainer.accumulate_grad_batches
+        apply_rates(self.trainer.optimizers[0], self.rates, self.extent, views)
+        self._step_rates = self.rates.of_step(views)
         self.stopwatch.start()
 
     def on_train_batch_start(self, batch: View, batch_idx: int) -> None:
         """Set the position's learning rate of this iteration, and how many SH coefficients it can change."""
         self._micro_batch = batch_idx % self.trainer.accumulate_grad_batches
+        if self._micro_batch == 0:
+            self._updates = True
         optimizer = self.trainer.optimizers[0]
-        rate = position_lr(self.global_step + 1, self.extent, self.rates, self.schedule.position_decay_end)
+        rate = position_lr(self.global_step + 1, self.extent, self._step_rates, self.schedule.position_decay_end)
         set_lr(optimizer, "means", rate)
         # Noise substitution scales a whole row, so from there on every coefficient has a gradient.
         degree = self.active_sh_degree if self.phase < Phase.QUANTIZE else self.splats.sh_degree
@@ -149,7 +162,8 @@ class SplatModule(SplatModel):
         """Loss of one view: (1 - w)·L1 + w·(1 - SSIM) + λ·Σ opacity (paper, section 3.3).
 
         Returns:
-            ``loss`` and the attached ``render``; None, which skips the update, when the loss is not finite.
+            ``loss`` and the attached ``render``. When the loss is not finite, the step will update nothing: then None,
+            or with several processes, which go through the backward pass together, the loss alone.
         """
         rendered = self(batch.camera)
         if self.wants_screen_gradients:
@@ -159,11 +173,16 @@ class SplatModule(SplatModel):
             loss = loss + self.opacity_weight * self.splats.opacities.sigmoid().sum()
         if (self.global_step + 1) % log_interval(self.trainer) == 0 or not is_on("metrics"):
             self._log_step(loss, rendered.image, batch.image)
-        # Several processes must skip together: their strategy sees to it.
-        if self.trainer.world_size == 1 and not math.isfinite(loss.item()):
+        if not math.isfinite(loss.item()):
             log.warning("step %d: the loss of %s is %s, no update", self.global_step + 1, batch.name, loss.item())
-            return None
+            self._updates = False
+            return {"loss": loss} if self.trainer.world_size > 1 else None
         return {"loss": loss, "render": rendered}
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Drop the gradients of a step that must not update; of several processes the strategy has done so."""
+        if not self._updates:
+            optimizer.zero_grad()
 
     def _log_step(self, loss: Tensor, image: Tensor, target: Tensor) -> None:
         quality = psnr(eight_bit(image.detach()), eight_bit(target)).float()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from nsvq_lightning.rendering.kernels import kernels_for
 from nsvq_lightning.skips import is_on
-from nsvq_lightning.splats import Splats
+from nsvq_lightning.splats import ATTRIBUTES, Splats
 
 __all__ = [
     "LearningRates",
@@ -28,6 +28,9 @@ __all__ = [
     "set_columns",
     "set_lr",
 ]
+
+BETAS = 0.9, 0.999
+"""Adam's defaults."""
 
 EPS = 1e-15
 """Adam's epsilon of 3D Gaussian splatting: gradients of a splat are far below PyTorch's default of 1e-8."""
@@ -52,6 +55,8 @@ class LearningRates:
         sh0: Constant colour coefficient.
         shN: Higher colour coefficients.
         codebook_factor: A codebook learns with the rate of its attribute times this.
+        scale_with_views: With B views in a step take √B times these rates, and Adam's other numbers to match
+            (:func:`apply_rates`); else those of one view.
 
     Raises:
         ValueError: A rate is negative or not finite, or a rate of the position is 0.
@@ -65,6 +70,7 @@ class LearningRates:
     sh0: float = 2.5e-3
     shN: float = 1.25e-4
     codebook_factor: float = 1.0
+    scale_with_views: bool = False
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -74,6 +80,12 @@ class LearningRates:
                 raise ValueError(
                     f"rate {field.name} must be finite and {'above' if positive else 'at least'} 0, got {value}"
                 )
+
+    def of_step(self, views: int) -> LearningRates:
+        """The rates of a step of ``views`` views, none left to scale."""
+        factor = math.sqrt(views) if self.scale_with_views else 1.0
+        scaled = {name: factor * getattr(self, name) for name in (*ATTRIBUTES, "means_final")}
+        return replace(self, **scaled, scale_with_views=False)
 
 
 def position_lr(iteration: int, extent: float, rates: LearningRates, decay_end: int) -> float:
@@ -121,10 +133,33 @@ def group_lr(name: str, rates: LearningRates, extent: float) -> float:
     return rate * extent if name == "means" else rate
 
 
-def apply_rates(optimizer: torch.optim.Optimizer, rates: LearningRates, extent: float) -> None:
-    """Set the learning rates of all groups, for example after a checkpoint has brought those of another run."""
+def apply_rates(optimizer: torch.optim.Optimizer, rates: LearningRates, extent: float, views: int = 1) -> None:
+    """Set learning rates, betas and epsilon of all groups, for example after a checkpoint has brought others.
+
+    With ``rates.scale_with_views``, of a step of B views, whose gradients are averaged: √B·lr, 1 - B·(1 - β), ε / √B.
+    B views in one step then move parameters as B steps of a view each, in mean and in variance (Malladi et al. 2022,
+    "On the SDEs and Scaling Rules for Adaptive Gradient Algorithms").
+
+    Args:
+        optimizer: Adam with named groups.
+        rates: Learning rates of a step of one view.
+        extent: Extent of the scene, scene units.
+        views: Views in a step, of all processes and micro-batches.
+
+    Raises:
+        ValueError: So many views that a beta would not be positive.
+    """
+    scale = views if rates.scale_with_views else 1
+    betas = tuple(1 - scale * (1 - beta) for beta in BETAS)
+    if min(betas) <= 0:
+        raise ValueError(
+            f"rates cannot scale with {views} views a step, as Adam's first beta would be {betas[0]:.2g}: train fewer "
+            "at once, or leave --model.rates.scale_with_views off"
+        )
+    scaled = rates.of_step(views)
     for group in optimizer.param_groups:
-        group["lr"] = group_lr(group["name"], rates, extent)
+        group["lr"] = group_lr(group["name"], scaled, extent)
+        group["betas"], group["eps"] = betas, EPS / math.sqrt(scale)
 
 
 class SplatAdam(torch.optim.Adam):

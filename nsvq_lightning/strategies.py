@@ -66,7 +66,7 @@ class ViewParallelStrategy(DDPStrategy):
         self._finite = True
         all_reduce(tally)
         failed, *wanted = tally.tolist()
-        if failed:
+        if failed and self.is_global_zero:
             log.warning("the loss of %d of %d processes is not finite, no update", int(failed), self.world_size)
         for parameter, count in zip(parameters, wanted, strict=True):
             if failed or not count:

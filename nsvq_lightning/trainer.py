@@ -6,41 +6,30 @@ import logging
 from pathlib import Path
 from typing import Any
 
-import torch
+from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch import Trainer
 
+from nsvq_lightning.checkpoint_file import PlainCheckpointIO, read_checkpoint
 from nsvq_lightning.io.container import write_nsvq
-from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.strategies import ViewParallelStrategy  # noqa: F401  registers its name
 
-__all__ = ["SplatTrainer", "read_checkpoint"]
+__all__ = ["SplatTrainer"]
 
 log = logging.getLogger(__name__)
 
 
-def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Read a checkpoint without running anything that it holds.
-
-    Raises:
-        FileNotFoundError: No such checkpoint.
-        FormatError: The file is damaged or no checkpoint of Lightning.
-    """
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError:
-        raise
-    except Exception as error:  # torch's readers of zip archives and pickles raise whatever damage leads them to
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        raise FormatError(f"{path}: damaged, or not a checkpoint ({reason})") from error
-    if not isinstance(checkpoint, dict) or not isinstance(checkpoint.get("state_dict"), dict):
-        raise FormatError(f"{path}: not a checkpoint of Lightning: it has no state_dict")
-    return checkpoint
-
-
 class SplatTrainer(Trainer):
-    """:class:`lightning.pytorch.Trainer`; every public method below is a subcommand of ``nsvq``."""
+    """:class:`lightning.pytorch.Trainer`; every public method below is a subcommand of ``nsvq``.
+
+    Checkpoints are read by :class:`~nsvq_lightning.checkpoint_file.PlainCheckpointIO` unless a plugin does it.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # Lightning's own
+            self.strategy.checkpoint_io = PlainCheckpointIO()
 
     def export(self, model: SplatModule, ckpt_path: str, output: str = "scene.nsvq") -> Path:
         """Write the scene of a checkpoint as a file.

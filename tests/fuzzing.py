@@ -227,12 +227,13 @@ def _build_checkpoint(folder: Path) -> list[Path]:
     from nsvq_lightning.module import SplatModule
 
     path = folder / "small.ckpt"
-    torch.save({"state_dict": SplatModule(codebooks={}).state_dict(), "global_step": 3}, path)
+    version = {"pytorch-lightning_version": "2.6.6"}
+    torch.save({"state_dict": SplatModule(codebooks={}).state_dict(), "global_step": 3, **version}, path)
     return [path]
 
 
 def _read_checkpoint(path: Path) -> object:
-    from nsvq_lightning.trainer import read_checkpoint
+    from nsvq_lightning.checkpoint_file import read_checkpoint
 
     return read_checkpoint(path)
 

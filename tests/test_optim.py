@@ -11,6 +11,7 @@ from torch import nn
 from nsvq_lightning.optim import (
     LearningRates,
     SplatAdam,
+    apply_rates,
     build_adam,
     find_group,
     param_groups,
@@ -54,6 +55,43 @@ def test_the_position_rate_falls_log_linearly_and_then_stays() -> None:
     assert position_lr(15_000, 2.0, rates, 30_000) == pytest.approx(2.0 * math.sqrt(1.6e-4 * 1.6e-6))
     assert position_lr(30_000, 2.0, rates, 30_000) == pytest.approx(3.2e-6)
     assert position_lr(45_000, 2.0, rates, 30_000) == pytest.approx(3.2e-6)
+
+
+def trained(steps: int, views: int, scale: bool) -> torch.Tensor:
+    """Where 20 000 numbers get to whose gradient in a view is 0.05 in the mean and varies by 1."""
+    numbers = nn.Parameter(torch.zeros(20_000))
+    optimizer = torch.optim.Adam([{"params": [numbers], "name": "scales"}], eps=1e-15)
+    apply_rates(optimizer, LearningRates(scales=1e-3, scale_with_views=scale), extent=1.0, views=views)
+    draws = torch.Generator().manual_seed(views)
+    for _ in range(steps):
+        numbers.grad = 0.05 + torch.randn(20_000, generator=draws) / math.sqrt(views)
+        optimizer.step()
+    return numbers.detach()
+
+
+def test_scaled_steps_of_four_views_move_as_four_steps_of_one() -> None:
+    one = trained(800, views=1, scale=True)
+    torch.testing.assert_close(trained(800, views=1, scale=False), one, rtol=0, atol=0)
+    four, unscaled = trained(200, views=4, scale=True), trained(200, views=4, scale=False)
+    for measure in (torch.mean, torch.std):
+        assert float(measure(four)) == pytest.approx(float(measure(one)), rel=0.05)
+        assert float(measure(unscaled)) == pytest.approx(0.5 * float(measure(one)), rel=0.05)
+
+
+def test_adams_numbers_follow_the_number_of_views() -> None:
+    rates = LearningRates(scale_with_views=True)
+    optimizer = build_adam(param_groups(splats(), {"scales": Codebook()}, rates, extent=3.0))
+    apply_rates(optimizer, rates, extent=3.0, views=4)
+    assert [group["lr"] for group in optimizer.param_groups] == [
+        pytest.approx(2 * rate) for rate in (4.8e-4, 1e-3, 5e-3, 0.05, 2.5e-3, 1.25e-4, 5e-3)
+    ]
+    for group in optimizer.param_groups:
+        assert group["betas"] == (pytest.approx(0.6), pytest.approx(0.996))
+        assert group["eps"] == pytest.approx(0.5e-15)
+    apply_rates(optimizer, LearningRates(), extent=3.0, views=4)
+    assert {(group["betas"], group["eps"]) for group in optimizer.param_groups} == {((0.9, 0.999), 1e-15)}
+    with pytest.raises(ValueError, match=r"16 views a step, as Adam.s first beta would be -0\.6"):
+        apply_rates(optimizer, rates, extent=3.0, views=16)
 
 
 def test_adam_is_the_textbook_one() -> None:

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.graph import increment_version
 
 from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest
@@ -167,6 +168,7 @@ class CodebookQuantizer(nn.Module, ABC):
     def count(self, codes: Tensor) -> None:
         """Count one iteration in which ``codes [N]`` were hit."""
         count_hits(codes, self.usage)
+        increment_version(self.usage)  # whoever keeps a copy must see that a kernel has written
         self.window += 1
 
     def reset_usage(self) -> None:

@@ -62,7 +62,10 @@ class Stage:
         )
 
     def end_batch(self, iteration: int, render: Render | None = None) -> None:
+        """End a step with a view, or one without an update."""
         self.trainer.global_step = iteration
+        for parameter in self.host.splats.parameters():
+            parameter.grad = None if render is None else torch.zeros_like(parameter)
         outputs = {} if render is None else {"loss": torch.tensor(0.0), "render": render}
         self.control.on_train_batch_end(self.trainer, self.host, outputs, None, 0)
 

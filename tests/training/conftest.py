@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ from nsvq_lightning.callbacks import (
 )
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.module import SplatModule
+
+sys.path.insert(0, str(Path(__file__).parent))  # test modules share what stands in modules beside them
 
 STEPS = 60
 CODES = {"scales": 24, "quats": 24, "sh0": 16, "shN": 16}

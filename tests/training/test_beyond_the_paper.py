@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from checkpoints import CheckpointAt
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
@@ -25,7 +26,6 @@ from nsvq_lightning.cli import main
 from nsvq_lightning.covariance_error import covariances
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.quantize import NSVQ
-from nsvq_lightning.schedule import Schedule
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 Recipe = Callable[..., dict[str, Callback]]
@@ -46,17 +46,6 @@ def options(**replaced: Callback) -> dict[str, Callback]:
 
 def scene_bytes(trainer: Trainer) -> bytes:
     return (Path(trainer.default_root_dir) / "scene.nsvq").read_bytes()
-
-
-class CheckpointAt(RunCheckpoint):
-    """Checkpoints at given iterations."""
-
-    def __init__(self, *iterations: int) -> None:
-        super().__init__(keep=True)
-        self.iterations = iterations
-
-    def is_due(self, schedule: Schedule, iteration: int) -> bool:
-        return iteration in self.iterations
 
 
 @pytest.fixture(scope="module")

@@ -145,6 +145,57 @@ def test_errors_of_the_user_are_one_line(
     assert "Traceback" not in error
 
 
+def damaged(whole: bytes) -> bytes:
+    """A checkpoint with one byte changed, in the middle of its largest part."""
+    place = len(whole) // 2
+    return whole[:place] + bytes([whole[place] ^ 255]) + whole[place + 1 :]
+
+
+@pytest.mark.parametrize(
+    ("command", "what"),
+    [
+        *(("fit", what) for what in ("missing", "truncated", "damaged", "foreign")),
+        *(("test", "damaged"), ("validate", "foreign"), ("export", "truncated")),
+    ],
+)
+def test_a_checkpoint_that_cannot_be_used_is_named_with_the_reason(
+    command: str, what: str, finished: Path, demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, whole = tmp_path / "a.ckpt", (finished / "checkpoints" / "last.ckpt").read_bytes()
+    if what == "foreign":
+        torch.save({"state_dict": {"weight": torch.ones(2)}, "pytorch-lightning_version": "2.6.6"}, path)
+    elif what != "missing":
+        path.write_bytes(damaged(whole) if what == "damaged" else whole[:-100])
+    arguments = [] if command == "export" else [f"--data.root={demo_scene}", f"--trainer.default_root_dir={tmp_path}"]
+    assert main([command, f"--ckpt_path={path}", *arguments]) == 1
+    error, hint = capsys.readouterr().err.splitlines()[-2:]
+    reason = {"missing": "no such checkpoint", "foreign": "a checkpoint of another model"}.get(what, what)
+    assert error.startswith(f"error: {path}: {reason}")
+    assert "pass a checkpoint that nsvq fit has written" in error
+    assert hint == "(NSVQ_TRACEBACK=1 shows where)"
+    assert not (tmp_path / demo_scene.name).exists()  # nothing was begun
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("--model.codebooks=null", "other codebooks or another quantizer: it has codebooks.scales"),
+        ("--model.sh_degree=2", "a run with SH degree 1, this one has 2; pass --model.sh_degree=1"),
+    ],
+)
+def test_a_fit_goes_on_with_the_model_of_the_checkpoint_only(
+    option: str,
+    message: str,
+    finished: Path,
+    demo_scene: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    checkpoint = finished / "checkpoints" / "last.ckpt"
+    assert main(fit(demo_scene, tmp_path, *CODES, option, f"--ckpt_path={checkpoint}")) == 1
+    assert message in capsys.readouterr().err
+
+
 def test_an_error_can_show_its_traceback(demo_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NSVQ_TRACEBACK", "1")
     with pytest.raises(ValueError, match="choose one of"):

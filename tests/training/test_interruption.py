@@ -1,4 +1,7 @@
-"""Runs that are stopped in any phase, in any way, and continued: every bit is that of the run not interrupted."""
+"""Runs that are stopped in any phase, in any way, and continued: every bit is that of the run not interrupted.
+
+Most start from a checkpoint shortly before their trouble, which the run that nothing interrupts has left.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
+from checkpoints import assert_same, assert_same_end, iteration_of, read
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import SIGTERMException
-from torch import Tensor
 
 from nsvq_lightning.callbacks import (
     CanonicalCovariance,
@@ -28,6 +30,7 @@ from nsvq_lightning.callbacks import (
     RunCheckpoint,
 )
 from nsvq_lightning.cli import main
+from nsvq_lightning.lightning_cli import continuation
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.quantize import StraightThrough
 from nsvq_lightning.schedule import Schedule
@@ -113,13 +116,15 @@ class Runner:
         return Path(trainer.default_root_dir)
 
     def whole(self) -> Path:
-        return self(checkpoint=RunCheckpoint(every=0))
+        return self(checkpoint=RunCheckpoint(every=10, keep=True))
 
-    def stopped(self, ends_with: type[BaseException], trouble: Callback, every: int = 0) -> Path:
-        """The checkpoint that a run leaves that gets into trouble."""
+    def stopped(
+        self, ends_with: type[BaseException], trouble: Callback, every: int = 0, start: Path | None = None
+    ) -> Path:
+        """The checkpoint that a run leaves that gets into trouble, itself continued from ``start``."""
         checkpoint = RunCheckpoint(every=every)
         with pytest.raises(ends_with):
-            self(trouble, checkpoint=checkpoint)
+            self(trouble, checkpoint=checkpoint, ckpt_path=start)
         assert checkpoint.last_path is not None
         assert sorted(os.listdir(checkpoint.last_path.parent)) == ["last.ckpt"]
         return checkpoint.last_path
@@ -141,39 +146,14 @@ def whole(run: RunFactory, recipe: Recipe) -> Callable[[str], Path]:
     return get
 
 
-def assert_same(first: Any, second: Any, where: str = "") -> None:
-    """Every tensor and number of two nested structures is the same, to the bit, but for the time they took."""
-    assert type(first) is type(second), where
-    if isinstance(first, dict):
-        assert first.keys() == second.keys(), where
-        for key in first:
-            if key not in ("seconds", "state._train_seconds"):
-                assert_same(first[key], second[key], f"{where}/{key}")
-    elif isinstance(first, list | tuple):
-        assert len(first) == len(second), where
-        for number, pair in enumerate(zip(first, second, strict=True)):
-            assert_same(*pair, f"{where}/{number}")
-    elif isinstance(first, Tensor):
-        assert torch.equal(first, second), where
-    else:
-        assert first == second, where
-
-
-def assert_same_end(first: Path, second: Path) -> None:
-    """Two runs have stored the same bytes, and their last checkpoints hold the same state in every part."""
-    assert (first / "scene.nsvq").read_bytes() == (second / "scene.nsvq").read_bytes()
-    ends = [torch.load(f / "checkpoints" / "last.ckpt", weights_only=True) for f in (first, second)]
-    assert ends[0]["global_step"] == 60
-    assert_same(*ends)
-
-
-def iteration_of(path: Path) -> int:
-    return int(torch.load(path, weights_only=True)["global_step"])
+def shortly_before(whole: Path, iteration: int) -> Path:
+    """A checkpoint of the whole run, such that one more iteration at least is complete before this one."""
+    return whole / "checkpoints" / f"step-{(iteration - 2) // 10 * 10}.ckpt"
 
 
 def check(runner: Runner, whole: Path, kind: str, iteration: int) -> None:
     act, ends_with, complete = KINDS[kind]
-    path = runner.stopped(ends_with, Trouble(iteration, act))
+    path = runner.stopped(ends_with, Trouble(iteration, act), start=shortly_before(whole, iteration))
     assert iteration_of(path) == iteration + complete
     assert_same_end(runner.continued(path), whole)
 
@@ -199,7 +179,8 @@ def test_an_exception_in_the_first_iteration_of_a_phase_leaves_a_checkpoint_of_t
     phase: str, run: RunFactory, recipe: Recipe, whole: Callable[[str], Path]
 ) -> None:
     runner, iteration = Runner(run, recipe, "defaults"), FIRST_OF_PHASE[phase]
-    path = runner.stopped(Broken, Trouble(iteration, fail), every=100)
+    start = shortly_before(whole("defaults"), iteration - 1)
+    path = runner.stopped(Broken, Trouble(iteration, fail), every=100, start=start)
     # Once codebooks are placed or codes frozen there is no way back; the checkpoint is that of the end of the phase.
     assert iteration_of(path) == iteration - 1
     assert_same_end(runner.continued(path), whole("defaults"))
@@ -209,7 +190,8 @@ def test_an_exception_after_the_update_leaves_the_periodic_checkpoint(
     run: RunFactory, recipe: Recipe, whole: Callable[[str], Path], caplog: pytest.LogCaptureFixture
 ) -> None:
     runner = Runner(run, recipe, "defaults")
-    path = runner.stopped(Broken, Trouble(47, fail_late, "on_train_batch_end"), every=20)
+    start = shortly_before(whole("defaults"), 40)
+    path = runner.stopped(Broken, Trouble(47, fail_late, "on_train_batch_end"), every=20, start=start)
     assert iteration_of(path) == 40
     assert f"stopped; the last checkpoint is of iteration 40: {path}" in caplog.messages
     assert_same_end(runner.continued(path), whole("defaults"))
@@ -222,7 +204,7 @@ def test_a_callback_that_fails_half_way_acts_again(
     runner = Runner(run, recipe, "options")
     with monkeypatch.context() as patch:
         patch.setattr(ContributionPruning, "_prune", lambda *_: fail())
-        path = runner.stopped(Broken, Callback())
+        path = runner.stopped(Broken, Callback(), start=shortly_before(whole("options"), 25))
     assert iteration_of(path) == 25
     assert_same_end(runner.continued(path), whole("options"))
 
@@ -256,9 +238,10 @@ def test_handlers_of_signals_are_given_back(run: RunFactory, recipe: Recipe) -> 
 def test_a_signal_in_the_last_evaluation_waits_for_the_last_checkpoint(
     run: RunFactory, recipe: Recipe, whole: Callable[[str], Path]
 ) -> None:
-    path = Runner(run, recipe, "defaults").stopped(SystemExit, Trouble(61, interrupt, "on_train_end"))
+    start = shortly_before(whole("defaults"), 60)
+    path = Runner(run, recipe, "defaults").stopped(SystemExit, Trouble(61, interrupt, "on_train_end"), start=start)
     last = whole("defaults") / "checkpoints" / "last.ckpt"
-    assert_same(*(torch.load(p, weights_only=True) for p in (path, last)))
+    assert_same(read(path), read(last))
 
 
 def test_a_run_that_broke_in_its_last_evaluation_makes_up_for_it(
@@ -267,7 +250,7 @@ def test_a_run_that_broke_in_its_last_evaluation_makes_up_for_it(
     runner = Runner(run, recipe, "defaults")
     with monkeypatch.context() as patch:
         patch.setattr(MetricReport, "on_train_end", lambda *_: fail())
-        path = runner.stopped(Broken, Callback())
+        path = runner.stopped(Broken, Callback(), start=shortly_before(whole("defaults"), 60))
     assert iteration_of(path) == 60
     folder = runner.continued(path)
     assert (folder / "scene.nsvq").read_bytes() == (whole("defaults") / "scene.nsvq").read_bytes()
@@ -295,13 +278,12 @@ def test_a_checkpoint_that_cannot_be_written_hides_no_error_and_harms_no_other(
 def test_lightnings_own_checkpoints_continue_to_the_same_bits(
     run: RunFactory, recipe: Recipe, whole: Callable[[str], Path], tmp_path: Path
 ) -> None:
-    own = ModelCheckpoint(tmp_path, "{step}", every_n_train_steps=25, save_top_k=-1)
+    own = ModelCheckpoint(tmp_path, "{step}", every_n_train_steps=12, save_top_k=-1)
     runner = Runner(run, recipe, "defaults")
-    with_both = runner(own, checkpoint=RunCheckpoint(every=0))
-    assert sorted(os.listdir(tmp_path)) == ["step=25.ckpt", "step=50.ckpt"]
-    continued = runner.continued(tmp_path / "step=25.ckpt")
-    assert_same_end(continued, whole("defaults"))
-    assert (with_both / "scene.nsvq").read_bytes() == (continued / "scene.nsvq").read_bytes()
+    with pytest.raises(Broken):
+        runner(own, Trouble(37, fail), checkpoint=RunCheckpoint(every=0))
+    assert sorted(os.listdir(tmp_path)) == ["step=12.ckpt", "step=24.ckpt", "step=36.ckpt"]
+    assert_same_end(runner.continued(tmp_path / "step=36.ckpt"), whole("defaults"))
 
 
 def test_a_run_continued_with_another_length_says_what_follows_from_it(
@@ -322,37 +304,53 @@ def arguments_of(scene: Path, folder: Path, *more: str) -> list[str]:
     ]
 
 
+@pytest.fixture(scope="module")
+def command_scene(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The file that the command writes when nothing interrupts it."""
+    folder = tmp_path_factory.mktemp("command")
+    assert main(arguments_of(demo_scene, folder)) == 0
+    return (folder / demo_scene.name / "version_0" / "scene.nsvq").read_bytes()
+
+
 def test_the_command_says_how_to_continue(
-    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    command_scene: bytes,
+    demo_scene: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     folder = tmp_path / "with space"
     step = SplatModule.training_step
 
     def terminated(module: SplatModule, batch: Any, batch_idx: int) -> Any:
-        if module.global_step + 1 in (4, 8):
+        if module.global_step + 1 == 4:
             terminate()
         return step(module, batch, batch_idx)
 
     with monkeypatch.context() as patch:
         patch.setattr(SplatModule, "training_step", terminated)
         assert main(arguments_of(demo_scene, folder)) == 128 + signal.SIGTERM
-        for version in (0, 1):
-            (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("continue with: ")]
-            program, *arguments = shlex.split(line.removeprefix("continue with: "))
-            path = folder / demo_scene.name / f"version_{version}" / "checkpoints" / "last.ckpt"
-            assert (program, arguments) == ("nsvq", [*arguments_of(demo_scene, folder), f"--ckpt_path={path}"])
-            assert iteration_of(path) == 4 * (version + 1)
-            if version == 0:
-                assert main(arguments) == 128 + signal.SIGTERM
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("continue with: ")]
+    program, *arguments = shlex.split(line.removeprefix("continue with: "))
+    path = folder / demo_scene.name / "version_0" / "checkpoints" / "last.ckpt"
+    assert (program, arguments) == ("nsvq", [*arguments_of(demo_scene, folder), f"--ckpt_path={path}"])
+    assert iteration_of(path) == 4
     assert main(arguments) == 0
-    assert main(arguments_of(demo_scene, folder)) == 0
-    scenes = [folder / demo_scene.name / f"version_{version}" / "scene.nsvq" for version in (2, 3)]
-    assert scenes[0].read_bytes() == scenes[1].read_bytes()
+    assert (folder / demo_scene.name / "version_1" / "scene.nsvq").read_bytes() == command_scene
+
+
+def test_the_command_that_continues_again_names_one_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    for before in (["--ckpt_path", "old.ckpt"], ["--ckpt_path=old.ckpt"], []):
+        command = continuation(["fit", *before, "--data.root=a b"], Path("new.ckpt"))
+        assert shlex.split(command) == ["nsvq", "fit", "--data.root=a b", "--ckpt_path=new.ckpt"]
+    monkeypatch.setattr(sys, "argv", ["/somewhere/nsvq_lightning/__main__.py"])
+    assert continuation(["fit"], Path("new.ckpt")) == "python -m nsvq_lightning fit --ckpt_path=new.ckpt"
 
 
 KILLED = """
 import os, signal, sys
 from nsvq_lightning.cli import main
+from nsvq_lightning.lightning_cli import continuation
 from nsvq_lightning.module import SplatModule
 step = SplatModule.training_step
 def killed(module, batch, batch_idx):
@@ -367,16 +365,16 @@ main(sys.argv[1:])
 @pytest.mark.parametrize(
     "iteration", [pytest.param(i, marks=[] if i == 9 else pytest.mark.slow) for i in (4, 6, 9, 12)]
 )
-def test_a_killed_process_leaves_its_periodic_checkpoint(iteration: int, demo_scene: Path, tmp_path: Path) -> None:
+def test_a_killed_process_leaves_its_periodic_checkpoint(
+    iteration: int, command_scene: bytes, demo_scene: Path, tmp_path: Path
+) -> None:
     arguments = arguments_of(demo_scene, tmp_path, "--callbacks.checkpoint.every=2")
     script = [sys.executable, "-c", KILLED.format(iteration=iteration), *arguments]
-    killed = subprocess.run(script, capture_output=True, timeout=120, check=False)
+    killed = subprocess.run(script, capture_output=True, timeout=300, check=False)
     assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
     path = tmp_path / demo_scene.name / "version_0" / "checkpoints" / "last.ckpt"
     assert os.listdir(path.parent) == ["last.ckpt"]
     ends = Schedule(total=12).ends
     assert iteration_of(path) == max(i for i in range(1, iteration) if i % 2 == 0 or i in ends)
     assert main([*arguments, f"--ckpt_path={path}"]) == 0
-    assert main(arguments) == 0
-    scenes = [tmp_path / demo_scene.name / f"version_{version}" / "scene.nsvq" for version in (1, 2)]
-    assert scenes[0].read_bytes() == scenes[1].read_bytes()
+    assert (tmp_path / demo_scene.name / "version_1" / "scene.nsvq").read_bytes() == command_scene

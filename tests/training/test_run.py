@@ -14,6 +14,7 @@ from unittest.mock import ANY
 import numpy as np
 import pytest
 import torch
+from checkpoints import CheckpointAt, read
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.callbacks import FiniteCodes, MetricReport, RunCheckpoint
@@ -22,6 +23,7 @@ from nsvq_lightning.io.container import read_header, read_nsvq, write_nsvq
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.precision import Storage
 from nsvq_lightning.module import SplatModule
+from nsvq_lightning.optim import LearningRates, position_lr
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.schedule import Phase, Schedule
 
@@ -46,17 +48,6 @@ class Witness(Callback):
         self.splats.append(len(pl_module.splats))
         self.opacity_weights.append(pl_module.opacity_weight)
         self.scales[trainer.global_step] = pl_module.splats.scales.detach().clone()
-
-
-class CheckpointAt(RunCheckpoint):
-    """Checkpoints at given iterations."""
-
-    def __init__(self, *iterations: int) -> None:
-        super().__init__(keep=True)
-        self.iterations = iterations
-
-    def is_due(self, schedule: Schedule, iteration: int) -> bool:
-        return iteration in self.iterations
 
 
 @dataclass
@@ -188,7 +179,7 @@ def test_a_resumed_run_is_the_run_not_interrupted(
     assert resumed.global_step == 60
     assert scene_bytes(resumed) == scene_bytes(whole.trainer)
     assert measured(module) == measured(whole.module)
-    stored = torch.load(path, weights_only=True)  # no code in a checkpoint
+    stored = read(path)  # no code in a checkpoint
     assert 0.0 < float(stored["state_dict"]["state._train_seconds"]) < module.train_seconds
 
 
@@ -218,6 +209,16 @@ def test_gradient_accumulation_acts_once_a_step(
     assert len(placed) == 1
     # Within a step the splats stand still: rows of the three micro-batches match.
     assert all(len(set(witness.splats[i : i + 3])) == 1 for i in range(2, 180 - 3, 3))
+
+
+def test_learning_rates_can_follow_the_views_of_a_step(run: RunFactory, recipe: Recipe) -> None:
+    for scale, factor in ((False, 1.0), (True, 2.0)):
+        rates = LearningRates(scale_with_views=scale)
+        trainer, module = run(recipe().values(), module={"rates": rates}, accumulate_grad_batches=4, max_steps=2)
+        groups = {group["name"]: group["lr"] for group in trainer.optimizers[0].param_groups}
+        assert groups["opacities"] == factor * rates.opacities
+        positions = position_lr(2, module.extent, rates, module.schedule.position_decay_end)
+        assert groups["means"] == pytest.approx(factor * positions)
 
 
 def test_a_run_without_codebooks_is_plain_splatting(run: RunFactory, recipe: Recipe, demo_scene: Path) -> None:

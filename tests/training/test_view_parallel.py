@@ -1,9 +1,14 @@
-"""Two processes with a view each are one process with two views, to the bit, from the first clone to the last code."""
+"""Two processes with a view each are one process with two views, to the bit, from the first clone to the last code.
+
+Some views are spoilt on the way: whatever one process meets, both take the same decision. And a run that is stopped in
+one of its processes continues to the bits of the run not interrupted.
+"""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,6 +20,7 @@ from typing import Any
 import pytest
 import torch
 import torch.distributed
+from checkpoints import assert_same_end, iteration_of, read
 
 from nsvq_lightning.cli import main
 from nsvq_lightning.schedule import Phase
@@ -28,6 +34,10 @@ HERE = Path(__file__).resolve().parent
 IN_QUANTIZE = 44
 """Iteration of a checkpoint between two replacements of codes."""
 
+LOSSES, GRADIENTS = (7, 33), (12, 46)
+"""Iterations in which the second view has a loss or a gradient that is not finite: in warm-up and quantize phase, where
+nothing else changes the splats."""
+
 
 @dataclass
 class Finished:
@@ -35,6 +45,7 @@ class Finished:
 
     folder: Path
     notes: Path
+    printed: str = ""
 
     def lines(self, rank: int = 0) -> list[str]:
         return (self.notes / f"{rank}.txt").read_text().splitlines()
@@ -44,9 +55,7 @@ class Finished:
         return read
 
     def checkpoint(self) -> dict[str, Any]:
-        path = self.folder / "checkpoints" / f"step-{IN_QUANTIZE}.ckpt"
-        loaded: dict[str, Any] = torch.load(path, weights_only=True)
-        return loaded
+        return read(self.folder / "checkpoints" / f"step-{IN_QUANTIZE}.ckpt")
 
 
 def arguments(scene: Path, root: Path, *more: str) -> list[str]:
@@ -63,12 +72,17 @@ def arguments(scene: Path, root: Path, *more: str) -> list[str]:
         "--callbacks.density.max_splats=1500",
         *("--callbacks.report.every=20", f"--callbacks.checkpoint.every={IN_QUANTIZE}"),
         *("--callbacks.checkpoint.keep=true", "--trainer.callbacks+=replica_witness.ReplicaWitness"),
-        *(f"--trainer.callbacks.folder={root / 'notes'}", *more),
+        f"--trainer.callbacks.folder={root / 'notes'}",
+        *("--callbacks.density.finite_every=7", "--trainer.callbacks+=replica_trouble.SpoiltViews"),
+        *(f"--trainer.callbacks.losses={list(LOSSES)}", f"--trainer.callbacks.gradients={list(GRADIENTS)}", *more),
     ]
 
 
-def run_command(arguments: list[str]) -> str:
-    """Run the command in processes of its own; what it printed."""
+TWO = ("--trainer.devices=2", "--trainer.strategy=view_parallel")
+
+
+def run_command(arguments: list[str]) -> tuple[int, str]:
+    """Run the command in a group of processes of its own; its exit status and what it printed."""
     package = HERE.parents[1]
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(HERE), str(package)]),
@@ -89,17 +103,14 @@ def run_command(arguments: list[str]) -> str:
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)  # the processes it started, too
             raise
-    assert process.returncode == 0, printed
-    return printed
+    return process.returncode, printed
 
 
 @pytest.fixture(scope="module")
 def one(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """One process, two views a step."""
     root = tmp_path_factory.mktemp("one")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(HERE)
-        assert main(arguments(demo_scene, root, "--trainer.devices=1", "--trainer.accumulate_grad_batches=2")) == 0
+    assert main(arguments(demo_scene, root, "--trainer.devices=1", "--trainer.accumulate_grad_batches=2")) == 0
     return Finished(root / demo_scene.name / "version_0", root / "notes")
 
 
@@ -107,10 +118,11 @@ def one(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
 def two(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """Two processes, a view each."""
     root = tmp_path_factory.mktemp("two")
-    printed = run_command(arguments(demo_scene, root, "--trainer.devices=2", "--trainer.strategy=view_parallel"))
+    status, printed = run_command(arguments(demo_scene, root, *TWO))
+    assert status == 0, printed
     assert printed.count("rendered from the decoded file") == 1  # the first process speaks for both
     assert printed.count("codebooks for") == 1
-    return Finished(root / demo_scene.name / "version_0", root / "notes")
+    return Finished(root / demo_scene.name / "version_0", root / "notes", printed)
 
 
 def test_replicas_stay_equal_to_the_bit(two: Finished) -> None:
@@ -153,3 +165,42 @@ def test_a_checkpoint_of_two_processes_is_that_of_one(one: Finished, two: Finish
     (adam,), (other,) = ours["optimizer_states"], theirs["optimizer_states"]
     assert adam["param_groups"] == other["param_groups"]
     torch.testing.assert_close(adam["state"], other["state"], rtol=0, atol=0)
+
+
+def test_what_one_process_meets_both_decide_alike(two: Finished) -> None:
+    for iteration in LOSSES:
+        assert two.printed.count(f"step {iteration}: the loss of ") == 1  # where it was, with the name of the view
+        before, after = (two.lines()[number].split()[-1] for number in (iteration - 1, iteration))
+        assert before == after  # no process has updated
+    assert two.printed.count("the loss of 1 of 2 processes is not finite, no update") == len(LOSSES)
+    # A gradient reaches all replicas; every seventh iteration they search, and drop the same splat.
+    dropped = re.findall(r"step (\d+): dropped 1 of (\d+) splats with non-finite values: means in 1 rows", two.printed)
+    assert sorted(int(step) for step, _ in dropped) == [14, 14, 49, 49]
+    assert len(set(dropped)) == 2
+    state = read(two.folder / "checkpoints" / "last.ckpt")["state_dict"]
+    assert all(bool(value.isfinite().all()) for value in state.values())
+
+
+@pytest.mark.parametrize(
+    ("by", "iteration", "left"),
+    [
+        ("exception", 16, 15),
+        pytest.param("SIGTERM", 41, 41, marks=pytest.mark.slow),
+        pytest.param("SIGKILL", 59, 57, marks=pytest.mark.slow),
+    ],
+)
+def test_a_run_stopped_in_one_process_continues_to_the_same_bits(
+    by: str, iteration: int, left: int, two: Finished, demo_scene: Path, tmp_path: Path
+) -> None:
+    # 15 is periodic, 57 the end of a phase. After SIGTERM all processes have stopped after the same iteration.
+    common = arguments(
+        demo_scene, tmp_path, *TWO, "--callbacks.checkpoint.every=15", "--callbacks.checkpoint.keep=false"
+    )
+    trouble = ["--trainer.callbacks+=replica_trouble.Stopped", f"--trainer.callbacks.iteration={iteration}"]
+    status, printed = run_command([*common, *trouble, f"--trainer.callbacks.by={by}"])
+    assert status == 128 + signal.SIGTERM if by == "SIGTERM" else status not in (0, 128 + signal.SIGTERM), printed
+    path = tmp_path / demo_scene.name / "version_0" / "checkpoints" / "last.ckpt"
+    assert iteration_of(path) == left
+    status, printed = run_command([*common, f"--ckpt_path={path}"])
+    assert status == 0, printed
+    assert_same_end(tmp_path / demo_scene.name / "version_1", two.folder)

@@ -1,0 +1,93 @@
+"""Read checkpoints: whole, undamaged, of this package, and without running anything that they hold."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+from zipfile import BadZipFile, ZipFile
+
+import torch
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+
+from nsvq_lightning.io.errors import FormatError
+
+__all__ = ["PlainCheckpointIO", "read_checkpoint"]
+
+WAY_OUT = "pass a checkpoint that nsvq fit has written, …/checkpoints/last.ckpt"
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """Read a checkpoint of this package onto the CPU.
+
+    Raises:
+        FileNotFoundError: No such file.
+        PermissionError: It may not be read.
+        FormatError: The file is damaged or truncated, holds more than tensors and plain data, or is no checkpoint of a
+            :class:`nsvq_lightning.SplatModule`.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such checkpoint; {WAY_OUT}")
+    if path.is_dir():
+        raise FormatError(f"{path}: a folder, not a checkpoint; {WAY_OUT}")
+    if path.stat().st_size == 0:
+        raise FormatError(f"{path}: an empty file, not a checkpoint; {WAY_OUT}")
+    try:
+        _check_sums(path)
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except (PermissionError, FormatError):
+        raise
+    except UnpicklingError as error:
+        named = re.search(r"GLOBAL (\S+)", str(error))
+        what = f"an object of {named[1]}" if named else "an object that is not plain data"
+        raise FormatError(
+            f"{path}: refused, it holds {what}, and loading that could run code; nsvq fit stores tensors and plain "
+            f"data only: {WAY_OUT}"
+        ) from error
+    except Exception as error:  # torch's readers of archives and pickles raise whatever damage leads them to
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise FormatError(f"{path}: damaged, or not a checkpoint ({reason}); {WAY_OUT}") from error
+    _check_contents(path, checkpoint)
+    return checkpoint  # type: ignore[no-any-return]  # checked
+
+
+def _check_sums(path: Path) -> None:
+    """Compare the checksums in the archive that a checkpoint is; torch itself does not look at them."""
+    try:
+        with ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except BadZipFile as error:
+        raise FormatError(f"{path}: truncated, or not a checkpoint; {WAY_OUT}") from error
+    if damaged is not None:
+        raise FormatError(f"{path}: damaged, its part {damaged} is not what was written; {WAY_OUT}")
+
+
+def _check_contents(path: Path, checkpoint: Any) -> None:
+    state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
+    if not isinstance(state, dict) or "pytorch-lightning_version" not in checkpoint:
+        raise FormatError(f"{path}: not a checkpoint of Lightning; {WAY_OUT}")
+    if not {"splats.means", "state._phase"} <= state.keys():
+        first = ", ".join(list(state)[:3]) or "nothing"
+        raise FormatError(f"{path}: a checkpoint of another model, which has {first} but no splats; {WAY_OUT}")
+
+
+class PlainCheckpointIO(TorchCheckpointIO):
+    """Lightning's reading and writing of checkpoints, with :func:`read_checkpoint` for files of this machine."""
+
+    def load_checkpoint(
+        self,
+        path: str | Path,
+        map_location: Callable[..., Any] | None = None,
+        weights_only: bool | None = None,
+    ) -> dict[str, Any]:
+        """Read a checkpoint; remote ones as Lightning does, but nothing that could run code either.
+
+        Raises:
+            FormatError: See :func:`read_checkpoint`.
+        """
+        if "://" in str(path):
+            return super().load_checkpoint(path, weights_only=True)
+        return read_checkpoint(path)

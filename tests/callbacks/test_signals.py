@@ -1,0 +1,59 @@
+"""Signals that are held back: by one process, and by one of two."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from nsvq_lightning.callbacks.signals import HeldSignals
+
+
+def trainer(world_size: int, other: tuple[float, float] = (0.0, 0.0)) -> Any:
+    """One of ``world_size`` processes; another has received so many SIGINT and SIGTERM."""
+
+    def reduce(tensor: Tensor, reduce_op: str) -> Tensor:
+        assert reduce_op == "sum"
+        return tensor.add_(torch.tensor(other))
+
+    strategy = SimpleNamespace(reduce=reduce, root_device=torch.device("cpu"))
+    return SimpleNamespace(world_size=world_size, strategy=strategy)
+
+
+@pytest.fixture
+def acted() -> Iterator[list[int]]:
+    """What the handler of SIGTERM from before has been given."""
+    numbers: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, frame: numbers.append(number))
+    yield numbers
+    signal.signal(signal.SIGTERM, before)
+
+
+@pytest.mark.parametrize(("world_size", "at_once"), [(1, 1), (2, 0)])
+def test_a_second_signal_acts_at_once_in_one_process_alone(world_size: int, at_once: int, acted: list[int]) -> None:
+    held = HeldSignals()
+    held.hold(trainer(world_size))
+    signal.raise_signal(signal.SIGTERM)
+    assert acted == []
+    signal.raise_signal(signal.SIGTERM)
+    assert len(acted) == at_once
+    held.deliver(held.received(trainer(world_size)))
+    assert acted == [signal.SIGTERM]
+    held.release()
+    signal.raise_signal(signal.SIGTERM)
+    assert len(acted) == 2
+
+
+def test_a_signal_of_another_process_is_taken_for_ones_own(acted: list[int]) -> None:
+    held = HeldSignals()
+    held.hold(trainer(2))
+    assert held.received(trainer(2)) == []
+    assert held.received(trainer(2, other=(0.0, 1.0))) == [signal.SIGTERM]
+    held.deliver([signal.SIGTERM])
+    assert acted == [signal.SIGTERM]
+    held.release()

@@ -1,0 +1,87 @@
+"""Checkpoints that cannot be used: refused by name, with the reason, and without running what they hold."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from nsvq_lightning.checkpoint_file import PlainCheckpointIO, read_checkpoint
+from nsvq_lightning.io.errors import FormatError
+
+SCENE = {"splats.means": torch.arange(300.0).view(100, 3), "state._phase": torch.tensor(0)}
+
+
+def write(path: Path, state: dict[str, Tensor] = SCENE, **more: Any) -> bytes:
+    """Write a checkpoint; returns its bytes."""
+    torch.save({"state_dict": state, "global_step": 7, "pytorch-lightning_version": "2.6.6", **more}, path)
+    return path.read_bytes()
+
+
+class Harmful:
+    """Leaves a folder behind when it is loaded."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = str(mark)
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (self.mark,)
+
+
+def test_a_whole_checkpoint_is_read(tmp_path: Path) -> None:
+    write(tmp_path / "a.ckpt")
+    for read in (read_checkpoint, PlainCheckpointIO().load_checkpoint):
+        found = read(tmp_path / "a.ckpt")
+        assert found["global_step"] == 7
+        assert torch.equal(found["state_dict"]["splats.means"], SCENE["splats.means"])
+
+
+@pytest.mark.parametrize("part", [0.0, 0.02, 0.5, 0.9, 0.999])
+def test_truncated_checkpoints_are_refused(part: float, tmp_path: Path) -> None:
+    path = tmp_path / "a.ckpt"
+    whole = write(path)
+    path.write_bytes(whole[: int(part * len(whole))])
+    with pytest.raises(FormatError, match=rf"^{path}: (an empty file|truncated), .*; pass a checkpoint that nsvq fit"):
+        read_checkpoint(path)
+
+
+def test_a_single_changed_number_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "a.ckpt"
+    whole = bytearray(write(path))
+    whole[whole.index(SCENE["splats.means"][40:60].numpy().tobytes())] ^= 1
+    path.write_bytes(whole)
+    torch.load(path, weights_only=True)  # torch does not see it
+    with pytest.raises(FormatError, match=rf"^{path}: damaged, its part \S+ is not what was written"):
+        read_checkpoint(path)
+
+
+def test_code_is_not_run(tmp_path: Path) -> None:
+    path, mark = tmp_path / "a.ckpt", tmp_path / "mark"
+    write(path, extra=Harmful(mark))
+    for read in (read_checkpoint, lambda p: PlainCheckpointIO().load_checkpoint(p, weights_only=False)):
+        with pytest.raises(FormatError, match=rf"^{path}: refused, it holds an object of posix.mkdir"):
+            read(path)
+    assert not mark.exists()
+    torch.load(path, weights_only=False)  # it would have been
+    assert mark.is_dir()
+
+
+def test_what_is_no_checkpoint_of_this_package_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.ckpt"
+    write(path, nn.Linear(2, 3).state_dict())
+    with pytest.raises(FormatError, match=rf"^{path}: a checkpoint of another model, which has weight, bias but"):
+        read_checkpoint(path)
+    torch.save({"weights": torch.ones(2)}, path)
+    with pytest.raises(FormatError, match=rf"^{path}: not a checkpoint of Lightning"):
+        read_checkpoint(path)
+    path.write_text("no archive at all")
+    with pytest.raises(FormatError, match=rf"^{path}: truncated, or not a checkpoint"):
+        read_checkpoint(path)
+    with pytest.raises(FormatError, match=rf"^{tmp_path}: a folder, not a checkpoint"):
+        read_checkpoint(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"none\.ckpt: no such checkpoint; pass a checkpoint"):
+        read_checkpoint(tmp_path / "none.ckpt")
