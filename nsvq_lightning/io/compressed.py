@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.arrays import SplatArrays, check_floats, sh_coefficients
+from nsvq_lightning.io.arrays import SplatArrays, check_floats, finite_rows, sh_coefficients
 from nsvq_lightning.io.ply import plain_ply_bytes
 
 if TYPE_CHECKING:
@@ -95,6 +95,28 @@ class CompressedScene:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def table(self, name: str) -> tuple[NDArray[np.float32], NDArray[np.integer] | None]:
+        """Distinct rows ``[K, D]`` of an attribute and the row of each splat ``[N]``; None where row i is splat i's."""
+        return (self.raw[name], None) if name in self.raw else (self.codebooks[name], self.codes[name])
+
+    def take(self, splats: NDArray[np.integer] | NDArray[np.bool_]) -> CompressedScene:
+        """The scene of some of the splats, by number or by mask ``[N]``; codebooks stay as they are."""
+        return replace(
+            self,
+            means=self.means[splats],
+            opacities=self.opacities[splats],
+            codes={name: codes[splats] for name, codes in self.codes.items()},
+            raw={name: values[splats] for name, values in self.raw.items()},
+            stored_bytes=None,
+        )
+
+    def finite(self) -> CompressedScene:
+        """The splats without NaN or infinite values, see :func:`~nsvq_lightning.io.arrays.finite_rows`."""
+        bad = {name: np.where(np.isfinite(rows).all(1), 0, np.nan) for name, rows in self.codebooks.items()}
+        flags = {name: flags.astype(np.float32)[self.codes[name]] for name, flags in bad.items()}
+        keep = finite_rows({"means": self.means, "opacities": self.opacities, **self.raw, **flags})
+        return self if keep.all() else self.take(keep)
 
     def arrays(self) -> SplatArrays:
         """The decoded scene, bit for bit the rows of the codebooks; positions stay relative to ``origin``."""

@@ -1,0 +1,110 @@
+"""The ``.splat`` file, which the first viewers on the web read: 32 bytes a splat, no spherical harmonics.
+
+=========  =====  ====================================================================
+offset     bytes  content
+=========  =====  ====================================================================
+0          12     position, 3 float32 little-endian
+12         12     axis lengths (not their logarithms), 3 float32
+24         4      red, green, blue and opacity, 255ths
+28         4      rotation wxyz: unit quaternion times 128, plus 128
+=========  =====  ====================================================================
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+
+from nsvq_lightning.io.arrays import SplatArrays
+from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.clamping import Clamped
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.errors import FormatError, naming_file
+from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
+from nsvq_lightning.io.rotation import unit
+
+__all__ = ["SPLAT_BYTES", "count_splats", "read_splat", "write_splat"]
+
+logger = logging.getLogger(__name__)
+
+_RECORD = np.dtype([("means", "<f4", 3), ("lengths", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
+SPLAT_BYTES = _RECORD.itemsize
+"""Bytes of a splat."""
+_SH_C0 = 0.5 / math.sqrt(math.pi)
+_SMALLEST, _LARGEST = float(np.log(np.finfo(np.float32).tiny)), float(np.log(np.finfo(np.float32).max))
+
+
+def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:
+    """Write a scene as ``.splat``.
+
+    View-dependent colour is lost, colours outside [0, 1] are clamped, and splats with a non-finite value are left out,
+    each with a warning.
+
+    Returns:
+        Bytes of the file.
+    """
+    scene = scene.finite()
+    if scene.sh_degree:
+        logger.warning("%s: .splat files hold no spherical harmonics; colours no longer change with the view", path)
+    clamped = Clamped()
+    records = np.empty(len(scene), _RECORD)
+    records["means"] = scene.means
+    rows = {name: scene.table(name) for name in ("scales", "quats", "sh0")}
+    scales, codes = rows["scales"]
+    lengths = np.exp(np.clip(scales.astype(np.float64), _SMALLEST, _LARGEST)).astype(np.float32)
+    records["lengths"] = lengths if codes is None else lengths[codes]
+    colors, codes = rows["sh0"]
+    records["colors"][:, :3] = clamped.nearest("sh0", 255 * (0.5 + _SH_C0 * colors), (0, 255), codes=codes)
+    records["colors"][:, 3] = np.rint(255 * opacity_of(scene.opacities))
+    quats, codes = rows["quats"]
+    units = unit(quats)
+    # Of q and -q the one whose largest component is negative: -1 is a byte, 1 is not.
+    largest = np.take_along_axis(units, np.abs(units).argmax(1)[:, None], 1)
+    turned = np.rint(128 + 128 * np.where(largest > 0, -units, units))
+    records["quats"] = turned if codes is None else turned[codes]
+    clamped.warn(path, len(scene))
+    with atomic_write(path) as file:
+        file.write(records.tobytes())
+    return records.nbytes
+
+
+def read_splat(path: str | os.PathLike[str]) -> CompressedScene:
+    """Read a ``.splat`` file.
+
+    Raises:
+        FormatError: The file does not consist of whole splats.
+    """
+    count_splats(path)
+    records = np.frombuffer(Path(path).read_bytes(), _RECORD)
+    lengths = np.maximum(records["lengths"], np.finfo(np.float32).tiny)
+    colors = records["colors"]
+    return CompressedScene.from_arrays(
+        SplatArrays(
+            means=records["means"].astype(np.float32),
+            quats=(records["quats"].astype(np.float32) - 128) / 128,
+            scales=np.log(lengths).astype(np.float32),
+            opacities=logits_of_bytes(colors[:, 3]),
+            sh0=((colors[:, None, :3] / 255 - 0.5) / _SH_C0).astype(np.float32),
+            shN=np.zeros((len(records), 0, 3), np.float32),
+        )
+    )
+
+
+def count_splats(path: str | os.PathLike[str]) -> int:
+    """Number of splats of a ``.splat`` file, which has no header.
+
+    Raises:
+        FormatError: The file does not consist of whole splats.
+    """
+    size = os.path.getsize(path)
+    with naming_file(path):
+        if size % SPLAT_BYTES:
+            raise FormatError(
+                f"truncated, or not a .splat file: {size} bytes are not a multiple of {SPLAT_BYTES}; "
+                f"the last {size % SPLAT_BYTES} bytes are no whole splat; export or copy it again"
+            )
+    return size // SPLAT_BYTES
