@@ -13,6 +13,9 @@ __all__ = ["Clamped"]
 
 logger = logging.getLogger(__name__)
 
+_ROUNDING = 1e-3
+"""Part of an integer that float32 may add to a distance of half a step."""
+
 
 class Clamped:
     """Rounds values to multiples of a step between two ends; counts the splats that lie beyond, by attribute."""
@@ -41,8 +44,8 @@ class Clamped:
             Integers ``[N, ...]``.
         """
         rounded = np.clip(np.rint(values / step) * step, *ends)
-        beyond = np.abs(rounded - values) > np.asarray(step) * 0.5 + 1e-4  # the rounding of float32
-        splats = beyond.reshape(len(values), -1).any(1)
+        missed = np.abs(rounded - values) - np.multiply(step, 0.5)
+        splats = (missed.reshape(len(values), -1) > _ROUNDING).any(1)
         integers = rounded.astype(np.int64)
         if codes is not None:
             splats, integers = splats[codes], integers[codes]

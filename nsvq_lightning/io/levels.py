@@ -16,7 +16,7 @@ _STEPS = 500
 def best_levels(
     values: NDArray[np.float32], weight: NDArray[np.integer] | None = None, count: int = 256
 ) -> NDArray[np.float32]:
-    """Levels ``[count]``, ascending, with nearly the least (weighted) mean square distance of values to the nearest one.
+    """Levels ``[count]``, ascending, to the nearest of which values have nearly the least mean square distance.
 
     Where there are no more distinct values than levels, the levels are those values. Otherwise one cell of all values
     is cut in two where that gains most, then whichever cell gains most, until there are enough; Lloyd's steps then move
@@ -27,10 +27,10 @@ def best_levels(
         weight: How often each value counts, broadcasts with ``values``; once if None.
         count: Number of levels; the last one is repeated where fewer are enough.
     """
-    numbers, inverse = np.unique(values, return_inverse=True)
+    distinct, inverse = np.unique(values, return_inverse=True)
     weights = None if weight is None else np.broadcast_to(weight, values.shape).ravel().astype(np.float64)
-    mass = np.bincount(inverse.ravel(), weights, minlength=len(numbers)).astype(np.float64)
-    numbers, mass = numbers[mass > 0].astype(np.float64), mass[mass > 0]
+    mass = np.bincount(inverse.ravel(), weights, minlength=len(distinct)).astype(np.float64)
+    numbers, mass = distinct[mass > 0].astype(np.float64), mass[mass > 0]
     if len(numbers) <= count:
         padded = np.concatenate([numbers, np.full(count - len(numbers), numbers[-1] if len(numbers) else 0.0)])
         return padded.astype(np.float32)
@@ -81,7 +81,7 @@ def _split(cells: _Cells, numbers: int, count: int) -> NDArray[np.intp]:
         for start, stop in ((first, cut), (cut, end)):
             gain, inner = cells.best_split(start, stop)
             heapq.heappush(heap, (-gain, start, inner, stop))
-    return np.array(sorted(cell[1] for cell in heap) + [numbers])
+    return np.array([*sorted(cell[1] for cell in heap), numbers])
 
 
 def _lloyd(numbers: NDArray[np.float64], cells: _Cells, ends: NDArray[np.intp]) -> NDArray[np.float64]:

@@ -31,7 +31,7 @@ def smallest_three(units: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArra
 
 
 def from_smallest_three(largest: NDArray[np.intp], others: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Unit quaternions ``[N, 4]`` of the two parts of :func:`smallest_three`; rounded parts may be a little too long."""
+    """Unit quaternions ``[N, 4]`` of the two parts of :func:`smallest_three`, the second of which may be rounded."""
     quats = np.empty((len(largest), 4))
     np.put_along_axis(quats, _others(largest), others, 1)
     rest = np.sqrt(np.maximum(0, 1 - np.square(others).sum(1)))

@@ -116,14 +116,18 @@ def _with_palette(scene: CompressedScene, palette: int, seed: int) -> Compressed
         rows, codes = _clustered(rows, codes, palette, seed)
     raw = {name: values for name, values in scene.raw.items() if name != "shN"}
     return replace(
-        scene, raw=raw, codes={**scene.codes, "shN": codes}, codebooks={**scene.codebooks, "shN": rows}, stored_bytes=None
+        scene,
+        raw=raw,
+        codes={**scene.codes, "shN": codes},
+        codebooks={**scene.codebooks, "shN": rows},
+        stored_bytes=None,
     )
 
 
 def _clustered(
     rows: NDArray[np.float32], codes: NDArray[np.integer] | None, palette: int, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Palette ``[K, D]`` of rows ``[M, D]`` and labels ``[N]`` of the splats with codes ``[N]``, each its own row if None."""
+    """Palette ``[K, D]`` of rows ``[M, D]``, and label ``[N]`` of each splat; without codes row i is splat i's."""
     import torch
 
     from nsvq_lightning.quantize.kmeans import kmeans
@@ -273,9 +277,9 @@ def _numbers(entry: Mapping[str, Any], name: str, count: range, largest: float) 
 
 def _file(meta: Mapping[str, Any], name: str, number: int = 0) -> str:
     files = _entry(meta, name).get("files")
-    if not isinstance(files, list) or len(files) <= number or not isinstance(files[number], str):
-        raise FormatError(f"damaged: {META} does not name the pictures of {name!r}")
-    return files[number]
+    if isinstance(files, list) and len(files) > number and isinstance(files[number], str):
+        return str(files[number])
+    raise FormatError(f"damaged: {META} does not name the pictures of {name!r}")
 
 
 def _look_up(meta: Mapping[str, Any], name: str, numbers: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -285,9 +289,7 @@ def _look_up(meta: Mapping[str, Any], name: str, numbers: NDArray[np.uint8]) -> 
     return levels.astype(np.float32)[numbers]
 
 
-def _unpacked_means(
-    meta: Mapping[str, Any], low: NDArray[np.uint8], high: NDArray[np.uint8]
-) -> NDArray[np.float32]:
+def _unpacked_means(meta: Mapping[str, Any], low: NDArray[np.uint8], high: NDArray[np.uint8]) -> NDArray[np.float32]:
     entry = _entry(meta, "means")
     mins, maxs = (_numbers(entry, name, range(3, 4), _FARTHEST) for name in ("mins", "maxs"))
     numbers = low[:, :3] + 256.0 * high[:, :3]

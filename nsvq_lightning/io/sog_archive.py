@@ -62,7 +62,7 @@ def _webp(texels: NDArray[np.uint8]) -> bytes:
 
     buffer = io.BytesIO()
     # Exact: else colours under alpha 0 are changed.
-    Image.fromarray(texels, "RGBA").save(buffer, "WEBP", lossless=True, exact=True, quality=100, method=4)
+    Image.fromarray(texels, "RGBA").save(buffer, "WEBP", lossless=True, exact=True, quality=75, method=3)
     return buffer.getvalue()
 
 

@@ -27,13 +27,13 @@ from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
 from nsvq_lightning.io.rotation import unit
 
-__all__ = ["SPLAT_BYTES", "count_splats", "read_splat", "write_splat"]
+__all__ = ["SPLAT_LAYOUT", "count_splats", "read_splat", "write_splat"]
 
 logger = logging.getLogger(__name__)
 
 _RECORD = np.dtype([("means", "<f4", 3), ("lengths", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
-SPLAT_BYTES = _RECORD.itemsize
-"""Bytes of a splat."""
+SPLAT_LAYOUT = {name: _RECORD[name].itemsize for name in _RECORD.names or ()}
+"""Bytes of each part of a splat."""
 _SH_C0 = 0.5 / math.sqrt(math.pi)
 _SMALLEST, _LARGEST = float(np.log(np.finfo(np.float32).tiny)), float(np.log(np.finfo(np.float32).max))
 
@@ -85,7 +85,7 @@ def read_splat(path: str | os.PathLike[str]) -> CompressedScene:
     return CompressedScene.from_arrays(
         SplatArrays(
             means=records["means"].astype(np.float32),
-            quats=(records["quats"].astype(np.float32) - 128) / 128,
+            quats=((records["quats"].astype(np.float32) - 128) / 128).astype(np.float32),
             scales=np.log(lengths).astype(np.float32),
             opacities=logits_of_bytes(colors[:, 3]),
             sh0=((colors[:, None, :3] / 255 - 0.5) / _SH_C0).astype(np.float32),
@@ -102,9 +102,9 @@ def count_splats(path: str | os.PathLike[str]) -> int:
     """
     size = os.path.getsize(path)
     with naming_file(path):
-        if size % SPLAT_BYTES:
+        if size % _RECORD.itemsize:
             raise FormatError(
-                f"truncated, or not a .splat file: {size} bytes are not a multiple of {SPLAT_BYTES}; "
-                f"the last {size % SPLAT_BYTES} bytes are no whole splat; export or copy it again"
+                f"truncated, or not a .splat file: of {size} bytes the last {size % _RECORD.itemsize} are no "
+                f"whole splat of {_RECORD.itemsize}; copy or export it again"
             )
-    return size // SPLAT_BYTES
+    return size // _RECORD.itemsize

@@ -58,6 +58,10 @@ _POSITION_ERROR = 0.05
 _COLOR = 0.15
 _SH_STEPS = (8, 16)
 """Steps, in 128ths, of coefficients of degree 1 and of higher ones, as Niantic's writer has them."""
+_FINE_SH_STEPS = (1, 1)
+"""Steps with a codebook: gzip sees each row many times, so that they cost a tenth of the bytes at most."""
+_ORDER = ("quats", "scales", "sh0", "shN")
+"""Attributes whose codes order the splats, the most important last."""
 _FLIPPED_AXES = np.array([1.0, -1.0, -1.0])
 _FLIPPED_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)[:, None]
 """Signs of the real spherical harmonics of degree 1 to 3 when y and z change theirs, ``[15, 1]``."""
@@ -95,17 +99,18 @@ class SpzHeader:
 def write_spz(path: str | os.PathLike[str], scene: CompressedScene) -> int:
     """Write a scene as ``.spz``, version 3.
 
-    Positions get as many bits after the point as the smallest splats need. Splats are ordered by their SH code, if they
-    have one, because gzip finds equal rows only where they are near, and by place. Splats with a non-finite value are
-    left out and values out of the format's range are clamped, each with a warning.
+    Positions get as many bits after the point as the smallest splats need. Splats are in the order of their codes,
+    those of the spherical harmonics first, because gzip finds equal rows only where they are near, and then of their
+    place. Splats with a non-finite value are left out and values out of the format's range are clamped, each with a
+    warning.
 
     Returns:
         Bytes of the file.
     """
     scene = scene.finite()
-    order = spatial_order(scene.means)
-    codes = scene.codes.get("shN")
-    scene = scene.take(order if codes is None else order[codes[order].argsort(kind="stable")])
+    scene = scene.take(spatial_order(scene.means))
+    codes = [scene.codes[name] for name in _ORDER if name in scene.codes]
+    scene = scene.take(np.lexsort([np.arange(len(scene)), *codes]))
     clamped = Clamped()
     fraction = _fraction_bits(scene)
     header = _HEADER.pack(_MAGIC, 3, len(scene), scene.sh_degree, fraction, 0, 0)
@@ -168,7 +173,8 @@ def _packed_sh(scene: CompressedScene, clamped: Clamped) -> NDArray[np.uint8]:
     rows, codes = scene.table("shN")
     coefficients = sh_coefficients(scene.sh_degree)
     flipped = 128 * _FLIPPED_SH[:coefficients] * rows.reshape(len(rows), coefficients, 3)
-    steps = np.array([_SH_STEPS[0]] * 3 + [_SH_STEPS[1]] * 12)[:coefficients, None]
+    first, higher = _SH_STEPS if codes is None else _FINE_SH_STEPS
+    steps = np.array([first] * 3 + [higher] * 12)[:coefficients, None]
     return (clamped.nearest("shN", flipped, (-128, 127), steps, codes) + 128).astype(np.uint8)
 
 
@@ -216,7 +222,9 @@ def _unzip(data: bytes) -> tuple[SpzHeader, bytes]:
 
 def _start(gunzip: zlib._Decompress, data: bytes) -> bytes:
     if data.startswith(_MAGIC):
-        raise FormatError("version 4 or later of the format; this release reads 1 to 3: save it as version 3 or as .ply")
+        raise FormatError(
+            "version 4 or later of the format; this release reads 1 to 3: save it as version 3 or as .ply"
+        )
     return _inflate(gunzip, data, _HEADER.size)
 
 
@@ -225,7 +233,9 @@ def _inflate(gunzip: zlib._Decompress, data: bytes, most: int) -> bytes:
     try:
         return gunzip.decompress(data, most) if most else b""
     except zlib.error as error:
-        raise FormatError(f"damaged, or not a .spz file: no valid gzip stream ({error}); copy or export it again") from None
+        raise FormatError(
+            f"damaged, or not a .spz file: no valid gzip stream ({error}); copy or export it again"
+        ) from None
 
 
 def _parse(start: bytes, file_bytes: int) -> SpzHeader:
@@ -233,14 +243,18 @@ def _parse(start: bytes, file_bytes: int) -> SpzHeader:
         raise FormatError("not a .spz file: the gzip stream does not start with a header 'NGSP'")
     _, version, count, sh_degree, fraction_bits, _, _ = _HEADER.unpack(start)
     if not 1 <= version <= 3:
-        raise FormatError(f"version {version} of the format; this release reads 1 to 3: save it as version 3 or as .ply")
+        raise FormatError(
+            f"version {version} of the format; this release reads 1 to 3: save it as version 3 or as .ply"
+        )
     if sh_degree > 3:
         raise FormatError(f"damaged, or of a degree that this release does not read: SH degree {sh_degree}, not 0 to 3")
     if fraction_bits > _MOST_FRACTION:
         raise FormatError(f"damaged: {fraction_bits} bits after the point, more than {_MOST_FRACTION}")
     header = SpzHeader(version, count, sh_degree, fraction_bits)
     if header.stream_bytes > _MOST_A_BYTE * file_bytes:
-        raise FormatError(f"truncated or damaged: {count} splats cannot be in {file_bytes} bytes; copy or export it again")
+        raise FormatError(
+            f"truncated or damaged: {count} splats cannot be in {file_bytes} bytes; copy or export it again"
+        )
     return header
 
 
@@ -250,10 +264,10 @@ def _unpacked(header: SpzHeader, arrays: dict[str, NDArray[np.uint8]]) -> SplatA
     return SplatArrays(
         means=(_unpacked_means(header, arrays["means"]) * _FLIPPED_AXES).astype(np.float32),
         quats=_unpacked_quats(header, arrays["quats"]),
-        scales=arrays["scales"].astype(np.float32) / 16 - 10,
+        scales=(arrays["scales"] / 16 - 10).astype(np.float32),
         opacities=logits_of_bytes(arrays["opacities"][:, 0]),
-        sh0=((arrays["sh0"][:, None].astype(np.float32) / 255 - 0.5) / _COLOR).astype(np.float32),
-        shN=sh * _FLIPPED_SH[:coefficients],
+        sh0=((arrays["sh0"][:, None] / 255 - 0.5) / _COLOR).astype(np.float32),
+        shN=(sh * _FLIPPED_SH[:coefficients]).astype(np.float32),
     )
 
 
