@@ -229,13 +229,13 @@ def test_values_out_of_range_are_clamped_and_counted(
     assert ("moved to its end" in caplog.text) == bool(expected)
     if suffix == ".spz":
         assert read.scales.min() == -10
-        assert read.shN.min() == -1
+        assert read.shN.min() == -127 / 128  # the sign of this coefficient changes with the axes
     if suffix == ".sog":
         np.testing.assert_allclose(read.sh0, written.sh0, atol=0.05)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_spz_and_others_drop_what_is_not_finite(tmp_path: Path, suffix: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_is_not_finite_is_left_out(tmp_path: Path, suffix: str, caplog: pytest.LogCaptureFixture) -> None:
     scene = coded_scene(30, 1)
     scene.codebooks["scales"][int(scene.codes["scales"][4]), 1] = np.nan
     scene.means[5, 0] = np.inf
