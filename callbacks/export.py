@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 
 class ExportScene(Callback):
-    """Writes ``scene.nsvq`` (the compressed scene) and ``scene.ply`` (its decoded splats, for any viewer).
+    """Writes ``scene.nsvq`` (the compressed scene) and ``scene.ply`` (its decoded splats, for any viewer), or others.
 
     Args:
         formats: Suffixes without the dot; ``sog``, ``spz`` and ``splat`` are smaller files for viewers.

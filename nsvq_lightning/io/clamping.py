@@ -28,29 +28,35 @@ class Clamped:
         name: str,
         values: NDArray[np.floating[Any]],
         ends: tuple[int, int],
-        step: int | NDArray[np.int64] = 1,
-        codes: NDArray[np.integer] | None = None,
-    ) -> NDArray[np.int64]:
+        step: int | NDArray[np.float32] = 1,
+        uses: NDArray[np.integer] | None = None,
+    ) -> NDArray[np.int32]:
         """The nearest integers that the format has.
 
         Args:
             name: Attribute, for the message.
-            values: Numbers ``[K, ...]`` in units of the format, finite.
+            values: Numbers ``[K, ...]`` in units of the format.
             ends: Smallest and largest integer of the format.
             step: Only multiples of it are used, and the ends; broadcasts with ``values``.
-            codes: Row of ``values`` of each splat ``[N]``; None if row i is that of splat i.
+            uses: How many splats have each row ``[K]``; one each if None. Rows that no splat uses may hold anything.
 
         Returns:
-            Integers ``[N, ...]``.
+            Integers ``[K, ...]``.
         """
         rounded = np.clip(np.rint(values / step) * step, *ends)
-        missed = np.abs(rounded - values) - np.multiply(step, 0.5)
-        splats = (missed.reshape(len(values), -1) > _ROUNDING).any(1)
-        integers = rounded.astype(np.int64)
-        if codes is not None:
-            splats, integers = splats[codes], integers[codes]
-        self._counts[name] = self._counts.get(name, 0) + int(splats.sum())
-        return integers
+        self._count(name, np.abs(rounded - values) - np.multiply(step, 0.5) > _ROUNDING, uses)
+        return np.nan_to_num(rounded).astype(np.int32)
+
+    def within(
+        self, name: str, values: NDArray[np.float32], low: float, high: float, uses: NDArray[np.integer] | None = None
+    ) -> NDArray[np.float32]:
+        """Numbers ``[K, ...]`` within two ends; arguments as of :meth:`nearest`."""
+        self._count(name, (values < low) | (values > high), uses)
+        return np.clip(values, low, high)
+
+    def _count(self, name: str, beyond: NDArray[np.bool_], uses: NDArray[np.integer] | None) -> None:
+        rows = np.asarray(beyond).any(tuple(range(1, np.ndim(beyond))))
+        self._counts[name] = self._counts.get(name, 0) + int(rows.sum() if uses is None else uses[rows].sum())
 
     def warn(self, path: str | os.PathLike[str], count: int) -> None:
         """Say how many of ``count`` splats were changed because the format does not reach so far."""

@@ -47,7 +47,7 @@ def load(path: str | os.PathLike[str]) -> Splats:
     """Load a scene of any supported format.
 
     Args:
-        path: File; its suffix (``.ply``, ``.nsvq``, in any case) names the format, see :data:`FORMATS`.
+        path: File; its suffix, in any case, names the format, see :data:`FORMATS`.
 
     Raises:
         ValueError: Unknown suffix.

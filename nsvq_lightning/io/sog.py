@@ -82,7 +82,7 @@ def write_sog(
     texels = {
         "means_l.webp": low,
         "means_u.webp": high,
-        "quats.webp": _packed_quats(scene),
+        "quats.webp": scene.spread("quats", lambda rows, _: _packed_quats(rows)),
         "scales.webp": scales,
         "sh0.webp": np.concatenate([colors, opacities[:, None]], axis=1),
     }
@@ -158,26 +158,28 @@ def _packed_means(
     )
 
 
-def _packed_quats(scene: CompressedScene) -> NDArray[np.uint8]:
-    rows, codes = scene.table("quats")
+def _packed_quats(rows: NDArray[np.float32]) -> NDArray[np.uint8]:
     largest, others = smallest_three(unit(rows))
     texels = np.empty((len(rows), 4), np.uint8)
     texels[:, :3] = np.rint(127.5 * (1 + math.sqrt(2) * others).clip(0, 2))
     texels[:, 3] = 252 + largest
-    return texels if codes is None else texels[codes]
+    return texels
 
 
 def _leveled(scene: CompressedScene, name: str) -> tuple[NDArray[np.uint8], list[float]]:
     """Numbers of levels ``[N, D]`` of an attribute, and the levels."""
-    rows, codes = scene.table(name)
-    levels = best_levels(rows, None if codes is None else np.bincount(codes, minlength=len(rows))[:, None], _LEVELS)
-    numbers = nearest_level(rows, levels)
-    return numbers if codes is None else numbers[codes], _decimals(levels)
+    levels = _levels(scene, name)
+    return scene.spread(name, lambda rows, _: nearest_level(rows, levels)), _decimals(levels)
+
+
+def _levels(scene: CompressedScene, name: str) -> NDArray[np.float32]:
+    rows, uses = scene.table(name)[0], scene.uses(name)
+    return best_levels(rows, None if uses is None else uses[:, None], _LEVELS)
 
 
 def _packed_sh(scene: CompressedScene) -> tuple[dict[str, Any], dict[str, NDArray[np.uint8]]]:
     rows, labels = scene.codebooks["shN"], scene.codes["shN"]
-    levels = best_levels(rows, np.bincount(labels, minlength=len(rows))[:, None], _LEVELS)
+    levels = _levels(scene, "shN")
     coefficients = sh_coefficients(scene.sh_degree)
     centroids = nearest_level(rows, levels).reshape(-1, 3)
     lines = math.ceil(len(rows) / _ROWS_A_LINE)

@@ -18,6 +18,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nsvq_lightning.io.arrays import SplatArrays
 from nsvq_lightning.io.atomic import atomic_write
@@ -35,7 +36,8 @@ _RECORD = np.dtype([("means", "<f4", 3), ("lengths", "<f4", 3), ("colors", "u1",
 SPLAT_LAYOUT = {name: _RECORD[name].itemsize for name in _RECORD.names or ()}
 """Bytes of each part of a splat."""
 _SH_C0 = 0.5 / math.sqrt(math.pi)
-_SMALLEST, _LARGEST = float(np.log(np.finfo(np.float32).tiny)), float(np.log(np.finfo(np.float32).max))
+_SMALLEST, _LARGEST = -87.0, 88.0
+"""Logarithms of lengths between which float32 has all its digits."""
 
 
 def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:
@@ -53,23 +55,27 @@ def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:
     clamped = Clamped()
     records = np.empty(len(scene), _RECORD)
     records["means"] = scene.means
-    rows = {name: scene.table(name) for name in ("scales", "quats", "sh0")}
-    scales, codes = rows["scales"]
-    lengths = np.exp(np.clip(scales.astype(np.float64), _SMALLEST, _LARGEST)).astype(np.float32)
-    records["lengths"] = lengths if codes is None else lengths[codes]
-    colors, codes = rows["sh0"]
-    records["colors"][:, :3] = clamped.nearest("sh0", 255 * (0.5 + _SH_C0 * colors), (0, 255), codes=codes)
+    records["lengths"] = scene.spread("scales", lambda rows, uses: _lengths(rows, uses, clamped))
+    records["colors"][:, :3] = scene.spread(
+        "sh0", lambda rows, uses: clamped.nearest("sh0", 255 * (0.5 + _SH_C0 * rows), (0, 255), uses=uses)
+    )
     records["colors"][:, 3] = np.rint(255 * opacity_of(scene.opacities))
-    quats, codes = rows["quats"]
-    units = unit(quats)
-    # Of q and -q the one whose largest component is negative: -1 is a byte, 1 is not.
-    largest = np.take_along_axis(units, np.abs(units).argmax(1)[:, None], 1)
-    turned = np.rint(128 + 128 * np.where(largest > 0, -units, units))
-    records["quats"] = turned if codes is None else turned[codes]
+    records["quats"] = scene.spread("quats", lambda rows, _: _packed_quats(rows))
     clamped.warn(path, len(scene))
     with atomic_write(path) as file:
         file.write(records.tobytes())
     return records.nbytes
+
+
+def _lengths(scales: NDArray[np.float32], uses: NDArray[np.int64] | None, clamped: Clamped) -> NDArray[np.float32]:
+    return np.exp(clamped.within("scales", scales, _SMALLEST, _LARGEST, uses))
+
+
+def _packed_quats(quats: NDArray[np.float32]) -> NDArray[np.uint8]:
+    units = unit(quats)
+    # Of q and -q the one whose largest component is negative: -1 is a byte, 1 is not.
+    largest = np.take_along_axis(units, np.abs(units).argmax(1)[:, None], 1)
+    return np.rint(128 + 128 * np.where(largest > 0, -units, units)).astype(np.uint8)
 
 
 def read_splat(path: str | os.PathLike[str]) -> CompressedScene:

@@ -60,6 +60,8 @@ _SH_STEPS = (8, 16)
 """Steps, in 128ths, of coefficients of degree 1 and of higher ones, as Niantic's writer has them."""
 _FINE_SH_STEPS = (1, 1)
 """Steps with a codebook: gzip sees each row many times, so that they cost a tenth of the bytes at most."""
+_BLOCK = 1 << 16
+"""Rows of spherical harmonics rounded at a time."""
 _ORDER = ("quats", "scales", "sh0", "shN")
 """Attributes whose codes order the splats, the most important last."""
 _FLIPPED_AXES = np.array([1.0, -1.0, -1.0])
@@ -119,8 +121,8 @@ def write_spz(path: str | os.PathLike[str], scene: CompressedScene) -> int:
         np.rint(255 * opacity_of(scene.opacities)).astype(np.uint8),
         _packed(scene, "sh0", _COLOR * 255, 127.5, clamped),
         _packed(scene, "scales", 16, 160, clamped),
-        _packed_quats(scene),
-        _packed_sh(scene, clamped),
+        scene.spread("quats", lambda rows, _: _packed_quats(rows)),
+        scene.spread("shN", lambda rows, uses: _packed_sh(rows, uses, scene.sh_degree, clamped)),
     )
     clamped.warn(path, len(scene))
     with atomic_write(path) as file:
@@ -139,8 +141,7 @@ def _fraction_bits(scene: CompressedScene) -> int:
     """
     if len(scene) == 0:
         return _USUAL_FRACTION
-    scales, codes = scene.table("scales")
-    sizes = scales.mean(1) if codes is None else scales.mean(1)[codes]
+    sizes = scene.spread("scales", lambda rows, _: rows.mean(1))
     needed = math.ceil(-(math.log2(2 * _POSITION_ERROR) + float(np.quantile(sizes, 0.001)) / math.log(2)))
     farthest, far = np.abs(scene.means).max(), np.quantile(np.abs(scene.means).max(1), 0.999)
     fits, mostly_fits = (_POSITION - 1 - math.frexp(float(reach))[1] for reach in (farthest, far))
@@ -154,28 +155,33 @@ def _packed_means(scene: CompressedScene, fraction: int, clamped: Clamped) -> ND
 
 
 def _packed(scene: CompressedScene, name: str, factor: float, zero: float, clamped: Clamped) -> NDArray[np.uint8]:
-    rows, codes = scene.table(name)
-    return clamped.nearest(name, factor * rows + zero, (0, 255), codes=codes).astype(np.uint8)
+    return scene.spread(
+        name, lambda rows, uses: clamped.nearest(name, factor * rows + zero, (0, 255), uses=uses).astype(np.uint8)
+    )
 
 
-def _packed_quats(scene: CompressedScene) -> NDArray[np.uint32]:
-    rows, codes = scene.table("quats")
+def _packed_quats(rows: NDArray[np.float32]) -> NDArray[np.uint32]:
     largest, others = smallest_three((unit(rows) * [1, *_FLIPPED_AXES])[:, [1, 2, 3, 0]])
     packed = largest.astype(np.uint32)
     for part in others.T:
-        magnitude = np.rint(511 * math.sqrt(2) * np.abs(part)).astype(np.uint32)
-        packed = (packed << np.uint32(10)) | ((part < 0).astype(np.uint32) << np.uint32(9)) | np.minimum(magnitude, 511)
-    packed = packed.astype("<u4")
-    return packed if codes is None else packed[codes]
+        magnitude = np.minimum(np.rint(511 * math.sqrt(2) * np.abs(part)), 511).astype(np.uint32)
+        packed = (packed << np.uint32(10)) | ((part < 0).astype(np.uint32) << np.uint32(9)) | magnitude
+    return packed.astype("<u4")
 
 
-def _packed_sh(scene: CompressedScene, clamped: Clamped) -> NDArray[np.uint8]:
-    rows, codes = scene.table("shN")
-    coefficients = sh_coefficients(scene.sh_degree)
-    flipped = 128 * _FLIPPED_SH[:coefficients] * rows.reshape(len(rows), coefficients, 3)
-    first, higher = _SH_STEPS if codes is None else _FINE_SH_STEPS
-    steps = np.array([first] * 3 + [higher] * 12)[:coefficients, None]
-    return (clamped.nearest("shN", flipped, (-128, 127), steps, codes) + 128).astype(np.uint8)
+def _packed_sh(
+    rows: NDArray[np.float32], uses: NDArray[np.int64] | None, sh_degree: int, clamped: Clamped
+) -> NDArray[np.uint8]:
+    coefficients = sh_coefficients(sh_degree)
+    first, higher = _SH_STEPS if uses is None else _FINE_SH_STEPS
+    steps = np.array([first] * 3 + [higher] * 12, np.float32)[:coefficients, None]
+    values = rows.reshape(len(rows), coefficients, 3)
+    packed = np.empty(values.shape, np.uint8)
+    for start in range(0, len(rows), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        flipped = 128 * _FLIPPED_SH[:coefficients] * values[block]
+        packed[block] = clamped.nearest("shN", flipped, (-128, 127), steps, None if uses is None else uses[block]) + 128
+    return packed
 
 
 def read_spz(path: str | os.PathLike[str]) -> CompressedScene:

@@ -322,7 +322,7 @@ def _with_meta(data: dict[str, object], path: Path, **changes: object) -> None:
         ({"count": 10**9}, "cannot be in"),
         ({"means": {"mins": [0, 0, 0], "maxs": [1e9, 0, 0], "files": ["means_l.webp", "means_u.webp"]}}, "'maxs'"),
         ({"means": {"mins": [0, 0, 0], "maxs": [1, 0, 0], "files": ["means_l.webp"]}}, "pictures of 'means'"),
-        ({"quats": {"files": ["scales.webp"]}}, "mark"),
+        ({"quats": {"files": ["sh0.webp"]}}, "mark"),
         ({"quats": {"files": ["../quats.webp"]}}, "no ../quats.webp"),
         ({"scales": {"codebook": [0.5], "files": ["scales.webp"]}}, "level .* of scales, there are 1"),
         ({"scales": {"codebook": [1e300] * 256, "files": ["scales.webp"]}}, "'codebook'"),
