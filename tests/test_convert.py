@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from nsvq_lightning.cli import OWN_COMMANDS
+from nsvq_lightning.compress import export_scene
 from nsvq_lightning.convert_command import main
 from nsvq_lightning.io import FORMATS, read_scene, save
+from nsvq_lightning.io.precision import Storage
 
 sys.path.insert(0, str(Path(__file__).parent / "io"))
 from viewer_scenes import coded_scene, nearest_in
@@ -35,6 +37,17 @@ def test_codebooks_survive_where_the_format_has_them(tmp_path: Path) -> None:
     assert main([str(tmp_path / "c.sog"), str(tmp_path / "d.nsvq"), "--level", "paper"]) == 0
     codebook = read_scene(tmp_path / "d.nsvq").codebooks["shN"]
     np.testing.assert_array_equal(codebook, read_scene(tmp_path / "c.sog").codebooks["shN"])
+
+
+def test_a_run_exports_its_codes_as_labels(tmp_path: Path) -> None:
+    scene = coded_scene(50, 1)
+    paths = export_scene(scene, tmp_path, Storage("paper"), ("nsvq", "sog", "spz"))
+    assert [path.name for path in paths.values()] == ["scene.nsvq", "scene.sog", "scene.spz"]
+    sog, plain = read_scene(paths["sog"]), read_scene(paths["nsvq"])
+    order = nearest_in(sog.arrays(), plain.arrays())
+    np.testing.assert_array_equal(np.unique(scene.codes["shN"])[sog.codes["shN"]], plain.codes["shN"][order])
+    with pytest.raises(ValueError, match=r"unknown export format 'obj'; choose from ply, nsvq, sog, spz, splat"):
+        export_scene(scene, tmp_path, Storage(), ("obj",))
 
 
 def test_measuring_says_how_the_pictures_differ(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -45,7 +45,8 @@ class Clamped:
         """
         rounded = np.clip(np.rint(values / step) * step, *ends)
         self._count(name, np.abs(rounded - values) - np.multiply(step, 0.5) > _ROUNDING, uses)
-        return np.nan_to_num(rounded).astype(np.int32)
+        integers: NDArray[np.int32] = np.nan_to_num(rounded).astype(np.int32)
+        return integers
 
     def within(
         self, name: str, values: NDArray[np.float32], low: float, high: float, uses: NDArray[np.integer] | None = None

@@ -118,7 +118,7 @@ class SogArchive:
         """
         if texels > self._texels:
             raise FormatError(
-                f"truncated or damaged: {texels} splats cannot be in {self._texels // _MOST_A_BYTE} bytes; "
+                f"truncated or damaged: {texels} splats or texels cannot be in {self._texels // _MOST_A_BYTE} bytes; "
                 "copy or export it again"
             )
 

@@ -75,7 +75,8 @@ def _packed_quats(quats: NDArray[np.float32]) -> NDArray[np.uint8]:
     units = unit(quats)
     # Of q and -q the one whose largest component is negative: -1 is a byte, 1 is not.
     largest = np.take_along_axis(units, np.abs(units).argmax(1)[:, None], 1)
-    return np.rint(128 + 128 * np.where(largest > 0, -units, units)).astype(np.uint8)
+    packed: NDArray[np.uint8] = np.rint(128 + 128 * np.where(largest > 0, -units, units)).astype(np.uint8)
+    return packed
 
 
 def read_splat(path: str | os.PathLike[str]) -> CompressedScene:
