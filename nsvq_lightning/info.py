@@ -48,6 +48,7 @@ def _fail(message: str) -> int:
 
 def _text(facts: dict[str, Any]) -> str:
     size = facts["bytes"]
+    whole = max(1, size)
     rows = [
         ("file", facts["file"]),
         ("format", facts["format"]),
@@ -62,7 +63,7 @@ def _text(facts: dict[str, Any]) -> str:
     if "attributes" in facts:
         entries = ((a["name"], a["storage"], a["dim"], a["codes"], a["bits"]) for a in facts["attributes"])
         parts.append(_table(("attribute", "storage", "D", "K", "bits"), entries))
-    shares = ((s["name"], s["encoding"], s["bytes"], f"{100 * s['bytes'] / size:.1f} %") for s in facts["streams"])
+    shares = ((s["name"], s["encoding"], s["bytes"], f"{100 * s['bytes'] / whole:.1f} %") for s in facts["streams"])
     parts.append(_table(("stream", "encoding", "bytes", "share"), shares))
     parts += [f"{key}\n{_indented(facts[key])}" for key in ("metrics", "config") if facts.get(key)]
     return "\n\n".join(parts)

@@ -40,7 +40,7 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
             raise FormatError(f"{path}: not a {', '.join(FORMATS)} file")
         facts = _describe_splat(path)
     facts["plain_bytes"] = plain_ply_bytes(facts["splats"], facts["sh_degree"])
-    facts["ratio"] = facts["plain_bytes"] / facts["bytes"]
+    facts["ratio"] = facts["plain_bytes"] / max(1, facts["bytes"])  # an empty .splat has no byte
     return {"file": str(path), **facts}
 
 

@@ -61,9 +61,9 @@ class _Cells:
         return np.where(mass > 0, np.diff(self._sum[ends]) / np.where(mass > 0, mass, 1) + self._middle, empty)
 
     def best_split(self, first: int, end: int) -> tuple[float, int]:
-        """Where to cut a cell in two so that the sum of squares falls most, and by how much."""
+        """By how much the sum of squares falls most if a cell is cut in two, and where; -1 for a cell of one value."""
         if end - first < 2:
-            return 0.0, first
+            return -1.0, first
         cuts = slice(first + 1, end)
         left, right = self._mass[cuts] - self._mass[first], self._mass[end] - self._mass[cuts]
         left_sum, right_sum = self._sum[cuts] - self._sum[first], self._sum[end] - self._sum[cuts]

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 
+from nsvq_lightning.info import main as info
 from nsvq_lightning.io import CompressedScene, FormatError, SplatArrays, load, read_scene, save
 from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.sog import write_sog
@@ -212,6 +213,16 @@ def test_spz_positions_suit_the_size_of_the_scene(tmp_path: Path, extent: float,
     assert read_spz_header(tmp_path / "x.spz").fraction_bits == bits
 
 
+def test_a_far_splat_does_not_make_spz_coarse(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    scene = plain_scene(2000, 0)
+    scene.means[7] = [1e5, 0, 0]
+    with caplog.at_level(logging.WARNING):
+        back = read_scene_of(scene, tmp_path / "x.spz").arrays()
+    assert "means 1 (of 2000" in caplog.text
+    assert read_spz_header(tmp_path / "x.spz").fraction_bits == 12
+    assert back.means.max() == pytest.approx(2048, abs=0.01)
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_values_out_of_range_are_clamped_and_counted(
     tmp_path: Path, suffix: str, caplog: pytest.LogCaptureFixture
@@ -262,6 +273,7 @@ def test_bytes_depend_on_the_scene_alone(tmp_path: Path, suffix: str) -> None:
 def test_empty_and_single_splats(tmp_path: Path, suffix: str, count: int) -> None:
     save(plain_scene(count, 2).decode(), tmp_path / f"x{suffix}")
     assert len(load(tmp_path / f"x{suffix}")) == count
+    assert info([str(tmp_path / f"x{suffix}")]) == 0
     zero = replace(plain_scene(1), raw={**plain_scene(1).raw, "quats": np.zeros((1, 4), np.float32)})
     back = read_scene_of(zero, tmp_path / f"x{suffix}").arrays()
     assert angles(back.quats, np.array([[1, 0, 0, 0]], np.float32)).max() < 0.01
