@@ -14,11 +14,11 @@ __all__ = ["Clamped"]
 logger = logging.getLogger(__name__)
 
 _ROUNDING = 1e-3
-"""Part of an integer that float32 may add to a distance of half a step."""
+"""What float32 may add to a distance of one half."""
 
 
 class Clamped:
-    """Rounds values to multiples of a step between two ends; counts the splats that lie beyond, by attribute."""
+    """Rounds values to what lies between two ends; counts the splats that lie beyond, by attribute."""
 
     def __init__(self) -> None:
         self._counts: dict[str, int] = {}
@@ -28,7 +28,6 @@ class Clamped:
         name: str,
         values: NDArray[np.floating[Any]],
         ends: tuple[int, int],
-        step: int | NDArray[np.float32] = 1,
         uses: NDArray[np.integer] | None = None,
     ) -> NDArray[np.int32]:
         """The nearest integers that the format has.
@@ -37,14 +36,13 @@ class Clamped:
             name: Attribute, for the message.
             values: Numbers ``[K, ...]`` in units of the format.
             ends: Smallest and largest integer of the format.
-            step: Only multiples of it are used, and the ends; broadcasts with ``values``.
             uses: How many splats have each row ``[K]``; one each if None. Rows that no splat uses may hold anything.
 
         Returns:
             Integers ``[K, ...]``.
         """
-        rounded = np.clip(np.rint(values / step) * step, *ends)
-        self._count(name, np.abs(rounded - values) - np.multiply(step, 0.5) > _ROUNDING, uses)
+        rounded = np.clip(np.rint(values), *ends)
+        self._count(name, np.abs(rounded - values) > 0.5 + _ROUNDING, uses)
         integers: NDArray[np.int32] = np.nan_to_num(rounded).astype(np.int32)
         return integers
 
