@@ -23,6 +23,7 @@ __all__ = ["DEFAULT_EXPORT", "EXPORT_FORMATS", "compress", "export_scene", "form
 EXPORT_FORMATS = tuple(suffix.removeprefix(".") for suffix, entry in FORMATS.items() if entry.write is not None)
 """Formats that :func:`export_scene` writes: the compressed scene, and its decoded splats for viewers."""
 DEFAULT_EXPORT = ("nsvq", "ply")
+"""Those that a run writes unless told otherwise."""
 
 
 @torch.no_grad()

@@ -68,7 +68,7 @@ def read_scene(path: str | os.PathLike[str]) -> CompressedScene:
     reader = _format_of(path, "read").read
     if reader is None:
         raise ValueError(f"cannot load {path}: {path.suffix} files are only written")
-    return reader(path)
+    return replace(reader(path), stored_bytes=path.stat().st_size)
 
 
 def save(splats: SplatTensors | CompressedScene, path: str | os.PathLike[str], **options: Any) -> int:

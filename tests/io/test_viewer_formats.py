@@ -102,6 +102,7 @@ def test_sog_takes_the_codebook_as_its_palette_and_the_codes_as_labels(tmp_path:
     scene = coded_scene(200, 3, rows=80)
     save(scene, tmp_path / "x.sog")
     back = read_scene(tmp_path / "x.sog")
+    assert back.file_bytes == (tmp_path / "x.sog").stat().st_size
     used = np.unique(scene.codes["shN"])
     order = nearest_in(back.arrays(), scene.arrays())
     np.testing.assert_array_equal(used[back.codes["shN"]], scene.codes["shN"][order])
