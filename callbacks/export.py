@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from nsvq_lightning.compress import EXPORT_FORMATS, export_scene
+from nsvq_lightning.compress import DEFAULT_EXPORT, EXPORT_FORMATS, export_scene
 from nsvq_lightning.host import as_host, is_trial, output_folder
 
 __all__ = ["ExportScene"]
@@ -17,17 +17,17 @@ log = logging.getLogger(__name__)
 
 
 class ExportScene(Callback):
-    """Writes ``scene.nsvq`` (the compressed scene) and ``scene.ply`` (its decoded splats, for any viewer).
+    """Writes ``scene.nsvq`` (the compressed scene) and ``scene.ply`` (its decoded splats, for any viewer), or others.
 
     Args:
-        formats: Which of the two.
+        formats: Suffixes without the dot; ``sog``, ``spz`` and ``splat`` are smaller files for viewers.
         folder: Where; None is the trainer's log folder.
 
     Raises:
         ValueError: An unknown format.
     """
 
-    def __init__(self, formats: Sequence[str] = EXPORT_FORMATS, folder: str | None = None) -> None:
+    def __init__(self, formats: Sequence[str] = DEFAULT_EXPORT, folder: str | None = None) -> None:
         unknown = sorted(set(formats) - set(EXPORT_FORMATS))
         if unknown:
             raise ValueError(f"unknown export formats {', '.join(unknown)}; choose from {', '.join(EXPORT_FORMATS)}")

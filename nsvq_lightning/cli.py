@@ -18,6 +18,7 @@ OWN_COMMANDS = {
     "info": "nsvq_lightning.info",
     "benchmark": "nsvq_lightning.benchmark.cli",
     "compress": "nsvq_lightning.compress_command",
+    "convert": "nsvq_lightning.convert_command",
     "sweep": "nsvq_lightning.sweep.cli",
     "doctor": "nsvq_lightning.doctor.cli",
 }

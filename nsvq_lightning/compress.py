@@ -12,17 +12,18 @@ from torch import Tensor
 
 from nsvq_lightning.io.arrays import finite_rows
 from nsvq_lightning.io.compressed import QUANTIZABLE, CompressedScene
-from nsvq_lightning.io.container import write_nsvq
-from nsvq_lightning.io.formats import save
+from nsvq_lightning.io.formats import FORMATS, save
 from nsvq_lightning.io.precision import Storage
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.quantized import attribute_rows, codes_of
 from nsvq_lightning.splats import RawSplats, sh_degree_of
 
-__all__ = ["compress", "export_scene", "formula_bytes"]
+__all__ = ["DEFAULT_EXPORT", "EXPORT_FORMATS", "compress", "export_scene", "formula_bytes", "save_as_stored"]
 
-EXPORT_FORMATS = ("nsvq", "ply")
-"""Formats that :func:`export_scene` writes: the compressed scene, and its decoded splats for any viewer."""
+EXPORT_FORMATS = tuple(suffix.removeprefix(".") for suffix, entry in FORMATS.items() if entry.write is not None)
+"""Formats that :func:`export_scene` writes: the compressed scene, and its decoded splats for viewers."""
+DEFAULT_EXPORT = ("nsvq", "ply")
+"""Those that a run writes unless told otherwise."""
 
 
 @torch.no_grad()
@@ -50,7 +51,7 @@ def compress(splats: RawSplats, quantizers: Mapping[str, Quantizer], config: Map
 
 
 def export_scene(
-    scene: CompressedScene, folder: Path, storage: Storage, formats: tuple[str, ...] = EXPORT_FORMATS
+    scene: CompressedScene, folder: Path, storage: Storage, formats: tuple[str, ...] = DEFAULT_EXPORT
 ) -> dict[str, Path]:
     """Write ``scene.<format>`` into ``folder`` for each format, atomically; the same scene gives the same bytes.
 
@@ -66,11 +67,18 @@ def export_scene(
         if suffix not in EXPORT_FORMATS:
             raise ValueError(f"unknown export format {suffix!r}; choose from {', '.join(EXPORT_FORMATS)}")
         paths[suffix] = folder / f"scene.{suffix}"
-        if suffix == "nsvq":
-            write_nsvq(paths[suffix], scene, storage.level, storage.precision)
-        else:
-            save(scene.decode(), paths[suffix])
+        save_as_stored(scene, paths[suffix], storage)
     return paths
+
+
+def save_as_stored(scene: CompressedScene, path: Path, storage: Storage) -> int:
+    """Save a scene in the format of the suffix: ``.nsvq`` as a run stores it, any other as the format has it.
+
+    Returns:
+        Bytes of the file.
+    """
+    options = {"level": storage.level, "precision": storage.precision} if path.suffix.lower() == ".nsvq" else {}
+    return save(scene, path, **options)
 
 
 def formula_bytes(scene: CompressedScene, header_bytes: int) -> int:

@@ -23,9 +23,6 @@ __all__ = ["main"]
 log = logging.getLogger("nsvq_lightning.compress")
 
 DEFAULT_CODEBOOKS = "16k"
-SYNTHETIC_CAMERAS = 8
-MOST_CAMERAS = 24
-"""Train views that errors are measured in, spread evenly over the folder's."""
 
 EPILOG = """\
 The error is the root mean square difference between pictures of the scene before and after, of channels in [0, 1]:
@@ -52,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(argv)
     if options.output.suffix.lower() != ".nsvq":
-        parser.error(f"{options.output}: the compressed scene is a .nsvq file; 'nsvq export' writes other formats")
+        parser.error(f"{options.output}: the compressed scene is a .nsvq file; 'nsvq convert' writes other formats")
     if options.max_steps is not None and options.root is None:
         parser.error("--max-steps trains with photos: give their COLMAP folder with --data.root")
     logging.basicConfig(format="%(message)s")
@@ -67,12 +64,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _compress(options: argparse.Namespace) -> int:
     from nsvq_lightning.io.arrays import SplatArrays
     from nsvq_lightning.io.formats import load
+    from nsvq_lightning.viewpoints import measuring_cameras
 
     source: Path = options.input
     arrays = SplatArrays.from_splats(load(source)).finite()
     if len(arrays) == 0:
         raise ValueError(f"{source} holds no splat with finite numbers; there is nothing to compress")
-    cameras = _cameras(options.root, arrays)
+    cameras = measuring_cameras(options.root, arrays.means)
     candidate = _candidate(options, arrays, cameras)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     if options.root is not None and options.max_steps != 0:
@@ -89,19 +87,6 @@ def _compress(options: argparse.Namespace) -> int:
         f"original in {len(cameras)} pictures)\n"
     )
     return 0
-
-
-def _cameras(root: Path | None, arrays: SplatArrays) -> list[Camera]:
-    """Views that errors are measured in."""
-    if root is None:
-        from nsvq_lightning.viewpoints import cameras_around
-
-        return cameras_around(arrays.means, SYNTHETIC_CAMERAS)
-    from nsvq_lightning.data.scene import load_scene
-
-    scene = load_scene(root)
-    chosen = scene.train[:: -(-len(scene.train) // MOST_CAMERAS)]
-    return [scene.cameras[index] for index in chosen]
 
 
 def _candidate(options: argparse.Namespace, arrays: SplatArrays, cameras: list[Camera]) -> Candidate:
@@ -160,7 +145,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("input", type=Path, metavar="SCENE", help="splat file, .ply or .nsvq")
+    parser.add_argument("input", type=Path, metavar="SCENE", help="splat file: .ply, .nsvq, .sog, .spz or .splat")
     parser.add_argument("output", type=Path, metavar="OUT.nsvq", help="file to write")
     aim = parser.add_mutually_exclusive_group()
     names = ("16k", "8k", "4k", "2k", "1k", "0.5k", "128k", "64k", "32k", "none")

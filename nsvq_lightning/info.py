@@ -6,17 +6,13 @@ import argparse
 import json
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.io.container import read_header
+from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.io.frame import MAGIC
-from nsvq_lightning.io.ply import plain_ply_bytes, read_ply_size
-from nsvq_lightning.io.ply_header import PLY_MAGIC, attribute_of
 
-__all__ = ["describe", "main"]
+__all__ = ["main"]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -28,7 +24,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0, or 1 after a one-line error if the file cannot be read.
     """
-    parser = argparse.ArgumentParser(prog="nsvq info", description="Say what a .nsvq or .ply file holds.")
+    parser = argparse.ArgumentParser(
+        prog="nsvq info", description="Say what a scene file holds: .nsvq, .ply, .sog, .spz or .splat."
+    )
     parser.add_argument("file", type=Path, metavar="FILE", help="scene file")
     parser.add_argument("--json", action="store_true", help="print the description as JSON")
     options = parser.parse_args(argv)
@@ -48,62 +46,9 @@ def _fail(message: str) -> int:
     return 1
 
 
-def describe(path: Path) -> dict[str, Any]:
-    """Facts about a file, as JSON values.
-
-    Raises:
-        FormatError: The file is damaged, or neither ``.nsvq`` nor ``.ply`` of Gaussian splats.
-        OSError: It cannot be read.
-    """
-    with open(path, "rb") as file:
-        start = file.read(len(MAGIC))
-    if start == MAGIC:
-        facts = _describe_nsvq(path)
-    elif start.startswith(PLY_MAGIC):
-        facts = _describe_ply(path)
-    else:
-        raise FormatError(f"{path}: neither a .nsvq nor a .ply file")
-    facts["plain_bytes"] = plain_ply_bytes(facts["splats"], facts["sh_degree"])
-    facts["ratio"] = facts["plain_bytes"] / facts["bytes"]
-    return {"file": str(path), **facts}
-
-
-def _describe_nsvq(path: Path) -> dict[str, Any]:
-    header, total = read_header(path), path.stat().st_size
-    streams = [{"name": s.name, "encoding": s.encoding, "bytes": s.length} for s in header.streams]
-    header_bytes = total - sum(stream.length for stream in header.streams)
-    return {
-        "format": f"nsvq, level {header.level}",
-        "splats": header.splats,
-        "sh_degree": header.sh_degree,
-        "origin": list(header.origin),
-        "bytes": total,
-        "attributes": [asdict(entry) for entry in header.attributes],
-        "streams": [{"name": "header", "encoding": "json", "bytes": header_bytes}, *streams],
-        "config": header.config,
-        "metrics": header.metrics,
-    }
-
-
-def _describe_ply(path: Path) -> dict[str, Any]:
-    header, total = read_ply_size(path)
-    sizes: dict[str, int] = {}
-    for name in header.properties:
-        attribute = attribute_of(name)
-        sizes[attribute] = sizes.get(attribute, 0) + header.count * header.dtype[name].itemsize
-    # The lengths of ascii numbers differ, so only the whole is known.
-    streams = {"header": header.offset, **sizes} if header.encoding != "ascii" else {"text": total}
-    return {
-        "format": f"ply, {header.encoding}",
-        "splats": header.count,
-        "sh_degree": header.sh_degree,
-        "bytes": total,
-        "streams": [{"name": name, "encoding": "ply", "bytes": size} for name, size in streams.items()],
-    }
-
-
 def _text(facts: dict[str, Any]) -> str:
     size = facts["bytes"]
+    whole = max(1, size)
     rows = [
         ("file", facts["file"]),
         ("format", facts["format"]),
@@ -118,7 +63,7 @@ def _text(facts: dict[str, Any]) -> str:
     if "attributes" in facts:
         entries = ((a["name"], a["storage"], a["dim"], a["codes"], a["bits"]) for a in facts["attributes"])
         parts.append(_table(("attribute", "storage", "D", "K", "bits"), entries))
-    shares = ((s["name"], s["encoding"], s["bytes"], f"{100 * s['bytes'] / size:.1f} %") for s in facts["streams"])
+    shares = ((s["name"], s["encoding"], s["bytes"], f"{100 * s['bytes'] / whole:.1f} %") for s in facts["streams"])
     parts.append(_table(("stream", "encoding", "bytes", "share"), shares))
     parts += [f"{key}\n{_indented(facts[key])}" for key in ("metrics", "config") if facts.get(key)]
     return "\n\n".join(parts)

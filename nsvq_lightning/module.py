@@ -57,7 +57,7 @@ class SplatModule(SplatModel):
         backend: Rasterizer, see :func:`nsvq_lightning.render`.
         seed: Seed of every draw of the run except the order of the views.
         storage: Level of the compressed file, and how exactly it stores the scene.
-        init_from: ``.ply`` or ``.nsvq`` file to start from instead of the scene's points.
+        init_from: Scene file of any format to start from instead of the scene's points.
         splats: Splats to start from, for use from Python.
 
     Raises:

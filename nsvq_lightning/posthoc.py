@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
-import numpy as np
 import torch
-from torch import Tensor
 
 from nsvq_lightning.canonical import canonical
 from nsvq_lightning.compress import compress
@@ -21,6 +18,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.container import decode, encode
 from nsvq_lightning.io.frame import frame, unframe
 from nsvq_lightning.io.precision import Precision, Storage
+from nsvq_lightning.picture_error import decibels, picture_error, pictures
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, Quantizer, codebook_sizes
 from nsvq_lightning.quantized import attribute_rows
 from nsvq_lightning.random import generator
@@ -84,7 +82,7 @@ class Candidate:
     @property
     def psnr(self) -> float:
         """The error in dB."""
-        return math.inf if self.error == 0 else -20 * math.log10(self.error)
+        return decibels(self.error)
 
 
 class Compressor:
@@ -108,7 +106,7 @@ class Compressor:
             raise ValueError(f"cannot compress {len(splats)} splats seen by {len(cameras)} cameras")
         self._splats = RawSplats(*(tensor.detach() for tensor in splats.to_splats().raw()))
         self._cameras, self._storage, self._seed = cameras, storage, seed
-        self._pictures = [_picture(self._splats, camera) for camera in cameras]
+        self._pictures = pictures(self._splats, cameras)
         self._weights = row_weights(contributions(self._splats, cameras, render))
         self._done: dict[str, Candidate] = {}
 
@@ -158,16 +156,7 @@ class Compressor:
 
     def _error(self, data: bytes) -> float:
         splats = RawSplats(*(tensor.detach() for tensor in decode(*unframe(data)).decode().raw()))
-        squares = [
-            float((_picture(splats, camera) - picture).double().square().mean())
-            for camera, picture in zip(self._cameras, self._pictures, strict=True)
-        ]
-        return math.sqrt(float(np.mean(squares)))
-
-
-@torch.no_grad()
-def _picture(splats: RawSplats, camera: Camera) -> Tensor:
-    return render(splats, camera).image.clamp(0, 1)
+        return picture_error(splats, self._cameras, self._pictures)
 
 
 def smallest_within(compressor: Compressor, error: float) -> Candidate:

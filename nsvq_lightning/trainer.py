@@ -10,8 +10,7 @@ from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch import Trainer
 
 from nsvq_lightning.checkpoint_file import PlainCheckpointIO, read_checkpoint
-from nsvq_lightning.io.container import write_nsvq
-from nsvq_lightning.io.formats import save
+from nsvq_lightning.compress import save_as_stored
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.strategies import ViewParallelStrategy  # noqa: F401  registers its name
 
@@ -38,7 +37,7 @@ class SplatTrainer(Trainer):
             model: Module that the checkpoint is loaded into.
             ckpt_path: Checkpoint of a run.
             output: File to write; its suffix names the format: .nsvq is the compressed scene, any other format holds
-                the decoded splats.
+                the decoded splats (.ply, .sog, .spz, .splat).
 
         Raises:
             FileNotFoundError: No such checkpoint.
@@ -50,9 +49,6 @@ class SplatTrainer(Trainer):
         path = Path(output)
         path.parent.mkdir(parents=True, exist_ok=True)
         scene = model.compressed()
-        if path.suffix.lower() == ".nsvq":
-            write_nsvq(path, scene, model.storage.level, model.storage.precision)
-        else:
-            save(scene.decode(), path)
+        save_as_stored(scene, path, model.storage)
         log.info("wrote %s: %d splats, %d bytes", path, len(scene), path.stat().st_size)
         return path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,7 +11,11 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.rendering.camera import Camera
 
-__all__ = ["cameras_around", "look_at", "middle_of"]
+__all__ = ["cameras_around", "look_at", "measuring_cameras", "middle_of"]
+
+SYNTHETIC_CAMERAS = 8
+MOST_CAMERAS = 24
+"""Train views that errors are measured in, spread evenly over the folder's."""
 
 ELEVATIONS = (0.1, 0.5)
 """Radians above the horizon, y down, in turns."""
@@ -62,3 +67,22 @@ def cameras_around(means: NDArray[np.float32], count: int, width: int = 800, hei
         direction = (math.cos(rise) * math.sin(turn), -math.sin(rise), -math.cos(rise) * math.cos(turn))
         cameras.append(look_at(middle, middle + 2 * reach * np.array(direction), width, height, math.radians(60)))
     return cameras
+
+
+def measuring_cameras(root: Path | None, means: NDArray[np.float32]) -> list[Camera]:
+    """Views that errors are measured in.
+
+    Args:
+        root: COLMAP folder whose train views they are; None for views from around the scene.
+        means: Positions ``[N, 3]``, N > 0.
+
+    Raises:
+        SceneError: The folder is no COLMAP scene.
+    """
+    if root is None:
+        return cameras_around(means, SYNTHETIC_CAMERAS)
+    from nsvq_lightning.data.scene import load_scene
+
+    scene = load_scene(root)
+    chosen = scene.train[:: -(-len(scene.train) // MOST_CAMERAS)]
+    return [scene.cameras[index] for index in chosen]

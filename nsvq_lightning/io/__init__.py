@@ -1,4 +1,4 @@
-"""Scenes on disk: the compressed ``.nsvq`` file, the plain ``.ply``, and the registry of formats.
+"""Scenes on disk: the compressed ``.nsvq`` file, what viewers open, and the registry of formats.
 
 Nothing here imports torch before a scene is turned into :class:`nsvq_lightning.Splats`.
 """
@@ -7,7 +7,7 @@ from nsvq_lightning.io.arrays import SplatArrays
 from nsvq_lightning.io.atomic import atomic_path, atomic_write
 from nsvq_lightning.io.container import CompressedScene, read_header, read_nsvq, write_nsvq
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.io.formats import FORMATS, Format, load, save
+from nsvq_lightning.io.formats import FORMATS, Format, load, read_scene, save
 from nsvq_lightning.io.ply import plain_ply_bytes, read_ply, write_ply
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "read_header",
     "read_nsvq",
     "read_ply",
+    "read_scene",
     "save",
     "write_nsvq",
     "write_ply",

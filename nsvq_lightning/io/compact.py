@@ -50,6 +50,7 @@ from nsvq_lightning.io.entropy import (
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.header import AttributeEntry, Header, tile
 from nsvq_lightning.io.morton import AXIS_BITS, Grid, morton_keys, nearest_before, unmorton
+from nsvq_lightning.io.opacity import opacity_of
 from nsvq_lightning.io.precision import Precision
 
 __all__ = ["decode_compact", "encode_compact"]
@@ -230,7 +231,7 @@ def _floats(values: NDArray[np.int64] | None, entry: AttributeEntry) -> NDArray[
 
 
 def _levels(logits: NDArray[np.float32], count: int) -> _Stored:
-    shares = 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80)))
+    shares = opacity_of(logits)
     values = np.minimum((shares * count).astype(np.int64), count - 1)
     return _Stored(AttributeEntry("opacities", 1, "levels", count, code_bits(count)), values)
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.arrays import SplatArrays, check_floats, sh_coefficients
+from nsvq_lightning.io.arrays import SplatArrays, check_floats, finite_rows, sh_coefficients
 from nsvq_lightning.io.ply import plain_ply_bytes
 
 if TYPE_CHECKING:
     from nsvq_lightning.splats import Splats
+
+_T = TypeVar("_T", bound=np.generic)
 
 __all__ = ["QUANTIZABLE", "CompressedScene", "attribute_dims"]
 
@@ -88,13 +90,56 @@ class CompressedScene:
             arrays: The scene.
             header: ``config``, ``metrics`` and ``origin``.
         """
-        raw = {name: getattr(arrays, name).reshape(len(arrays), -1) for name in QUANTIZABLE if name != "shN"}
-        # -1 cannot be inferred where an axis is empty.
-        raw["shN"] = arrays.shN.reshape(len(arrays), attribute_dims(arrays.sh_degree)["shN"])
+        dims = attribute_dims(arrays.sh_degree)
+        # Not -1, which cannot be inferred where an axis is empty.
+        raw = {name: getattr(arrays, name).reshape(len(arrays), dims[name]) for name in QUANTIZABLE}
         return cls(arrays.means, arrays.opacities, raw=raw, sh_degree=arrays.sh_degree, **header)
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def table(self, name: str) -> tuple[NDArray[np.float32], NDArray[np.integer] | None]:
+        """Distinct rows ``[K, D]`` of an attribute and the row of each splat ``[N]``; None where row i is splat i's."""
+        return (self.raw[name], None) if name in self.raw else (self.codebooks[name], self.codes[name])
+
+    def uses(self, name: str) -> NDArray[np.int64] | None:
+        """How many splats use each row of :meth:`table` ``[K]``; None where each splat has its own."""
+        if name in self.raw:
+            return None
+        return np.bincount(self.codes[name], minlength=len(self.codebooks[name])).astype(np.int64)
+
+    def spread(
+        self, name: str, function: Callable[[NDArray[np.float32], NDArray[np.int64] | None], NDArray[_T]]
+    ) -> NDArray[_T]:
+        """What a function makes of the rows of an attribute, for each splat: computed once a row of the codebook.
+
+        Args:
+            name: Attribute.
+            function: Of the rows ``[K, D]`` and of how many splats use each ``[K]`` (None: one each), to ``[K, ...]``.
+
+        Returns:
+            ``[N, ...]``.
+        """
+        values = function(self.table(name)[0], self.uses(name))
+        return values if name in self.raw else values[self.codes[name]]
+
+    def take(self, splats: NDArray[np.integer] | NDArray[np.bool_]) -> CompressedScene:
+        """The scene of some of the splats, by number or by mask ``[N]``; codebooks stay as they are."""
+        return replace(
+            self,
+            means=self.means[splats],
+            opacities=self.opacities[splats],
+            codes={name: codes[splats] for name, codes in self.codes.items()},
+            raw={name: values[splats] for name, values in self.raw.items()},
+            stored_bytes=None,
+        )
+
+    def finite(self) -> CompressedScene:
+        """The splats without NaN or infinite values, see :func:`~nsvq_lightning.io.arrays.finite_rows`."""
+        bad = {name: np.where(np.isfinite(rows).all(1), 0, np.nan) for name, rows in self.codebooks.items()}
+        flags = {name: flags.astype(np.float32)[self.codes[name]] for name, flags in bad.items()}
+        keep = finite_rows({"means": self.means, "opacities": self.opacities, **self.raw, **flags})
+        return self if keep.all() else self.take(keep)
 
     def arrays(self) -> SplatArrays:
         """The decoded scene, bit for bit the rows of the codebooks; positions stay relative to ``origin``."""

@@ -1,11 +1,11 @@
-"""Load and save scenes, the format chosen by the file's suffix."""
+"""Load, save and convert scenes, the format chosen by the file's suffix."""
 
 from __future__ import annotations
 
 import logging
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +14,14 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.container import read_nsvq, write_nsvq
 from nsvq_lightning.io.ply import read_ply, write_ply
 from nsvq_lightning.io.precision import DEFAULT_LEVEL, Precision
+from nsvq_lightning.io.sog import read_sog, write_sog
+from nsvq_lightning.io.splat import read_splat, write_splat
+from nsvq_lightning.io.spz import read_spz, write_spz
 
 if TYPE_CHECKING:
     from nsvq_lightning.splats import Splats, SplatTensors
 
-__all__ = ["FORMATS", "Format", "load", "save"]
+__all__ = ["FORMATS", "Format", "load", "read_scene", "save"]
 
 logger = logging.getLogger(__name__)
 
@@ -29,42 +32,56 @@ class Format:
 
     Attributes:
         description: A few words for error messages and help.
-        read: Scene from a file; None if the format is only written.
-        write: ``write(path, arrays, **options) -> bytes written``; None if the format is only read.
+        read: Scene from a file; None if the format is only written. Codebooks are kept where the format has them.
+        write: ``write(path, scene, **options) -> bytes written``; None if the format is only read.
+        keeps_origin: Whether the file holds the origin that positions are relative to.
     """
 
     description: str
-    read: Callable[[Path], SplatArrays] | None
+    read: Callable[[Path], CompressedScene] | None
     write: Callable[..., int] | None
+    keeps_origin: bool = False
 
 
 def load(path: str | os.PathLike[str]) -> Splats:
     """Load a scene of any supported format.
 
     Args:
-        path: File; its suffix (``.ply``, ``.nsvq``, in any case) names the format, see :data:`FORMATS`.
+        path: File; its suffix, in any case, names the format, see :data:`FORMATS`.
 
     Raises:
         ValueError: Unknown suffix.
         FormatError: The file is damaged or of another format than its suffix says.
         FileNotFoundError: No such file.
     """
+    scene = read_scene(path)
+    if any(scene.origin):
+        logger.warning(
+            "%s: positions are relative to the world point %s; read_nsvq(path).origin has it", path, scene.origin
+        )
+    return scene.decode()
+
+
+def read_scene(path: str | os.PathLike[str]) -> CompressedScene:
+    """Read a scene of any supported format with the codebooks that it has; arguments and errors as of :func:`load`."""
     path = Path(path)
     reader = _format_of(path, "read").read
     if reader is None:
         raise ValueError(f"cannot load {path}: {path.suffix} files are only written")
-    return reader(path).to_splats()
+    return replace(reader(path), stored_bytes=path.stat().st_size)
 
 
-def save(splats: SplatTensors, path: str | os.PathLike[str], **options: Any) -> int:
+def save(splats: SplatTensors | CompressedScene, path: str | os.PathLike[str], **options: Any) -> int:
     """Save a scene in any supported format; splats with non-finite values are left out with a warning.
 
     Args:
-        splats: The scene, for example :class:`nsvq_lightning.Splats`.
+        splats: The scene, for example :class:`nsvq_lightning.Splats`. A :class:`CompressedScene` keeps its codebooks
+            where the format has them: all of them in ``.nsvq``, that of the spherical harmonics in ``.sog``.
         path: File to write, replaced atomically; its suffix names the format.
         options: For ``.ply``: ``normals`` (bool, default True). For ``.nsvq``: ``config``, ``metrics``, ``origin``,
             ``level`` and ``precision``; plain splats have no codebooks, so level ``paper`` stores all attributes as
-            they are, and ``compact`` within its precision and in another order.
+            they are, and ``compact`` within its precision and in another order. For ``.sog``: ``palette`` (rows of the
+            palette of spherical harmonics without a codebook, default 4096) and ``seed``.
 
     Returns:
         Bytes of the file.
@@ -74,10 +91,14 @@ def save(splats: SplatTensors, path: str | os.PathLike[str], **options: Any) -> 
         TypeError: The format has no such option.
     """
     path = Path(path)
-    writer = _format_of(path, "write").write
-    if writer is None:
+    entry = _format_of(path, "write")
+    if entry.write is None:
         raise ValueError(f"cannot save {path}: {path.suffix} files are only read")
-    return writer(path, SplatArrays.from_splats(splats), **options)
+    if not isinstance(splats, CompressedScene):
+        splats = CompressedScene.from_arrays(SplatArrays.from_splats(splats))
+    if any(splats.origin) and not entry.keeps_origin:
+        logger.warning("%s: the origin %s of the positions is not stored; add it in the viewer", path, splats.origin)
+    return entry.write(path, splats, **options)
 
 
 def _format_of(path: Path, action: str) -> Format:
@@ -88,28 +109,30 @@ def _format_of(path: Path, action: str) -> Format:
         raise ValueError(f"cannot {action} {path}: unknown suffix {path.suffix!r}; supported are {supported}") from None
 
 
-def _read_nsvq(path: Path) -> SplatArrays:
-    scene = read_nsvq(path)
-    if any(scene.origin):
-        logger.warning(
-            "%s: positions are relative to the world point %s; read_nsvq(path).origin has it", path, scene.origin
-        )
-    return scene.arrays()
+def _read_ply(path: Path) -> CompressedScene:
+    return CompressedScene.from_arrays(read_ply(path))
+
+
+def _write_ply(path: Path, scene: CompressedScene, *, normals: bool = True) -> int:
+    return write_ply(path, scene.arrays(), normals=normals)
 
 
 def _write_nsvq(
     path: Path,
-    arrays: SplatArrays,
+    scene: CompressedScene,
     *,
     level: str = DEFAULT_LEVEL,
     precision: Precision | None = None,
     **header: Any,
 ) -> int:
-    return write_nsvq(path, CompressedScene.from_arrays(arrays.finite(), **header), level, precision)
+    return write_nsvq(path, replace(scene.finite(), **header), level, precision)
 
 
 FORMATS: dict[str, Format] = {
-    ".ply": Format("3D Gaussian Splatting", read_ply, write_ply),
-    ".nsvq": Format("compressed scene of this package", _read_nsvq, _write_nsvq),
+    ".ply": Format("3D Gaussian Splatting", _read_ply, _write_ply),
+    ".nsvq": Format("compressed scene of this package", read_nsvq, _write_nsvq, keeps_origin=True),
+    ".sog": Format("PlayCanvas, SuperSplat", read_sog, write_sog),
+    ".spz": Format("Niantic", read_spz, write_spz),
+    ".splat": Format("first viewers on the web, without spherical harmonics", read_splat, write_splat),
 }
 """Formats by suffix; a new format is one more entry."""

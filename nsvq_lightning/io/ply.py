@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 from nsvq_lightning.io.arrays import SplatArrays, sh_coefficients
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.errors import FormatError, naming_file
+from nsvq_lightning.io.opacity import finite_logits
 from nsvq_lightning.io.ply_header import PlyHeader, read_ply_header
 
 __all__ = ["plain_ply_bytes", "read_ply", "read_ply_size", "write_ply"]
 
 _ROWS = 1 << 12
 """Rows converted at a time, about 1 MB: they stay in the cache, and memory at one copy of the scene."""
-
-_OPAQUE = 20.0
-"""Logit that stands for ±inf: its sigmoid is 1 in float32, and training can still move it."""
 
 
 def read_ply(path: str | os.PathLike[str]) -> SplatArrays:
@@ -162,7 +160,7 @@ def _store(table: NDArray[np.float32], splats: SplatArrays, rows: slice) -> None
     splats.means[rows] = means
     splats.sh0[rows, 0] = sh0
     # Writers that store opacity as a byte turn 0 and 255 into an infinite logit.
-    splats.opacities[rows] = np.where(np.isinf(opacities), np.copysign(_OPAQUE, opacities), opacities)[:, 0]
+    splats.opacities[rows] = finite_logits(opacities[:, 0])
     splats.scales[rows] = scales
     splats.quats[rows] = quats
     splats.shN[rows] = rest.reshape(len(table), 3, -1 if rest.size else 0).transpose(0, 2, 1)

@@ -1,0 +1,45 @@
+"""Rotations as the three smallest components of a unit quaternion; the largest one follows from them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["from_smallest_three", "smallest_three", "unit"]
+
+
+def unit(quats: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Quaternions wxyz ``[N, 4]`` of length 1; zero means no rotation."""
+    wide = quats.astype(np.float64)
+    length = np.linalg.norm(wide, axis=1, keepdims=True)
+    return np.where(length > 0, wide / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
+
+
+def smallest_three(units: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Which component is the largest ``[N]``, and the other three ``[N, 3]`` in their order, each in ±1/√2.
+
+    Args:
+        units: Quaternions ``[N, 4]`` of length 1, components in any order.
+
+    Returns:
+        Of the two quaternions of a rotation, the one whose largest component is positive is meant.
+    """
+    largest = np.abs(units).argmax(1)
+    negative = np.take_along_axis(units, largest[:, None], 1) < 0
+    others = np.take_along_axis(units, _others(largest), 1)
+    return largest, np.where(negative, -others, others)
+
+
+def from_smallest_three(largest: NDArray[np.intp], others: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Unit quaternions ``[N, 4]`` of the two parts of :func:`smallest_three`, the second of which may be rounded."""
+    quats = np.empty((len(largest), 4))
+    np.put_along_axis(quats, _others(largest), others, 1)
+    rest = np.sqrt(np.maximum(0, 1 - np.square(others).sum(1)))
+    np.put_along_axis(quats, largest[:, None], rest[:, None], 1)
+    return quats.astype(np.float32)
+
+
+def _others(largest: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The three components ``[N, 3]`` other than ``largest [N]``, ascending."""
+    table = np.array([[j for j in range(4) if j != i] for i in range(4)])
+    return table[largest]

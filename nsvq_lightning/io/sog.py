@@ -1,0 +1,324 @@
+"""The ``.sog`` file of PlayCanvas, version 2: pictures of bytes that a web page can hand to its GPU as they are.
+
+==================  ===========================================================================================
+picture             texel
+==================  ===========================================================================================
+``means_l``         low bytes of the position: sign(x) ln(1 + |x|) in 65535ths between smallest and largest
+``means_u``         high bytes
+``quats``           smallest three of wxyz, 127.5 (1 + √2 q); alpha is 252 plus the number of the largest
+``scales``          numbers of levels, shared by the axes; logarithms
+``sh0``             numbers of levels, shared by the colours; alpha is the opacity in 255ths
+``shN_labels``      row of the palette, low byte and high byte
+``shN_centroids``   64 rows of the palette a line, a texel a coefficient: numbers of levels
+==================  ===========================================================================================
+
+The palette is what an SH codebook is, so a scene with one needs no clustering: codes become labels.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nsvq_lightning.io.arrays import sh_coefficients
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.errors import FormatError, naming_file
+from nsvq_lightning.io.levels import best_levels, nearest_level
+from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
+from nsvq_lightning.io.rotation import from_smallest_three, smallest_three, unit
+from nsvq_lightning.io.sog_archive import META, SogArchive, picture_shape, write_archive
+from nsvq_lightning.io.splat_order import spatial_order
+
+__all__ = ["DEFAULT_PALETTE", "PALETTE_LIMIT", "read_sog", "read_sog_header", "write_sog"]
+
+logger = logging.getLogger(__name__)
+
+DEFAULT_PALETTE = 4096
+"""Rows of the palette of a scene whose spherical harmonics have no codebook."""
+PALETTE_LIMIT = 1 << 16
+"""Rows that a label of 16 bits can name."""
+_ROWS_A_LINE = 64
+_LEVELS = 256
+_FARTHEST = math.log1p(float(np.finfo(np.float32).max))
+
+
+def write_sog(
+    path: str | os.PathLike[str], scene: CompressedScene, *, palette: int = DEFAULT_PALETTE, seed: int = 0
+) -> int:
+    """Write a scene as ``.sog``, in Morton order of the positions.
+
+    A codebook of the spherical harmonics becomes the palette and its codes the labels, renumbered where rows are not
+    used. A scene without one, or with more rows in use than a label can name, gets a palette by k-means. Splats with a
+    non-finite value are left out with a warning.
+
+    Args:
+        path: File to write, replaced atomically.
+        scene: The scene.
+        palette: Rows of a palette by k-means.
+        seed: Seed of k-means.
+
+    Returns:
+        Bytes of the file.
+
+    Raises:
+        ValueError: The palette has no rows or more than 65536.
+    """
+    if not 1 <= palette <= PALETTE_LIMIT:
+        raise ValueError(f"palette must be in 1..{PALETTE_LIMIT}, got {palette}")
+    scene = scene.finite()
+    scene = _with_palette(scene.take(spatial_order(scene.means)), palette, seed)
+    count = len(scene)
+    low, high, means = _packed_means(scene.means)
+    scales, scale_levels = _leveled(scene, "scales")
+    colors, color_levels = _leveled(scene, "sh0")
+    opacities = np.rint(255 * opacity_of(scene.opacities)).astype(np.uint8)
+    texels = {
+        "means_l.webp": low,
+        "means_u.webp": high,
+        "quats.webp": scene.spread("quats", lambda rows, _: _packed_quats(rows)),
+        "scales.webp": scales,
+        "sh0.webp": np.concatenate([colors, opacities[:, None]], axis=1),
+    }
+    meta: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": "nsvq-lightning"},
+        "count": count,
+        "means": {**means, "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"codebook": scale_levels, "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": color_levels, "files": ["sh0.webp"]},
+    }
+    pictures = {name: _picture(values, picture_shape(count)) for name, values in texels.items()}
+    if scene.sh_degree:
+        meta["shN"], sh_pictures = _packed_sh(scene)
+        pictures |= sh_pictures
+    return write_archive(path, meta, pictures)
+
+
+def _with_palette(scene: CompressedScene, palette: int, seed: int) -> CompressedScene:
+    """The scene with an SH codebook, all of whose rows are in use; of one row if there is no splat."""
+    if scene.sh_degree == 0:
+        return scene
+    rows, codes = scene.table("shN")
+    if codes is not None:
+        used, codes = np.unique(codes, return_inverse=True)
+        rows = rows[used]
+    if len(scene) == 0:
+        rows, codes = np.zeros((1, rows.shape[1]), np.float32), np.zeros(0, np.int64)
+    elif codes is None or len(rows) > PALETTE_LIMIT:
+        rows, codes = _clustered(rows, codes, palette, seed)
+    raw = {name: values for name, values in scene.raw.items() if name != "shN"}
+    return replace(
+        scene,
+        raw=raw,
+        codes={**scene.codes, "shN": codes},
+        codebooks={**scene.codebooks, "shN": rows},
+        stored_bytes=None,
+    )
+
+
+def _clustered(
+    rows: NDArray[np.float32], codes: NDArray[np.integer] | None, palette: int, seed: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Palette ``[K, D]`` of rows ``[M, D]``, and label ``[N]`` of each splat; without codes row i is splat i's."""
+    import torch
+
+    from nsvq_lightning.quantize.kmeans import kmeans
+    from nsvq_lightning.quantize.nearest import nearest
+    from nsvq_lightning.random import generator
+
+    logger.info("clustering the spherical harmonics of %d splats into %d rows", len(rows), palette)
+    x = torch.from_numpy(np.ascontiguousarray(rows))
+    weight = None if codes is None else torch.from_numpy(np.bincount(codes, minlength=len(rows)))
+    centroids = kmeans(x, palette, generator(seed, 0, "sog", "shN"), weight)
+    labels: NDArray[np.int64] = nearest(x, centroids).numpy()
+    used, labels = np.unique(labels, return_inverse=True)
+    return centroids.numpy()[used], labels if codes is None else labels[codes]
+
+
+def _packed_means(
+    means: NDArray[np.float32],
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], dict[str, list[float]]]:
+    wide = means.astype(np.float64)
+    logs = np.copysign(np.log1p(np.abs(wide)), wide)
+    low, high = (logs.min(0), logs.max(0)) if len(logs) else (np.zeros(3), np.zeros(3))
+    extent = np.where(high > low, high - low, 1)
+    numbers = np.rint(65535 * ((logs - low) / extent)).astype(np.uint16)
+    return (
+        (numbers & 255).astype(np.uint8),
+        (numbers >> 8).astype(np.uint8),
+        {"mins": low.tolist(), "maxs": high.tolist()},
+    )
+
+
+def _packed_quats(rows: NDArray[np.float32]) -> NDArray[np.uint8]:
+    largest, others = smallest_three(unit(rows))
+    texels = np.empty((len(rows), 4), np.uint8)
+    texels[:, :3] = np.rint(127.5 * (1 + math.sqrt(2) * others).clip(0, 2))
+    texels[:, 3] = 252 + largest
+    return texels
+
+
+def _leveled(scene: CompressedScene, name: str) -> tuple[NDArray[np.uint8], list[float]]:
+    """Numbers of levels ``[N, D]`` of an attribute, and the levels."""
+    levels = _levels(scene, name)
+    return scene.spread(name, lambda rows, _: nearest_level(rows, levels)), _decimals(levels)
+
+
+def _levels(scene: CompressedScene, name: str) -> NDArray[np.float32]:
+    rows, uses = scene.table(name)[0], scene.uses(name)
+    return best_levels(rows, None if uses is None else uses[:, None], _LEVELS)
+
+
+def _packed_sh(scene: CompressedScene) -> tuple[dict[str, Any], dict[str, NDArray[np.uint8]]]:
+    rows, labels = scene.codebooks["shN"], scene.codes["shN"]
+    levels = _levels(scene, "shN")
+    coefficients = sh_coefficients(scene.sh_degree)
+    centroids = nearest_level(rows, levels).reshape(-1, 3)
+    lines = math.ceil(len(rows) / _ROWS_A_LINE)
+    numbers = np.stack([labels & 255, labels >> 8], axis=1).astype(np.uint8)
+    meta = {
+        "count": len(rows),
+        "bands": scene.sh_degree,
+        "codebook": _decimals(levels),
+        "files": ["shN_centroids.webp", "shN_labels.webp"],
+    }
+    return meta, {
+        "shN_centroids.webp": _picture(centroids, (lines, _ROWS_A_LINE * coefficients)),
+        "shN_labels.webp": _picture(numbers, picture_shape(len(labels))),
+    }
+
+
+def _decimals(levels: NDArray[np.float32]) -> list[float]:
+    """Levels as the shortest decimals that are the same float32."""
+    return [float(str(level)) for level in levels]
+
+
+def _picture(texels: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Texels ``[N, C]`` as picture ``[H, W, 4]``; what is missing is black and opaque."""
+    picture = np.zeros((shape[0] * shape[1], 4), np.uint8)
+    picture[:, 3] = 255
+    picture[: len(texels), : texels.shape[1]] = texels
+    return picture.reshape(*shape, 4)
+
+
+def read_sog(path: str | os.PathLike[str]) -> CompressedScene:
+    """Read a ``.sog`` file; its palette becomes the codebook of the spherical harmonics.
+
+    Raises:
+        FormatError: The file is truncated, altered, of another version, or no ``.sog`` file.
+    """
+    with naming_file(path), SogArchive(path) as archive:
+        meta = archive.meta()
+        count, degree = _checked(meta, archive)
+        raw = {
+            "quats": _unpacked_quats(archive.texels(_file(meta, "quats"), count)),
+            "scales": _look_up(meta, "scales", archive.texels(_file(meta, "scales"), count)[:, :3]),
+        }
+        colors = archive.texels(_file(meta, "sh0"), count)
+        raw["sh0"] = _look_up(meta, "sh0", colors[:, :3])
+        codes, codebooks = {}, {}
+        if degree:
+            codebooks["shN"], codes["shN"] = _unpacked_sh(meta, archive, count, degree)
+        else:
+            raw["shN"] = np.zeros((count, 0), np.float32)
+        means = _unpacked_means(meta, *(archive.texels(_file(meta, "means", i), count) for i in range(2)))
+        opacities = logits_of_bytes(colors[:, 3])
+        return CompressedScene(means, opacities, codes, codebooks, raw, degree)
+
+
+def read_sog_header(path: str | os.PathLike[str]) -> tuple[int, int, dict[str, int]]:
+    """Number of splats, SH degree, and bytes by name of what is in the archive of a ``.sog`` file.
+
+    Raises:
+        FormatError: The file is truncated, of another version, or no ``.sog`` file.
+    """
+    with naming_file(path), SogArchive(path) as archive:
+        return *_checked(archive.meta(), archive), archive.sizes
+
+
+def _checked(meta: Mapping[str, Any], archive: SogArchive) -> tuple[int, int]:
+    """Number of splats and SH degree."""
+    version = meta.get("version", 1)
+    if version != 2:
+        raise FormatError(f"version {version} of the format; this release reads version 2: save it as that or as .ply")
+    count = _integer(meta, "count", 0, 1 << 40)
+    archive.check_count(count)
+    return count, _integer(_entry(meta, "shN"), "bands", 0, 3) if "shN" in meta else 0
+
+
+def _entry(meta: Mapping[str, Any], name: str) -> dict[str, Any]:
+    entry = meta.get(name)
+    if not isinstance(entry, dict):
+        raise FormatError(f"damaged: {META} has no object {name!r}")
+    return entry
+
+
+def _integer(entry: Mapping[str, Any], name: str, low: int, high: int) -> int:
+    value = entry.get(name)
+    if type(value) is not int or not low <= value <= high:
+        raise FormatError(f"damaged: {name!r} in {META} must be an integer in {low}..{high}, got {str(value)[:40]}")
+    return value
+
+
+def _numbers(entry: Mapping[str, Any], name: str, count: range, largest: float) -> NDArray[np.float64]:
+    values = entry.get(name)
+    if not isinstance(values, list) or len(values) not in count:
+        raise FormatError(f"damaged: {name!r} in {META} must be a list of {count[0]} to {count[-1]} numbers")
+    if not all(type(value) in (int, float) and abs(value) <= largest for value in values):
+        raise FormatError(f"damaged: {name!r} in {META} must hold numbers of at most {largest:.4g}")
+    return np.array(values, np.float64)
+
+
+def _file(meta: Mapping[str, Any], name: str, number: int = 0) -> str:
+    files = _entry(meta, name).get("files")
+    if isinstance(files, list) and len(files) > number and isinstance(files[number], str):
+        return str(files[number])
+    raise FormatError(f"damaged: {META} does not name the pictures of {name!r}")
+
+
+def _look_up(meta: Mapping[str, Any], name: str, numbers: NDArray[np.uint8]) -> NDArray[np.float32]:
+    levels = _numbers(_entry(meta, name), "codebook", range(1, _LEVELS + 1), float(np.finfo(np.float32).max))
+    if numbers.size and numbers.max() >= len(levels):
+        raise FormatError(f"damaged: level {numbers.max()} of {name}, there are {len(levels)}")
+    return levels.astype(np.float32)[numbers]
+
+
+def _unpacked_means(meta: Mapping[str, Any], low: NDArray[np.uint8], high: NDArray[np.uint8]) -> NDArray[np.float32]:
+    entry = _entry(meta, "means")
+    mins, maxs = (_numbers(entry, name, range(3, 4), _FARTHEST) for name in ("mins", "maxs"))
+    numbers = low[:, :3] + 256.0 * high[:, :3]
+    logs = mins + (maxs - mins) * (numbers / 65535)
+    # The logarithm of the largest float32 may round to one that it is not.
+    positions = np.clip(np.copysign(np.expm1(np.abs(logs)), logs), -3.4e38, 3.4e38)
+    return positions.astype(np.float32)
+
+
+def _unpacked_quats(texels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    if len(texels) and texels[:, 3].min() < 252:
+        raise FormatError(f"damaged: a rotation has the mark {texels[:, 3].min()}, not 252 to 255")
+    others = (texels[:, :3] / 127.5 - 1) / math.sqrt(2)
+    return from_smallest_three((texels[:, 3] - 252).astype(np.intp), others)
+
+
+def _unpacked_sh(
+    meta: Mapping[str, Any], archive: SogArchive, count: int, degree: int
+) -> tuple[NDArray[np.float32], NDArray[np.uint16]]:
+    """Palette ``[K, D]`` and labels ``[N]``."""
+    rows = _integer(_entry(meta, "shN"), "count", 1, PALETTE_LIMIT)
+    coefficients = sh_coefficients(degree)
+    lines = math.ceil(rows / _ROWS_A_LINE)
+    centroids = archive.texels(_file(meta, "shN", 0), lines * _ROWS_A_LINE * coefficients)
+    palette = _look_up(meta, "shN", centroids[: rows * coefficients, :3]).reshape(rows, 3 * coefficients)
+    texels = archive.texels(_file(meta, "shN", 1), count)
+    labels = texels[:, 0] + (texels[:, 1].astype(np.uint16) << 8)
+    if count and labels.max() >= rows:
+        raise FormatError(f"damaged: label {labels.max()} of a palette of {rows} rows; copy or export it again")
+    return palette, labels

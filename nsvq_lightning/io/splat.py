@@ -1,0 +1,117 @@
+"""The ``.splat`` file, which the first viewers on the web read: 32 bytes a splat, no spherical harmonics.
+
+=========  =====  ====================================================================
+offset     bytes  content
+=========  =====  ====================================================================
+0          12     position, 3 float32 little-endian
+12         12     axis lengths (not their logarithms), 3 float32
+24         4      red, green, blue and opacity, 255ths
+28         4      rotation wxyz: unit quaternion times 128, plus 128
+=========  =====  ====================================================================
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nsvq_lightning.io.arrays import SplatArrays
+from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.clamping import Clamped
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.errors import FormatError, naming_file
+from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
+from nsvq_lightning.io.rotation import unit
+
+__all__ = ["SPLAT_LAYOUT", "count_splats", "read_splat", "write_splat"]
+
+logger = logging.getLogger(__name__)
+
+_RECORD = np.dtype([("means", "<f4", 3), ("lengths", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
+SPLAT_LAYOUT = {name: _RECORD[name].itemsize for name in _RECORD.names or ()}
+"""Bytes of each part of a splat."""
+_SH_C0 = 0.5 / math.sqrt(math.pi)
+_SMALLEST, _LARGEST = -87.0, 88.0
+"""Logarithms of lengths between which float32 has all its digits."""
+
+
+def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:
+    """Write a scene as ``.splat``.
+
+    View-dependent colour is lost, colours outside [0, 1] are clamped, and splats with a non-finite value are left out,
+    each with a warning.
+
+    Returns:
+        Bytes of the file.
+    """
+    scene = scene.finite()
+    if scene.sh_degree:
+        logger.warning("%s: .splat files hold no spherical harmonics; colours no longer change with the view", path)
+    clamped = Clamped()
+    records = np.empty(len(scene), _RECORD)
+    records["means"] = scene.means
+    records["lengths"] = scene.spread("scales", lambda rows, uses: _lengths(rows, uses, clamped))
+    records["colors"][:, :3] = scene.spread(
+        "sh0", lambda rows, uses: clamped.nearest("sh0", 255 * (0.5 + _SH_C0 * rows), (0, 255), uses=uses)
+    )
+    records["colors"][:, 3] = np.rint(255 * opacity_of(scene.opacities))
+    records["quats"] = scene.spread("quats", lambda rows, _: _packed_quats(rows))
+    clamped.warn(path, len(scene))
+    with atomic_write(path) as file:
+        file.write(records.tobytes())
+    return records.nbytes
+
+
+def _lengths(scales: NDArray[np.float32], uses: NDArray[np.int64] | None, clamped: Clamped) -> NDArray[np.float32]:
+    return np.exp(clamped.within("scales", scales, _SMALLEST, _LARGEST, uses))
+
+
+def _packed_quats(quats: NDArray[np.float32]) -> NDArray[np.uint8]:
+    units = unit(quats)
+    # Of q and -q the one whose largest component is negative: -1 is a byte, 1 is not.
+    largest = np.take_along_axis(units, np.abs(units).argmax(1)[:, None], 1)
+    packed: NDArray[np.uint8] = np.rint(128 + 128 * np.where(largest > 0, -units, units)).astype(np.uint8)
+    return packed
+
+
+def read_splat(path: str | os.PathLike[str]) -> CompressedScene:
+    """Read a ``.splat`` file.
+
+    Raises:
+        FormatError: The file does not consist of whole splats.
+    """
+    count_splats(path)
+    records = np.frombuffer(Path(path).read_bytes(), _RECORD)
+    lengths = np.maximum(records["lengths"], np.finfo(np.float32).tiny)
+    colors = records["colors"]
+    return CompressedScene.from_arrays(
+        SplatArrays(
+            means=records["means"].astype(np.float32),
+            quats=((records["quats"].astype(np.float32) - 128) / 128).astype(np.float32),
+            scales=np.log(lengths).astype(np.float32),
+            opacities=logits_of_bytes(colors[:, 3]),
+            sh0=((colors[:, None, :3] / 255 - 0.5) / _SH_C0).astype(np.float32),
+            shN=np.zeros((len(records), 0, 3), np.float32),
+        )
+    )
+
+
+def count_splats(path: str | os.PathLike[str]) -> int:
+    """Number of splats of a ``.splat`` file, which has no header.
+
+    Raises:
+        FormatError: The file does not consist of whole splats.
+    """
+    size = os.path.getsize(path)
+    with naming_file(path):
+        if size % _RECORD.itemsize:
+            raise FormatError(
+                f"truncated, or not a .splat file: of {size} bytes the last {size % _RECORD.itemsize} are no "
+                f"whole splat of {_RECORD.itemsize}; copy or export it again"
+            )
+    return size // _RECORD.itemsize

@@ -1,0 +1,410 @@
+"""``.splat``, ``.spz`` and ``.sog``: what comes back, how exactly, and what damage leads to."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import logging
+import math
+import struct
+import sys
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nsvq_lightning.info import main as info
+from nsvq_lightning.io import CompressedScene, FormatError, SplatArrays, load, read_scene, save
+from nsvq_lightning.io.describe import describe
+from nsvq_lightning.io.sog import write_sog
+from nsvq_lightning.io.spz import read_spz_header
+from nsvq_lightning.picture_error import decibels, picture_error, pictures
+from nsvq_lightning.viewpoints import cameras_around
+
+sys.path.insert(0, str(Path(__file__).parent))
+from viewer_scenes import angles, coded_scene, nearest_in, plain_scene, sigmoid
+
+SUFFIXES = (".splat", ".spz", ".sog")
+SH_C0 = 0.28209479177387814
+
+
+def round_trip(scene: CompressedScene, path: Path) -> tuple[SplatArrays, SplatArrays]:
+    """What was read, and what was written in the order of the file."""
+    assert save(scene, path) == path.stat().st_size
+    read, written = read_scene(path).arrays(), scene.arrays()
+    order = nearest_in(read, written)
+    return read, SplatArrays(**{name: values[order] for name, values in vars(written).items()})
+
+
+def rotation_bound(component: float) -> float:
+    """Largest angle where each of the smallest three is off by so much: the largest follows with √3 times theirs."""
+    return 2 * 2 * math.sqrt(3) * component * 1.02
+
+
+@pytest.mark.parametrize("make", [plain_scene, coded_scene])
+def test_splat_is_as_exact_as_its_bytes(tmp_path: Path, make: type) -> None:
+    scene = make(150)
+    read, written = round_trip(scene, tmp_path / "x.splat")
+    assert (tmp_path / "x.splat").stat().st_size == 32 * 150
+    np.testing.assert_array_equal(read.means, scene.means)
+    np.testing.assert_allclose(read.scales, written.scales, rtol=0, atol=2e-6)
+    assert np.abs(sigmoid(read.opacities) - sigmoid(written.opacities)).max() <= 0.5 / 255 + 1e-7
+    assert np.abs(read.sh0 - written.sh0).max() <= 0.5 / 255 / SH_C0 + 1e-6
+    assert angles(read.quats, written.quats).max() <= 2 * math.asin(math.sqrt(4) * 0.5 / 128)
+    assert read.sh_degree == 0
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("make", [plain_scene, coded_scene])
+def test_spz_is_as_exact_as_its_bits(tmp_path: Path, make: type, degree: int) -> None:
+    path = tmp_path / "x.spz"
+    scene = make(150, degree)
+    read, written = round_trip(scene, path)
+    header = read_spz_header(path)
+    assert (header.version, header.count, header.sh_degree) == (3, 150, degree)
+    assert np.abs(read.means - written.means).max() <= 0.5 / (1 << header.fraction_bits) + 1e-6
+    assert np.abs(read.scales - written.scales).max() <= 0.5 / 16 + 1e-6
+    assert np.abs(sigmoid(read.opacities) - sigmoid(written.opacities)).max() <= 0.5 / 255 + 1e-7
+    assert np.abs(read.sh0 - written.sh0).max() <= 0.5 / 255 / 0.15 + 1e-6
+    assert angles(read.quats, written.quats).max() <= rotation_bound(0.5 / 511 / math.sqrt(2))
+    assert degree == 0 or np.abs(read.shN - written.shN).max() <= 0.5 / 128 + 1e-6
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("make", [plain_scene, coded_scene])
+def test_sog_is_as_exact_as_its_bits(tmp_path: Path, make: type, degree: int) -> None:
+    path = tmp_path / "x.sog"
+    scene = make(150, degree)
+    read, written = round_trip(scene, path)
+    with zipfile.ZipFile(path) as archive:
+        meta = json.loads(archive.read("meta.json"))
+    extent = np.subtract(meta["means"]["maxs"], meta["means"]["mins"])
+    bound = 0.5 * extent / 65535 * (1 + np.abs(written.means)) * 1.001 + 1e-6
+    assert (np.abs(read.means - written.means) <= bound).all()
+    assert np.abs(sigmoid(read.opacities) - sigmoid(written.opacities)).max() <= 0.5 / 255 + 1e-7
+    assert angles(read.quats, written.quats).max() <= rotation_bound(0.5 / 127.5 / math.sqrt(2))
+    for name in ("scales", "sh0", "shN")[: 3 if degree else 2]:
+        levels = np.array(meta[name]["codebook"])
+        assert len(levels) == 256
+        values = getattr(written, name).astype(np.float64)
+        nearest = np.abs(values[..., None] - levels).min(-1)
+        np.testing.assert_allclose(np.abs(getattr(read, name) - values), nearest, rtol=0, atol=1e-6)
+    if make is coded_scene:  # 20 rows of 3 numbers fit into 256 levels
+        np.testing.assert_array_equal(read.scales, written.scales)
+        np.testing.assert_array_equal(read.sh0, written.sh0)
+    assert ("shN" in meta) == (degree > 0)
+
+
+def test_sog_takes_the_codebook_as_its_palette_and_the_codes_as_labels(tmp_path: Path) -> None:
+    scene = coded_scene(200, 3, rows=80)
+    save(scene, tmp_path / "x.sog")
+    back = read_scene(tmp_path / "x.sog")
+    assert back.file_bytes == (tmp_path / "x.sog").stat().st_size
+    used = np.unique(scene.codes["shN"])
+    order = nearest_in(back.arrays(), scene.arrays())
+    np.testing.assert_array_equal(used[back.codes["shN"]], scene.codes["shN"][order])
+    assert back.codebooks["shN"].shape == (len(used), 45)
+    assert np.abs(back.codebooks["shN"] - scene.codebooks["shN"][used]).max() < 0.01  # 256 levels for ±0.9
+    # And back: a second file has the same palette and labels.
+    save(back, tmp_path / "y.sog")
+    again = read_scene(tmp_path / "y.sog")
+    np.testing.assert_array_equal(again.codebooks["shN"], back.codebooks["shN"])
+
+
+def test_sog_finds_a_palette_of_the_stated_size_where_there_is_none(tmp_path: Path) -> None:
+    scene = plain_scene(300)
+    assert len(read_scene_of(scene, tmp_path / "x.sog").codebooks["shN"]) == 300  # all distinct rows: fewer than 4096
+    small = read_scene_of(scene, tmp_path / "y.sog", palette=16)
+    assert len(small.codebooks["shN"]) == 16
+    order = nearest_in(small.arrays(), scene.arrays())
+    rows = scene.raw["shN"][order]
+    distances = np.square(rows[:, None] - small.codebooks["shN"][None]).sum(2)
+    found = np.square(rows - small.codebooks["shN"][small.codes["shN"]]).sum(1)
+    np.testing.assert_allclose(found, distances.min(1), rtol=0.02)  # nearest before the palette itself was rounded
+    for palette in (0, 65537):
+        with pytest.raises(ValueError, match=r"palette must be in 1\.\.65536"):
+            write_sog(tmp_path / "z.sog", scene, palette=palette)
+
+
+def test_sog_clusters_a_codebook_with_more_rows_than_labels(tmp_path: Path) -> None:
+    n = 65600
+    rng = np.random.default_rng(0)
+    plain = plain_scene(n, 1)
+    codes = {"shN": np.repeat(np.arange(n), 1)}
+    codebook = np.repeat(rng.normal(size=(8, 9)), n // 8, axis=0).astype(np.float32)
+    raw = {name: values for name, values in plain.raw.items() if name != "shN"}
+    scene = replace(plain, raw=raw, codes=codes, codebooks={"shN": codebook})
+    back = read_scene_of(scene, tmp_path / "x.sog", palette=8)
+    assert len(back.codebooks["shN"]) == 8
+    assert np.unique(back.codes["shN"], return_counts=True)[1].tolist() == [n // 8] * 8
+
+
+def read_scene_of(scene: CompressedScene, path: Path, **options: int) -> CompressedScene:
+    save(scene, path, **options)
+    return read_scene(path)
+
+
+def test_spz_has_the_axes_right_up_back(tmp_path: Path) -> None:
+    """Oracle: the picture of a scene turned by 180° about x is that of the turned coefficients."""
+    path = tmp_path / "x.spz"
+    scene = plain_scene(1, 3)
+    turned = read_scene_of(scene, path).arrays()
+    stream = gzip.decompress(path.read_bytes())
+    x, y, z = (int.from_bytes(stream[16 + 3 * i : 19 + 3 * i], "little", signed=True) for i in range(3))
+    scale = 1 << stream[13]
+    np.testing.assert_allclose(np.array([x, -y, -z]) / scale, scene.means[0], atol=1 / scale)
+    stored = (np.frombuffer(stream[-45:], np.uint8).astype(np.float64).reshape(15, 3) - 128) / 128
+    rng = np.random.default_rng(0)
+    for direction in rng.normal(size=(5, 3)):
+        direction /= np.linalg.norm(direction)
+        ours = _basis(direction) @ turned.shN[0]
+        theirs = _basis(direction * [1, -1, -1]) @ stored
+        np.testing.assert_allclose(theirs, ours, atol=1e-6)
+
+
+def _basis(direction: np.ndarray) -> np.ndarray:
+    """Spherical harmonics of degree 1 to 3, from their polynomials up to factors (which do not matter here)."""
+    x, y, z = direction
+    return np.array(
+        [
+            *(-y, z, -x),
+            *(x * y, -y * z, 2 * z * z - x * x - y * y, -x * z, x * x - y * y),
+            *(-y * (3 * x * x - y * y), x * y * z, -y * (4 * z * z - x * x - y * y)),
+            z * (2 * z * z - 3 * x * x - 3 * y * y),
+            *(-x * (4 * z * z - x * x - y * y), z * (x * x - y * y), -x * (x * x - 3 * y * y)),
+        ]
+    )
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_spz_of_older_versions(tmp_path: Path, version: int) -> None:
+    """Two splats written by hand."""
+    means = np.array([[1.5, 2, -3], [0, -0.25, 100]])
+    positions = (
+        means.astype("<f2").tobytes()
+        if version == 1
+        else b"".join(round(v * 256).to_bytes(3, "little", signed=True) for v in means.ravel())
+    )
+    body = (
+        positions + bytes([0, 255]) + bytes([0, 128, 255] * 2) + bytes([160] * 6) + bytes([255, 128, 128, 128] * 2)[:6]
+    )
+    header = struct.pack("<4sIIBBBB", b"NGSP", version, 2, 0, 8, 0, 0)
+    path = tmp_path / "x.spz"
+    path.write_bytes(gzip.compress(header + body + b"extensions"))
+    read = load(path)
+    np.testing.assert_allclose(read.means.detach().numpy(), means * [1, -1, -1])
+    assert read.opacities.tolist() == [-20, 20]
+    np.testing.assert_allclose(read.scales.detach().numpy(), 0)
+    np.testing.assert_allclose(read.sh0[0, 0].tolist(), [-0.5 / 0.15, 0.5 / 255 / 0.15, 0.5 / 0.15], atol=1e-6)
+    half = 1 / 255
+    np.testing.assert_allclose(read.quats[0].tolist(), [0, 1, -half, -half], atol=1e-6)
+
+
+@pytest.mark.parametrize(("extent", "log_scale", "bits"), [(10.0, -5.0, 12), (0.01, -11.0, 20), (3e4, -3.0, 8)])
+def test_spz_positions_suit_the_size_of_the_scene(tmp_path: Path, extent: float, log_scale: float, bits: int) -> None:
+    scene = plain_scene(100, 0)
+    means = (scene.means / np.abs(scene.means).max() * extent).astype(np.float32)
+    scales = np.full((100, 3), log_scale, np.float32)
+    scene = replace(scene, means=means, raw={**scene.raw, "scales": scales})
+    save(scene, tmp_path / "x.spz")
+    assert read_spz_header(tmp_path / "x.spz").fraction_bits == bits
+
+
+def test_a_far_splat_does_not_make_spz_coarse(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    scene = plain_scene(2000, 0)
+    scene.means[7] = [1e5, 0, 0]
+    with caplog.at_level(logging.WARNING):
+        back = read_scene_of(scene, tmp_path / "x.spz").arrays()
+    assert "means 1 (of 2000" in caplog.text
+    assert read_spz_header(tmp_path / "x.spz").fraction_bits == 12
+    assert back.means.max() == pytest.approx(2048, abs=0.01)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_values_out_of_range_are_clamped_and_counted(
+    tmp_path: Path, suffix: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = plain_scene(50, 1)
+    raw = {name: values.copy() for name, values in scene.raw.items()}
+    raw["sh0"][:3, 0] = 9
+    raw["scales"][4, 1] = -30
+    raw["shN"][7:9, 2] = -5
+    scene = replace(scene, raw=raw)
+    with caplog.at_level(logging.WARNING):
+        read, written = round_trip(scene, tmp_path / f"x{suffix}")
+    expected = {".splat": "sh0 3 (of 50", ".spz": "sh0 3, scales 1, shN 2 (of 50", ".sog": ""}[suffix]
+    assert expected in caplog.text
+    assert ("moved to its end" in caplog.text) == bool(expected)
+    if suffix == ".spz":
+        assert read.scales.min() == -10
+        assert read.shN.min() == -127 / 128  # the sign of this coefficient changes with the axes
+    if suffix == ".sog":
+        np.testing.assert_allclose(read.sh0, written.sh0, atol=0.05)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_what_is_not_finite_is_left_out(tmp_path: Path, suffix: str, caplog: pytest.LogCaptureFixture) -> None:
+    scene = coded_scene(30, 1)
+    scene.codebooks["scales"][int(scene.codes["scales"][4]), 1] = np.nan
+    scene.means[5, 0] = np.inf
+    lost = (scene.codes["scales"] == scene.codes["scales"][4]) | (np.arange(30) == 5)
+    with caplog.at_level(logging.WARNING):
+        save(scene, tmp_path / f"x{suffix}")
+    assert f"dropped {lost.sum()} of 30" in caplog.text
+    back = read_scene(tmp_path / f"x{suffix}").arrays()
+    assert len(back) == 30 - lost.sum()
+    assert all(np.isfinite(values).all() for values in vars(back).values())
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_bytes_depend_on_the_scene_alone(tmp_path: Path, suffix: str) -> None:
+    for make in (plain_scene, coded_scene):
+        a, b = tmp_path / f"a{suffix}", tmp_path / f"another{suffix}"
+        save(make(40), a)
+        save(make(40), b)
+        assert a.read_bytes() == b.read_bytes()
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("count", [0, 1])
+def test_empty_and_single_splats(tmp_path: Path, suffix: str, count: int) -> None:
+    save(plain_scene(count, 2).decode(), tmp_path / f"x{suffix}")
+    assert len(load(tmp_path / f"x{suffix}")) == count
+    assert info([str(tmp_path / f"x{suffix}")]) == 0
+    zero = replace(plain_scene(1), raw={**plain_scene(1).raw, "quats": np.zeros((1, 4), np.float32)})
+    back = read_scene_of(zero, tmp_path / f"x{suffix}").arrays()
+    assert angles(back.quats, np.array([[1, 0, 0, 0]], np.float32)).max() < 0.01
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_description_without_decoding(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"x{suffix}"
+    save(coded_scene(60, 2), path)
+    facts = describe(path)
+    assert facts["format"].startswith(suffix[1:])
+    assert (facts["splats"], facts["sh_degree"]) == (60, 0 if suffix == ".splat" else 2)
+    assert sum(stream["bytes"] for stream in facts["streams"]) == facts["bytes"] == path.stat().st_size
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_truncated_and_altered_files_are_refused_or_read_as_they_were(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"bad{suffix}"
+    save(coded_scene(12, 1), path)
+    data, expected = path.read_bytes(), vars(read_scene(path).arrays())
+    for length in range(0, len(data), 1 if suffix == ".spz" else 13):
+        path.write_bytes(data[:length])
+        if suffix == ".splat" and length % 32 == 0:
+            continue
+        with pytest.raises(FormatError, match=rf"bad{suffix}: "):
+            read_scene(path)
+    if suffix == ".splat":
+        return  # it has no sum that could expose changes
+    rng = np.random.default_rng(5)
+    refused = 0
+    for position in rng.integers(0, len(data), 200):
+        path.write_bytes(data[:position] + bytes([data[position] ^ (1 << rng.integers(8))]) + data[position + 1 :])
+        try:
+            read = vars(read_scene(path).arrays())
+        except FormatError:
+            refused += 1
+        else:
+            for name, values in expected.items():
+                np.testing.assert_array_equal(read[name], values)
+    assert refused > 150
+
+
+def _with_meta(data: dict[str, object], path: Path, **changes: object) -> None:
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    files["meta.json"] = json.dumps({**data, **changes}).encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"version": 3}, "version 3 of the format"),
+        ({"count": -1}, "'count'"),
+        ({"count": 300}, "12 x 8|8 x 8|16 x|texels"),
+        ({"count": 10**9}, "cannot be in"),
+        ({"means": {"mins": [0, 0, 0], "maxs": [1e9, 0, 0], "files": ["means_l.webp", "means_u.webp"]}}, "'maxs'"),
+        ({"means": {"mins": [0, 0, 0], "maxs": [1, 0, 0], "files": ["means_l.webp"]}}, "pictures of 'means'"),
+        ({"quats": {"files": ["sh0.webp"]}}, "mark"),
+        ({"quats": {"files": ["../quats.webp"]}}, "no ../quats.webp"),
+        ({"scales": {"codebook": [0.5], "files": ["scales.webp"]}}, "level .* of scales, there are 1"),
+        ({"scales": {"codebook": [1e300] * 256, "files": ["scales.webp"]}}, "'codebook'"),
+        (
+            {
+                "shN": {
+                    "count": 2,
+                    "bands": 1,
+                    "codebook": [0] * 256,
+                    "files": ["shN_centroids.webp", "shN_labels.webp"],
+                }
+            },
+            "label",
+        ),
+        ({"shN": {"count": 2, "bands": 4}}, "'bands'"),
+    ],
+)
+def test_a_wrong_description_of_sog(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    path = tmp_path / "x.sog"
+    save(coded_scene(60, 1), path)
+    with zipfile.ZipFile(path) as archive:
+        meta = json.loads(archive.read("meta.json"))
+    _with_meta(meta, path, **changes)
+    with pytest.raises(FormatError, match=rf"x\.sog: .*({message})"):
+        read_scene(path)
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ((b"NGSP", 4, 2, 0, 12, 0, 0), "version 4"),
+        ((b"PLYY", 3, 2, 0, 12, 0, 0), "does not start"),
+        ((b"NGSP", 3, 2, 4, 12, 0, 0), "SH degree 4"),
+        ((b"NGSP", 3, 2, 0, 99, 0, 0), "99 bits"),
+        ((b"NGSP", 3, 1 << 31, 0, 12, 0, 0), "cannot be in"),
+        ((b"NGSP", 3, 3, 0, 12, 0, 0), "truncated: 3 splats"),
+    ],
+)
+def test_a_wrong_header_of_spz(
+    tmp_path: Path, header: tuple[bytes, int, int, int, int, int, int], message: str
+) -> None:
+    path = tmp_path / "x.spz"
+    path.write_bytes(gzip.compress(struct.pack("<4sIIBBBB", *header) + bytes(40)))
+    with pytest.raises(FormatError, match=rf"x\.spz: .*{message}"):
+        read_scene(path)
+    path.write_bytes(struct.pack("<4sII", b"NGSP", 4, 7) + bytes(60))
+    with pytest.raises(FormatError, match="version 4 or later"):
+        read_scene(path)
+
+
+def test_an_origin_is_not_lost_silently(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    scene = replace(plain_scene(5, 0), origin=(4e6, 0.0, 0.0))
+    with caplog.at_level(logging.WARNING):
+        save(scene, tmp_path / "x.nsvq")
+        assert caplog.text == ""
+        save(scene, tmp_path / "x.spz")
+    assert "4000000.0" in caplog.text
+    assert read_scene(tmp_path / "x.nsvq").origin == (4e6, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("suffix", "least"), [(".ply", math.inf), (".spz", 38.0), (".sog", 40.0), (".splat", 20.0)])
+def test_pictures_of_the_file_are_those_of_the_scene(tmp_path: Path, suffix: str, least: float) -> None:
+    scene = plain_scene(400)
+    rng = np.random.default_rng(1)
+    raw = {**scene.raw, "scales": (scene.raw["scales"] * 0.2 - 1).astype(np.float32)}
+    raw["shN"] = rng.normal(0, 0.1, raw["shN"].shape).astype(np.float32)
+    scene = replace(scene, raw=raw)
+    cameras = cameras_around(scene.means, 2, 96, 64)
+    save(scene, tmp_path / f"x{suffix}")
+    expected = pictures(scene.decode(), cameras)
+    assert torch.stack(expected).std() > 0.1
+    found = decibels(picture_error(load(tmp_path / f"x{suffix}"), cameras, expected))
+    assert least <= found

@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nsvq_lightning.cli import OWN_COMMANDS
+from nsvq_lightning.compress import export_scene
+from nsvq_lightning.convert_command import main
+from nsvq_lightning.io import FORMATS, read_scene, save
+from nsvq_lightning.io.precision import Storage
+
+sys.path.insert(0, str(Path(__file__).parent / "io"))
+from viewer_scenes import coded_scene, nearest_in
+
+
+def test_every_readable_format_becomes_every_writable_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = coded_scene(30, 1)
+    for source in FORMATS:
+        save(scene, tmp_path / f"a{source}")
+        for target in FORMATS:
+            output = tmp_path / "new" / f"b{target}"
+            assert main([str(tmp_path / f"a{source}"), str(output)]) == 0
+            assert f"30 splats in {output.stat().st_size:,} bytes" in capsys.readouterr().out
+            nearest_in(read_scene(output).arrays(), scene.arrays())
+    assert OWN_COMMANDS["convert"] == main.__module__
+
+
+def test_codebooks_survive_where_the_format_has_them(tmp_path: Path) -> None:
+    scene = coded_scene(50, 2)
+    save(scene, tmp_path / "a.nsvq", level="paper")
+    assert main([str(tmp_path / "a.nsvq"), str(tmp_path / "b.nsvq"), "--level", "paper"]) == 0
+    assert (tmp_path / "b.nsvq").read_bytes() == (tmp_path / "a.nsvq").read_bytes()
+    assert main([str(tmp_path / "a.nsvq"), str(tmp_path / "c.sog")]) == 0
+    assert main([str(tmp_path / "c.sog"), str(tmp_path / "d.nsvq"), "--level", "paper"]) == 0
+    codebook = read_scene(tmp_path / "d.nsvq").codebooks["shN"]
+    np.testing.assert_array_equal(codebook, read_scene(tmp_path / "c.sog").codebooks["shN"])
+
+
+def test_a_run_exports_its_codes_as_labels(tmp_path: Path) -> None:
+    scene = coded_scene(50, 1)
+    paths = export_scene(scene, tmp_path, Storage("paper"), ("nsvq", "sog", "spz"))
+    assert [path.name for path in paths.values()] == ["scene.nsvq", "scene.sog", "scene.spz"]
+    sog, plain = read_scene(paths["sog"]), read_scene(paths["nsvq"])
+    order = nearest_in(sog.arrays(), plain.arrays())
+    np.testing.assert_array_equal(np.unique(scene.codes["shN"])[sog.codes["shN"]], plain.codes["shN"][order])
+    with pytest.raises(ValueError, match=r"unknown export format 'obj'; choose from ply, nsvq, sog, spz, splat"):
+        export_scene(scene, tmp_path, Storage(), ("obj",))
+
+
+def test_measuring_says_how_the_pictures_differ(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save(coded_scene(20, 1), tmp_path / "a.nsvq")
+    assert main([str(tmp_path / "a.nsvq"), str(tmp_path / "b.ply"), "--measure"]) == 0
+    assert "error 0 (inf dB against a.nsvq in 8 pictures)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["missing.ply", "b.spz"], "missing.ply"),
+        (["bad.spz", "b.ply"], "bad.spz: "),
+        (["a.nsvq", "b.obj"], "unknown suffix '.obj'"),
+        (["a.nsvq", "b.sog", "--palette", "0"], "palette must be in 1..65536"),
+    ],
+)
+def test_errors_in_files_are_one_line_and_status_1(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save(coded_scene(5, 1), tmp_path / "a.nsvq")
+    (tmp_path / "bad.spz").write_bytes(b"nothing")
+    assert main(arguments) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("nsvq convert: ")
+    assert message in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.glob("b.*"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["a.nsvq", "b.ply", "--palette", "8"], "--palette is an option of .sog files"),
+        (["a.nsvq", "b.sog", "--level", "paper"], "--level is an option of .nsvq files"),
+        (["a.nsvq", "b.sog", "--data.root", "x"], "add --measure"),
+    ],
+)
+def test_options_that_do_not_fit_end_with_status_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == 2
+    assert message in capsys.readouterr().err
