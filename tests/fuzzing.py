@@ -263,6 +263,35 @@ def _read_config(path: Path) -> object:
     return path
 
 
+def _build_photos(folder: Path) -> list[Path]:
+    import cv2
+
+    rng = np.random.default_rng(0)
+    smooth = cv2.resize(rng.integers(0, 256, (3, 4, 4), dtype=np.uint8), (20, 15), interpolation=cv2.INTER_LINEAR)
+    pictures = {
+        "rgb.png": smooth[..., :3],
+        "rgba.png": smooth,
+        "grey16.png": smooth[..., 0].astype(np.uint16) * 257,
+        "rgb.jpg": smooth[..., :3],
+        "grey.jpg": smooth[..., 0],
+        "rgb.tiff": smooth[..., :3],
+        "rgb.bmp": smooth[..., :3],
+        "rgb.webp": smooth[..., :3],
+    }
+    for name, picture in pictures.items():
+        assert cv2.imwrite(str(folder / name), picture)
+    return [folder / name for name in pictures]
+
+
+def _read_photo(path: Path) -> object:
+    """Load it as the photo of a view."""
+    from nsvq_lightning.data.images import ImageSource, image_size
+    from nsvq_lightning.data.undistort import Pinhole
+
+    size = image_size(path)
+    return ImageSource(path, size, None, Pinhole(np.eye(3), *size)).load()
+
+
 def targets() -> dict[str, Target]:
     """Kinds of files by name."""
     from nsvq_lightning.data.model_files import SceneError
@@ -273,6 +302,7 @@ def targets() -> dict[str, Target]:
         "nsvq": Target(_build_nsvq, _read_nsvq, (FormatError,), _mend_nsvq),
         "colmap-bin": Target(lambda folder: _build_colmap(folder, ".bin"), _read_colmap, (SceneError,)),
         "colmap-txt": Target(lambda folder: _build_colmap(folder, ".txt"), _read_colmap, (SceneError,)),
+        "photo": Target(_build_photos, _read_photo, (SceneError,)),
         "config": Target(_build_config, _read_config, (ValueError,)),
         "checkpoint": Target(_build_checkpoint, _read_checkpoint, (FormatError,)),
     }
