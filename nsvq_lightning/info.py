@@ -62,7 +62,7 @@ def describe(path: Path) -> dict[str, Any]:
     elif start.startswith(PLY_MAGIC):
         facts = _describe_ply(path)
     else:
-        raise FormatError(f"{path}: neither a .nsvq nor a .ply file")
+        raise FormatError(f"{path}: neither a .nsvq nor a .ply file", "give the file of a scene")
     facts["plain_bytes"] = plain_ply_bytes(facts["splats"], facts["sh_degree"])
     facts["ratio"] = facts["plain_bytes"] / facts["bytes"]
     return {"file": str(path), **facts}

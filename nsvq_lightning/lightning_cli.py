@@ -22,7 +22,7 @@ from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.progress import SplatProgressBar
 from nsvq_lightning.skips import SKIPS, switch, switched
-from nsvq_lightning.trainer import SplatTrainer
+from nsvq_lightning.trainer import SplatTrainer, read_checkpoint
 
 __all__ = ["DEFAULT_CALLBACKS", "SplatCLI", "default_loggers"]
 
@@ -152,7 +152,14 @@ class SplatCLI(LightningCLI):
         switch(**self._get(self.config, "skips").as_dict())
 
     def _parse_ckpt_path(self) -> None:
-        """Take the model's settings from the checkpoint, except in ``fit``: there the user's options must win."""
+        """Take the model's settings from the checkpoint, except in ``fit``: there the user's options must win.
+
+        Raises:
+            FormatError: It is damaged; Lightning's own reader would fail somewhere inside torch, or not notice.
+        """
+        path = self._get(self.config, "ckpt_path")
+        if path is not None and Path(path).is_file():
+            read_checkpoint(path)
         if self.config.subcommand != "fit":
             super()._parse_ckpt_path()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -21,22 +22,38 @@ log = logging.getLogger(__name__)
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Read a checkpoint without running anything that it holds.
+    """Read a checkpoint without running anything that it holds; tensors stay in the file until they are used.
 
     Raises:
         FileNotFoundError: No such checkpoint.
-        FormatError: The file is damaged or no checkpoint of Lightning.
+        FormatError: The file is damaged or no checkpoint of a training run of this package.
     """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such checkpoint; a run has its own in checkpoints/last.ckpt")
     try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError:
-        raise
-    except Exception as error:  # torch's readers of zip archives and pickles raise whatever damage leads them to
+        _check_sums(path)
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception as error:  # readers of zip archives and pickles raise whatever damage leads them to
         reason = str(error).partition("\n")[0] or type(error).__name__
-        raise FormatError(f"{path}: damaged, or not a checkpoint ({reason})") from error
-    if not isinstance(checkpoint, dict) or not isinstance(checkpoint.get("state_dict"), dict):
-        raise FormatError(f"{path}: not a checkpoint of Lightning: it has no state_dict")
-    return checkpoint
+        raise FormatError(
+            f"{path}: damaged, or not a checkpoint ({reason})", "copy it again, or take another one of the run"
+        ) from error
+    state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
+    if not isinstance(state, dict) or "splats.means" not in state:
+        raise FormatError(f"{path}: not the checkpoint of a run: it holds no splats", "give one that nsvq fit wrote")
+    return checkpoint  # type: ignore[no-any-return]
+
+
+def _check_sums(path: str | Path) -> None:
+    """Compare the checksums of a zip archive, which torch's reader ignores.
+
+    Raises:
+        ValueError: An entry has been altered.
+    """
+    with zipfile.ZipFile(path) as archive:
+        altered = archive.testzip()
+    if altered is not None:
+        raise ValueError(f"the checksum of its entry {altered} does not fit")
 
 
 class SplatTrainer(Trainer):
