@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -109,8 +110,12 @@ class Compressor:
         self._splats = RawSplats(*(tensor.detach() for tensor in splats.to_splats().raw()))
         self._cameras, self._storage, self._seed = cameras, storage, seed
         self._pictures = [_picture(self._splats, camera) for camera in cameras]
-        self._weights = row_weights(contributions(self._splats, cameras, render))
         self._done: dict[str, Candidate] = {}
+
+    @cached_property
+    def _weights(self) -> Tensor:
+        """Weight of each splat ``[N]`` in k-means; only codebooks need it."""
+        return row_weights(contributions(self._splats, self._cameras, render))
 
     def at(self, rung: Rung) -> Candidate:
         """The scene at a rung."""

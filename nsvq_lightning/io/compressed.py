@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.arrays import SplatArrays, check_floats, sh_coefficients
+from nsvq_lightning.io.arrays import SplatArrays, check_floats
 from nsvq_lightning.io.ply import plain_ply_bytes
+from nsvq_lightning.sh_degree import sh_coefficients
 
 if TYPE_CHECKING:
     from nsvq_lightning.splats import Splats
