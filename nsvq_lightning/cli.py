@@ -159,7 +159,7 @@ def check_config(path: str) -> None:
     except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error
     if not isinstance(settings, dict):
-        found = "nothing" if settings is None else f"a {type(settings).__name__}"
+        found = "nothing" if settings is None else type(settings).__name__
         raise ValueError(f"config {path} holds {found}: give settings by name, as 'trainer: {{max_steps: 1000}}'")
 
 

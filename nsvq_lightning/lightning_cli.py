@@ -157,7 +157,7 @@ class SplatCLI(LightningCLI):
         Raises:
             FormatError: It is damaged; Lightning's own reader would fail somewhere inside torch, or not notice.
         """
-        path = self._get(self.config, "ckpt_path")
+        path = self.config[self.config.subcommand].get("ckpt_path")  # self.subcommand is set later
         if path is not None and Path(path).is_file():
             read_checkpoint(path)
         if self.config.subcommand != "fit":

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-CASES = {"ply": 300, "nsvq": 200, "colmap-bin": 200, "colmap-txt": 150, "config": 10, "checkpoint": 40}
+CASES = {"ply": 300, "nsvq": 200, "colmap-bin": 200, "colmap-txt": 150, "photo": 300, "config": 20, "checkpoint": 60}
 
 
 @pytest.mark.parametrize("kind", CASES)
