@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.rendering.kernels import kernels_for
+from nsvq_lightning.rendering.reference import rotation_matrices
 from nsvq_lightning.splats import RawSplats
 
 __all__ = [
@@ -185,17 +186,6 @@ def split(parents: RawSplats, rules: DensityRules, generator: torch.Generator) -
     draws = torch.randn(count, 3, generator=generator).to(parents.means)
     offsets = torch.einsum("nij,nj->ni", rotation_matrices(repeated.quats), repeated.scales.exp() * draws)
     return repeated._replace(means=repeated.means + offsets, scales=repeated.scales - math.log(rules.shrink))
-
-
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotation matrices ``[N, 3, 3]`` of quaternions ``[N, 4]``, wxyz, any norm."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    rows = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1),
-    ]
-    return torch.stack(rows, 1)
 
 
 def lower_opacities(opacities: Tensor, ceiling: float) -> Tensor:

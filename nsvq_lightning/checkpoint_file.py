@@ -32,9 +32,9 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such checkpoint; {WAY_OUT}")
     if path.is_dir():
-        raise FormatError(f"{path}: a folder, not a checkpoint; {WAY_OUT}")
+        raise FormatError(f"{path}: a folder, not a checkpoint", WAY_OUT)
     if path.stat().st_size == 0:
-        raise FormatError(f"{path}: an empty file, not a checkpoint; {WAY_OUT}")
+        raise FormatError(f"{path}: an empty file, not a checkpoint", WAY_OUT)
     try:
         _check_sums(path)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
@@ -44,12 +44,12 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         named = re.search(r"GLOBAL (\S+)", str(error))
         what = f"an object of {named[1]}" if named else "an object that is not plain data"
         raise FormatError(
-            f"{path}: refused, it holds {what}, and loading that could run code; nsvq fit stores tensors and plain "
-            f"data only: {WAY_OUT}"
+            f"{path}: refused, it holds {what}, and loading that could run code",
+            WAY_OUT,
         ) from error
     except Exception as error:  # torch's readers of archives and pickles raise whatever damage leads them to
         reason = str(error).partition("\n")[0] or type(error).__name__
-        raise FormatError(f"{path}: damaged, or not a checkpoint ({reason}); {WAY_OUT}") from error
+        raise FormatError(f"{path}: damaged, or not a checkpoint ({reason})", WAY_OUT) from error
     _check_contents(path, checkpoint)
     return checkpoint  # type: ignore[no-any-return]  # checked
 
@@ -60,18 +60,18 @@ def _check_sums(path: Path) -> None:
         with ZipFile(path) as archive:
             damaged = archive.testzip()
     except BadZipFile as error:
-        raise FormatError(f"{path}: truncated, or not a checkpoint; {WAY_OUT}") from error
+        raise FormatError(f"{path}: truncated, or not a checkpoint", WAY_OUT) from error
     if damaged is not None:
-        raise FormatError(f"{path}: damaged, its part {damaged} is not what was written; {WAY_OUT}")
+        raise FormatError(f"{path}: damaged, its part {damaged} is not what was written", WAY_OUT)
 
 
 def _check_contents(path: Path, checkpoint: Any) -> None:
     state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
     if not isinstance(state, dict) or "pytorch-lightning_version" not in checkpoint:
-        raise FormatError(f"{path}: not a checkpoint of Lightning; {WAY_OUT}")
+        raise FormatError(f"{path}: not a checkpoint of Lightning", WAY_OUT)
     if not {"splats.means", "state._phase"} <= state.keys():
         first = ", ".join(list(state)[:3]) or "nothing"
-        raise FormatError(f"{path}: a checkpoint of another model, which has {first} but no splats; {WAY_OUT}")
+        raise FormatError(f"{path}: a checkpoint of another model, which has {first} but no splats", WAY_OUT)
 
 
 class PlainCheckpointIO(TorchCheckpointIO):

@@ -7,12 +7,12 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
 
-__all__ = ["find_config", "main", "resolve_configs"]
+__all__ = ["check_config", "find_config", "main", "resolve_configs"]
 
 OWN_COMMANDS = {
     "info": "nsvq_lightning.info",
@@ -23,6 +23,8 @@ OWN_COMMANDS = {
     "doctor": "nsvq_lightning.doctor.cli",
 }
 """Commands without a trainer: modules with a ``main(argv)``, which must not pay for Lightning's start."""
+
+CONFIG_OPTIONS = ("--config", "-c")
 
 TRACEBACK = "NSVQ_TRACEBACK"
 """Environment variable that makes errors show their traceback."""
@@ -73,12 +75,20 @@ def _run_lightning(arguments: list[str]) -> int:
     from nsvq_lightning.lightning_cli import SplatCLI
 
     _quiet_lightning()
+    configs = _config_values(arguments)
     try:
+        for config in configs:
+            check_config(config)
         SplatCLI(arguments)
+    except SystemExit as end:
+        if end.code == 2 and configs:  # the parser's messages name the option, not the file it came from
+            sys.stderr.write(f"Settings came from {', '.join(configs)} and the command line\n")
+        raise
     except SIGTERMException:
         return 128 + signal.SIGTERM  # Lightning's own exit status is that of success
-    except (ValueError, FileNotFoundError, PermissionError) as error:
-        if os.environ.get(TRACEBACK) or not (isinstance(error, OSError) or _is_ours(error)):
+    except (ValueError, OSError) as error:
+        names_file = isinstance(error, FileNotFoundError) or (isinstance(error, OSError) and error.filename is not None)
+        if os.environ.get(TRACEBACK) or not (names_file or _is_ours(error)):
             raise
         sys.stderr.write(f"error: {error}\n({TRACEBACK}=1 shows where)\n")
         return 1
@@ -113,17 +123,45 @@ def _quiet_lightning() -> None:
 
 def resolve_configs(arguments: Sequence[str]) -> list[str]:
     """The arguments with every ``--config NAME`` that is no file replaced by the shipped one of that name."""
-    resolved: list[str] = []
+    resolved = list(arguments)
+    for place, name in _configs(arguments):
+        resolved[place] = resolved[place].removesuffix(name) + find_config(name)
+    return resolved
+
+
+def _config_values(arguments: Sequence[str]) -> list[str]:
+    return [name for _, name in _configs(arguments)]
+
+
+def _configs(arguments: Sequence[str]) -> Iterator[tuple[int, str]]:
+    """Place of each argument that ends with the name of a config, and that name."""
     expects_config = False
-    for argument in arguments:
+    for place, argument in enumerate(arguments):
         option, equals, value = argument.partition("=")
         if expects_config:
-            argument = find_config(argument)
-        elif option in ("--config", "-c") and equals:
-            argument = f"{option}={find_config(value)}"
-        expects_config = argument in ("--config", "-c")
-        resolved.append(argument)
-    return resolved
+            yield place, argument
+        elif option in CONFIG_OPTIONS and equals:
+            yield place, value
+        expects_config = not expects_config and argument in CONFIG_OPTIONS
+
+
+def check_config(path: str) -> None:
+    """Refuse a file that cannot be a config at all; a name that is no file is for the parser to complain about.
+
+    Raises:
+        ValueError: It is not text, not YAML, or not a table of settings.
+    """
+    import yaml
+
+    if not Path(path).is_file():
+        return
+    try:
+        settings = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error
+    if not isinstance(settings, dict):
+        found = "nothing" if settings is None else type(settings).__name__
+        raise ValueError(f"config {path} holds {found}: give settings by name, as 'trainer: {{max_steps: 1000}}'")
 
 
 def find_config(name: str) -> str:

@@ -18,6 +18,7 @@ from nsvq_lightning.optim import find_group
 from nsvq_lightning.splats import ATTRIBUTES, Splats
 
 __all__ = [
+    "LARGEST_LOG_SCALE",
     "append_rows",
     "change_coordinates",
     "drop_non_finite",
@@ -28,6 +29,10 @@ __all__ = [
 ]
 
 log = logging.getLogger(__name__)
+
+LARGEST_LOG_SCALE = 32.0
+"""Up to here (8e13 scene units) float32 holds the square of what a splat covers on the near plane of any camera; no
+view shows larger ones, so nothing would ever train or prune them."""
 
 FIRST_MOMENT = "exp_avg"
 MOMENTS = (FIRST_MOMENT, "exp_avg_sq", "max_exp_avg_sq")
@@ -133,15 +138,17 @@ def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -
 
 
 def finite_rows(splats: Splats) -> tuple[Tensor, dict[str, int]]:
-    """Which splats are finite in every attribute.
+    """Which splats are finite in every attribute, and so are their projections (:data:`LARGEST_LOG_SCALE`).
 
     Returns:
-        A mask ``[N]`` (bool) and, for each attribute with non-finite rows, how many.
+        A mask ``[N]`` (bool) and, for each attribute with other rows, how many.
     """
     mask = torch.ones(len(splats), dtype=torch.bool, device=splats.means.device)
     culprits: dict[str, int] = {}
     for name, parameter in splats.attributes().items():
         finite = torch.isfinite(parameter.detach()).flatten(1).all(1) if parameter.dim() > 1 else parameter.isfinite()
+        if name == "scales":
+            finite &= (parameter.detach() <= LARGEST_LOG_SCALE).all(1)
         bad = int((~finite).sum())
         if bad:
             culprits[name] = bad
@@ -150,7 +157,7 @@ def finite_rows(splats: Splats) -> tuple[Tensor, dict[str, int]]:
 
 
 def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> int:
-    """Drop splats with a NaN or infinite attribute, with a warning that names attribute, rows and step.
+    """Drop splats that :func:`finite_rows` leaves out, with a warning that names attribute, rows and step.
 
     Returns:
         Number of dropped splats.

@@ -14,7 +14,6 @@ from torchmetrics import Metric
 from nsvq_lightning.branch import branch_checkpoint, can_branch, check_continuation
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.host import log_interval
-from nsvq_lightning.io.arrays import sh_coefficients
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.precision import Storage
 from nsvq_lightning.losses import photometric_loss
@@ -32,6 +31,7 @@ from nsvq_lightning.optim import (
 from nsvq_lightning.quantize.nsvq import NSVQ
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.schedule import Phase
+from nsvq_lightning.sh_degree import sh_coefficients
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats import Splats
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import cast
 
 import torch
+from torch import Tensor
 
 from nsvq_lightning.canonical import canonical
 from nsvq_lightning.compress import compress
@@ -107,8 +109,12 @@ class Compressor:
         self._splats = RawSplats(*(tensor.detach() for tensor in splats.to_splats().raw()))
         self._cameras, self._storage, self._seed = cameras, storage, seed
         self._pictures = pictures(self._splats, cameras)
-        self._weights = row_weights(contributions(self._splats, cameras, render))
         self._done: dict[str, Candidate] = {}
+
+    @cached_property
+    def _weights(self) -> Tensor:
+        """Weight of each splat ``[N]`` in k-means; only codebooks need it."""
+        return row_weights(contributions(self._splats, self._cameras, render))
 
     def at(self, rung: Rung) -> Candidate:
         """The scene at a rung."""

@@ -11,6 +11,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
+from nsvq_lightning.sh_degree import sh_coefficients, shN_degree
+
 __all__ = ["ATTRIBUTES", "RawSplats", "SplatTensors", "Splats", "sh_degree_of"]
 
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -65,10 +67,7 @@ def sh_degree_of(shN: Tensor) -> int:
     Raises:
         ValueError: No degree from 0 to 3 has that many coefficients.
     """
-    degree = math.isqrt(shN.shape[1] + 1) - 1
-    if (degree + 1) ** 2 - 1 != shN.shape[1] or degree > 3:
-        raise ValueError(f"shN must have 0, 3, 8 or 15 coefficients (degree 0 to 3), got shape {list(shN.shape)}")
-    return degree
+    return shN_degree(shN.shape[1])
 
 
 def _check_shapes(tensors: Mapping[str, Tensor]) -> None:
@@ -91,6 +90,9 @@ class Splats(nn.Module):
 
     Args:
         sh_degree: Highest degree of the spherical harmonics, 0 to 3.
+
+    Raises:
+        ValueError: ``sh_degree`` is none of these.
     """
 
     means: nn.Parameter
@@ -102,12 +104,11 @@ class Splats(nn.Module):
 
     def __init__(self, sh_degree: int = 3) -> None:
         super().__init__()
-        if not 0 <= sh_degree <= 3:
-            raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {sh_degree}")
+        coefficients = sh_coefficients(sh_degree)
         empty = {"means": (0, 3), "quats": (0, 4), "scales": (0, 3), "opacities": (0,), "sh0": (0, 1, 3)}
         for name, shape in empty.items():
             self.register_parameter(name, nn.Parameter(torch.zeros(shape)))
-        self.register_parameter("shN", nn.Parameter(torch.zeros(0, (sh_degree + 1) ** 2 - 1, 3)))
+        self.register_parameter("shN", nn.Parameter(torch.zeros(0, coefficients, 3)))
         self._tables: list[str] = []
 
     @classmethod
@@ -165,7 +166,7 @@ class Splats(nn.Module):
             scales=(0.5 * spread.log())[:, None].repeat(1, 3),
             opacities=torch.full((n,), math.log(0.1 / 0.9)),
             sh0=((colors - 0.5) / SH_C0)[:, None, :],
-            shN=torch.zeros(n, (sh_degree + 1) ** 2 - 1, 3),
+            shN=torch.zeros(n, sh_coefficients(sh_degree), 3),
         )
 
     def __len__(self) -> int:

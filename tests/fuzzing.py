@@ -12,8 +12,9 @@ import re
 import resource
 import sys
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout, suppress
+from contextlib import redirect_stderr, suppress
 from dataclasses import dataclass
+from functools import cache
 from hashlib import blake2b
 from pathlib import Path
 
@@ -23,6 +24,8 @@ SECONDS = 20
 """A case that takes longer hangs."""
 MEMORY = 3 << 30
 """Bytes of address space that a case may add to what the process has before."""
+REMEDY = re.compile(r"\b(copy|export|run|update|correct|give|set|undistort|register|rename|remove|All options)\b", re.I)
+"""What messages tell the user to do."""
 NUMBERS = (0, 1, 2, 127, 128, 255, 256, 65535, 65536, 1 << 31, (1 << 32) - 1, 1 << 60, (1 << 64) - 1)
 TOKENS = (b"0", b"-1", b"1", b"7", b"99", b"65536", b"4294967296", b"1e400", b"nan", b"-inf", b"", b"x", b"\xff", b"[]")
 
@@ -120,14 +123,21 @@ def run(target: Target, folder: Path, cases: int, seed: int = 0) -> tuple[int, i
         faulthandler.dump_traceback_later(SECONDS, exit=True)
         try:
             target.read(path)
-        except target.errors:
+        except target.errors as error:
             refused += 1
+            _check_message(str(error), folder)
         except BaseException as error:
             raise AssertionError(f"case {case} of seed {seed}, {path}: {type(error).__name__}: {error}") from error
         finally:
             faulthandler.cancel_dump_traceback_later()
         path.write_bytes(originals[path])
     return cases - refused, refused
+
+
+def _check_message(message: str, folder: Path) -> None:
+    """It names the file, or the folder of a scene, and what to do."""
+    assert str(folder) in message, f"no file is named: {message}"
+    assert REMEDY.search(message), f"no remedy: {message}"
 
 
 def _limit_memory() -> None:
@@ -296,20 +306,67 @@ def _build_config(folder: Path) -> list[Path]:
     return files
 
 
+@cache
+def _parser() -> Callable[[list[str]], object]:
+    """The parser of the command line, built once: it takes longer than reading a config."""
+    from nsvq_lightning.lightning_cli import SplatCLI
+
+    class Cli(SplatCLI):
+        def parse_arguments(self, parser: object, args: object) -> None:
+            raise StopIteration(parser)
+
+    try:
+        Cli([])
+    except StopIteration as built:
+        return built.value.parse_args  # type: ignore[no-any-return]
+    raise AssertionError("the command line has no parser")
+
+
 def _read_config(path: Path) -> object:
     """Parse it as ``nsvq fit`` would; what is wrong ends the command with status 2 and a message."""
-    from nsvq_lightning.cli import main
+    from nsvq_lightning.cli import check_config
 
+    check_config(str(path))
     status: object = 0
-    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()) as said:
+    with redirect_stderr(io.StringIO()) as said:
         try:
-            main(["fit", "--config", str(path), "--data.root=scene", "--print_config"])
+            _parser()(["fit", "--config", str(path), "--data.root=scene"])
         except SystemExit as end:
             status = end.code
-    if status == 2 and said.getvalue().startswith("error: "):
-        raise ValueError(said.getvalue())
-    assert status == 0, said.getvalue()
+    message = said.getvalue()
+    if status == 2 and message.startswith("error: "):
+        raise ValueError(f"{path}: {message}")  # the command adds which files the settings came from
+    assert status == 0, message
     return path
+
+
+def _build_photos(folder: Path) -> list[Path]:
+    import cv2
+
+    rng = np.random.default_rng(0)
+    smooth = cv2.resize(rng.integers(0, 256, (3, 4, 4), dtype=np.uint8), (20, 15), interpolation=cv2.INTER_LINEAR)
+    pictures = {
+        "rgb.png": smooth[..., :3],
+        "rgba.png": smooth,
+        "grey16.png": smooth[..., 0].astype(np.uint16) * 257,
+        "rgb.jpg": smooth[..., :3],
+        "grey.jpg": smooth[..., 0],
+        "rgb.tiff": smooth[..., :3],
+        "rgb.bmp": smooth[..., :3],
+        "rgb.webp": smooth[..., :3],
+    }
+    for name, picture in pictures.items():
+        assert cv2.imwrite(str(folder / name), picture)
+    return [folder / name for name in pictures]
+
+
+def _read_photo(path: Path) -> object:
+    """Load it as the photo of a view."""
+    from nsvq_lightning.data.images import ImageSource, image_size
+    from nsvq_lightning.data.undistort import Pinhole
+
+    size = image_size(path)
+    return ImageSource(path, size, None, Pinhole(np.eye(3), *size)).load()
 
 
 def targets() -> dict[str, Target]:
@@ -325,6 +382,7 @@ def targets() -> dict[str, Target]:
         "splat": Target(lambda folder: _build_viewer(folder, ".splat"), _read_viewer, (FormatError,)),
         "colmap-bin": Target(lambda folder: _build_colmap(folder, ".bin"), _read_colmap, (SceneError,)),
         "colmap-txt": Target(lambda folder: _build_colmap(folder, ".txt"), _read_colmap, (SceneError,)),
+        "photo": Target(_build_photos, _read_photo, (SceneError,)),
         "config": Target(_build_config, _read_config, (ValueError,)),
         "checkpoint": Target(_build_checkpoint, _read_checkpoint, (FormatError,)),
     }

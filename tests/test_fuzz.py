@@ -19,8 +19,9 @@ CASES = {
     "splat": 100,
     "colmap-bin": 200,
     "colmap-txt": 150,
-    "config": 10,
-    "checkpoint": 40,
+    "photo": 300,
+    "config": 20,
+    "checkpoint": 60,
 }
 
 

@@ -13,9 +13,10 @@ from nsvq_lightning.benchmark.extremes import BROKEN, BROKEN_ROWS
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.suites import quantize, stability
 from nsvq_lightning.benchmark.suites.render import Method, trace
-from nsvq_lightning.edit import drop_non_finite
+from nsvq_lightning.edit import LARGEST_LOG_SCALE, drop_non_finite
 from nsvq_lightning.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats import ATTRIBUTES, RawSplats, Splats
 
@@ -91,20 +92,54 @@ def test_a_quantizer_with_nothing_to_do_or_to_choose(name: str) -> None:
     assert len(attribute.quantizer.codebook) == codes.get(name, 16)
 
 
-def test_inf_scale_and_determinant_that_under_or_overflows() -> None:
-    """One splat far larger than the picture covers it evenly: α is its opacity everywhere."""
+def _one_splat(log_scale: float) -> RawSplats:
+    return RawSplats(
+        torch.zeros(1, 3),
+        torch.tensor([[1.0, 0.5, 0.2, 0.1]]),
+        torch.full((1, 3), log_scale),
+        torch.zeros(1),
+        torch.ones(1, 1, 3),
+        torch.zeros(1, 0, 3),
+    )
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_determinant_that_would_under_or_overflow(backend: str) -> None:
+    """One splat far larger than the picture covers it evenly, α is its opacity everywhere; a tiny one is a dot."""
+    camera = SCENES["one splat"].workload.camera
     for scale in (1e3, 1e6, 1e9, 1e12):
-        one = RawSplats(
-            torch.zeros(1, 3),
-            torch.tensor([[1.0, 0.5, 0.2, 0.1]]),
-            torch.full((1, 3), math.log(scale)),
-            torch.zeros(1),
-            torch.ones(1, 1, 3),
-            torch.zeros(1, 0, 3),
-        )
-        for backend in BACKENDS:
-            image = render(one, SCENES["one splat"].workload.camera, backend=backend).alpha
-            torch.testing.assert_close(image, torch.full_like(image, 0.5), atol=1e-5, rtol=0)
+        image = render(_one_splat(math.log(scale)), camera, backend=backend).alpha
+        torch.testing.assert_close(image, torch.full_like(image, 0.5), atol=1e-5, rtol=0)
+    dot = render(_one_splat(-math.inf), camera, backend=backend).alpha
+    for scale in (1e-12, 1e-30, 1e-45):
+        torch.testing.assert_close(render(_one_splat(math.log(scale)), camera, backend=backend).alpha, dot)
+    assert 0 < dot.max() <= 0.5
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("log_scale", [LARGEST_LOG_SCALE + 1, 44.4, 88.8, 1e4, math.inf])
+def test_inf_scale_is_named_and_dropped(log_scale: float, backend: str, caplog: pytest.LogCaptureFixture) -> None:
+    """Sizes whose squares, or which themselves, are infinite in float32."""
+    both = RawSplats(*map(torch.cat, zip(_one_splat(-2.0), _one_splat(log_scale), strict=True)))
+    image = render(both, SCENES["one splat"].workload.camera, backend=backend).image
+    assert image.isfinite().all()
+    splats = Splats.from_tensors(*both)
+    optimizer = build_adam(param_groups(splats, {}, LearningRates(), extent=1.0))
+    with caplog.at_level(logging.WARNING):
+        assert drop_non_finite(splats, optimizer, 5) == 1
+    assert "step 5: dropped 1 of 2 splats with non-finite values: scales in 1 rows" in caplog.text
+    assert splats.scales.max() == -2.0
+
+
+def test_the_largest_size_that_is_kept_trains() -> None:
+    """On the near plane, where a splat covers most pixels; plain torch overflows there, and then drops the splat."""
+    camera = SCENES["one splat"].workload.camera
+    place = camera.position + (1.01 * NEAR) * camera.viewmat[2, :3]
+    splat = _one_splat(LARGEST_LOG_SCALE)._replace(means=place[None])
+    leaves = RawSplats(*(tensor.requires_grad_() for tensor in splat))
+    gradients = torch.autograd.grad(render(leaves, camera, backend="cpu").image.square().sum(), leaves)
+    assert all(bool(gradient.isfinite().all()) for gradient in gradients)
+    assert gradients[RawSplats._fields.index("scales")].any()
 
 
 def test_sfm_point_at_a_camera_centre_or_duplicated() -> None:

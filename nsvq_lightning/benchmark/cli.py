@@ -20,7 +20,6 @@ from nsvq_lightning.benchmark.sizes import LARGE, STANDARD
 from nsvq_lightning.benchmark.switch_table import PLACE as SWITCHES
 from nsvq_lightning.benchmark.switch_table import fill_switches, scene_name, shares_saved
 from nsvq_lightning.io.atomic import write_text
-from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.skips import SKIPS
 
 __all__ = ["main"]
@@ -62,12 +61,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     log.setLevel(logging.INFO)
     try:
         document = _read_document(options.document, suites, parser)
-        if settings.scene is not None:
-            _check_scene(settings)
+        fault = _fault_of_scene(settings)
+        if fault is not None:
+            return _fail(fault)
         results = _measure(suites, settings)
         _write(results, options.output, options.document, document)
-    except FormatError as error:
-        return _fail(str(error))
     except OSError as error:
         return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     sys.stdout.write(results.json() if options.json else results.markdown())
@@ -162,14 +160,17 @@ def _settings(options: argparse.Namespace) -> Settings:
     )
 
 
-def _check_scene(settings: Settings) -> None:
-    """Read the scene once before anything is measured: a wrong file is an error of the user, later it would be ours."""
+def _fault_of_scene(settings: Settings) -> str | None:
+    """Read the user's scene before anything is measured: a wrong file is the user's error, later it would be ours."""
     from nsvq_lightning.benchmark.workloads import workloads
 
+    if settings.scene is None:
+        return None
     try:
         workloads(settings)
     except ValueError as error:
-        raise FormatError(str(error)) from error
+        return str(error)
+    return None
 
 
 class _Results(NamedTuple):

@@ -24,6 +24,9 @@ __all__ = ["ImageSource", "ImageStore", "image_size", "read_image"]
 # COLMAP works on the pixels as stored, so the EXIF orientation must not turn them.
 _READ = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
+_MOST_A_BYTE = 10_000
+"""Pixels a byte of the file; no photo comes near, an empty PNG of one bit a pixel has 8000."""
+
 
 def _undecodable(path: Path, reason: str) -> SceneError:
     return SceneError(f"image {path} cannot be decoded ({reason}): copy it again, or remove it and run COLMAP again")
@@ -33,13 +36,16 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels as stored, read from the head of the file.
 
     Raises:
-        SceneError: The file is not an image.
+        SceneError: The file is not an image, or its head announces more pixels than there can be.
     """
     try:
         with PIL.Image.open(path) as image:
-            return image.size
-    except (OSError, ValueError, SyntaxError) as error:
+            width, height = image.size
+    except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:
         raise _undecodable(path, str(error)) from error
+    if width * height > _MOST_A_BYTE * path.stat().st_size:
+        raise _undecodable(path, f"its head announces {width}x{height} pixels in {path.stat().st_size} bytes")
+    return width, height
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -49,7 +55,10 @@ def read_image(path: Path) -> NDArray[np.uint8]:
         SceneError: The file is damaged or has floating-point pixels.
     """
     data = path.read_bytes()  # imread itself fails on names outside the locale's character set
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), _READ) if data and not _is_cut_jpeg(data) else None
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), _READ) if _is_whole(data) else None
+    except cv2.error as error:  # a size beyond OpenCV's limits
+        raise _undecodable(path, str(error)) from error
     if image is None:
         raise _undecodable(path, f"truncated, damaged or of an unknown format, {len(data)} bytes")
     if image.dtype == np.uint16:
@@ -59,13 +68,32 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)  # type: ignore[no-any-return]
 
 
-def _is_cut_jpeg(data: bytes) -> bool:
-    """Whether a JPEG has no end marker behind its first scan: OpenCV 4 would fill what is missing with grey."""
+def _is_whole(data: bytes) -> bool:
+    """Whether nothing is missing at the end, as far as the format tells without decoding."""
+    if data.startswith(b"\xff\xd8"):
+        return _is_whole_jpeg(data)
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return _is_whole_png(data)
+    return len(data) > 0
+
+
+def _is_whole_jpeg(data: bytes) -> bool:
+    """Whether there is an end marker behind the first scan: OpenCV 4 would fill what is missing with grey."""
     position = 2
-    while data.startswith(b"\xff\xd8") and data[position : position + 1] == b"\xff":
+    while data[position : position + 1] == b"\xff":
         if data[position + 1 : position + 2] == b"\xda":
-            return b"\xff\xd9" not in data[position:]
+            return b"\xff\xd9" in data[position:]
         position += 2 + max(2, int.from_bytes(data[position + 2 : position + 4], "big"))
+    return True
+
+
+def _is_whole_png(data: bytes) -> bool:
+    """Whether all chunks up to the last one are there: OpenCV allocates their lengths, up to 2 GB, before it looks."""
+    position = 8
+    while position + 12 <= len(data):
+        if data[position + 4 : position + 8] == b"IEND":
+            return True
+        position += 12 + int.from_bytes(data[position : position + 4], "big")
     return False
 
 

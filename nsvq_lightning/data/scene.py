@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, read_model
@@ -31,6 +32,8 @@ _CAMERAS_WITH_KEPT_MAPS = 8
 """With more distorted cameras than this (each photo its own, say) the undistortion maps would outweigh the images."""
 _FARTHEST = 1e4
 """Distance of the cameras from the origin, in extents, beyond which rounding moves splats by a good part of a pixel."""
+_AT_CAMERA = 1e-6
+"""Distance from a camera's centre, in extents, within which a point is no surface but a failed triangulation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +69,7 @@ class Scene:
         names: Names of the views, sorted.
         cameras: Pinhole camera of each view, float32.
         images: Pictures of the views, decoded at first use.
-        points: Sparse points ``[P, 3]`` float32, scene units.
+        points: Sparse points ``[P, 3]`` float32, scene units, without those at the centre of a camera.
         colors: Their colours ``[P, 3]`` float32, RGB in [0, 1].
         train: Indices of the train views, ascending.
         test: Indices of the test views, ascending.
@@ -127,16 +130,17 @@ def load_scene(
     train, test = split_views([image.name for image in model.images], test_every)
     folder, divisor = _image_folder(root, images_folder, factor)
     sources = _image_sources(model, _locate(model.images, folder), divisor, max_width if factor is None else None)
-    centres = np.stack([-model.images[i].viewmat[:3, :3].T @ model.images[i].viewmat[:3, 3] for i in train])
-    extent = _extent(centres)
-    _warn_if_far(centres, extent)
+    centres = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in model.images])
+    extent = _extent(centres[list(train)])
+    _warn_if_far(centres[list(train)], extent)
+    usable = _away_from(centres, model.points, _AT_CAMERA * extent)
     return Scene(
         root=root,
         names=tuple(image.name for image in model.images),
         cameras=tuple(_camera(image, source.pinhole) for image, source in zip(model.images, sources, strict=True)),
         images=ImageStore(sources, cache_bytes),
-        points=torch.from_numpy(model.points).float(),
-        colors=torch.from_numpy(model.colors).float() / 255,
+        points=torch.from_numpy(model.points[usable]).float(),
+        colors=torch.from_numpy(model.colors[usable]).float() / 255,
         train=train,
         test=test,
         extent=extent,
@@ -237,6 +241,19 @@ def _camera(image: ColmapImage, pinhole: Pinhole) -> Camera:
 
 def _extent(centres: NDArray[np.float64]) -> float:
     return float(1.1 * np.linalg.norm(centres - centres.mean(0), axis=1).max())
+
+
+def _away_from(centres: NDArray[np.float64], points: NDArray[np.float64], radius: float) -> NDArray[np.bool_]:
+    """Which points ``[P, 3]`` are more than ``radius`` from all ``centres [V, 3]``, or not finite; warns of the others.
+
+    At a camera's centre a point has no direction; splats there are in nobody's view, or cover that camera's whole view.
+    """
+    away = np.ones(len(points), bool)
+    finite = np.isfinite(points).all(1)
+    away[finite] = cKDTree(centres).query(points[finite])[0] > radius
+    if not away.all():
+        log.warning("left out %d of %d points, which are at the centre of a camera", len(away) - away.sum(), len(away))
+    return away
 
 
 def _warn_if_far(centres: NDArray[np.float64], extent: float) -> None:

@@ -10,35 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from nsvq_lightning.sh_degree import shN_degree
+
 if TYPE_CHECKING:
     from nsvq_lightning.splats import Splats, SplatTensors
 
-__all__ = ["SplatArrays", "check_floats", "finite_rows", "shN_degree", "sh_coefficients"]
+__all__ = ["SplatArrays", "check_floats", "finite_rows"]
 
 logger = logging.getLogger(__name__)
-
-
-def sh_coefficients(degree: int) -> int:
-    """Number of higher spherical-harmonic coefficients a colour channel, (degree + 1)² - 1.
-
-    Raises:
-        ValueError: ``degree`` is not in 0..3.
-    """
-    if degree not in (0, 1, 2, 3):
-        raise ValueError(f"the SH degree must be 0, 1, 2 or 3, got {degree}")
-    return (degree + 1) ** 2 - 1
-
-
-def shN_degree(coefficients: int) -> int:
-    """Degree that has this many higher coefficients a colour channel.
-
-    Raises:
-        ValueError: No degree in 0..3 has.
-    """
-    for degree in range(4):
-        if sh_coefficients(degree) == coefficients:
-            return degree
-    raise ValueError(f"SH degrees 0 to 3 have 0, 3, 8 or 15 higher coefficients, got {coefficients}")
 
 
 def check_floats(name: str, array: NDArray[np.float32], shape: tuple[int, ...]) -> None:

@@ -60,6 +60,8 @@ _T = TypeVar("_T")
 _GRID = struct.Struct("<qqqd")
 _MOST_A_BYTE = 4096
 """Splats, or rows of a codebook, a byte of their streams: chances have a floor, so no honest file comes near."""
+_LARGEST_LOG_SIZE = 300.0
+"""Logarithm of a size, scene units, that float64 still holds together with its multiples."""
 
 _STREAMS = {"grid": ("means.grid", "means", "means.far"), "codes": ("{}.codebook", "{}"), "steps": ("{}",)}
 _ENCODINGS = {"means.grid": "grid", "means": "keys", "means.far": "float32"}
@@ -104,10 +106,11 @@ def encode_compact(scene: CompressedScene, precision: Precision | None = None) -
     dims = attribute_dims(scene.sh_degree)
     stored = _all_of({name: _bind(_stored, scene, name, dim, precision) for name, dim in dims.items()})
     stored["opacities"] = _levels(scene.opacities, precision.opacity_levels)
-    size = stored["scales"].rows().sum(1) * (stored["scales"].entry.step / 3)
-    grid = Grid.around(scene.means, 2 * precision.position * np.exp(size))
+    sums, step = stored["scales"].rows().sum(1), stored["scales"].entry.step
+    size = np.exp(np.minimum(sums * (step / 3), _LARGEST_LOG_SIZE))
+    grid = Grid.around(scene.means, 2 * precision.position * size)
     doublings = math.log2(2 * precision.position / grid.step)
-    depths = grid.depths(_doublings(stored["scales"], doublings))
+    depths = grid.depths(_doublings(sums, step, doublings))
     cells, inside = grid.cells(scene.means)
     keys = morton_keys(cells, depths)
     near = np.flatnonzero(inside)
@@ -236,13 +239,17 @@ def _levels(logits: NDArray[np.float32], count: int) -> _Stored:
     return _Stored(AttributeEntry("opacities", 1, "levels", count, code_bits(count)), values)
 
 
-def _doublings(scales: _Stored, for_size_one: float) -> NDArray[np.float64]:
+def _doublings(sums: NDArray[np.int64], step: float, for_size_one: float) -> NDArray[np.float64]:
     """Base-2 logarithm ``[N]`` of the widest cell of each splat in steps of the grid.
 
     Sums, products and quotients only, whose rounding is the same everywhere: the depth of a key hangs on it.
+
+    Args:
+        sums: Sum of the three integers ``[N]`` of each splat's log-scales.
+        step: What these are multiples of.
+        for_size_one: The result for a splat of size 1.
     """
-    sums: NDArray[np.int64] = scales.rows().sum(1)
-    factor = scales.entry.step / 3 / math.log(2.0)
+    factor = step / 3 / math.log(2.0)
     return sums.astype(np.float64) * factor + for_size_one
 
 
@@ -293,7 +300,7 @@ def _decode_means(
     grid = Grid(step, (base[0], base[1], base[2]))
     far = np.frombuffer(streams["means.far"], "<f4").astype(np.float32).reshape(-1, 3)
     count = len(scales.values)
-    depths = grid.depths(_doublings(scales, doublings))[: count - len(far)]
+    depths = grid.depths(_doublings(scales.rows().sum(1), scales.entry.step, doublings))[: count - len(far)]
     keys = decode_keys(streams["means"], 3 * depths)
     means = np.concatenate([grid.centers(unmorton(keys), depths), far])
     return means, _neighbours(keys, depths, count)

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.arrays import SplatArrays, check_floats, finite_rows, sh_coefficients
+from nsvq_lightning.io.arrays import SplatArrays, check_floats, finite_rows
 from nsvq_lightning.io.ply import plain_ply_bytes
+from nsvq_lightning.sh_degree import sh_coefficients
 
 if TYPE_CHECKING:
     from nsvq_lightning.splats import Splats

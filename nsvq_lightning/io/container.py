@@ -83,4 +83,6 @@ def decode(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene
         from nsvq_lightning.io.paper import decode_paper
 
         return decode_paper(header, streams)
-    raise FormatError(f"compression level {header.level!r}; this release reads {', '.join(LEVELS)}: update it")
+    raise FormatError(
+        f"compression level {header.level!r}; this release reads {', '.join(LEVELS)}", "update nsvq-lightning"
+    )

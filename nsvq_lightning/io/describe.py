@@ -37,7 +37,7 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
             break
     else:
         if path.suffix.lower() != ".splat":
-            raise FormatError(f"{path}: not a {', '.join(FORMATS)} file")
+            raise FormatError(f"{path}: not a {', '.join(FORMATS)} file", "give the file of a scene")
         facts = _describe_splat(path)
     facts["plain_bytes"] = plain_ply_bytes(facts["splats"], facts["sh_degree"])
     facts["ratio"] = facts["plain_bytes"] / max(1, facts["bytes"])  # an empty .splat has no byte

@@ -63,10 +63,10 @@ def unframe(data: bytes) -> tuple[Header, dict[str, memoryview]]:
         raise FormatError(f"truncated: {len(data)} bytes, the prefix alone has {_PREFIX.size}")
     _, digest, version, json_bytes = _PREFIX.unpack_from(data)
     if blake2b(memoryview(data)[_DIGEST_END:], digest_size=len(digest)).digest() != digest:
-        raise FormatError("truncated or altered: the checksum does not fit the content; copy or export it again")
+        raise FormatError("truncated or altered: the checksum does not fit the content")
     if version != VERSION:
         raise FormatError(
-            f"version {version} of the format; this release reads version {VERSION}: update nsvq-lightning"
+            f"version {version} of the format; this release reads version {VERSION}", "update nsvq-lightning"
         )
     payload = memoryview(data)[_PREFIX.size + json_bytes :]
     if _PREFIX.size + json_bytes > len(data):

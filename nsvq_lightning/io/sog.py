@@ -27,7 +27,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.arrays import sh_coefficients
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.levels import best_levels, nearest_level
@@ -35,6 +34,7 @@ from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
 from nsvq_lightning.io.rotation import from_smallest_three, smallest_three, unit
 from nsvq_lightning.io.sog_archive import META, SogArchive, picture_shape, write_archive
 from nsvq_lightning.io.splat_order import spatial_order
+from nsvq_lightning.sh_degree import sh_coefficients
 
 __all__ = ["DEFAULT_PALETTE", "PALETTE_LIMIT", "read_sog", "read_sog_header", "write_sog"]
 
@@ -248,7 +248,9 @@ def _checked(meta: Mapping[str, Any], archive: SogArchive) -> tuple[int, int]:
     """Number of splats and SH degree."""
     version = meta.get("version", 1)
     if version != 2:
-        raise FormatError(f"version {version} of the format; this release reads version 2: save it as that or as .ply")
+        raise FormatError(
+            f"version {version} of the format; this release reads version 2", "save it as that or as .ply"
+        )
     count = _integer(meta, "count", 0, 1 << 40)
     archive.check_count(count)
     return count, _integer(_entry(meta, "shN"), "bands", 0, 3) if "shN" in meta else 0
@@ -320,5 +322,5 @@ def _unpacked_sh(
     texels = archive.texels(_file(meta, "shN", 1), count)
     labels = texels[:, 0] + (texels[:, 1].astype(np.uint16) << 8)
     if count and labels.max() >= rows:
-        raise FormatError(f"damaged: label {labels.max()} of a palette of {rows} rows; copy or export it again")
+        raise FormatError(f"damaged: label {labels.max()} of a palette of {rows} rows")
     return palette, labels

@@ -81,9 +81,7 @@ class SogArchive:
         try:
             self._zip = zipfile.ZipFile(path)
         except (zipfile.BadZipFile, ValueError, NotImplementedError, EOFError) as error:
-            raise FormatError(
-                f"truncated, or not a .sog file: no valid zip archive ({error}); copy or export it again"
-            ) from None
+            raise FormatError(f"truncated, or not a .sog file: no valid zip archive ({error})") from None
 
     def __enter__(self) -> SogArchive:
         return self
@@ -105,7 +103,7 @@ class SogArchive:
         try:
             meta = json.loads(self._bytes(META, _META_LIMIT))
         except (ValueError, RecursionError) as error:
-            raise FormatError(f"damaged: {META} is no JSON ({error}); copy or export it again") from None
+            raise FormatError(f"damaged: {META} is no JSON ({error})") from None
         if not isinstance(meta, dict):
             raise FormatError(f"damaged: {META} is no JSON object")
         return meta
@@ -118,8 +116,7 @@ class SogArchive:
         """
         if texels > self._texels:
             raise FormatError(
-                f"truncated or damaged: {texels} splats or texels cannot be in {self._texels // _MOST_A_BYTE} bytes; "
-                "copy or export it again"
+                f"truncated or damaged: {texels} splats or texels cannot be in {self._texels // _MOST_A_BYTE} bytes"
             )
 
     def texels(self, name: str, count: int) -> NDArray[np.uint8]:
@@ -134,16 +131,13 @@ class SogArchive:
         try:
             with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
                 if image.width * image.height < count:
-                    raise FormatError(
-                        f"damaged: {name} has {image.width} x {image.height} texels, {count} are needed; "
-                        "copy or export it again"
-                    )
+                    raise FormatError(f"damaged: {name} has {image.width} x {image.height} texels, {count} are needed")
                 self.check_count(image.width * image.height)
                 return np.asarray(image.convert("RGBA")).reshape(-1, 4)[:count]
         except FormatError:
             raise
         except Exception as error:  # Pillow's decoders raise whatever damage leads them to
-            raise FormatError(f"damaged: {name} is no picture ({error}); copy or export it again") from None
+            raise FormatError(f"damaged: {name} is no picture ({error})") from None
 
     def _bytes(self, name: str, most: int) -> bytes:
         try:
@@ -151,8 +145,8 @@ class SogArchive:
                 raise FormatError(f"damaged: {name} cannot have {self._zip.getinfo(name).file_size} bytes")
             return self._zip.read(name)
         except KeyError:
-            raise FormatError(f"not a whole .sog file: the archive has no {name}; copy or export it again") from None
+            raise FormatError(f"not a whole .sog file: the archive has no {name}") from None
         except FormatError:
             raise
         except (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, ValueError, struct.error) as error:
-            raise FormatError(f"damaged: {name} cannot be unpacked ({error}); copy or export it again") from None
+            raise FormatError(f"damaged: {name} cannot be unpacked ({error})") from None

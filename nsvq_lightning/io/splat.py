@@ -112,6 +112,6 @@ def count_splats(path: str | os.PathLike[str]) -> int:
         if size % _RECORD.itemsize:
             raise FormatError(
                 f"truncated, or not a .splat file: of {size} bytes the last {size % _RECORD.itemsize} are no "
-                f"whole splat of {_RECORD.itemsize}; copy or export it again"
+                f"whole splat of {_RECORD.itemsize}"
             )
     return size // _RECORD.itemsize

@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.arrays import SplatArrays, sh_coefficients
+from nsvq_lightning.io.arrays import SplatArrays
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.clamping import Clamped
 from nsvq_lightning.io.compressed import CompressedScene
@@ -44,6 +44,7 @@ from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
 from nsvq_lightning.io.rotation import from_smallest_three, smallest_three, unit
 from nsvq_lightning.io.splat_order import spatial_order
+from nsvq_lightning.sh_degree import sh_coefficients
 
 __all__ = ["SPZ_MAGICS", "SpzHeader", "read_spz", "read_spz_header", "write_spz"]
 
@@ -219,14 +220,14 @@ def _unzip(data: bytes) -> tuple[SpzHeader, bytes]:
         raise FormatError(f"truncated: {header.count} splats need {header.stream_bytes} bytes, got {len(stream)}")
     while not gunzip.eof:
         if not _inflate(gunzip, gunzip.unconsumed_tail, 1 << 16) and not gunzip.eof:
-            raise FormatError("truncated: the gzip stream has no end; copy or export it again")
+            raise FormatError("truncated: the gzip stream has no end")
     return header, stream
 
 
 def _start(gunzip: zlib._Decompress, data: bytes) -> bytes:
     if data.startswith(_MAGIC):
         raise FormatError(
-            "version 4 or later of the format; this release reads 1 to 3: save it as version 3 or as .ply"
+            "version 4 or later of the format; this release reads 1 to 3", "save it as version 3 or as .ply"
         )
     return _inflate(gunzip, data, _HEADER.size)
 
@@ -236,9 +237,7 @@ def _inflate(gunzip: zlib._Decompress, data: bytes, most: int) -> bytes:
     try:
         return gunzip.decompress(data, most) if most else b""
     except zlib.error as error:
-        raise FormatError(
-            f"damaged, or not a .spz file: no valid gzip stream ({error}); copy or export it again"
-        ) from None
+        raise FormatError(f"damaged, or not a .spz file: no valid gzip stream ({error})") from None
 
 
 def _parse(start: bytes, file_bytes: int) -> SpzHeader:
@@ -247,7 +246,7 @@ def _parse(start: bytes, file_bytes: int) -> SpzHeader:
     _, version, count, sh_degree, fraction_bits, _, _ = _HEADER.unpack(start)
     if not 1 <= version <= 3:
         raise FormatError(
-            f"version {version} of the format; this release reads 1 to 3: save it as version 3 or as .ply"
+            f"version {version} of the format; this release reads 1 to 3", "save it as version 3 or as .ply"
         )
     if sh_degree > 3:
         raise FormatError(f"damaged, or of a degree that this release does not read: SH degree {sh_degree}, not 0 to 3")
@@ -255,9 +254,7 @@ def _parse(start: bytes, file_bytes: int) -> SpzHeader:
         raise FormatError(f"damaged: {fraction_bits} bits after the point, more than {_MOST_FRACTION}")
     header = SpzHeader(version, count, sh_degree, fraction_bits)
     if header.stream_bytes > _MOST_A_BYTE * file_bytes:
-        raise FormatError(
-            f"truncated or damaged: {count} splats cannot be in {file_bytes} bytes; copy or export it again"
-        )
+        raise FormatError(f"truncated or damaged: {count} splats cannot be in {file_bytes} bytes")
     return header
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from nsvq_lightning.sh_degree import sh_coefficients
+
 __all__ = ["C0", "C1", "C2", "C3", "sh_basis", "sh_colors"]
 
 C0 = 0.28209479177387814
@@ -44,5 +46,5 @@ def sh_colors(directions: Tensor, sh0: Tensor, shN: Tensor, degree: int) -> Tens
         shN: Higher coefficients ``[N, ≥ (degree + 1)² - 1, 3]``; those above ``degree`` are ignored.
         degree: Highest degree used.
     """
-    coefficients = torch.cat([sh0, shN[:, : (degree + 1) ** 2 - 1]], 1)
+    coefficients = torch.cat([sh0, shN[:, : sh_coefficients(degree)]], 1)
     return ((sh_basis(directions, degree)[..., None] * coefficients).sum(1) + 0.5).clamp_min(0)

@@ -16,7 +16,6 @@ from nsvq_lightning.callbacks.density_rules import (
     limit_growth,
     lower_opacities,
     prune_mask,
-    rotation_matrices,
     screen_gradient,
     split,
     split_mask,
@@ -64,12 +63,6 @@ def test_transparent_splats_are_pruned_and_huge_ones_only_when_size_counts() -> 
     scales = log_scales(0.1, 0.1, 0.21)  # the limit is 0.1 · extent = 0.2
     assert prune_mask(logits, scales, 2.0, RULES, huge=False).tolist() == [True, False, False]
     assert prune_mask(logits, scales, 2.0, RULES, huge=True).tolist() == [True, False, True]
-
-
-def test_rotations_are_scipys() -> None:
-    quats = torch.randn(20, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    oracle = Rotation.from_quat(quats.numpy()[:, [1, 2, 3, 0]]).as_matrix()
-    np.testing.assert_allclose(rotation_matrices(quats).numpy(), oracle, atol=1e-12)
 
 
 def test_children_follow_the_parents_own_gaussian() -> None:

@@ -1,7 +1,10 @@
 from __future__ import annotations
 
 import pickle
+import struct
 import threading
+import time
+import zlib
 from pathlib import Path
 
 import cv2
@@ -66,6 +69,37 @@ def test_what_is_no_picture_is_found_by_its_head(tmp_path: Path) -> None:
     (tmp_path / "text.jpg").write_text("no picture")
     with pytest.raises(SceneError, match=r"text\.jpg cannot be decoded"):
         image_size(tmp_path / "text.jpg")
+
+
+def _png(width: int, height: int, data: bytes) -> bytes:
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("side", [5000, 12_000, 40_000, 1 << 20])
+def test_a_head_that_promises_more_than_the_file_holds(tmp_path: Path, side: int) -> None:
+    path = tmp_path / "bomb.png"
+    path.write_bytes(_png(side, side, zlib.compress(b"\0" * 1000)))
+    for read in (image_size, read_image):
+        with pytest.raises(SceneError, match=r"bomb\.png cannot be decoded"):
+            read(path)
+
+
+def test_a_chunk_longer_than_the_file_is_not_allocated(tmp_path: Path) -> None:
+    path = tmp_path / "long.png"
+    whole = _png(3, 2, zlib.compress(b"\0" * 20))
+    path.write_bytes(whole)
+    assert read_image(path).shape == (2, 3, 3)
+    place = whole.index(b"IDAT") - 4
+    path.write_bytes(whole[:place] + struct.pack(">I", 0x7FFFFF00) + whole[place + 4 :])
+    assert image_size(path) == (3, 2)
+    started = time.process_time()  # OpenCV fills 2 GB with zeros before it finds the end of the file
+    with pytest.raises(SceneError, match=r"long\.png cannot be decoded \(truncated"):
+        read_image(path)
+    assert time.process_time() - started < 0.2
 
 
 def test_floating_point_pictures_are_refused(tmp_path: Path) -> None:

@@ -72,6 +72,24 @@ def test_points_and_extent(make_scene: SceneFactory) -> None:
     assert scene.extent == pytest.approx(expected, rel=1e-6)
 
 
+def test_points_at_a_camera_centre_are_left_out(make_scene: SceneFactory, caplog: pytest.LogCaptureFixture) -> None:
+    root = make_scene()
+    scene = load_scene(root)
+    assert not caplog.text
+    model = root / "sparse" / "0"
+    reconstruction = import_pycolmap().Reconstruction(str(model))
+    beside = 0.01 * scene.extent * torch.eye(3)[0].double().numpy()
+    for i in (0, 3):  # a test view and a train view
+        centre = -scene.cameras[i].viewmat[:3, 3].double().numpy()  # rotations are 1
+        for xyz in (centre, centre + 1e-5 * beside, centre + beside):
+            reconstruction.add_point3D(xyz, import_pycolmap().Track(), np.zeros(3, np.uint8))
+    reconstruction.write_binary(str(model))
+    points = load_scene(root).points
+    assert "left out 4 of 26 points, which are at the centre of a camera" in caplog.text
+    assert torch.equal(points[:20], scene.points)
+    assert len(points) == 22
+
+
 def test_test_cameras_do_not_enter_the_extent(make_scene: SceneFactory) -> None:
     scene = load_scene(make_scene(), test_every=2)
     everything = load_scene(make_scene("other"), test_every=9)

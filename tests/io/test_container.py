@@ -232,7 +232,7 @@ def test_a_newer_version_says_so(tmp_path: Path) -> None:
     write_nsvq(path, scene(4, {}))
     body = struct.pack("<I", 2) + path.read_bytes()[28:]
     path.write_bytes(path.read_bytes()[:8] + hashlib.blake2b(body, digest_size=16).digest() + body)
-    with pytest.raises(FormatError, match="reads version 1: update"):
+    with pytest.raises(FormatError, match="reads version 1; update"):
         read_nsvq(path)
 
 

@@ -66,12 +66,13 @@ RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 
 @pytest.fixture(scope="module")
 def run(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFactory:
-    """``run(callbacks, ckpt_path=…, module={…}, **trainer)`` fits and returns trainer and module."""
+    """``run(callbacks, ckpt_path=…, module={…}, scene=…, **trainer)`` fits and returns trainer and module."""
 
     def fit(
         callbacks: Iterable[Callback],
         ckpt_path: Path | None = None,
         module: dict[str, Any] | None = None,
+        scene: Path = demo_scene,
         **trainer_arguments: Any,
     ) -> tuple[Trainer, SplatModule]:
         callbacks = list(callbacks)
@@ -84,7 +85,7 @@ def run(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFactor
             **trainer_arguments,
         )
         splat_module = SplatModule(**{"sh_degree": 1, "codebooks": CODES, **(module or {})})
-        trainer.fit(splat_module, datamodule=ColmapDataModule(str(demo_scene), factor=2), ckpt_path=ckpt_path)
+        trainer.fit(splat_module, datamodule=ColmapDataModule(str(scene), factor=2), ckpt_path=ckpt_path)
         return trainer, splat_module
 
     return fit

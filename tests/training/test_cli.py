@@ -13,7 +13,7 @@ import pytest
 import torch
 import yaml
 
-from nsvq_lightning.cli import find_config, main, resolve_configs
+from nsvq_lightning.cli import check_config, find_config, main, resolve_configs
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.schedule import Phase
@@ -124,6 +124,10 @@ def test_a_checkpoint_of_another_phase_is_refused_with_the_way_out(
         (["export", "--ckpt_path=no.ckpt"], "no.ckpt"),
         (["fit", "--model.codebooks=3k"], "choose one of 0.5k"),
         (["fit", "--trainer.max_steps=0"], "set trainer.max_steps"),
+        (["fit", "--ckpt_path=broken.ckpt"], "broken.ckpt: damaged, or not a checkpoint"),
+        (["test", "--ckpt_path=broken.ckpt"], "broken.ckpt: damaged, or not a checkpoint"),
+        (["export", "--ckpt_path=broken.ckpt"], "broken.ckpt: damaged, or not a checkpoint"),
+        (["fit", "--config=empty.yaml"], "config empty.yaml holds nothing: give settings by name"),
         (["test"], "--ckpt_path"),
         (["predict"], "--ckpt_path"),
     ],
@@ -137,6 +141,8 @@ def test_errors_of_the_user_are_one_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    Path("broken.ckpt").write_bytes(b"PK\3\4")
+    Path("empty.yaml").touch()
     if arguments[0] != "export":
         arguments = [*arguments, f"--data.root={demo_scene}"]
     assert main(arguments) == 1
@@ -321,6 +327,35 @@ def test_configs_are_found_as_files_first_then_by_name(tmp_path: Path) -> None:
     assert resolve_configs(arguments) == [
         *("fit", "--config", shipped, f"--config={shipped}", "-c", str(mine), "--data.root", "nsvq_4k")
     ]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "holds nothing: give settings by name"),
+        (b"- 1\n", "holds list: give settings by name"),
+        (b"5", "holds int: give"),
+        (b"a: [1, {", "is not YAML .*: correct the file"),
+        (b"\xff\xfe\0", "is not YAML .*can't decode"),
+    ],
+)
+def test_what_cannot_be_a_config(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=rf"mine\.yaml {message}"):
+        check_config(str(path))
+    check_config(str(tmp_path / "none.yaml"))  # the parser's to complain about
+
+
+def test_wrong_settings_name_the_file_they_came_from(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("model: {nonsense: 3}")
+    with pytest.raises(SystemExit) as stop:
+        main(["fit", "--config", str(path), "--data.root=x"])
+    assert stop.value.code == 2
+    message = capsys.readouterr().err
+    assert "nonsense" in message
+    assert f"Settings came from {path} and the command line" in message
 
 
 def test_errors_are_one_line_and_name_the_option(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -13,9 +13,9 @@ from nsvq_lightning.benchmark.errors import relative_l2, worst_first
 from nsvq_lightning.benchmark.row import Row
 from nsvq_lightning.benchmark.settings import Settings
 from nsvq_lightning.benchmark.timing import Case, measure, use_threads
-from nsvq_lightning.io.arrays import sh_coefficients
 from nsvq_lightning.optim import EPS, LearningRates, build_adam, param_groups, set_columns
 from nsvq_lightning.random import generator
+from nsvq_lightning.sh_degree import sh_coefficients
 from nsvq_lightning.skips import switched
 from nsvq_lightning.splats import ATTRIBUTES, Splats
 
