@@ -80,12 +80,12 @@ def _run_lightning(arguments: list[str]) -> int:
         for config in configs:
             check_config(config)
         SplatCLI(arguments)
+    except SIGTERMException:  # a kind of SystemExit
+        return 128 + signal.SIGTERM  # Lightning's own exit status is that of success
     except SystemExit as end:
         if end.code == 2 and configs:  # the parser's messages name the option, not the file it came from
             sys.stderr.write(f"Settings came from {', '.join(configs)} and the command line\n")
         raise
-    except SIGTERMException:
-        return 128 + signal.SIGTERM  # Lightning's own exit status is that of success
     except (ValueError, OSError) as error:
         names_file = isinstance(error, FileNotFoundError) or (isinstance(error, OSError) and error.filename is not None)
         if os.environ.get(TRACEBACK) or not (names_file or _is_ours(error)):

@@ -13,7 +13,19 @@ from importlib.metadata import EntryPoint, entry_points
 
 __all__ = ["COMMANDS", "main"]
 
-COMMANDS = ("fit", "validate", "test", "predict", "export", "info", "compress", "benchmark", "sweep", "doctor")
+COMMANDS = (
+    "fit",
+    "validate",
+    "test",
+    "predict",
+    "export",
+    "info",
+    "compress",
+    "convert",
+    "benchmark",
+    "sweep",
+    "doctor",
+)
 """Subcommands of ``nsvq``, named here so that foreign words do not import torch."""
 
 _OURS = "nsvq-lightning"

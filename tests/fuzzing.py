@@ -24,7 +24,9 @@ SECONDS = 20
 """A case that takes longer hangs."""
 MEMORY = 3 << 30
 """Bytes of address space that a case may add to what the process has before."""
-REMEDY = re.compile(r"\b(copy|export|run|update|correct|give|set|undistort|register|rename|remove|All options)\b", re.I)
+REMEDY = re.compile(
+    r"\b(copy|save|export|pass|run|update|correct|give|set|undistort|register|rename|remove|All options)\b", re.I
+)
 """What messages tell the user to do."""
 NUMBERS = (0, 1, 2, 127, 128, 255, 256, 65535, 65536, 1 << 31, (1 << 32) - 1, 1 << 60, (1 << 64) - 1)
 TOKENS = (b"0", b"-1", b"1", b"7", b"99", b"65536", b"4294967296", b"1e400", b"nan", b"-inf", b"", b"x", b"\xff", b"[]")

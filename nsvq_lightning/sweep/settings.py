@@ -45,6 +45,9 @@ class _Reader(SplatCLI):
     def instantiate_classes(self) -> None:
         """Nothing."""
 
+    def _parse_ckpt_path(self) -> None:
+        """Nothing."""
+
     def _run_subcommand(self, subcommand: str) -> None:
         """Nothing."""
 

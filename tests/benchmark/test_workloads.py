@@ -75,8 +75,8 @@ def test_crop_must_fit() -> None:
 
 
 def test_unknown_name_is_refused() -> None:
-    with pytest.raises(ValueError, match="'D1M'; choose one of A20k, B100k, C500k"):
-        synthetic_workload("D1M")
+    with pytest.raises(ValueError, match="'X1'; choose one of A20k, B100k, C500k"):
+        synthetic_workload("X1")
 
 
 def test_scene_file_is_seen_whole_and_without_broken_splats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
