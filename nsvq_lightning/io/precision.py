@@ -21,7 +21,8 @@ class Precision:
 
     Attributes:
         position: Of each coordinate, as a share of the splat's size: the geometric mean of its axis lengths. Small
-            splats get more digits than large ones, down to 2⁻²¹ of the extent of the scene.
+            splats get more digits than large ones, down to 2⁻²¹ of the extent of the scene; the smallest thousandth of
+            them gets no more than the others.
         opacity: Of the opacity, which is in [0, 1].
         codebook: Of the numbers of a codebook, as a share of how much neighbouring codes typically differ.
         scales: Of logarithms of axis lengths without a codebook; 0.01 is one per cent of the length.

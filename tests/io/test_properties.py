@@ -1,0 +1,96 @@
+"""What must hold for any scene: written and read, it is the same one, within what the format promises."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from nsvq_lightning.io import CompressedScene, read_nsvq, write_nsvq
+from nsvq_lightning.io.compressed import attribute_dims
+from nsvq_lightning.io.formats import FORMATS, read_scene
+from nsvq_lightning.io.precision import Precision
+
+CASES = int(os.environ.get("NSVQ_FUZZ_CASES", "40"))
+"""Scenes for each property; more in a run by hand."""
+
+
+def any_scene(seed: int) -> CompressedScene:
+    """A scene of any size, degree, unit of length and set of codebooks, with splats that coincide and flat clouds."""
+    rng = np.random.default_rng([seed, 5])
+    n, degree = int(rng.choice([0, 1, 2, 3, 17, 64, 65, 300])), int(rng.integers(4))
+    unit = 10.0 ** rng.uniform(-4, 4)
+    dims = attribute_dims(degree)
+    coded = {name: int(rng.integers(1, 70)) for name in dims if dims[name] and rng.random() < 0.5}
+
+    def rows(name: str, count: int) -> NDArray[np.float32]:
+        values = rng.normal(0, 0.1 if name == "shN" else 1, (count, dims[name]))
+        if name == "scales":
+            values += np.log(unit) - 4
+        if name == "quats":
+            values[:, 0] += np.where(np.abs(values).max(1) < 0.05, 1, 0)
+        return values.astype(np.float32)
+
+    means = unit * rng.normal(size=(n, 3)) * rng.choice([0, 1], 3, p=[0.2, 0.8])
+    means[rng.random(n) < 0.1] = means[0] if n else 0
+    return CompressedScene(
+        means=means.astype(np.float32),
+        opacities=rng.normal(0, 4, n).astype(np.float32),
+        codes={name: rng.integers(0, k, n) for name, k in coded.items()},
+        codebooks={name: rows(name, k) for name, k in coded.items()},
+        raw={name: rows(name, n) for name in dims if name not in coded},
+        sh_degree=degree,
+    )
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".nsvq"])
+def test_what_loses_nothing_gives_every_number_back(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"scene{suffix}"
+    options = {"level": "paper"} if suffix == ".nsvq" else {}
+    for seed in range(CASES):
+        scene = any_scene(seed)
+        writer = FORMATS[suffix].write
+        assert writer is not None
+        writer(path, scene, **options)
+        back, expected = read_scene(path).arrays(), scene.arrays()
+        for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+            np.testing.assert_array_equal(getattr(back, name), getattr(expected, name), err_msg=f"{name}, seed {seed}")
+
+
+def test_compact_keeps_every_splat_where_it_promises(tmp_path: Path) -> None:
+    path, precision = tmp_path / "scene.nsvq", Precision()
+    for seed in range(CASES):
+        scene = any_scene(seed)
+        write_nsvq(path, scene, level="compact", precision=precision)
+        back = read_nsvq(path)
+        assert len(back) == len(scene), f"seed {seed}"
+        if len(scene) == 0:
+            continue
+        arrays, stored = scene.arrays(), back.arrays()
+        extent = np.ptp(arrays.means, axis=0).max()
+        distance, nearest = cKDTree(stored.means).query(arrays.means, p=np.inf)
+        # Steps follow the sizes as stored, which have an error of their own.
+        size = np.exp(np.maximum(arrays.scales.mean(1, dtype=np.float64), stored.scales[nearest].mean(1)))
+        rounding = 4 * np.finfo(np.float32).eps * np.abs(arrays.means).max()
+        bound = np.maximum(precision.position * size, extent * 2.0**-21)
+        # The grid is as fine as all but the smallest thousandth of the splats ask for.
+        assert (distance > 1.01 * bound + rounding).sum() <= np.ceil(len(scene) / 1000), f"seed {seed}"
+
+
+@pytest.mark.parametrize("suffix", sorted(FORMATS))
+def test_the_same_scene_gives_the_same_bytes_and_all_its_splats(suffix: str, tmp_path: Path) -> None:
+    first, second = tmp_path / f"first{suffix}", tmp_path / f"second{suffix}"
+    for seed in range(CASES):
+        scene = any_scene(seed)
+        writer = FORMATS[suffix].write
+        assert writer is not None
+        for path in (first, second):
+            writer(path, scene)
+        assert first.read_bytes() == second.read_bytes(), f"seed {seed}"
+        back = read_scene(first).arrays()
+        assert len(back) == len(scene), f"seed {seed}"
+        assert all(np.isfinite(getattr(back, name)).all() for name in ("means", "quats", "scales", "opacities", "sh0"))
