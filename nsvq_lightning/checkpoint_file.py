@@ -43,10 +43,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     except UnpicklingError as error:
         named = re.search(r"GLOBAL (\S+)", str(error))
         what = f"an object of {named[1]}" if named else "an object that is not plain data"
-        raise FormatError(
-            f"{path}: refused, it holds {what}, and loading that could run code",
-            WAY_OUT,
-        ) from error
+        raise FormatError(f"{path}: refused, it holds {what}, and loading that could run code", WAY_OUT) from error
     except Exception as error:  # torch's readers of archives and pickles raise whatever damage leads them to
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise FormatError(f"{path}: damaged, or not a checkpoint ({reason})", WAY_OUT) from error
