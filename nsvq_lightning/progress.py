@@ -55,11 +55,15 @@ class SplatProgressBar(TQDMProgressBar):
         bar.set_description_str("fit", refresh=False)
         return bar
 
+    def on_train_start(self, trainer: Trainer, *args: Any) -> None:
+        """Start the bar where the run is."""
+        super().on_train_start(trainer, *args)
+        done = trainer.global_step * trainer.accumulate_grad_batches
+        self.train_progress_bar.reset(total=self.total_train_batches)
+        self.train_progress_bar.initial = self.train_progress_bar.n = done  # n - initial, over the time, is the speed
+
     def on_train_epoch_start(self, trainer: Trainer, *args: Any) -> None:
-        """Start the bar where the run is; there is only one epoch."""
-        bar = self.train_progress_bar
-        bar.reset(total=self.total_train_batches)
-        bar.initial = trainer.global_step * trainer.accumulate_grad_batches
+        """Leave the bar as it is: there is only one epoch, and a resumed run is in the middle of it."""
 
     def get_metrics(
         self, trainer: Trainer, pl_module: LightningModule

@@ -31,7 +31,6 @@ def fit(scene: Path, folder: Path, *more: str, steps: int = 20) -> list[str]:
         f"--trainer.default_root_dir={folder}",
         "--trainer.accelerator=cpu",
         "--trainer.enable_progress_bar=false",
-        "--callbacks.progress=null",
         "--model.sh_degree=1",
         *more,
     ]
@@ -104,6 +103,18 @@ def test_options_win_over_the_checkpoint_in_fit(demo_scene: Path, finished: Path
     stored = torch.load(tmp_path / demo_scene.name / "version_0" / "checkpoints" / "last.ckpt", weights_only=True)
     rates = {group["name"]: group["lr"] for group in stored["optimizer_states"][0]["param_groups"]}
     assert rates["opacities"] == 0.0123
+
+
+def test_the_bar_of_a_resumed_run_counts_the_whole_run(
+    demo_scene: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    checkpoint = finished / "checkpoints" / "last.ckpt"
+    more = ["--callbacks.phases.total=20", f"--ckpt_path={checkpoint}"]
+    shown = ["--trainer.enable_progress_bar=true", "--callbacks.progress.refresh_rate=1"]
+    assert main(fit(demo_scene, tmp_path, *CODES, *more, *shown, steps=22)) == 0
+    counts = re.findall(r"fit: .*?(\d+)/(\S+) \[", capsys.readouterr().out)
+    assert {total for _, total in counts[1:]} == {"22"}  # the first line is of a bar that knows nothing yet
+    assert {int(done) for done, _ in counts} >= {21, 22}
 
 
 def test_a_checkpoint_of_another_phase_is_refused_with_the_way_out(
