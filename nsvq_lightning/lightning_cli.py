@@ -8,9 +8,11 @@ import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from types import NoneType
 from typing import Any, NoReturn
 
 from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
@@ -174,10 +176,14 @@ class SplatCLI(LightningCLI):
         return kwargs
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """The trainer with default loggers, and without the callbacks that are null."""
+        """The trainer with default loggers, without the callbacks that are null or switched off with the bar."""
         parser = self._parser(self.subcommand)
-        parser.callback_keys = [key for key in parser.callback_keys if self._get(self.config_init, key) is not None]
         settings = self._get(self.config_init, "trainer")
+        # Lightning refuses the callback beside the flag, and the default callbacks hold one.
+        unwanted = (NoneType, ProgressBar) if settings.enable_progress_bar is False else NoneType
+        parser.callback_keys = [
+            key for key in parser.callback_keys if not isinstance(self._get(self.config_init, key), unwanted)
+        ]
         if settings.logger in (None, True) and self.subcommand != "export":
             kwargs["logger"] = default_loggers(settings.default_root_dir, self._run_name())
         return super().instantiate_trainer(**kwargs)

@@ -221,7 +221,7 @@ def test_options_are_reached_from_the_command_line(capsys: pytest.CaptureFixture
 
 def test_the_shipped_config_runs(demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = [f"--data.root={demo_scene}", "--data.factor=2", f"--trainer.default_root_dir={tmp_path}"]
-    quiet = ["--callbacks.progress=null", "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
+    quiet = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
     assert main(["fit", "--config=better_4k", *arguments, *quiet, "--trainer.max_steps=30", "--model.sh_degree=1"]) == 0
     assert "rendered from the decoded file" in capsys.readouterr().out
     config = yaml.safe_load(next(tmp_path.rglob("config.yaml")).read_text())

@@ -300,7 +300,7 @@ def arguments_of(scene: Path, folder: Path, *more: str) -> list[str]:
     return [
         *("fit", f"--data.root={scene}", "--data.factor=2", "--trainer.max_steps=12", "--model.sh_degree=1"),
         *(f"--trainer.default_root_dir={folder}", "--trainer.accelerator=cpu", "--trainer.enable_progress_bar=false"),
-        *("--callbacks.progress=null", "--model.codebooks.scales=16", *more),
+        *("--model.codebooks.scales=16", *more),
     ]
 
 

@@ -63,7 +63,7 @@ def arguments(scene: Path, root: Path, *more: str) -> list[str]:
     return [
         *("fit", f"--data.root={scene}", "--data.factor=2", "--data.test_every=3"),
         *("--trainer.max_steps=60", "--trainer.accelerator=cpu", f"--trainer.default_root_dir={root}"),
-        *("--trainer.enable_progress_bar=false", "--callbacks.progress=null"),
+        "--trainer.enable_progress_bar=false",
         *("--model.sh_degree=1", "--model.codebooks.scales=24", "--model.codebooks.quats=2000"),
         *("--model.codebooks.sh0=16", "--model.codebooks.shN=16", "--model.background=random"),
         *("--callbacks.phases.min_density_interval=4", "--callbacks.phases.min_reset_interval=11"),
