@@ -1,4 +1,4 @@
-"""Differentiable selection of distinct rows."""
+"""Distinct rows out of a table and back into one."""
 
 from __future__ import annotations
 
@@ -6,11 +6,19 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.rendering.cpu.rows import gather_rows, spread_rows
 from nsvq_lightning.rendering.kernels import kernels_for
 
-__all__ = ["take_rows"]
+__all__ = ["put_rows", "take_rows"]
+
+
+def put_rows(values: Tensor, rows: Tensor, count: int) -> Tensor:
+    """A table ``[count, ...]`` of zeros but for ``values [V, ...]`` at ``rows [V]``, int64, ascending, distinct."""
+    if kernels_for(values) == "cpu":
+        return spread_rows(values, rows, count)
+    return values.new_zeros(count, *values.shape[1:]).index_copy_(0, rows, values)
 
 
 class _TakeRows(torch.autograd.Function):
@@ -23,12 +31,10 @@ class _TakeRows(torch.autograd.Function):
         return gather_rows(tensor, rows) if kernels_for(tensor) == "cpu" else tensor.index_select(0, rows)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         (rows,) = ctx.saved_tensors
-        grad = grads[0]
-        if kernels_for(grad) == "cpu":
-            return spread_rows(grad, rows, ctx.count), None
-        return grad.new_zeros(ctx.count, *grad.shape[1:]).index_copy_(0, rows, grad), None
+        return put_rows(grad, rows, ctx.count), None
 
 
 def take_rows(tensor: Tensor, rows: Tensor) -> Tensor:

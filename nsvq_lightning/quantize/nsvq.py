@@ -13,6 +13,7 @@ from nsvq_lightning.quantize.noise import draw_seed
 from nsvq_lightning.quantize.substitution import substitute, substitute_backward
 from nsvq_lightning.quantize.sums import sum_by_code
 from nsvq_lightning.rendering.kernels import kernels_for
+from nsvq_lightning.subset import put_rows
 
 __all__ = ["NSVQ", "noise_substitution"]
 
@@ -102,7 +103,7 @@ class _Substitution(torch.autograd.Function):
         radial = (grad * _directions(residual, *ctx.mix)).sum(1, keepdim=True) * _unit(residual)
         grad_x = grad + radial
         if rows is not None:
-            grad_x = torch.zeros_like(x).index_copy_(0, rows, grad_x)
+            grad_x = put_rows(grad_x, rows, x.shape[0])
         return grad_x, -sum_by_code(radial, codes, codebook.shape[0]), None, None, None
 
 
