@@ -20,7 +20,14 @@ __all__ = ["BRANCH_CALLBACKS", "Settings", "digest", "resolve", "trunk_of"]
 Settings = dict[str, Any]
 """What ``--print_config`` shows, as JSON values."""
 
-BRANCH_CALLBACKS = ("canonical", "codebook_init", "codebook_replacement", "freeze", "refit")
+BRANCH_CALLBACKS = (
+    "canonical",
+    "codebook_init",
+    "codebook_refit",
+    "codebook_replacement",
+    "codebook_finite",
+    "freeze",
+)
 """Callbacks that do nothing before the iterations of the prune phase are done."""
 
 BRANCH_PHASES = ("min_finetune", "min_replacement_interval")
@@ -94,7 +101,7 @@ def trunk_of(settings: Settings) -> Settings | None:
         that are not this package's, or a trainer that may stop elsewhere.
     """
     trainer, callbacks = settings["trainer"], settings["callbacks"]
-    drivers = [callbacks[name] for name in ("phases", *BRANCH_CALLBACKS) if name in callbacks]
+    drivers = [callbacks[name] for name in ("phases", *BRANCH_CALLBACKS)]
     in_one_piece = any(trainer[name] not in values for name, values in IN_ONE_PIECE.items())
     if in_one_piece or callbacks["phases"] is None or not all(map(_is_known, drivers)):
         return None
@@ -112,7 +119,7 @@ def trunk_of(settings: Settings) -> Settings | None:
     trunk_phases |= {"total": total, "quantize_end": schedule.reference_total}
     for name in BRANCH_PHASES:
         trunk_phases.pop(name, None)
-    trunk["callbacks"] |= {name: None for name in (*BRANCH_CALLBACKS, "export") if name in callbacks}
+    trunk["callbacks"] |= dict.fromkeys((*BRANCH_CALLBACKS, "export"))
     # What all branches start from, whatever they keep of themselves.
     del trunk["callbacks"]["checkpoint"]
     del trunk["model"]["quantizer"]
