@@ -252,6 +252,8 @@ class NearestTracker:
         thread_count()
         _check_kernel(dim)(x.ravel(), rows, codebook.ravel(), memory, _overlap(dim), self._travelled, drift, result)
         unsure = np.flatnonzero(result < 0)
+        if 2 * len(unsure) > len(rows):  # codes have jumped; the rows in the next searches need not pay for it again
+            drift = self._take_snapshot(codebook, drift)
         if len(unsure):
             where = rows[unsure]
             found, lists, distances = score_search(x[where], centre_codes(codebook), with_lists=True)
@@ -261,7 +263,7 @@ class NearestTracker:
         return result
 
     def _drift(self, codebook: Floats, every: int) -> float:
-        """Farthest way of a code since the snapshot; takes a new snapshot after ``every`` searches."""
+        """Farthest way of a code since the snapshot; a new one is taken after ``every`` searches."""
         if self._snapshot is None:
             self._snapshot = codebook.copy()
         squares = np.empty(len(codebook), np.float32)
@@ -269,10 +271,13 @@ class NearestTracker:
         _row_distances(codebook, self._snapshot, squares)
         drift = float(np.sqrt(squares.max())) * ROUNDING
         self._steps += 1
-        if self._steps % every == 0:
-            self._travelled += drift
-            self._snapshot, drift = codebook.copy(), 0.0
-        return drift
+        return self._take_snapshot(codebook, drift) if self._steps % every == 0 else drift
+
+    def _take_snapshot(self, codebook: Floats, drift: float) -> float:
+        """Take a snapshot of codes that have moved by ``drift`` since the last; returns their drift from it, 0."""
+        self._travelled += drift
+        self._snapshot = codebook.copy()
+        return 0.0
 
     def _grow(self, count: int) -> None:
         """Room for ``count`` rows."""

@@ -60,6 +60,18 @@ def test_a_search_is_rare_where_little_moves(dim: int, searched: list[int]) -> N
     assert 0 <= sum(searched) - 600 < 0.02 * 40 * 300
 
 
+def test_a_jump_of_codes_is_paid_for_once(searched: list[int]) -> None:
+    """As a refit makes them: every row is searched anew when it is next in view, not in each search."""
+    tracker, jump = NearestTracker(), torch.zeros(100, 45)
+    jump[::10] = torch.randn(10, 45, generator=generator(1))
+    for step, (x, codebook, rows) in enumerate(walk(45, 40, 1e-4)):
+        codebook = codebook + jump if step >= 5 else codebook
+        assert torch.equal(tracker.search(x, codebook, rows), nearest(x[rows], codebook))
+        if step == 4:
+            before = sum(searched)
+    assert 600 <= sum(searched) - before < 1.1 * 600
+
+
 def test_equal_codes() -> None:
     """Copies of codes, as replacement makes them, tie exactly: the lower one is right, lists or not."""
     tracker = NearestTracker()
