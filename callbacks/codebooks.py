@@ -138,9 +138,9 @@ class CodebookReplacement(Callback):
         schedule = host.schedule
         if schedule.phase_at(iteration) is not Phase.QUANTIZE:
             return False
-        early = schedule.replacement_times(self.start, self.early_end, self.early_every)
-        late = schedule.replacement_times(self.early_end + self.late_every, self.end, self.late_every)
-        return iteration in early or iteration in late
+        return iteration in schedule.replacement_times(
+            self.start, self.early_end, self.early_every, self.end, self.late_every
+        )
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int

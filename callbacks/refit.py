@@ -44,9 +44,7 @@ class CodebookRefit(Callback):
         schedule = host.schedule
         if schedule.phase_at(iteration) is not Phase.QUANTIZE:
             return False
-        return iteration in schedule.replacement_times(
-            schedule.prune_end + self.every, schedule.quantize_end, self.every
-        )
+        return iteration in schedule.refit_times(self.every)
 
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
         """Refit when it is time, on the first process."""

@@ -21,7 +21,9 @@ opacity resets                   proportionally, interval not below ``min_reset_
                                  hundred steps of Adam to come back)
 pruning in the prune phase       proportionally
 replacement, refits of codes     proportionally, interval not below ``min_replacement_interval`` (a code is called
-                                 unused after a window of views; to refit codes takes as long as some steps)
+                                 unused after a window of views, also the first time: after the three views of an
+                                 unlimited one in 1500 iterations, a fifth of the SH codes were replaced; to refit
+                                 codes takes as long as some steps)
 decay of the position's rate     proportionally (30 000 of 45 000)
 λ of the opacities               inversely: what it takes from an opacity in a whole phase stays the same
 learning rates, thresholds       not at all
@@ -30,9 +32,10 @@ learning rates, thresholds       not at all
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 
 __all__ = ["Phase", "Schedule"]
@@ -128,6 +131,8 @@ class Schedule:
             latest = self.total - sum(exists[phase + 1 :])
             ends.append(min(max(self._end(phase, end, before), before + 1), latest) if exists[phase] else before)
         warmup, prune, quantize, finetune = (max(end, 0) for end in ends)
+        if exists[Phase.QUANTIZE] and quantize == prune:
+            quantize = finetune  # a run of one iteration: codes are placed before they are tuned
         return warmup, prune, quantize, finetune
 
     def _end(self, phase: int, reference: int, before: int) -> int:
@@ -150,7 +155,7 @@ class Schedule:
         first = self.ends[phase - 1] + 1 if phase else 1
         return first if first <= self.ends[phase] else None
 
-    def iteration(self, reference: int) -> int:
+    def iteration(self, reference: float) -> int:
         """The iteration of this run that stands for iteration ``reference`` of the reference run, at least 1."""
         return max(1, round(reference * self.scale))
 
@@ -158,22 +163,49 @@ class Schedule:
         """The interval of this run that stands for ``reference`` iterations, at least ``minimum``."""
         return max(minimum, self.iteration(reference)) if self.scale < 1 else self.iteration(reference)
 
-    def times(self, start: int, last: int, every: int, minimum: int = 1) -> range:
-        """The iterations ``start, start + every, …, last`` of the reference run as iterations of this run."""
-        return range(self.iteration(start), self.iteration(last) + 1, self.interval(every, minimum))
+    def stride(self, reference: int, minimum: int) -> float:
+        """The same interval in iterations of the reference run, which is not rounded."""
+        return max(reference, minimum / self.scale) if self.scale < 1 else reference
 
-    def density_times(self, start: int, last: int, every: int) -> range:
+    def times(self, start: float, last: float, every: int, minimum: int = 1) -> tuple[int, ...]:
+        """The iterations ``start, start + every, …, last`` of the reference run as iterations of this run.
+
+        Each is rounded on its own: an interval rounded up would lose the last of them.
+        """
+        return _times(self, start, last, self.stride(every, minimum))
+
+    def density_times(self, start: int, last: int, every: int) -> tuple[int, ...]:
         """Iterations at which splats are cloned, split and pruned."""
         return self.times(start, last, every, self.min_density_interval)
 
-    def reset_times(self, last: int, every: int) -> range:
+    def reset_times(self, last: int, every: int) -> tuple[int, ...]:
         """Iterations at which opacities are reset: the multiples of the interval up to ``last``."""
-        step = self.interval(every, self.min_reset_interval)
-        return range(step, self.iteration(last) + 1, step)
+        return self.times(self.stride(every, self.min_reset_interval), last, every, self.min_reset_interval)
 
-    def replacement_times(self, start: int, last: int, every: int) -> range:
-        """Iterations at which inactive codes are replaced, or codebooks refitted."""
-        return self.times(start, last, every, self.min_replacement_interval)
+    def refit_times(self, every: int) -> tuple[int, ...]:
+        """Iterations of the quantize phase at which codebooks are refitted."""
+        first = self.prune_end + self.stride(every, self.min_replacement_interval)
+        return self.times(first, self._quantized, every, self.min_replacement_interval)
+
+    def replacement_times(
+        self, start: int, early_end: int, early_every: int, end: int, late_every: int
+    ) -> tuple[int, ...]:
+        """Iterations of the quantize phase at which inactive codes are replaced.
+
+        An early series from ``start`` to ``early_end``, a late one to ``end``. No window is shorter than
+        ``min_replacement_interval``, nor is the first, and what lies between ``end`` and the end of the phase stays
+        where a longer fine-tune phase moves that.
+        """
+        minimum = self.min_replacement_interval
+        first = max(start, self.prune_end + self.stride(1, minimum))
+        early = self.times(first, early_end, early_every, minimum)
+        last = self._quantized - max(0, self.quantize_end - end)
+        return early + self.times(early_end + self.stride(late_every, minimum), last, late_every, minimum)
+
+    @property
+    def _quantized(self) -> float:
+        """Where the quantize phase of this run ends, in iterations of the reference run."""
+        return self.ends[Phase.QUANTIZE] / self.scale
 
     def sh_degree_at(self, iteration: int, every: int, highest: int) -> int:
         """SH degree in use at a 1-based iteration: one more every ``every`` reference iterations."""
@@ -191,3 +223,10 @@ class Schedule:
     def position_decay_end(self) -> int:
         """Iteration from which the position's learning rate is constant."""
         return self.iteration(POSITION_DECAY_END)
+
+
+@lru_cache
+def _times(schedule: Schedule, start: float, last: float, stride: float) -> tuple[int, ...]:
+    """Kept, as callbacks ask in every step."""
+    count = math.floor((last - start) / stride + 1e-9) + 1
+    return tuple(dict.fromkeys(schedule.iteration(start + k * stride) for k in range(count)))

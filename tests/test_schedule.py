@@ -30,8 +30,9 @@ def test_the_papers_run_has_the_papers_milestones() -> None:
     assert (density[0], density[1], density[-1], len(density)) == (600, 700, 14_900, 144)
     assert list(schedule.reset_times(12_000, 3000)) == [3000, 6000, 9000, 12_000]
     assert list(schedule.times(16_000, 20_000, 1000)) == [16_000, 17_000, 18_000, 19_000, 20_000]
-    assert schedule.replacement_times(20_100, 22_000, 100)[-1] == 22_000
-    assert list(schedule.replacement_times(22_500, 43_000, 500))[-2:] == [42_500, 43_000]
+    replaced = schedule.replacement_times(20_100, 22_000, 100, 43_000, 500)
+    assert replaced == (*range(20_100, 22_001, 100), *range(22_500, 43_001, 500))
+    assert schedule.refit_times(100) == tuple(range(20_100, 43_001, 100))
     assert [schedule.sh_degree_at(i, 1000, 3) for i in (1, 999, 1000, 1999, 2000, 3000, 45_000)] == [
         0,
         0,
@@ -60,9 +61,24 @@ def test_a_shorter_run_is_the_same_run_scaled() -> None:
 def test_intervals_of_short_runs_have_a_lower_limit_and_paper_runs_have_none() -> None:
     short = Schedule(total=3000, min_density_interval=40)
     times = short.density_times(600, 14_900, 100)
-    assert times.step == 40
-    assert times[0] == 40  # 600 / 15
-    assert Schedule(min_density_interval=400).density_times(600, 14_900, 100).step == 100
+    assert times[:3] == (40, 80, 120)  # 600 / 15
+    assert Schedule(min_density_interval=400).density_times(600, 14_900, 100)[:2] == (600, 700)
+
+
+@pytest.mark.parametrize("total", [*range(100, 2000, 37), *range(2500, 50_000, 2500), 70_001])
+def test_rounding_loses_none_of_a_series(total: int) -> None:
+    """As a rounded interval would, added up: whoever prunes five times in the paper's run does so in any."""
+    schedule = Schedule(total=total, min_reset_interval=1)
+    for times, last in ((schedule.times(16_000, 20_000, 1000), 20_000), (schedule.reset_times(12_000, 3000), 12_000)):
+        assert len(times) == {20_000: 5, 12_000: 4}[last]
+        assert times[-1] == schedule.iteration(last)
+
+
+@pytest.mark.parametrize("total", range(1, 6))
+def test_codes_are_placed_before_they_are_tuned(total: int) -> None:
+    for schedule in (Schedule(total=total), Schedule(total=total, warmup_end=0, prune_end=0)):
+        assert schedule.first_of(Phase.QUANTIZE) is not None
+        assert schedule.ends[-1] == total
 
 
 def test_fine_tuning_of_short_runs_has_a_lower_limit_up_to_half_of_what_follows_pruning() -> None:

@@ -30,10 +30,31 @@ def test_a_short_run_replaces_over_windows_of_several_views() -> None:
     callback = CodebookReplacement()
     short: Any = SimpleNamespace(schedule=Schedule(total=4500, min_replacement_interval=40, min_finetune=1))
     due = [i for i in range(1, 4501) if callback.is_due(short, i)]
-    assert due[0] == 2010
+    assert due[0] == 2040
     assert {b - a for a, b in pairwise(due) if b < 2250} == {40}
     assert due[-1] == 4300
     assert all(short.schedule.phase_at(i) is Phase.QUANTIZE for i in due)
+
+
+@pytest.mark.parametrize("total", [500, 1000, 1500, 2000, 4500, 7000, 20_000])
+def test_no_window_of_a_short_run_is_below_the_limit(total: int) -> None:
+    """The first counts from the start of the phase: codes that few views could hit are not out of use."""
+    schedule = Schedule(total=total)
+    short: Any = SimpleNamespace(schedule=schedule)
+    due = [i for i in range(1, total + 1) if CodebookReplacement().is_due(short, i)]
+    windows = [b - a for a, b in pairwise([schedule.ends[Phase.PRUNE], *due])]
+    assert min(windows) >= 49  # 50, but for the rounding of both ends
+    assert len(windows) >= 2
+
+
+def test_replacement_stops_as_long_before_codes_freeze_as_asked_for() -> None:
+    """Also where a longer fine-tune phase ends the quantize phase earlier."""
+    callback = CodebookReplacement(end=40_000)
+    for total in (1500, 2000, 4500, 9000):
+        schedule = Schedule(total=total)
+        short: Any = SimpleNamespace(schedule=schedule)
+        last = max(i for i in range(1, total + 1) if callback.is_due(short, i))
+        assert schedule.ends[Phase.QUANTIZE] - last >= round(3000 * schedule.scale)
 
 
 def test_replacement_can_stop_before_codes_freeze() -> None:

@@ -42,7 +42,7 @@ def test_refits_scale_like_replacement() -> None:
         return [i for i in range(1, total + 1) if CodebookRefit(every=every).is_due(host, i)]
 
     assert due(45_000) == list(range(20_100, 43_001, 100))
-    assert due(4500) == list(range(2010, 4201, 50))
+    assert due(4500) == list(range(2050, 4201, 50))
     assert due(4500, 1000) == list(range(2100, 4201, 100))
 
 
