@@ -19,6 +19,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 import nsvq_lightning.callbacks as callbacks
 import nsvq_lightning.quantize  # noqa: F401  short class names resolve to what is imported
 from nsvq_lightning.checkpoint_file import read_checkpoint
+from nsvq_lightning.cli import OWN_COMMANDS
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
 from nsvq_lightning.host import is_trial, output_folder
 from nsvq_lightning.io.atomic import write_text
@@ -64,9 +65,10 @@ NAMED_CHECKPOINTS = frozenset({"last", "best", "hpc", "registry"})
 
 PARSER_TEXTS: dict[str, Any] = {
     "prog": "nsvq",
-    "description": "Train 3D Gaussian splatting scenes and store them small. Five more commands have their own "
-    "options: 'nsvq info FILE' describes a scene file, 'nsvq compress' makes one small, 'nsvq sweep' trains many runs "
-    "and compares them, 'nsvq benchmark' measures this machine, 'nsvq doctor' says whether it and a folder are fit.",
+    "description": "Train 3D Gaussian splatting scenes and store them small. More commands have their own options: "
+    "'nsvq info FILE' describes a scene file, 'nsvq compress' makes one small, 'nsvq convert' writes it in another "
+    "format, 'nsvq sweep' trains many runs and compares them, 'nsvq benchmark' measures this machine, 'nsvq doctor' "
+    "says whether it and a folder are fit.",
     "fit": {"description": "Train a scene, compress it, and measure the decoded file."},
     "validate": {"description": "Measure the scene of a checkpoint."},
     "test": {"description": "Write the compressed file of a checkpoint, read it back and measure it."},
@@ -81,8 +83,13 @@ class QuietParser(LightningArgumentParser):
         """Write the message to stderr and exit with status 2."""
         # Parsers of nested classes are made by jsonargparse and named after the script.
         program = self.prog.replace(" [options]", "") if self.prog.startswith("nsvq") else "nsvq COMMAND"
-        hint = " (--data.root=path/to/scene)" if message.endswith("required: root") else ""
-        sys.stderr.write(f"error: {message}{hint}\nAll options: {program} --help\n")
+        if message.endswith("required: root"):
+            message += " (--data.root=path/to/scene)"
+        elif message.startswith('Parser key "data":') and Path(message.rpartition("Given value: ")[2]).is_dir():
+            message = "--data takes the name of a data module; the folder of a scene is --data.root=path/to/scene"
+        elif "subcommand: invalid choice" in message:
+            message = message.removesuffix(")") + "".join(f", '{name}'" for name in OWN_COMMANDS) + ")"
+        sys.stderr.write(f"error: {message}\nAll options: {program} --help\n")
         self.exit(2)
 
 

@@ -71,6 +71,14 @@ class ColmapDataModule(LightningDataModule):
         rank_zero_info(_summary(scene, self.test_every))
         return scene
 
+    def prepare_data(self) -> None:
+        """Load the scene where this is the only process: a folder that cannot be used leaves none of a run behind.
+
+        Lightning calls this before its loggers make theirs; of several processes only one would fail here.
+        """
+        if self.process == (0, 1):
+            _ = self.scene
+
     def setup(self, stage: str | None = None) -> None:
         """Load the scene; a second call does nothing."""
         _ = self.scene
@@ -140,7 +148,7 @@ class DemoDataModule(ColmapDataModule):
         self.views, self.width, self.height = views, width, height
 
     def prepare_data(self) -> None:
-        """Build the scene unless it is there."""
+        """Build the scene unless it is there, and load it."""
         if not self.root.exists():
             rank_zero_info(f"rendering the demo scene into {self.root} (once, some seconds)")
             try:
@@ -148,6 +156,7 @@ class DemoDataModule(ColmapDataModule):
             except OSError:
                 if not self.root.exists():  # else another node has built it meanwhile
                     raise
+        super().prepare_data()
 
     def setup(self, stage: str | None = None) -> None:
         """Load the scene.
@@ -160,8 +169,9 @@ class DemoDataModule(ColmapDataModule):
         found, wanted = (len(self.scene), camera.width, camera.height), (self.views, self.width, self.height)
         if found != wanted:
             raise SceneError(
-                f"{self.root} holds {found[0]} views of {found[1]}x{found[2]}, asked for are {wanted[0]} views of "
-                f"{wanted[1]}x{wanted[2]}: remove the folder or give another root"
+                f"{self.root} holds {found[0]} views of {found[1]}x{found[2]}, not the demo scene of {wanted[0]} views "
+                f"of {wanted[1]}x{wanted[2]}: train photos of your own with --config nsvq_4k.yaml, or give --data.root "
+                "a folder for the demo scene"
             )
 
 

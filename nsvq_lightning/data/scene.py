@@ -179,10 +179,14 @@ def _image_folder(root: Path, name: str, factor: int | None) -> tuple[Path, int]
         return scaled, 1
     folder = root / name
     if not folder.is_dir():
-        others = sorted(path.name for path in root.iterdir() if path.is_dir() and path.name.startswith(f"{name}_"))
-        hint = (
-            f"; there is {', '.join(others)}: set factor" if others else ": copy the photos there or set images_folder"
-        )
+        folders = sorted(path.name for path in root.iterdir() if path.is_dir())
+        scaled_copies = [other for other in folders if other.startswith(f"{name}_")]
+        if scaled_copies:
+            hint = f"; there is {', '.join(scaled_copies)}: set factor"
+        elif folders:
+            hint = f": copy the photos there, or set images_folder to one of {', '.join(folders)}"
+        else:
+            hint = ": copy the photos there"
         raise SceneError(f"image folder {folder} does not exist{hint}")
     return folder, factor or 1
 

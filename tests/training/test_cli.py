@@ -369,6 +369,30 @@ def test_wrong_settings_name_the_file_they_came_from(tmp_path: Path, capsys: pyt
     assert f"Settings came from {path} and the command line" in message
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fit", "--data", "{folder}"], "the folder of a scene is --data.root=path/to/scene"),
+        (["fit", "--data", "no.Such"], "no.Such"),
+        (["compres", "a.ply", "b.nsvq"], "'doctor')"),
+    ],
+)
+def test_likely_slips_are_told_what_was_meant(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([argument.format(folder=tmp_path) for argument in arguments])
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_used_leaves_no_run_behind(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    runs = tmp_path / "runs"
+    assert main(["fit", f"--data.root={tmp_path / 'photos'}", f"--trainer.default_root_dir={runs}"]) == 1
+    assert not runs.exists()
+
+
 def test_errors_are_one_line_and_name_the_option(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["fit", "--data.root=x", "--model.shdegree=2"])
