@@ -105,7 +105,7 @@ def _parser() -> argparse.ArgumentParser:
         help=f"synthetic scenes of render, codec, gpu ({','.join(STANDARD)}; gpu also {','.join(LARGE)}; quick A20k)",
     )
     what.add_argument(
-        "--scene", type=Path, metavar="PATH", help="scene file (.ply, .nsvq) or COLMAP folder instead of synthetic ones"
+        "--scene", type=Path, metavar="PATH", help="scene file or COLMAP folder instead of synthetic ones"
     )
     what.add_argument(
         "--init-from",
