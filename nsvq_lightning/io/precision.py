@@ -36,7 +36,7 @@ class Precision:
 
     position: float = 0.05
     opacity: float = 1 / 256
-    codebook: float = 0.125
+    codebook: float = 0.0625
     scales: float = 0.02
     quats: float = 0.005
     sh0: float = 0.01
