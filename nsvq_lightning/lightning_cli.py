@@ -164,7 +164,7 @@ class SplatCLI(LightningCLI):
         switch(**self._get(self.config, "skips").as_dict())
 
     def _parse_ckpt_path(self) -> None:
-        """Take the model's settings from the checkpoint, except in ``fit``: there the user's options must win.
+        """Take the model's settings from the checkpoint, but for those on the command line; in ``fit`` none of them.
 
         Raises:
             FormatError: The checkpoint cannot be used; better said now than after the scene has been loaded.
@@ -175,6 +175,8 @@ class SplatCLI(LightningCLI):
             read_checkpoint(path)
         if self.config.subcommand != "fit":
             super()._parse_ckpt_path()
+            own = [self.config.subcommand, *_options_of("model", self._arguments)]
+            self.config = self.parser.parse_args(own, namespace=self.config, defaults=False)
 
     def _prepare_subcommand_kwargs(self, subcommand: str) -> dict[str, Any]:
         kwargs = super()._prepare_subcommand_kwargs(subcommand)
@@ -230,6 +232,17 @@ class SplatCLI(LightningCLI):
         path = output_folder(self.trainer) / "metrics.json"
         if self.trainer.is_global_zero and path.is_file():
             sys.stdout.write(summary(path.parent, json.loads(path.read_text())))
+
+
+def _options_of(group: str, arguments: Sequence[str]) -> list[str]:
+    """The options of a group among arguments, each with its value."""
+    found, takes_value = [], False
+    for argument in arguments:
+        starts = argument.startswith((f"--{group}.", f"--{group}="))
+        if starts or (takes_value and not argument.startswith("--")):
+            found.append(argument)
+        takes_value = starts and "=" not in argument
+    return found
 
 
 def continuation(arguments: Sequence[str], checkpoint: Path) -> str:

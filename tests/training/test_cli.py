@@ -14,6 +14,7 @@ import torch
 import yaml
 
 from nsvq_lightning.cli import check_config, find_config, main, resolve_configs
+from nsvq_lightning.io.container import read_nsvq
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.schedule import Phase
@@ -237,6 +238,17 @@ def test_export_reads_no_scene(finished: Path, tmp_path: Path) -> None:
         assert main(["export", f"--ckpt_path={checkpoint}", f"--output={output}"]) == 0
         assert output.read_bytes() == (finished / f"scene.{suffix}").read_bytes()
     assert len(load(tmp_path / "out.ply")) > 0
+
+
+def test_options_win_over_the_checkpoint_in_export(finished: Path, tmp_path: Path) -> None:
+    arguments = ["export", f"--ckpt_path={finished / 'checkpoints' / 'last.ckpt'}"]
+    for level in ("compact", "paper"):
+        more = [f"--output={tmp_path / level}.nsvq", "--model.storage.level", level]
+        assert main([*arguments, *more]) == 0
+    compact, paper = (read_nsvq(tmp_path / f"{level}.nsvq") for level in ("compact", "paper"))
+    assert len(paper.codebooks["scales"]) == 16  # of the checkpoint
+    assert len(paper) == len(compact)
+    assert (tmp_path / "compact.nsvq").stat().st_size < (tmp_path / "paper.nsvq").stat().st_size
 
 
 def test_predict_writes_a_picture_of_every_view(demo_scene: Path, finished: Path, tmp_path: Path) -> None:
