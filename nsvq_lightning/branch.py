@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from nsvq_lightning.schedule import Phase
+from nsvq_lightning.schedule import Phase, Schedule
 from nsvq_lightning.splats import ATTRIBUTES, sh_degree_of
 
-__all__ = ["branch_checkpoint", "branch_optimizer_state", "can_branch", "check_continuation"]
+__all__ = [
+    "QUANTIZE_RULES",
+    "branch_checkpoint",
+    "branch_optimizer_state",
+    "can_branch",
+    "changed_schedule",
+    "check_continuation",
+]
+
+QUANTIZE_RULES = ("quantize_end", "min_finetune", "min_replacement_interval")
+"""Settings of a schedule that mean nothing before the quantize phase."""
 
 CODEBOOKS = "codebooks."
 """Prefix of the codebooks in a module's state."""
@@ -25,9 +36,9 @@ PHASE = "state._phase"
 
 def can_branch(checkpoint: Mapping[str, Any], codebooks: nn.ModuleDict) -> bool:
     """Whether a checkpoint is from before the quantize phase and has other codebooks, in number or size, than these."""
-    state = checkpoint["state_dict"]
-    if PHASE not in state or Phase(int(state[PHASE])) >= Phase.QUANTIZE:
+    if not _is_unquantized(checkpoint):
         return False
+    state = checkpoint["state_dict"]
     stored = {name: value.shape for name, value in state.items() if name.startswith(CODEBOOKS)}
     return stored != {name: value.shape for name, value in _prefixed(codebooks).items()}
 
@@ -73,6 +84,27 @@ def branch_optimizer_state(stored: Mapping[str, Any], fresh: Mapping[str, Any]) 
     return merged
 
 
+def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str | None:
+    """What to tell about a run that goes on from a checkpoint with this schedule; None where nothing changes by it."""
+    stored = Schedule(**checkpoint["schedule"])
+    if stored.total != schedule.total:
+        return (
+            f"the checkpoint is of a run of {stored.total} iterations, this one has {schedule.total}: phases, density "
+            "control and learning rates follow the new length; pass "
+            f"--trainer.max_steps={stored.total} to continue that run as it was"
+        )
+    own, without_effect = asdict(schedule), QUANTIZE_RULES if _is_unquantized(checkpoint) else ()
+    changed = {name: v for name, v in asdict(stored).items() if v != own[name] and name not in without_effect}
+    if not changed:
+        return None
+    return (
+        f"the checkpoint is of a run with {', '.join(f'{name} = {value}' for name, value in changed.items())}, this "
+        f"one goes on with {', '.join(f'{name} = {own[name]}' for name in changed)}; pass "
+        f"{' '.join(f'--callbacks.phases.{name}={value}' for name, value in changed.items())} to continue that run as "
+        "it was"
+    )
+
+
 def check_continuation(checkpoint: Mapping[str, Any], module: nn.Module) -> None:
     """Check that a module can be trained on from a checkpoint.
 
@@ -103,6 +135,12 @@ def check_continuation(checkpoint: Mapping[str, Any], module: nn.Module) -> None
             f"that this run has not, and lacks {_some(wanted - stored)}; pass the --model.codebooks and "
             "--model.quantizer that it was trained with"
         )
+
+
+def _is_unquantized(checkpoint: Mapping[str, Any]) -> bool:
+    """Whether a checkpoint is from before the quantize phase."""
+    state = checkpoint["state_dict"]
+    return PHASE in state and Phase(int(state[PHASE])) < Phase.QUANTIZE
 
 
 def _some(names: set[str]) -> str:

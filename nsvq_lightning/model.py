@@ -12,6 +12,7 @@ from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
 from nsvq_lightning import __version__
+from nsvq_lightning.branch import changed_schedule
 from nsvq_lightning.compress import compress
 from nsvq_lightning.hyperparameters import plain
 from nsvq_lightning.io.compressed import CompressedScene
@@ -213,17 +214,10 @@ class SplatModel(LightningModule):
         self.history = list(checkpoint.get("history", []))
         if "schedule" not in checkpoint:
             return
-        stored = Schedule(**checkpoint["schedule"])
         if not self.is_fitting:
-            self.schedule = stored
-        elif stored != self.schedule:
-            log.warning(
-                "the checkpoint is of a run of %d iterations, this one has %d: phases, density control and learning "
-                "rates follow the new length; pass --trainer.max_steps=%d to continue that run as it was",
-                stored.total,
-                self.schedule.total,
-                stored.total,
-            )
+            self.schedule = Schedule(**checkpoint["schedule"])
+        elif (change := changed_schedule(checkpoint, self.schedule)) is not None:
+            log.warning(change)
 
     def _settings(self, quantizers: Mapping[str, Quantizer]) -> dict[str, Any]:
         """What is stored in the file about the run: nothing that differs between two runs of one seed."""

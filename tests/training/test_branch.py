@@ -11,7 +11,7 @@ import torch
 from lightning.pytorch import Callback, Trainer
 from torch import nn
 
-from nsvq_lightning.branch import branch_optimizer_state, can_branch
+from nsvq_lightning.branch import branch_optimizer_state, can_branch, changed_schedule
 from nsvq_lightning.callbacks import PhaseSchedule, RunCheckpoint
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.schedule import Phase, Schedule
@@ -58,6 +58,48 @@ def test_a_branch_ends_in_the_bytes_of_the_run_trained_from_its_start(
     assert outcome(*branched) == outcome(*whole)
     trunk_seconds = float(torch.load(trunk, weights_only=True)["state_dict"]["state._train_seconds"])
     assert branched[1].train_seconds > trunk_seconds > 0
+
+
+@pytest.mark.parametrize(
+    ("rules", "named"),
+    [
+        ({"quantize_end": 44_000, "min_finetune": 7, "min_replacement_interval": 9}, None),
+        ({"quantize_end": 44_000, "min_reset_interval": 12}, ("min_reset_interval = 11", "min_reset_interval = 12")),
+    ],
+    ids=["of the quantize phase", "of another"],
+)
+def test_a_branch_tells_which_rules_of_its_trunk_have_changed(
+    run: RunFactory,
+    recipe: Recipe,
+    trunk: Path,
+    caplog: pytest.LogCaptureFixture,
+    rules: dict[str, int],
+    named: tuple[str, str] | None,
+) -> None:
+    phases = PhaseSchedule(**{"total": 60, **INTERVALS, **rules})
+    run(recipe(phases=phases).values(), ckpt_path=trunk, max_steps=PRUNE_END + 1)
+    messages = [message for message in caplog.messages if message.startswith("the checkpoint is of")]
+    if named is None:
+        assert messages == []
+        return
+    assert messages == [
+        f"the checkpoint is of a run with {named[0]}, this one goes on with {named[1]}; pass "
+        "--callbacks.phases.min_reset_interval=11 to continue that run as it was"
+    ]
+
+
+def test_once_quantized_the_rules_of_that_phase_count() -> None:
+    module = SplatModule(sh_degree=1)
+    module.schedule = Schedule(min_finetune=200)
+    for phase in Phase:
+        module.phase = phase
+        stored: dict[str, Any] = {"state_dict": module.state_dict()}
+        module.on_save_checkpoint(stored)
+        told = changed_schedule(stored, Schedule())
+        assert (told is None) is (phase < Phase.QUANTIZE)
+        assert changed_schedule(stored, module.schedule) is None
+    assert told is not None
+    assert "--callbacks.phases.min_finetune=200" in told
 
 
 def test_codebooks_may_change_until_they_are_placed() -> None:
