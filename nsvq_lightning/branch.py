@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -12,7 +12,11 @@ from torch.optim import Optimizer
 from nsvq_lightning.schedule import Phase, Schedule
 from nsvq_lightning.splats import ATTRIBUTES, sh_degree_of
 
+if TYPE_CHECKING:
+    from nsvq_lightning.model import SplatModel
+
 __all__ = [
+    "QUANTIZER_SETTINGS",
     "QUANTIZE_RULES",
     "branch_checkpoint",
     "branch_optimizer_state",
@@ -29,6 +33,9 @@ CODEBOOKS = "codebooks."
 
 SPLATS = "splats."
 """Prefix of the splats in a module's state."""
+
+QUANTIZER_SETTINGS = "quantizer_settings"
+"""Where a checkpoint holds the class and the number of codes that each quantizer was made with."""
 
 PHASE = "state._phase"
 """The phase of the last trained iteration in a module's state."""
@@ -105,12 +112,12 @@ def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str |
     )
 
 
-def check_continuation(checkpoint: Mapping[str, Any], module: nn.Module) -> None:
+def check_continuation(checkpoint: Mapping[str, Any], module: SplatModel) -> None:
     """Check that a module can be trained on from a checkpoint.
 
     Args:
         checkpoint: The checkpoint, codebooks exchanged where they may be (:func:`branch_checkpoint`).
-        module: The module; numbers of splats and codes may differ.
+        module: The module; numbers of splats may differ, and those of codes where k-means has found fewer rows.
 
     Raises:
         ValueError: It holds weights only, or is of a module with other settings.
@@ -127,6 +134,13 @@ def check_continuation(checkpoint: Mapping[str, Any], module: nn.Module) -> None
             f"the checkpoint is of a run with SH degree {degrees[0]}, this one has {degrees[1]}; pass "
             f"--model.sh_degree={degrees[0]}"
         )
+    trained = checkpoint.get(QUANTIZER_SETTINGS)
+    if trained is not None and trained != module.quantizer_settings and not _is_unquantized(checkpoint):
+        raise ValueError(
+            f"the checkpoint has quantized with {_described(trained)}, and this run would with "
+            f"{_described(module.quantizer_settings)}; that can change before the quantize phase only: pass "
+            f"{_options(trained)}, or a checkpoint from before it"
+        )
     # Side tables of the splats come and go.
     stored, wanted = ({name for name in values if not name.startswith(SPLATS)} for values in (state, own))
     if stored != wanted:
@@ -135,6 +149,26 @@ def check_continuation(checkpoint: Mapping[str, Any], module: nn.Module) -> None
             f"that this run has not, and lacks {_some(wanted - stored)}; pass the --model.codebooks and "
             "--model.quantizer that it was trained with"
         )
+
+
+def _described(settings: Mapping[str, Mapping[str, Any]]) -> str:
+    """What a run quantizes with, for a message."""
+    return f"{_kinds(settings)} ({_sizes(settings)})" if settings else "no codebooks"
+
+
+def _options(settings: Mapping[str, Mapping[str, Any]]) -> str:
+    """The options of a run that quantizes so."""
+    if not settings:
+        return "--model.codebooks=null"
+    return f"--model.quantizer={_kinds(settings)} --model.codebooks='{{{_sizes(settings)}}}'"
+
+
+def _kinds(settings: Mapping[str, Mapping[str, Any]]) -> str:
+    return ", ".join(sorted({str(one["quantizer"]) for one in settings.values()}))
+
+
+def _sizes(settings: Mapping[str, Mapping[str, Any]]) -> str:
+    return ", ".join(f"{name}: {one['codes']}" for name, one in settings.items())
 
 
 def _is_unquantized(checkpoint: Mapping[str, Any]) -> bool:

@@ -12,7 +12,7 @@ from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
 from nsvq_lightning import __version__
-from nsvq_lightning.branch import changed_schedule
+from nsvq_lightning.branch import QUANTIZER_SETTINGS, changed_schedule
 from nsvq_lightning.compress import compress
 from nsvq_lightning.hyperparameters import plain
 from nsvq_lightning.io.compressed import CompressedScene
@@ -84,6 +84,10 @@ class SplatModel(LightningModule):
         self.storage = storage
         self.splats = splats
         self.codebooks = nn.ModuleDict(build_quantizers(quantizer, codebooks, splats))
+        self.quantizer_settings = {
+            name: {"quantizer": type(q).__name__, "codes": q.codebook.shape[0]} for name, q in self.quantizers.items()
+        }
+        """Class and number of codes by attribute, as asked for; k-means and checkpoints may bring fewer codes."""
         self.state = RunState()
         self.stopwatch = Stopwatch(self.state)
         self.schedule = Schedule()
@@ -202,8 +206,9 @@ class SplatModel(LightningModule):
         return generator(self.seed, self.global_step, 0, *salts, self._micro_batch * processes + self.global_rank)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add history and schedule; keep plain data only, so that ``weights_only=True`` can read it."""
+        """Add history, schedule and quantizers; plain data only, so that ``weights_only=True`` can read it."""
         checkpoint["history"] = self.history
+        checkpoint[QUANTIZER_SETTINGS] = self.quantizer_settings
         checkpoint["schedule"] = asdict(self.schedule)
         stored = checkpoint.get(self.CHECKPOINT_HYPER_PARAMS_KEY)
         if stored is not None:
