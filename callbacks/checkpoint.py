@@ -38,7 +38,7 @@ class RunCheckpoint(Checkpoint):
     in one they cannot agree on an iteration any more, and the last periodic checkpoint is the one to continue from.
 
     Args:
-        every: Iterations between two checkpoints; None is a tenth of the run, 0 saves at the end of the run only.
+        every: Iterations between two checkpoints; None is a tenth of the schedule, 0 saves at the end of the run only.
         keep: Keep each checkpoint as ``step-<iteration>.ckpt`` too, instead of only the last.
         folder: Where; None is ``checkpoints`` in the trainer's log folder.
 
@@ -67,7 +67,7 @@ class RunCheckpoint(Checkpoint):
         Ends of phases are, as what comes next (placing codebooks, freezing codes) takes longest and cannot be undone.
         """
         every = max(1, schedule.total // 10) if self.every is None else self.every
-        return 0 < iteration < schedule.total and every > 0 and (iteration % every == 0 or iteration in schedule.ends)
+        return every > 0 and (iteration % every == 0 or iteration in schedule.ends)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Begin to hold back signals."""
@@ -90,8 +90,9 @@ class RunCheckpoint(Checkpoint):
             return
         if trainer.world_size == 1:
             self._boundary.take(trainer, pl_module)
-        # At the last iteration signals wait: what comes at the end belongs to the checkpoint, too.
-        received = self._signals.received(trainer) if iteration != trainer.max_steps else []
+        if iteration == trainer.max_steps:
+            return  # what comes at the end belongs to the checkpoint, too: it is saved then, and signals wait
+        received = self._signals.received(trainer)
         # One process writes its checkpoint when it has stopped; several are together now, but not any more then.
         if self.is_due(as_host(pl_module).schedule, iteration) or (received and trainer.world_size > 1):
             self._save(trainer, pl_module)

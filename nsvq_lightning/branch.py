@@ -3,15 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from nsvq_lightning.schedule import Phase
+from nsvq_lightning.schedule import Phase, Schedule
 from nsvq_lightning.splats import ATTRIBUTES, sh_degree_of
 
-__all__ = ["branch_checkpoint", "branch_optimizer_state", "can_branch", "check_continuation"]
+if TYPE_CHECKING:
+    from nsvq_lightning.model import SplatModel
+
+__all__ = [
+    "QUANTIZER_SETTINGS",
+    "QUANTIZE_RULES",
+    "branch_checkpoint",
+    "branch_optimizer_state",
+    "can_branch",
+    "changed_schedule",
+    "check_continuation",
+]
+
+QUANTIZE_RULES = ("quantize_end", "min_finetune", "min_replacement_interval")
+"""Settings of a schedule that mean nothing before the quantize phase."""
 
 CODEBOOKS = "codebooks."
 """Prefix of the codebooks in a module's state."""
@@ -19,15 +34,18 @@ CODEBOOKS = "codebooks."
 SPLATS = "splats."
 """Prefix of the splats in a module's state."""
 
+QUANTIZER_SETTINGS = "quantizer_settings"
+"""Where a checkpoint holds the class and the number of codes that each quantizer was made with."""
+
 PHASE = "state._phase"
 """The phase of the last trained iteration in a module's state."""
 
 
 def can_branch(checkpoint: Mapping[str, Any], codebooks: nn.ModuleDict) -> bool:
     """Whether a checkpoint is from before the quantize phase and has other codebooks, in number or size, than these."""
-    state = checkpoint["state_dict"]
-    if PHASE not in state or Phase(int(state[PHASE])) >= Phase.QUANTIZE:
+    if not _is_unquantized(checkpoint):
         return False
+    state = checkpoint["state_dict"]
     stored = {name: value.shape for name, value in state.items() if name.startswith(CODEBOOKS)}
     return stored != {name: value.shape for name, value in _prefixed(codebooks).items()}
 
@@ -73,12 +91,33 @@ def branch_optimizer_state(stored: Mapping[str, Any], fresh: Mapping[str, Any]) 
     return merged
 
 
-def check_continuation(checkpoint: Mapping[str, Any], module: nn.Module) -> None:
+def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str | None:
+    """What to tell about a run that goes on from a checkpoint with this schedule; None where nothing changes by it."""
+    stored = Schedule(**checkpoint["schedule"])
+    if stored.total != schedule.total:
+        return (
+            f"the checkpoint is of a run of {stored.total} iterations, this one has {schedule.total}: phases, density "
+            "control and learning rates follow the new length; pass "
+            f"--trainer.max_steps={stored.total} to continue that run as it was"
+        )
+    own, without_effect = asdict(schedule), QUANTIZE_RULES if _is_unquantized(checkpoint) else ()
+    changed = {name: v for name, v in asdict(stored).items() if v != own[name] and name not in without_effect}
+    if not changed:
+        return None
+    return (
+        f"the checkpoint is of a run with {', '.join(f'{name} = {value}' for name, value in changed.items())}, this "
+        f"one goes on with {', '.join(f'{name} = {own[name]}' for name in changed)}; pass "
+        f"{' '.join(f'--callbacks.phases.{name}={value}' for name, value in changed.items())} to continue that run as "
+        "it was"
+    )
+
+
+def check_continuation(checkpoint: Mapping[str, Any], module: SplatModel) -> None:
     """Check that a module can be trained on from a checkpoint.
 
     Args:
         checkpoint: The checkpoint, codebooks exchanged where they may be (:func:`branch_checkpoint`).
-        module: The module; numbers of splats and codes may differ.
+        module: The module; numbers of splats may differ, and those of codes where k-means has found fewer rows.
 
     Raises:
         ValueError: It holds weights only, or is of a module with other settings.
@@ -95,6 +134,13 @@ def check_continuation(checkpoint: Mapping[str, Any], module: nn.Module) -> None
             f"the checkpoint is of a run with SH degree {degrees[0]}, this one has {degrees[1]}; pass "
             f"--model.sh_degree={degrees[0]}"
         )
+    trained = checkpoint.get(QUANTIZER_SETTINGS)
+    if trained is not None and trained != module.quantizer_settings and not _is_unquantized(checkpoint):
+        raise ValueError(
+            f"the checkpoint has quantized with {_described(trained)}, and this run would with "
+            f"{_described(module.quantizer_settings)}; that can change before the quantize phase only: pass "
+            f"{_options(trained)}, or a checkpoint from before it"
+        )
     # Side tables of the splats come and go.
     stored, wanted = ({name for name in values if not name.startswith(SPLATS)} for values in (state, own))
     if stored != wanted:
@@ -103,6 +149,32 @@ def check_continuation(checkpoint: Mapping[str, Any], module: nn.Module) -> None
             f"that this run has not, and lacks {_some(wanted - stored)}; pass the --model.codebooks and "
             "--model.quantizer that it was trained with"
         )
+
+
+def _described(settings: Mapping[str, Mapping[str, Any]]) -> str:
+    """What a run quantizes with, for a message."""
+    return f"{_kinds(settings)} ({_sizes(settings)})" if settings else "no codebooks"
+
+
+def _options(settings: Mapping[str, Mapping[str, Any]]) -> str:
+    """The options of a run that quantizes so."""
+    if not settings:
+        return "--model.codebooks=null"
+    return f"--model.quantizer={_kinds(settings)} --model.codebooks='{{{_sizes(settings)}}}'"
+
+
+def _kinds(settings: Mapping[str, Mapping[str, Any]]) -> str:
+    return ", ".join(sorted({str(one["quantizer"]) for one in settings.values()}))
+
+
+def _sizes(settings: Mapping[str, Mapping[str, Any]]) -> str:
+    return ", ".join(f"{name}: {one['codes']}" for name, one in settings.items())
+
+
+def _is_unquantized(checkpoint: Mapping[str, Any]) -> bool:
+    """Whether a checkpoint is from before the quantize phase."""
+    state = checkpoint["state_dict"]
+    return PHASE in state and Phase(int(state[PHASE])) < Phase.QUANTIZE
 
 
 def _some(names: set[str]) -> str:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import logging
-import shutil
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +27,7 @@ DEFAULT_CODEBOOKS = "16k"
 EPILOG = """\
 The error is the root mean square difference between pictures of the scene before and after, of channels in [0, 1]:
 0.01 is 40 dB, 0.003 is 50 dB. Pictures are the train views of --data.root, or taken from around the scene.
+Photos keep to the aim: if training leads past it, OUT is the file without training, and the trained one stays beside.
 
 examples:
   nsvq compress scene.ply scene.nsvq
@@ -61,9 +62,26 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
 
 
+@dataclass(frozen=True)
+class Result:
+    """A compressed file.
+
+    Attributes:
+        settings: How it was made, for the user.
+        data: Its bytes.
+        error: Root mean square difference of its pictures to those of the original, of channels in [0, 1].
+    """
+
+    settings: str
+    data: bytes
+    error: float
+
+
 def _compress(options: argparse.Namespace) -> int:
     from nsvq_lightning.io.arrays import SplatArrays
     from nsvq_lightning.io.formats import load
+    from nsvq_lightning.picture_error import decibels
+    from nsvq_lightning.posthoc import Compressor
     from nsvq_lightning.viewpoints import measuring_cameras
 
     source: Path = options.input
@@ -73,20 +91,44 @@ def _compress(options: argparse.Namespace) -> int:
     cameras = measuring_cameras(options.root, arrays.means)
     candidate = _candidate(options, arrays, cameras)
     options.output.parent.mkdir(parents=True, exist_ok=True)
+    result = Result(candidate.rung.name, candidate.data, candidate.error)
     if options.root is not None and options.max_steps != 0:
         if not candidate.rung.codebooks:
             log.info("nothing to train: %s is exact enough without codebooks", source)
         else:
-            return _train(options, candidate)
+            folder = options.output.parent / f"{options.output.stem}_training"
+            status = _train(options, candidate, folder)
+            if status != 0:
+                return status
+            (path,) = sorted(folder.glob("*/version_*/scene.nsvq"), key=lambda path: path.stat().st_mtime)[-1:]
+            data = path.read_bytes()
+            # Made anew: the pictures of the original would fill the memory while training.
+            error = Compressor(arrays, cameras, candidate.storage).error(data)
+            result = _within_aim(options, result, Result(f"{result.settings}, trained with photos", data, error), path)
     with atomic_write(options.output) as file:
-        file.write(candidate.data)
-    before, after = source.stat().st_size, len(candidate.data)
+        file.write(result.data)
+    before, after = source.stat().st_size, len(result.data)
     sys.stdout.write(
         f"{options.output}: {len(arrays):,} splats in {after:,} bytes, {before / after:.1f} times smaller than "
-        f"{source.name}\n  {candidate.rung.name}, error {candidate.error:.4g} ({candidate.psnr:.2f} dB against the "
+        f"{source.name}\n  {result.settings}, error {result.error:.4g} ({decibels(result.error):.2f} dB against the "
         f"original in {len(cameras)} pictures)\n"
     )
     return 0
+
+
+def _within_aim(options: argparse.Namespace, untrained: Result, trained: Result, path: Path) -> Result:
+    """The trained file, read from ``path``, unless it misses the aim that the untrained one meets."""
+    if options.target_bytes is not None and len(trained.data) > options.target_bytes:
+        missed = f"has {len(trained.data):,} bytes, more than --target-bytes={options.target_bytes}"
+    elif options.max_error is not None and trained.error > options.max_error:
+        missed = f"has an error of {trained.error:.4g}, more than --max-error={options.max_error:g}"
+    else:
+        return trained
+    log.warning(
+        "the trained file %s %s: %s is the one without training; allow more for a trained one",
+        *(path, missed, options.output),
+    )
+    return replace(untrained, settings=f"{untrained.settings}, without training")
 
 
 def _candidate(options: argparse.Namespace, arrays: SplatArrays, cameras: list[Camera]) -> Candidate:
@@ -101,15 +143,18 @@ def _candidate(options: argparse.Namespace, arrays: SplatArrays, cameras: list[C
     return compressor.at(rungs[options.codebooks] if options.codebooks != "none" else RUNGS[1])
 
 
-def _train(options: argparse.Namespace, candidate: Candidate) -> int:
-    """Train the candidate's codebooks with photos: quantize and fine-tune phase only, from the splats as they are."""
+def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> int:
+    """Train the candidate's codebooks with photos: quantize and fine-tune phase only, from the splats as they are.
+
+    Returns:
+        Exit status of ``nsvq fit``, which writes a run into ``folder``.
+    """
     from nsvq_lightning.cli import main as run
 
     steps = 3000 if options.max_steps is None else options.max_steps
     precision = vars(candidate.storage.precision)
     codebooks = ", ".join(f"{name}: {codes}" for name, codes in candidate.rung.codebooks.items())
-    folder = options.output.parent / f"{options.output.stem}_training"
-    status = run(
+    return run(
         [
             "fit",
             f"--data.root={options.root}",
@@ -130,12 +175,6 @@ def _train(options: argparse.Namespace, candidate: Candidate) -> int:
             f"--trainer.default_root_dir={folder}",
         ]
     )
-    if status == 0:
-        (run_folder,) = sorted(folder.glob("*/version_*"), key=lambda path: path.stat().st_mtime)[-1:]
-        with atomic_write(options.output) as file, open(run_folder / "scene.nsvq", "rb") as trained:
-            shutil.copyfileobj(trained, file)
-        sys.stdout.write(f"{options.output}: {options.output.stat().st_size:,} bytes\n")
-    return status
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -12,6 +12,7 @@ from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
 from nsvq_lightning import __version__
+from nsvq_lightning.branch import QUANTIZER_SETTINGS, changed_schedule
 from nsvq_lightning.compress import compress
 from nsvq_lightning.hyperparameters import plain
 from nsvq_lightning.io.compressed import CompressedScene
@@ -83,6 +84,10 @@ class SplatModel(LightningModule):
         self.storage = storage
         self.splats = splats
         self.codebooks = nn.ModuleDict(build_quantizers(quantizer, codebooks, splats))
+        self.quantizer_settings = {
+            name: {"quantizer": type(q).__name__, "codes": q.codebook.shape[0]} for name, q in self.quantizers.items()
+        }
+        """Class and number of codes by attribute, as asked for; k-means and checkpoints may bring fewer codes."""
         self.state = RunState()
         self.stopwatch = Stopwatch(self.state)
         self.schedule = Schedule()
@@ -201,8 +206,9 @@ class SplatModel(LightningModule):
         return generator(self.seed, self.global_step, 0, *salts, self._micro_batch * processes + self.global_rank)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add history and schedule; keep plain data only, so that ``weights_only=True`` can read it."""
+        """Add history, schedule and quantizers; plain data only, so that ``weights_only=True`` can read it."""
         checkpoint["history"] = self.history
+        checkpoint[QUANTIZER_SETTINGS] = self.quantizer_settings
         checkpoint["schedule"] = asdict(self.schedule)
         stored = checkpoint.get(self.CHECKPOINT_HYPER_PARAMS_KEY)
         if stored is not None:
@@ -213,17 +219,10 @@ class SplatModel(LightningModule):
         self.history = list(checkpoint.get("history", []))
         if "schedule" not in checkpoint:
             return
-        stored = Schedule(**checkpoint["schedule"])
         if not self.is_fitting:
-            self.schedule = stored
-        elif stored != self.schedule:
-            log.warning(
-                "the checkpoint is of a run of %d iterations, this one has %d: phases, density control and learning "
-                "rates follow the new length; pass --trainer.max_steps=%d to continue that run as it was",
-                stored.total,
-                self.schedule.total,
-                stored.total,
-            )
+            self.schedule = Schedule(**checkpoint["schedule"])
+        elif (change := changed_schedule(checkpoint, self.schedule)) is not None:
+            log.warning(change)
 
     def _settings(self, quantizers: Mapping[str, Quantizer]) -> dict[str, Any]:
         """What is stored in the file about the run: nothing that differs between two runs of one seed."""

@@ -124,13 +124,18 @@ class Compressor:
             log.info("%s: %s bytes, error %.4g (%.2f dB)", rung.name, f"{len(found.data):,}", found.error, found.psnr)
         return self._done[rung.name]
 
+    def error(self, data: bytes) -> float:
+        """Root mean square difference of the pictures of a ``.nsvq`` file to those of the scene."""
+        splats = RawSplats(*(tensor.detach() for tensor in decode(*unframe(data)).decode().raw()))
+        return picture_error(splats, self._cameras, self._pictures)
+
     def _compressed(self, rung: Rung) -> Candidate:
         scene = self._quantized(rung.codebooks)
         errors = {name: rung.coarseness * value for name, value in vars(self._storage.precision).items()}
         errors["opacity"] = min(errors["opacity"], 0.25)
         storage = replace(self._storage, precision=Precision(**errors))
         data = b"".join(frame(*encode(scene, storage.level, storage.precision)))
-        return Candidate(rung, scene, storage, data, self._error(data))
+        return Candidate(rung, scene, storage, data, self.error(data))
 
     @torch.no_grad()
     def _quantized(self, codebooks: Mapping[str, int]) -> CompressedScene:
@@ -159,10 +164,6 @@ class Compressor:
             return self._splats
         new = canonical(scales, quats, form)
         return self._splats._replace(scales=new.scales, quats=new.quats)
-
-    def _error(self, data: bytes) -> float:
-        splats = RawSplats(*(tensor.detach() for tensor in decode(*unframe(data)).decode().raw()))
-        return picture_error(splats, self._cameras, self._pictures)
 
 
 def smallest_within(compressor: Compressor, error: float) -> Candidate:

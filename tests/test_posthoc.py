@@ -173,6 +173,42 @@ def test_photos_train_the_codebooks(tmp_path: Path, demo_scene: Path, capsys: py
     assert "PSNR" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("aim", ["--target-bytes", "--max-error"])
+def test_photos_keep_to_the_aim(
+    aim: str, tmp_path: Path, demo_scene: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    source, output = tmp_path / "scene.ply", tmp_path / "out.nsvq"
+    write_ply(source, arrays(400, degree=0))
+
+    def compress(*options: str) -> tuple[str, float]:
+        """How the summary says that the file was made, and what the aim is about: its bytes or its error."""
+        caplog.clear()
+        assert main(["compress", str(source), str(output), f"--data.root={demo_scene}", *options]) == 0
+        size, made = capsys.readouterr().out.splitlines()[-2:]
+        assert f"splats in {output.stat().st_size:,} bytes" in size
+        settings, _, error = made.strip().partition(", error ")
+        return settings, output.stat().st_size if aim == "--target-bytes" else float(error.split()[0])
+
+    # An aim that the scene just meets, its trained file not: a run stores its settings, and these photos of another
+    # scene lead away from this one.
+    _, found = compress("--codebooks", "0.5k", "--max-steps=0")
+    aimed = found if aim == "--target-bytes" else found * 1.001
+    settings, reached = compress(aim, str(aimed), "--max-steps=4")
+    assert settings.endswith(", without training")
+    assert reached <= aimed
+    (message,) = [message for message in caplog.messages if message.startswith("the trained file")]
+    assert f"more than {aim}={aimed:g}: {output} is the one without training" in message
+    (trained,) = tmp_path.glob("out_training/*/version_0/scene.nsvq")
+    assert str(trained) in message
+
+    enough = trained.stat().st_size if aim == "--target-bytes" else 10
+    settings, reached = compress(aim, str(enough), "--max-steps=4")
+    assert settings.endswith(", trained with photos")
+    assert reached <= enough
+    assert output.read_bytes() == next(tmp_path.glob("out_training/*/version_1/scene.nsvq")).read_bytes()
+    assert "the trained file" not in caplog.text
+
+
 def test_precision_of_a_rung_follows_that_of_the_user() -> None:
     scene = arrays(200)
     storage = Storage(precision=Precision(position=0.2, opacity=0.1))

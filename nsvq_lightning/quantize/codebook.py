@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -175,14 +174,6 @@ class CodebookQuantizer(nn.Module, ABC):
         """Start a new window."""
         self.usage.zero_()
         self.window.zero_()
-
-    def perplexity(self) -> float:
-        """Effective number of codes, exp of the entropy of the usage in this window; 0 before the first count."""
-        total = int(self.usage.sum())
-        if total == 0:
-            return 0.0
-        share = self.usage[self.usage > 0].double() / total
-        return math.exp(-float((share * share.log()).sum()))
 
     @torch.no_grad()
     def replace_unused(

@@ -10,6 +10,7 @@ from copy import deepcopy
 from typing import Any
 
 from nsvq_lightning import __version__
+from nsvq_lightning.branch import QUANTIZE_RULES
 from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.cli import resolve_configs
 from nsvq_lightning.lightning_cli import SplatCLI
@@ -29,9 +30,6 @@ BRANCH_CALLBACKS = (
     "freeze",
 )
 """Callbacks that do nothing before the iterations of the prune phase are done."""
-
-BRANCH_PHASES = ("min_finetune", "min_replacement_interval")
-"""Settings of the phases that mean nothing before the quantize phase; its end is another."""
 
 IN_ONE_PIECE: dict[str, Any] = {
     "callbacks": (None, []),
@@ -116,9 +114,9 @@ def trunk_of(settings: Settings) -> Settings | None:
     trunk = deepcopy(settings)
     trunk["trainer"]["max_steps"] = end
     trunk_phases = trunk["callbacks"]["phases"]["init_args"]
-    trunk_phases |= {"total": total, "quantize_end": schedule.reference_total}
-    for name in BRANCH_PHASES:
+    for name in QUANTIZE_RULES:
         trunk_phases.pop(name, None)
+    trunk_phases |= {"total": total, "quantize_end": schedule.reference_total}
     trunk["callbacks"] |= dict.fromkeys((*BRANCH_CALLBACKS, "export"))
     # What all branches start from, whatever they keep of themselves.
     del trunk["callbacks"]["checkpoint"]

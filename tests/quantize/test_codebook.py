@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from itertools import chain
 
 import pytest
@@ -73,13 +72,6 @@ def test_usage_counts_iterations_not_rows() -> None:
     quantizer.eval()
     quantizer(x)
     assert int(quantizer.window) == 2
-
-
-def test_perplexity_counts_equally_used_codes() -> None:
-    quantizer, _ = fitted()
-    assert quantizer.perplexity() == 0.0
-    quantizer.count(torch.tensor([1, 1, 3, 5]))
-    assert math.isclose(quantizer.perplexity(), 3.0)
 
 
 ROWS, SEEN, TRAINED, FROZEN = 300, 200, 7, 2

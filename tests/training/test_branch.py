@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +13,16 @@ import torch
 from lightning.pytorch import Callback, Trainer
 from torch import nn
 
-from nsvq_lightning.branch import branch_optimizer_state, can_branch
+from nsvq_lightning.branch import (
+    QUANTIZER_SETTINGS,
+    branch_optimizer_state,
+    can_branch,
+    changed_schedule,
+    check_continuation,
+)
 from nsvq_lightning.callbacks import PhaseSchedule, RunCheckpoint
 from nsvq_lightning.module import SplatModule
+from nsvq_lightning.quantize import NSVQ, StraightThrough
 from nsvq_lightning.schedule import Phase, Schedule
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
@@ -60,6 +69,48 @@ def test_a_branch_ends_in_the_bytes_of_the_run_trained_from_its_start(
     assert branched[1].train_seconds > trunk_seconds > 0
 
 
+@pytest.mark.parametrize(
+    ("rules", "named"),
+    [
+        ({"quantize_end": 44_000, "min_finetune": 7, "min_replacement_interval": 9}, None),
+        ({"quantize_end": 44_000, "min_reset_interval": 12}, ("min_reset_interval = 11", "min_reset_interval = 12")),
+    ],
+    ids=["of the quantize phase", "of another"],
+)
+def test_a_branch_tells_which_rules_of_its_trunk_have_changed(
+    run: RunFactory,
+    recipe: Recipe,
+    trunk: Path,
+    caplog: pytest.LogCaptureFixture,
+    rules: dict[str, int],
+    named: tuple[str, str] | None,
+) -> None:
+    phases = PhaseSchedule(**{"total": 60, **INTERVALS, **rules})
+    run(recipe(phases=phases).values(), ckpt_path=trunk, max_steps=PRUNE_END + 1)
+    messages = [message for message in caplog.messages if message.startswith("the checkpoint is of")]
+    if named is None:
+        assert messages == []
+        return
+    assert messages == [
+        f"the checkpoint is of a run with {named[0]}, this one goes on with {named[1]}; pass "
+        "--callbacks.phases.min_reset_interval=11 to continue that run as it was"
+    ]
+
+
+def test_once_quantized_the_rules_of_that_phase_count() -> None:
+    module = SplatModule(sh_degree=1)
+    module.schedule = Schedule(min_finetune=200)
+    for phase in Phase:
+        module.phase = phase
+        stored: dict[str, Any] = {"state_dict": module.state_dict()}
+        module.on_save_checkpoint(stored)
+        told = changed_schedule(stored, Schedule())
+        assert (told is None) is (phase < Phase.QUANTIZE)
+        assert changed_schedule(stored, module.schedule) is None
+    assert told is not None
+    assert "--callbacks.phases.min_finetune=200" in told
+
+
 def test_codebooks_may_change_until_they_are_placed() -> None:
     module = SplatModule(sh_degree=1, codebooks={"scales": 12})
     for phase in Phase:
@@ -88,3 +139,60 @@ def test_moments_follow_their_parameters_when_groups_move() -> None:
     assert float(states["means"]["exp_avg"][0]) == pytest.approx(0.2)
     assert float(states["sh0"]["exp_avg"][0]) == pytest.approx(0.3)
     assert states["codebook_scales"] == {}  # another codebook: no moments
+
+
+def quantizing(**settings: Any) -> SplatModule:
+    module = SplatModule(**{"sh_degree": 0, "codebooks": {"scales": 12, "sh0": 8}, **settings})
+    module.phase = Phase.QUANTIZE
+    return module
+
+
+def saved(module: SplatModule) -> dict[str, Any]:
+    """What a checkpoint holds of a module."""
+    checkpoint: dict[str, Any] = {"state_dict": module.state_dict(), "optimizer_states": [{}]}
+    module.on_save_checkpoint(checkpoint)
+    return checkpoint
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"codebooks": {"scales": 24, "sh0": 8}}, "this run would with NSVQ (scales: 24, sh0: 8)"),
+        ({"codebooks": {"scales": 12}}, "this run would with NSVQ (scales: 12)"),
+        ({"codebooks": None}, "this run would with no codebooks"),
+        ({"quantizer": StraightThrough}, "this run would with StraightThrough (scales: 12, sh0: 8)"),
+    ],
+)
+def test_a_quantized_run_cannot_go_on_with_other_quantizers(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(words)) as refusal:
+        check_continuation(saved(quantizing()), quantizing(**settings))
+    assert "has quantized with NSVQ (scales: 12, sh0: 8)" in str(refusal.value)
+    assert "pass --model.quantizer=NSVQ --model.codebooks='{scales: 12, sh0: 8}'" in str(refusal.value)
+    with pytest.raises(ValueError, match=r"has quantized with no codebooks.*pass --model.codebooks=null"):
+        check_continuation(saved(quantizing(codebooks=None)), quantizing())
+
+
+def test_the_same_quantizers_go_on_whatever_they_are_called() -> None:
+    module = quantizing()
+    scales = module.codebooks["scales"]
+    assert isinstance(scales, NSVQ)
+    scales.fit(torch.arange(9.0).reshape(3, 3))  # fewer rows than codes
+    assert scales.num_codes == 3
+    for same in (quantizing(), quantizing(quantizer=partial(NSVQ, kmeans_steps=3))):
+        check_continuation(saved(module), same)
+    paper = quantizing(codebooks="0.5k")  # without SH coefficients there are three codebooks
+    check_continuation(saved(paper), quantizing(codebooks={"scales": 512, "quats": 512, "sh0": 128, "shN": 7}))
+    older = saved(module)
+    del older[QUANTIZER_SETTINGS]
+    check_continuation(older, quantizing())
+
+
+def test_a_fit_from_a_quantized_checkpoint_keeps_its_codebooks(run: RunFactory, recipe: Recipe) -> None:
+    trainer, module = run(recipe(checkpoint=RunCheckpoint()).values(), max_steps=12)
+    assert module.phase >= Phase.QUANTIZE
+    path = checkpoint_of(trainer)
+    loaded = SplatModule.load_from_checkpoint(path)
+    assert loaded.quantizer_settings == module.quantizer_settings
+    for other in ({"codebooks": {"scales": 23, "quats": 24, "sh0": 16, "shN": 16}}, {"quantizer": StraightThrough}):
+        with pytest.raises(ValueError, match="that can change before the quantize phase only"):
+            run(recipe().values(), ckpt_path=path, module=other, max_steps=12)

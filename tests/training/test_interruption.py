@@ -27,6 +27,7 @@ from nsvq_lightning.callbacks import (
     CodebookReplacement,
     ContributionPruning,
     MetricReport,
+    PhaseSchedule,
     RunCheckpoint,
 )
 from nsvq_lightning.cli import main
@@ -294,6 +295,18 @@ def test_a_run_continued_with_another_length_says_what_follows_from_it(
     (message,) = [message for message in caplog.messages if message.startswith("the checkpoint is of a run of 8 ")]
     assert "this one has 9" in message
     assert "pass --trainer.max_steps=8" in message
+
+
+def test_a_run_that_goes_on_past_its_schedule_keeps_its_checkpoints(run: RunFactory, recipe: Recipe) -> None:
+    def fit(checkpoint: RunCheckpoint, ckpt_path: Path | None = None) -> Path:
+        callbacks = recipe(phases=PhaseSchedule(total=20, min_finetune=1), checkpoint=checkpoint)
+        trainer, _ = run(callbacks.values(), ckpt_path, max_steps=27)
+        return Path(trainer.default_root_dir)
+
+    whole = fit(RunCheckpoint(every=6, keep=True))
+    kept = {iteration_of(path) for path in (whole / "checkpoints").glob("step-*.ckpt")}
+    assert kept == {6, 12, 18, 24, *Schedule(total=20, min_finetune=1).ends, 27}
+    assert_same_end(fit(RunCheckpoint(every=0), whole / "checkpoints" / "step-24.ckpt"), whole)
 
 
 def arguments_of(scene: Path, folder: Path, *more: str) -> list[str]:
