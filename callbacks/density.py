@@ -6,7 +6,7 @@ import logging
 from typing import Any
 
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 
@@ -29,7 +29,7 @@ from .density_rules import (
     split_mask,
 )
 from .finite_search import FiniteSearch
-from .latch import StepLatch
+from .latch import LatchedCallback
 
 __all__ = ["DensityControl"]
 
@@ -39,7 +39,7 @@ GRADIENTS, VIEWS = "gradient_sum", "view_count"
 """Side tables of the splats: sum of the screen-space gradient norms, and number of views that saw the splat."""
 
 
-class DensityControl(Callback):
+class DensityControl(LatchedCallback):
     """Clones, splits and prunes splats (Kerbl et al. 2023, section 5), and drops those that turn non-finite.
 
     During warm-up the norm of the screen-space gradient is averaged over the views that see a splat; at the scheduled
@@ -63,12 +63,12 @@ class DensityControl(Callback):
         max_splats: int | None = None,
         finite_every: int = 100,
     ) -> None:
+        super().__init__()
         if max_splats is not None and max_splats < rules.min_splats:
             raise ValueError(f"max_splats must be at least min_splats={rules.min_splats}, got {max_splats}")
         self.rules = rules
         self.max_splats = max_splats
         self._search = FiniteSearch(finite_every, "finite_every")
-        self._latch = StepLatch()
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Refuse strategies that would lose the replaced parameters.
@@ -76,6 +76,7 @@ class DensityControl(Callback):
         Raises:
             ValueError: The strategy wraps the module in ``DistributedDataParallel``.
         """
+        super().setup(trainer, pl_module, stage)
         # A strategy that follows parameters when they are replaced says so with this attribute.
         follows = getattr(trainer.strategy, "follows_replaced_parameters", False)
         if stage == "fit" and isinstance(trainer.strategy, DDPStrategy) and not follows:
@@ -194,14 +195,6 @@ class DensityControl(Callback):
         lowered = lower_opacities(host.splats.opacities, self.rules.reset_opacity)
         replace_attribute(host.splats, optimizer, "opacities", lowered)
         reset_moments(optimizer, "opacities")
-
-    def state_dict(self) -> dict[str, Any]:
-        """The last iteration acted on; the statistics are side tables of the splats."""
-        return {"last": self._latch.last}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Do not repeat what was done before the checkpoint."""
-        self._latch.last = state_dict["last"]
 
 
 def _add(sums: Tensor, views: Tensor, render: Render | None, micro_batches: int) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,13 @@ import torch
 from checkpoints import CheckpointAt, read
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from nsvq_lightning.callbacks import FiniteCodes, MetricReport, RunCheckpoint
+from nsvq_lightning.callbacks import (
+    CanonicalCovariance,
+    ContributionPruning,
+    FiniteCodes,
+    MetricReport,
+    RunCheckpoint,
+)
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io.container import read_header, read_nsvq, write_nsvq
 from nsvq_lightning.io.formats import load
@@ -219,6 +225,27 @@ def test_learning_rates_can_follow_the_views_of_a_step(run: RunFactory, recipe: 
         assert groups["opacities"] == factor * rates.opacities
         positions = position_lr(2, module.extent, rates, module.schedule.position_decay_end)
         assert groups["means"] == pytest.approx(factor * positions)
+
+
+def test_callbacks_of_an_earlier_fit_act_again(run: RunFactory, recipe: Recipe) -> None:
+    def stored(callbacks: Iterable[Callback]) -> bytes:
+        trainer, module = run(callbacks, max_steps=20)
+        assert all(bool(quantizer.codebook.any()) for quantizer in module.quantizers.values())
+        return scene_bytes(trainer)
+
+    def every_option() -> list[Callback]:
+        options = {"canonical": CanonicalCovariance("full"), "contribution": ContributionPruning(share=0.02)}
+        return list(recipe(**options).values())
+
+    callbacks = every_option()
+    assert stored(callbacks) == stored(callbacks) == stored(every_option())
+
+
+def test_codes_of_a_codebook_that_was_never_placed_are_not_frozen(run: RunFactory, recipe: Recipe) -> None:
+    callbacks = recipe()
+    del callbacks["codebook_init"]
+    with pytest.raises(RuntimeError, match="the codebook of scales has never been placed"):
+        run(callbacks.values(), max_steps=20)
 
 
 def test_a_run_without_codebooks_is_plain_splatting(run: RunFactory, recipe: Recipe, demo_scene: Path) -> None:
