@@ -158,7 +158,8 @@ class DensityControl(LatchedCallback):
         cloned = clone_mask(statistic, splats.scales, host.extent, rules)
         divided = split_mask(statistic, splats.scales, host.extent, rules)
         if self.max_splats is not None:
-            grown = limit_growth(cloned | divided, statistic, self.max_splats - len(splats))
+            added = torch.where(divided, rules.children - 1, 1)
+            grown = limit_growth(cloned | divided, statistic, added, self.max_splats - len(splats))
             cloned, divided = cloned & grown, divided & grown
         before = len(splats)
         draws = generator(host.seed, iteration, "split")

@@ -159,6 +159,14 @@ def test_growth_stops_at_the_cap() -> None:
     assert stage.host.splats.means.detach()[:3].tolist() == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
 
 
+def test_growth_into_many_children_stops_at_the_cap() -> None:
+    for cap, count in ((6, 5), (7, 7)):  # a clone adds 1, a split into 3 adds 2
+        control = DensityControl(DensityRules(min_splats=1, children=3), max_splats=cap)
+        stage = Stage(make_splats([SMALL, LARGE, LARGE, SMALL], [0.5] * 4), control)
+        stage.end_batch(600, view([3e-4, 4e-4, 5e-4, 9e-4], [True] * 4))
+        assert stage.count == count
+
+
 def test_a_non_finite_splat_is_dropped_as_soon_as_the_loss_shows_it(caplog: pytest.LogCaptureFixture) -> None:
     stage = Stage(make_splats([SMALL] * 3, [0.5] * 3), DensityControl())
     with torch.no_grad():
