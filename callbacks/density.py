@@ -1,4 +1,4 @@
-"""Adaptive density control of warm-up and prune phase."""
+"""Adaptive density control of warm-up and prune phase; the search for splats that turn non-finite."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 
-from nsvq_lightning.edit import append_rows, drop_non_finite, keep_rows, replace_attribute, reset_moments
+from nsvq_lightning.edit import append_rows, keep_rows, replace_attribute, reset_moments
 from nsvq_lightning.host import SplatHost, as_host, next_iteration, raw_optimizer, sum_over_processes
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
@@ -28,7 +28,7 @@ from .density_rules import (
     split,
     split_mask,
 )
-from .finite_search import FiniteSearch
+from .finite_search import FiniteSearch, keep_finite_splats
 from .latch import LatchedCallback
 
 __all__ = ["DensityControl"]
@@ -44,7 +44,7 @@ class DensityControl(LatchedCallback):
 
     During warm-up the norm of the screen-space gradient is averaged over the views that see a splat; at the scheduled
     iterations splats above the threshold are cloned or split, transparent and huge ones pruned, and opacities reset. In
-    the prune phase transparent splats are pruned and none are added.
+    the prune phase transparent splats are pruned and none are added. Non-finite splats are searched in every phase.
 
     Args:
         rules: All numbers.
@@ -103,11 +103,9 @@ class DensityControl(LatchedCallback):
         iteration = trainer.global_step
         if iteration == 0 or not self._latch.first_time(iteration):
             return
-        phase = host.schedule.phase_at(iteration)
-        if phase is Phase.FINETUNE:
-            return
         if self._search.is_due(trainer):
-            drop_non_finite(host.splats, raw_optimizer(trainer), iteration)
+            keep_finite_splats(trainer, host)
+        phase = host.schedule.phase_at(iteration)
         if phase is Phase.WARMUP:
             self._warmup_step(trainer, host, iteration)
         elif phase is Phase.PRUNE:

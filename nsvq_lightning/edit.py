@@ -156,18 +156,18 @@ def finite_rows(splats: Splats) -> tuple[Tensor, dict[str, int]]:
     return mask, culprits
 
 
-def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> int:
+def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> Tensor:
     """Drop splats that :func:`finite_rows` leaves out, with a warning that names attribute, rows and step.
 
     Returns:
-        Number of dropped splats.
+        Which of the splats before were kept, ``[N]`` bool.
 
     Raises:
         FloatingPointError: No finite splat is left.
     """
     mask, culprits = finite_rows(splats)
     if not culprits:
-        return 0
+        return mask
     kept = int(mask.sum())
     found = ", ".join(f"{name} in {count} rows" for name, count in culprits.items())
     if kept == 0:
@@ -177,7 +177,7 @@ def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> int:
     dropped = len(splats) - kept
     log.warning("step %d: dropped %d of %d splats with non-finite values: %s", step, dropped, len(splats), found)
     keep_rows(splats, optimizer, mask)
-    return dropped
+    return mask
 
 
 def _rebind(

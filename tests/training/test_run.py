@@ -22,6 +22,7 @@ from nsvq_lightning.callbacks import (
     ContributionPruning,
     FiniteCodes,
     MetricReport,
+    PhaseSchedule,
     RunCheckpoint,
 )
 from nsvq_lightning.data.datamodule import ColmapDataModule
@@ -295,4 +296,30 @@ def test_a_run_whose_codes_turn_non_finite_goes_on(
     found = [message for message in caplog.messages if "codes of sh0 are non-finite" in message]
     # Frozen codes are drawn: the loss shows a broken one at once, not only at the next check.
     assert [message.split(" codes")[0] for message in found] == ["step 32: 1 of 16", "step 59: 1 of 16"]
+    assert 10 < module.history[-1]["psnr"] < 100
+
+
+class PlantSplats(Callback):
+    """Breaks an attribute of some splats before an iteration."""
+
+    def __init__(self, attribute: str, iteration: int) -> None:
+        self.attribute, self.iteration = attribute, iteration
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        assert isinstance(pl_module, SplatModule)
+        if trainer.global_step + 1 == self.iteration:
+            pl_module.splats.attributes()[self.attribute].data[:20] = torch.nan
+
+
+def test_splats_that_turn_non_finite_in_fine_tuning_are_dropped(
+    run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
+) -> None:
+    phases = PhaseSchedule(quantize_end=30_000, min_finetune=1)
+    callbacks = [PlantSplats("sh0", 16), *recipe(phases=phases).values()]
+    _, module = run(callbacks, module={"codebooks": {"scales": 24}}, max_steps=20)
+    assert module.schedule.phase_at(16) is Phase.FINETUNE
+    found = [message for message in caplog.messages if message.endswith("with non-finite values: sh0 in 20 rows")]
+    assert [message.split(" of")[0] for message in found] == ["step 16: dropped 20"]
+    assert sum("no update" in message for message in caplog.messages) == 1
+    assert module.quantizers["scales"].codes.shape == (len(module.splats),)
     assert 10 < module.history[-1]["psnr"] < 100
