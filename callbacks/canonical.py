@@ -10,7 +10,7 @@ from lightning.pytorch import LightningModule, Trainer
 
 from nsvq_lightning.canonical import Form, canonical
 from nsvq_lightning.covariance_error import form_errors
-from nsvq_lightning.edit import change_coordinates
+from nsvq_lightning.edit import change_coordinates, finite_rows
 from nsvq_lightning.host import SplatHost, as_host, raw_optimizer
 from nsvq_lightning.random import derive_seed
 from nsvq_lightning.schedule import Phase
@@ -70,11 +70,11 @@ class CanonicalCovariance(LatchedCallback):
                 self._apply(trainer, host, form)
 
     def _chosen(self, trainer: Trainer, host: SplatHost) -> Form:
-        """The form with the smallest error; of equals the one that changes least."""
+        """The form with the smallest error over the finite splats; of equals the one that changes least."""
+        finite, _ = finite_rows(host.splats)
+        scales, quats = host.splats.scales.detach()[finite], host.splats.quats.detach()[finite]
         codes = {name: len(q.codebook) for name, q in host.quantizers.items() if name in ("scales", "quats")}
-        errors = form_errors(
-            host.splats.scales, host.splats.quats, codes, derive_seed(host.seed, trainer.global_step, "canonical")
-        )
+        errors = form_errors(scales, quats, codes, derive_seed(host.seed, trainer.global_step, "canonical"))
         log.info("covariance error by form: %s", ", ".join(f"{form} {error:.3g}" for form, error in errors.items()))
         form: Form = trainer.strategy.broadcast(min(errors, key=errors.__getitem__))
         return form

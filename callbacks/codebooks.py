@@ -27,6 +27,7 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.replicas import check_replicas, follow_first
 from nsvq_lightning.schedule import Phase
 
+from .finite_search import keep_finite_splats
 from .latch import LatchedCallback
 
 __all__ = ["CodebookInit", "CodebookReplacement", "perplexity"]
@@ -43,6 +44,8 @@ def perplexity(usage: Tensor) -> float:
 
 class CodebookInit(LatchedCallback):
     """At the first iteration of the quantize phase, fit every codebook to the rows of all splats (k-means).
+
+    Splats that are not finite are dropped first, whenever the last search for them was.
 
     Args:
         weights: What a splat counts in k-means: ``none`` counts all alike, as in the paper; ``contribution`` counts
@@ -74,6 +77,7 @@ class CodebookInit(LatchedCallback):
         iteration = next_iteration(trainer)
         if iteration != host.schedule.first_of(Phase.QUANTIZE) or not self._latch.first_time(iteration):
             return
+        keep_finite_splats(trainer, host)
         weights = row_weights(train_contributions(trainer, host)) if self.weights == "contribution" else None
         for name, quantizer in host.quantizers.items():
             if trainer.is_global_zero:
@@ -150,6 +154,8 @@ class CodebookReplacement(LatchedCallback):
         iteration = trainer.global_step
         if not self.is_due(host, iteration) or not self._latch.first_time(iteration):
             return
+        if self.jitter is not None:
+            keep_finite_splats(trainer, host)
         values: dict[str, float] = {}
         for name, quantizer in host.quantizers.items():
             _sum_usage(trainer, quantizer)

@@ -10,6 +10,7 @@ from nsvq_lightning.host import as_host, from_first_process, next_iteration
 from nsvq_lightning.replicas import check_replicas
 from nsvq_lightning.schedule import Phase
 
+from .finite_search import keep_finite_splats
 from .latch import LatchedCallback
 
 __all__ = ["FreezeCodes"]
@@ -31,6 +32,7 @@ class FreezeCodes(LatchedCallback):
         iteration = next_iteration(trainer)
         if iteration != host.schedule.first_of(Phase.FINETUNE) or not self._latch.first_time(iteration):
             return
+        keep_finite_splats(trainer, host)
         for name, quantizer in host.quantizers.items():
             codes = quantizer.encode(host.rows(name))
             # Only now: some place their codebooks where rows are encoded.

@@ -19,6 +19,9 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.callbacks import (
     CanonicalCovariance,
+    CodebookInit,
+    CodebookRefit,
+    CodebookReplacement,
     ContributionPruning,
     FiniteCodes,
     MetricReport,
@@ -31,6 +34,7 @@ from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.precision import Storage
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.optim import LearningRates, position_lr
+from nsvq_lightning.quantize import NSVQ, PostHoc, StraightThrough
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.schedule import Phase, Schedule
 
@@ -300,26 +304,76 @@ def test_a_run_whose_codes_turn_non_finite_goes_on(
 
 
 class PlantSplats(Callback):
-    """Breaks an attribute of some splats before an iteration."""
+    """Breaks an attribute of some splats at the end of an iteration."""
 
     def __init__(self, attribute: str, iteration: int) -> None:
         self.attribute, self.iteration = attribute, iteration
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
         assert isinstance(pl_module, SplatModule)
-        if trainer.global_step + 1 == self.iteration:
+        if trainer.global_step == self.iteration:
             pl_module.splats.attributes()[self.attribute].data[:20] = torch.nan
+
+
+def drops(caplog: pytest.LogCaptureFixture, attribute: str) -> list[str]:
+    """Where splats with a non-finite attribute were dropped, and how many."""
+    suffix = f"with non-finite values: {attribute} in 20 rows"
+    return [message.split(" of ")[0] for message in caplog.messages if message.endswith(suffix)]
 
 
 def test_splats_that_turn_non_finite_in_fine_tuning_are_dropped(
     run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
 ) -> None:
     phases = PhaseSchedule(quantize_end=30_000, min_finetune=1)
-    callbacks = [PlantSplats("sh0", 16), *recipe(phases=phases).values()]
+    callbacks = [*recipe(phases=phases).values(), PlantSplats("sh0", 15)]
     _, module = run(callbacks, module={"codebooks": {"scales": 24}}, max_steps=20)
-    assert module.schedule.phase_at(16) is Phase.FINETUNE
-    found = [message for message in caplog.messages if message.endswith("with non-finite values: sh0 in 20 rows")]
-    assert [message.split(" of")[0] for message in found] == ["step 16: dropped 20"]
+    assert module.schedule.phase_at(15) is Phase.FINETUNE
+    assert drops(caplog, "sh0") == ["step 16: dropped 20"]
     assert sum("no update" in message for message in caplog.messages) == 1
     assert module.quantizers["scales"].codes.shape == (len(module.splats),)
     assert 10 < module.history[-1]["psnr"] < 100
+
+
+@pytest.mark.parametrize("with_density", [True, False])
+def test_codebooks_are_placed_on_finite_splats(
+    with_density: bool, run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
+) -> None:
+    callbacks = recipe(codebook_init=CodebookInit(weights="contribution"))
+    if not with_density:
+        del callbacks["density"]
+    # After the search at the end of the prune phase, and before the form of the covariances is chosen.
+    late = [PlantSplats("quats", 9), CanonicalCovariance("auto")]
+    _, module = run([*callbacks.values(), *late], max_steps=20)
+    assert module.schedule.first_of(Phase.QUANTIZE) == 10
+    assert drops(caplog, "quats") == ["step 9: dropped 20"]
+    assert 10 < module.history[-1]["psnr"] < 100
+
+
+@pytest.mark.parametrize(
+    ("callbacks", "quantizer", "step"),
+    [
+        ({"refit": CodebookRefit()}, StraightThrough, 13),  # refits come at 14 and 19
+        ({"codebook_replacement": CodebookReplacement(jitter=0.5)}, NSVQ, 15),  # after 10 and 15
+    ],
+)
+def test_codes_move_to_finite_splats_only(
+    callbacks: dict[str, Callback],
+    quantizer: type,
+    step: int,
+    run: RunFactory,
+    recipe: Recipe,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    standard = [*recipe(**callbacks).values(), PlantSplats("quats", 13)]
+    _, module = run(standard, module={"quantizer": quantizer}, max_steps=20)
+    assert drops(caplog, "quats") == [f"step {step}: dropped 20"]
+    assert 10 < module.history[-1]["psnr"] < 100
+
+
+def test_post_hoc_codebooks_are_evaluated_although_splats_are_not_finite(run: RunFactory, recipe: Recipe) -> None:
+    callbacks = [*recipe(report=MetricReport(every=15)).values(), PlantSplats("quats", 15)]
+    _, module = run(callbacks, module={"quantizer": PostHoc}, max_steps=20)
+    assert 15 in [entry["iteration"] for entry in module.history]
+    assert all(10 < entry["psnr"] < 100 for entry in module.history if entry["iteration"] >= 15)
