@@ -6,16 +6,16 @@ import logging
 from typing import Any, Literal, get_args
 
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
 
 from nsvq_lightning.canonical import Form, canonical
 from nsvq_lightning.covariance_error import form_errors
-from nsvq_lightning.edit import change_coordinates
+from nsvq_lightning.edit import change_coordinates, finite_rows
 from nsvq_lightning.host import SplatHost, as_host, raw_optimizer
 from nsvq_lightning.random import derive_seed
 from nsvq_lightning.schedule import Phase
 
-from .latch import StepLatch
+from .latch import LatchedCallback
 
 __all__ = ["CanonicalCovariance"]
 
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 Mode = Literal["none", "sign", "full", "auto"]
 
 
-class CanonicalCovariance(Callback):
+class CanonicalCovariance(LatchedCallback):
     """After the last iteration before the quantize phase, gives every covariance one scale and rotation out of 48.
 
     Nothing that is rendered changes (:mod:`nsvq_lightning.canonical`), but k-means then finds together what means the
@@ -44,10 +44,10 @@ class CanonicalCovariance(Callback):
     """
 
     def __init__(self, mode: Mode = "none") -> None:
+        super().__init__()
         if mode not in get_args(Mode):
             raise ValueError(f"mode must be one of {', '.join(get_args(Mode))}, got {mode!r}")
         self.mode = mode
-        self._latch = StepLatch()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Act before the first iteration of a run that starts in the quantize phase."""
@@ -70,11 +70,11 @@ class CanonicalCovariance(Callback):
                 self._apply(trainer, host, form)
 
     def _chosen(self, trainer: Trainer, host: SplatHost) -> Form:
-        """The form with the smallest error; of equals the one that changes least."""
+        """The form with the smallest error over the finite splats; of equals the one that changes least."""
+        finite, _ = finite_rows(host.splats)
+        scales, quats = host.splats.scales.detach()[finite], host.splats.quats.detach()[finite]
         codes = {name: len(q.codebook) for name, q in host.quantizers.items() if name in ("scales", "quats")}
-        errors = form_errors(
-            host.splats.scales, host.splats.quats, codes, derive_seed(host.seed, trainer.global_step, "canonical")
-        )
+        errors = form_errors(scales, quats, codes, derive_seed(host.seed, trainer.global_step, "canonical"))
         log.info("covariance error by form: %s", ", ".join(f"{form} {error:.3g}" for form, error in errors.items()))
         form: Form = trainer.strategy.broadcast(min(errors, key=errors.__getitem__))
         return form
@@ -86,11 +86,3 @@ class CanonicalCovariance(Callback):
         change_coordinates(splats, optimizer, "scales", new.scales, new.scale_maps)
         change_coordinates(splats, optimizer, "quats", new.quats, new.quat_maps)
         log.info("iteration %d: canonical covariances, form %s", trainer.global_step, form)
-
-    def state_dict(self) -> dict[str, Any]:
-        """The last iteration acted on."""
-        return {"last": self._latch.last}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Do not repeat what was done before the checkpoint."""
-        self._latch.last = state_dict["last"]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any, Literal, cast
 
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor, nn
 
 from nsvq_lightning.edit import reset_moments
@@ -27,7 +27,8 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.replicas import check_replicas, follow_first
 from nsvq_lightning.schedule import Phase
 
-from .latch import StepLatch
+from .finite_search import keep_finite_splats
+from .latch import LatchedCallback
 
 __all__ = ["CodebookInit", "CodebookReplacement", "perplexity"]
 
@@ -41,8 +42,10 @@ def perplexity(usage: Tensor) -> float:
     return float(entropy.exp()) if bool(usage.any()) else 0.0
 
 
-class CodebookInit(Callback):
+class CodebookInit(LatchedCallback):
     """At the first iteration of the quantize phase, fit every codebook to the rows of all splats (k-means).
+
+    Splats that are not finite are dropped first, whenever the last search for them was.
 
     Args:
         weights: What a splat counts in k-means: ``none`` counts all alike, as in the paper; ``contribution`` counts
@@ -61,12 +64,12 @@ class CodebookInit(Callback):
         weights: Literal["none", "contribution"] = "none",
         weighted: Sequence[str] = ("quats", "sh0", "shN"),
     ) -> None:
+        super().__init__()
         if weights not in ("none", "contribution"):
             raise ValueError(f"weights must be 'none' or 'contribution', got {weights!r}")
         if not set(weighted) <= set(QUANTIZED):
             raise ValueError(f"weighted must be among {', '.join(QUANTIZED)}, got {', '.join(weighted)}")
         self.weights, self.weighted = weights, weighted
-        self._latch = StepLatch()
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         """Fit when the quantize phase starts."""
@@ -74,6 +77,7 @@ class CodebookInit(Callback):
         iteration = next_iteration(trainer)
         if iteration != host.schedule.first_of(Phase.QUANTIZE) or not self._latch.first_time(iteration):
             return
+        keep_finite_splats(trainer, host)
         weights = row_weights(train_contributions(trainer, host)) if self.weights == "contribution" else None
         for name, quantizer in host.quantizers.items():
             if trainer.is_global_zero:
@@ -86,7 +90,7 @@ class CodebookInit(Callback):
             log.info("iteration %d: codebooks for %d splats: %s", iteration, len(host.splats), sizes)
 
 
-class CodebookReplacement(Callback):
+class CodebookReplacement(LatchedCallback):
     """Replaces inactive codes by copies of active ones, at first often, then less so (paper, section 3.2).
 
     All numbers are iterations of the reference run; the paper's are every 100 from 20 100 to 22 000, then every 500 up
@@ -121,6 +125,7 @@ class CodebookReplacement(Callback):
         jitter: float | None = None,
         reset_moments: bool = False,
     ) -> None:
+        super().__init__()
         if jitter is not None and not 0.0 < jitter <= 1.0:
             raise ValueError(f"jitter must be None or above 0 and at most 1, got {jitter}")
         if not 0 < start <= early_end <= end or early_every < 1 or late_every < 1:
@@ -131,7 +136,6 @@ class CodebookReplacement(Callback):
         self.start, self.early_end, self.early_every = start, early_end, early_every
         self.end, self.late_every = end, late_every
         self.jitter, self.reset_moments = jitter, reset_moments
-        self._latch = StepLatch()
 
     def is_due(self, host: SplatHost, iteration: int) -> bool:
         """Whether codes are replaced after this iteration."""
@@ -150,6 +154,8 @@ class CodebookReplacement(Callback):
         iteration = trainer.global_step
         if not self.is_due(host, iteration) or not self._latch.first_time(iteration):
             return
+        if self.jitter is not None:
+            keep_finite_splats(trainer, host)
         values: dict[str, float] = {}
         for name, quantizer in host.quantizers.items():
             _sum_usage(trainer, quantizer)
@@ -182,14 +188,6 @@ class CodebookReplacement(Callback):
             _sum_usage(trainer, quantizer)
         if not trainer.is_global_zero:
             _forget_usage(host)
-
-    def state_dict(self) -> dict[str, Any]:
-        """The last iteration codes were replaced at."""
-        return {"last": self._latch.last}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Do not replace again what was replaced before the checkpoint."""
-        self._latch.last = state_dict["last"]
 
 
 def _sum_usage(trainer: Trainer, quantizer: Quantizer) -> None:

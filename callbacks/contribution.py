@@ -5,21 +5,21 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
 
 from nsvq_lightning.edit import keep_rows
 from nsvq_lightning.host import SplatHost, as_host, next_iteration, raw_optimizer, train_contributions
 from nsvq_lightning.importance import least_contributing
 from nsvq_lightning.schedule import Phase
 
-from .latch import StepLatch
+from .latch import LatchedCallback
 
 __all__ = ["ContributionPruning"]
 
 log = logging.getLogger(__name__)
 
 
-class ContributionPruning(Callback):
+class ContributionPruning(LatchedCallback):
     """Once before the quantize phase, removes the splats that contribute least to the train views.
 
     A splat contributes its blending weight, summed over all pixels (:func:`nsvq_lightning.importance.contributions`):
@@ -38,13 +38,13 @@ class ContributionPruning(Callback):
     """
 
     def __init__(self, share: float = 0.0, at: int = 18_500) -> None:
+        super().__init__()
         if not 0.0 <= share < 1.0:
             raise ValueError(f"share must be at least 0 and below 1, got {share}")
         if at < 1:
             raise ValueError(f"at must be at least 1, got {at}")
         self.share = share
         self.at = at
-        self._latch = StepLatch()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Check that the pruning comes before the quantize phase.
@@ -80,11 +80,3 @@ class ContributionPruning(Callback):
             before,
             self.share,
         )
-
-    def state_dict(self) -> dict[str, Any]:
-        """The last iteration acted on."""
-        return {"last": self._latch.last}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Do not repeat what was done before the checkpoint."""
-        self._latch.last = state_dict["last"]

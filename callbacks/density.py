@@ -1,4 +1,4 @@
-"""Adaptive density control of warm-up and prune phase."""
+"""Adaptive density control of warm-up and prune phase; the search for splats that turn non-finite."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import logging
 from typing import Any
 
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 
-from nsvq_lightning.edit import append_rows, drop_non_finite, keep_rows, replace_attribute, reset_moments
+from nsvq_lightning.edit import append_rows, keep_rows, replace_attribute, reset_moments
 from nsvq_lightning.host import SplatHost, as_host, next_iteration, raw_optimizer, sum_over_processes
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
@@ -28,8 +28,8 @@ from .density_rules import (
     split,
     split_mask,
 )
-from .finite_search import FiniteSearch
-from .latch import StepLatch
+from .finite_search import FiniteSearch, keep_finite_splats
+from .latch import LatchedCallback
 
 __all__ = ["DensityControl"]
 
@@ -39,12 +39,12 @@ GRADIENTS, VIEWS = "gradient_sum", "view_count"
 """Side tables of the splats: sum of the screen-space gradient norms, and number of views that saw the splat."""
 
 
-class DensityControl(Callback):
+class DensityControl(LatchedCallback):
     """Clones, splits and prunes splats (Kerbl et al. 2023, section 5), and drops those that turn non-finite.
 
     During warm-up the norm of the screen-space gradient is averaged over the views that see a splat; at the scheduled
     iterations splats above the threshold are cloned or split, transparent and huge ones pruned, and opacities reset. In
-    the prune phase transparent splats are pruned and none are added.
+    the prune phase transparent splats are pruned and none are added. Non-finite splats are searched in every phase.
 
     Args:
         rules: All numbers.
@@ -63,12 +63,12 @@ class DensityControl(Callback):
         max_splats: int | None = None,
         finite_every: int = 100,
     ) -> None:
+        super().__init__()
         if max_splats is not None and max_splats < rules.min_splats:
             raise ValueError(f"max_splats must be at least min_splats={rules.min_splats}, got {max_splats}")
         self.rules = rules
         self.max_splats = max_splats
         self._search = FiniteSearch(finite_every, "finite_every")
-        self._latch = StepLatch()
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Refuse strategies that would lose the replaced parameters.
@@ -76,6 +76,7 @@ class DensityControl(Callback):
         Raises:
             ValueError: The strategy wraps the module in ``DistributedDataParallel``.
         """
+        super().setup(trainer, pl_module, stage)
         # A strategy that follows parameters when they are replaced says so with this attribute.
         follows = getattr(trainer.strategy, "follows_replaced_parameters", False)
         if stage == "fit" and isinstance(trainer.strategy, DDPStrategy) and not follows:
@@ -102,11 +103,9 @@ class DensityControl(Callback):
         iteration = trainer.global_step
         if iteration == 0 or not self._latch.first_time(iteration):
             return
-        phase = host.schedule.phase_at(iteration)
-        if phase is Phase.FINETUNE:
-            return
         if self._search.is_due(trainer):
-            drop_non_finite(host.splats, raw_optimizer(trainer), iteration)
+            keep_finite_splats(trainer, host)
+        phase = host.schedule.phase_at(iteration)
         if phase is Phase.WARMUP:
             self._warmup_step(trainer, host, iteration)
         elif phase is Phase.PRUNE:
@@ -157,7 +156,8 @@ class DensityControl(Callback):
         cloned = clone_mask(statistic, splats.scales, host.extent, rules)
         divided = split_mask(statistic, splats.scales, host.extent, rules)
         if self.max_splats is not None:
-            grown = limit_growth(cloned | divided, statistic, self.max_splats - len(splats))
+            added = torch.where(divided, rules.children - 1, 1)
+            grown = limit_growth(cloned | divided, statistic, added, self.max_splats - len(splats))
             cloned, divided = cloned & grown, divided & grown
         before = len(splats)
         draws = generator(host.seed, iteration, "split")
@@ -194,14 +194,6 @@ class DensityControl(Callback):
         lowered = lower_opacities(host.splats.opacities, self.rules.reset_opacity)
         replace_attribute(host.splats, optimizer, "opacities", lowered)
         reset_moments(optimizer, "opacities")
-
-    def state_dict(self) -> dict[str, Any]:
-        """The last iteration acted on; the statistics are side tables of the splats."""
-        return {"last": self._latch.last}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Do not repeat what was done before the checkpoint."""
-        self._latch.last = state_dict["last"]
 
 
 def _add(sums: Tensor, views: Tensor, render: Render | None, micro_batches: int) -> None:

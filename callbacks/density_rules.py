@@ -162,14 +162,22 @@ def prune_mask(opacities: Tensor, scales: Tensor, extent: float, rules: DensityR
     return prune
 
 
-def limit_growth(mask: Tensor, statistic: Tensor, budget: int) -> Tensor:
-    """The at most ``budget`` splats of ``mask [N]`` with the largest statistic; of equals the first."""
-    if int(mask.sum()) <= budget:
-        return mask
+def limit_growth(mask: Tensor, statistic: Tensor, added: Tensor, budget: int) -> Tensor:
+    """The splats of ``mask [N]`` with the largest statistic that add at most ``budget`` together; of equals the first.
+
+    Args:
+        mask: Splats that want to grow.
+        statistic: Mean screen-space gradient ``[N]``.
+        added: Splats that each would add ``[N]`` int64, not negative: 1 for a clone, children - 1 for a split.
+        budget: Splats that may be added.
+    """
     candidates = mask.nonzero()[:, 0]
+    if int(added[candidates].sum()) <= budget:
+        return mask
     order = statistic[candidates].argsort(descending=True, stable=True)
+    candidates = candidates[order]
     limited = torch.zeros_like(mask)
-    limited[candidates[order[: max(budget, 0)]]] = True
+    limited[candidates[added[candidates].cumsum(0) <= budget]] = True
     return limited
 
 

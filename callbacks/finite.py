@@ -6,7 +6,7 @@ import logging
 from typing import Any
 
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
 
 from nsvq_lightning.edit import reset_moments
 from nsvq_lightning.host import SplatHost, as_host, raw_optimizer
@@ -16,14 +16,14 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.schedule import Phase
 
 from .finite_search import FiniteSearch
-from .latch import StepLatch
+from .latch import LatchedCallback
 
 __all__ = ["FiniteCodes"]
 
 log = logging.getLogger(__name__)
 
 
-class FiniteCodes(Callback):
+class FiniteCodes(LatchedCallback):
     """Searches codebooks for NaN and infinite numbers, from the quantize phase on, and mends such codes with a warning.
 
     As with splats that turn non-finite (:class:`~nsvq_lightning.callbacks.DensityControl`), the run goes on. A code
@@ -38,8 +38,8 @@ class FiniteCodes(Callback):
     """
 
     def __init__(self, every: int = 100) -> None:
+        super().__init__()
         self._search = FiniteSearch(every)
-        self._latch = StepLatch()
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -66,14 +66,6 @@ class FiniteCodes(Callback):
             quantizer.mend(broken, host.rows(name), generator(host.seed, iteration, "mend", name))
             reset_moments(raw_optimizer(trainer), codebook_group(name), broken)
             log.warning("%s (%s); mended", found, _numbers(broken.tolist()))
-
-    def state_dict(self) -> dict[str, Any]:
-        """The last iteration seen."""
-        return {"last": self._latch.last}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Do not repeat what was done before the checkpoint."""
-        self._latch.last = state_dict["last"]
 
 
 def _numbers(rows: list[int]) -> str:

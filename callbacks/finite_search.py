@@ -1,12 +1,13 @@
-"""When to look for numbers that are not finite."""
+"""When to look for numbers that are not finite, and how splats with such numbers leave the scene."""
 
 from __future__ import annotations
 
 from lightning.pytorch import Trainer
 
-from nsvq_lightning.host import raw_optimizer
+from nsvq_lightning.edit import drop_non_finite
+from nsvq_lightning.host import SplatHost, raw_optimizer
 
-__all__ = ["FiniteSearch"]
+__all__ = ["FiniteSearch", "keep_finite_splats"]
 
 
 class FiniteSearch:
@@ -37,3 +38,20 @@ class FiniteSearch:
 def _was_updated(trainer: Trainer) -> bool:
     groups = raw_optimizer(trainer).param_groups
     return any(parameter.grad is not None for group in groups for parameter in group["params"])
+
+
+def keep_finite_splats(trainer: Trainer, host: SplatHost) -> None:
+    """Drop splats that are not finite, with their frozen codes (:func:`nsvq_lightning.edit.drop_non_finite`).
+
+    The replicas of several processes are equal, so all drop the same without asking each other. Gradients are lost
+    where splats are dropped: call it between an update and the next backward pass.
+
+    Raises:
+        FloatingPointError: No finite splat is left.
+    """
+    kept = drop_non_finite(host.splats, raw_optimizer(trainer), trainer.global_step)
+    if len(host.splats) == len(kept):
+        return
+    for quantizer in host.quantizers.values():
+        if len(quantizer.codes) > 0:
+            quantizer.freeze(quantizer.codes[kept])

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-__all__ = ["StepLatch"]
+from typing import Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+__all__ = ["LatchedCallback", "StepLatch"]
 
 
 class StepLatch:
@@ -23,3 +27,24 @@ class StepLatch:
             return False
         self.last = iteration
         return True
+
+
+class LatchedCallback(Callback):
+    """Callback that acts at most once an iteration of a fit, also when the fit is resumed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._latch = StepLatch()
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Forget an earlier fit of the same callback; a checkpoint's state is loaded after this."""
+        if stage == "fit":
+            self._latch = StepLatch()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The last iteration acted on."""
+        return {"last": self._latch.last}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Do not repeat what was done before the checkpoint."""
+        self._latch.last = state_dict["last"]

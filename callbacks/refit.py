@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch.optim import Optimizer
@@ -10,6 +11,8 @@ from torch.optim import Optimizer
 from nsvq_lightning.host import SplatHost, as_host, from_first_process, next_iteration
 from nsvq_lightning.quantize.base import Refittable
 from nsvq_lightning.schedule import Phase
+
+from .finite_search import keep_finite_splats
 
 __all__ = ["CodebookRefit"]
 
@@ -46,16 +49,25 @@ class CodebookRefit(Callback):
             return False
         return iteration in schedule.refit_times(self.every)
 
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Drop non-finite splats before a refit to all rows: after the backward pass it would take the gradients."""
+        host = as_host(pl_module)
+        if self.is_due(host, next_iteration(trainer)) and _refittable(host):
+            keep_finite_splats(trainer, host)
+
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
         """Refit when it is time, on the first process."""
         host = as_host(pl_module)
         iteration = next_iteration(trainer)
         if not self.is_due(host, iteration):
             return
-        for name, quantizer in host.quantizers.items():
-            if not isinstance(quantizer, Refittable):
-                continue
+        for name, quantizer in _refittable(host).items():
             if trainer.is_global_zero:
                 quantizer.refit(host.rows(name), self.steps)
             quantizer.codebook.data = from_first_process(trainer, quantizer.codebook.data)
             log.debug("iteration %d: refitted the codebook of %s", iteration, name)
+
+
+def _refittable(host: SplatHost) -> dict[str, Refittable]:
+    """The quantizers that offer it, by attribute."""
+    return {name: quantizer for name, quantizer in host.quantizers.items() if isinstance(quantizer, Refittable)}

@@ -69,7 +69,7 @@ def canonical(scales: Tensor, quats: Tensor, form: Form) -> Canonical:
 
     ``sign`` gives every quaternion length 1 and w ≥ 0. ``full`` also sorts the axes, longest first, and of the
     rotations that are left takes the smallest, the one with the largest w. A quaternion too short to have a direction
-    is the identity, as for the renderer.
+    is the identity, as for the renderer; what is not finite stays so.
 
     Args:
         scales: Log-scales ``[N, 3]``.
@@ -83,7 +83,7 @@ def canonical(scales: Tensor, quats: Tensor, form: Form) -> Canonical:
         raise ValueError(f"a canonical form is 'sign' or 'full', got {form!r}")
     squared = quats.square().sum(1, keepdim=True)
     identity = torch.eye(4, dtype=quats.dtype, device=quats.device)
-    directed = squared >= MIN_SQUARED_NORM
+    directed = ~(squared < MIN_SQUARED_NORM)
     quats = torch.where(directed, quats, identity[0])
     lengths = torch.where(directed, squared, 1.0).sqrt()
     if form == "full":

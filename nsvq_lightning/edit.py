@@ -23,6 +23,7 @@ __all__ = [
     "change_coordinates",
     "drop_non_finite",
     "finite_rows",
+    "finite_splats",
     "keep_rows",
     "replace_attribute",
     "reset_moments",
@@ -156,28 +157,53 @@ def finite_rows(splats: Splats) -> tuple[Tensor, dict[str, int]]:
     return mask, culprits
 
 
-def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> int:
+def finite_splats(splats: Splats, source: str) -> Splats:
+    """The splats without those that :func:`finite_rows` leaves out, with a warning that names source and attributes.
+
+    Args:
+        splats: Splats that no optimiser knows yet.
+        source: Where they come from.
+
+    Raises:
+        ValueError: No finite splat is left.
+    """
+    mask, culprits = finite_rows(splats)
+    if not culprits:
+        return splats
+    if not bool(mask.any()):
+        raise ValueError(f"{source} holds no splat with finite numbers ({_named(culprits)}); there is nothing to train")
+    _warn_of_dropped(source, mask, culprits)
+    return Splats.from_tensors(*(tensor.detach()[mask] for tensor in splats.raw()))
+
+
+def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> Tensor:
     """Drop splats that :func:`finite_rows` leaves out, with a warning that names attribute, rows and step.
 
     Returns:
-        Number of dropped splats.
+        Which of the splats before were kept, ``[N]`` bool.
 
     Raises:
         FloatingPointError: No finite splat is left.
     """
     mask, culprits = finite_rows(splats)
     if not culprits:
-        return 0
-    kept = int(mask.sum())
-    found = ", ".join(f"{name} in {count} rows" for name, count in culprits.items())
-    if kept == 0:
+        return mask
+    if not bool(mask.any()):
         raise FloatingPointError(
-            f"step {step}: all {len(splats)} splats are non-finite ({found}); lower the learning rates"
+            f"step {step}: all {len(splats)} splats are non-finite ({_named(culprits)}); lower the learning rates"
         )
-    dropped = len(splats) - kept
-    log.warning("step %d: dropped %d of %d splats with non-finite values: %s", step, dropped, len(splats), found)
+    _warn_of_dropped(f"step {step}", mask, culprits)
     keep_rows(splats, optimizer, mask)
-    return dropped
+    return mask
+
+
+def _warn_of_dropped(where: str, kept: Tensor, culprits: Mapping[str, int]) -> None:
+    dropped, total, found = int((~kept).sum()), len(kept), _named(culprits)
+    log.warning("%s: dropped %d of %d splats with non-finite values: %s", where, dropped, total, found)
+
+
+def _named(culprits: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} in {count} rows" for name, count in culprits.items())
 
 
 def _rebind(

@@ -13,6 +13,7 @@ from torchmetrics import Metric
 
 from nsvq_lightning.branch import branch_checkpoint, can_branch, check_continuation
 from nsvq_lightning.data.scene import View
+from nsvq_lightning.edit import finite_splats
 from nsvq_lightning.host import log_interval
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.precision import Storage
@@ -57,7 +58,7 @@ class SplatModule(SplatModel):
         backend: Rasterizer, see :func:`nsvq_lightning.render`.
         seed: Seed of every draw of the run except the order of the views.
         storage: Level of the compressed file, and how exactly it stores the scene.
-        init_from: Scene file of any format to start from instead of the scene's points.
+        init_from: Scene file of any format to start from instead of the scene's points; non-finite splats are left out.
         splats: Splats to start from, for use from Python.
 
     Raises:
@@ -117,7 +118,7 @@ class SplatModule(SplatModel):
                     f"set sh_degree={loaded.sh_degree}"
                 )
             self.active_sh_degree = loaded.sh_degree
-            return loaded
+            return finite_splats(loaded, self.init_from)
         if scene is None:
             raise ValueError("no splats to start from: fit with a data module that has a scene, or set init_from")
         return Splats.from_points(scene.points, scene.colors, self.splats.sh_degree)

@@ -102,3 +102,15 @@ def test_canonical_rows_stay_and_a_zero_quaternion_is_the_identity() -> None:
     assert zero.quat_maps.isfinite().all()
     with pytest.raises(ValueError, match="'sign' or 'full'"):
         canonical(scales, quats, "none")
+
+
+@pytest.mark.parametrize("form", ["sign", "full"])
+def test_what_is_not_finite_stays_so_and_changes_no_other(form: Form) -> None:
+    scales, quats = rows(5)
+    expected = canonical(scales, quats, form)
+    scales[1, 2], quats[3, 0] = torch.nan, torch.nan
+    found = canonical(scales, quats, form)
+    assert found.scales.isfinite().all(1).tolist() == [True, False, True, True, True]
+    assert found.quats.isfinite().all(1).tolist()[3] is False
+    for row in (0, 2, 4):
+        assert all(torch.equal(a[row], b[row]) for a, b in zip(found, expected, strict=True))

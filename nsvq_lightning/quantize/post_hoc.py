@@ -55,9 +55,13 @@ class PostHoc(CodebookQuantizer):
         return x if rows is None else take_rows(x, rows)
 
     def encode(self, x: Tensor) -> Tensor:
-        """Nearest codes ``[N]`` int64 of ``x [N, D]``, in a codebook that is fitted to ``x`` unless it is frozen."""
+        """Nearest codes ``[N]`` int64 of ``x [N, D]``, in a codebook that is fitted to ``x`` unless it is frozen.
+
+        Rows that are not finite, which a run drops at its next search, have no part in the codebook.
+        """
         if not self.frozen:
-            self.fit(x.detach())
+            rows = x.detach()
+            self.fit(rows[rows.isfinite().all(1)])
         return super().encode(x)
 
     def _search(self, x: Tensor, rows: Tensor | None) -> Tensor:

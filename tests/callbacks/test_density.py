@@ -13,6 +13,7 @@ from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 
 from nsvq_lightning.callbacks import DensityControl, DensityRules
 from nsvq_lightning.optim import LearningRates, build_adam, param_groups
+from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.schedule import Schedule
 from nsvq_lightning.splats import Splats
@@ -51,6 +52,7 @@ class Stage:
         optimizer = build_adam(param_groups(splats, {}, LearningRates(), EXTENT))
         self.host: Any = SimpleNamespace(
             splats=splats,
+            quantizers={},
             schedule=Schedule(),
             extent=EXTENT,
             seed=0,
@@ -159,6 +161,14 @@ def test_growth_stops_at_the_cap() -> None:
     assert stage.host.splats.means.detach()[:3].tolist() == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
 
 
+def test_growth_into_many_children_stops_at_the_cap() -> None:
+    for cap, count in ((6, 5), (7, 7)):  # a clone adds 1, a split into 3 adds 2
+        control = DensityControl(DensityRules(min_splats=1, children=3), max_splats=cap)
+        stage = Stage(make_splats([SMALL, LARGE, LARGE, SMALL], [0.5] * 4), control)
+        stage.end_batch(600, view([3e-4, 4e-4, 5e-4, 9e-4], [True] * 4))
+        assert stage.count == count
+
+
 def test_a_non_finite_splat_is_dropped_as_soon_as_the_loss_shows_it(caplog: pytest.LogCaptureFixture) -> None:
     stage = Stage(make_splats([SMALL] * 3, [0.5] * 3), DensityControl())
     with torch.no_grad():
@@ -166,6 +176,19 @@ def test_a_non_finite_splat_is_dropped_as_soon_as_the_loss_shows_it(caplog: pyte
     stage.end_batch(7, None)  # the step was skipped: no outputs
     assert stage.count == 2
     assert "step 7: dropped 1 of 3 splats with non-finite values: quats in 1 rows" in caplog.text
+
+
+def test_frozen_codes_go_with_the_splats_that_are_dropped_in_fine_tuning() -> None:
+    stage = Stage(make_splats([SMALL] * 4, [0.5] * 4), DensityControl())
+    frozen, free = NSVQ(3, 3), NSVQ(3, 3)
+    frozen.freeze(torch.tensor([2, 0, 1, 2]))
+    stage.host.quantizers = {"scales": frozen, "sh0": free}
+    with torch.no_grad():
+        stage.host.splats.sh0[1] = math.inf
+    stage.end_batch(44_000, view([0.0] * 4, [True] * 4))
+    assert stage.host.splats.means.detach().tolist() == [[0, 1, 2], [6, 7, 8], [9, 10, 11]]
+    assert frozen.codes.tolist() == [2, 1, 2]
+    assert not free.frozen
 
 
 def test_resuming_right_after_an_edit_does_not_repeat_it() -> None:

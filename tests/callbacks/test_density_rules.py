@@ -92,10 +92,22 @@ def test_children_follow_the_parents_own_gaussian() -> None:
 def test_growth_is_limited_to_the_largest_statistics_and_ties_go_to_the_first() -> None:
     mask = torch.tensor([True, True, False, True, True])
     statistic = torch.tensor([1.0, 3.0, 9.0, 3.0, 2.0])
-    assert limit_growth(mask, statistic, 4).tolist() == mask.tolist()
-    assert limit_growth(mask, statistic, 1).tolist() == [False, True, False, False, False]
-    assert limit_growth(mask, statistic, 3).tolist() == [False, True, False, True, True]
-    assert not limit_growth(mask, statistic, -5).any()
+    one = torch.ones(5, dtype=torch.int64)
+    assert limit_growth(mask, statistic, one, 4).tolist() == mask.tolist()
+    assert limit_growth(mask, statistic, one, 1).tolist() == [False, True, False, False, False]
+    assert limit_growth(mask, statistic, one, 3).tolist() == [False, True, False, True, True]
+    assert not limit_growth(mask, statistic, one, -5).any()
+
+
+def test_growth_counts_what_each_splat_adds() -> None:
+    mask, statistic = torch.tensor([True, True, False, True, True]), torch.tensor([1.0, 3.0, 9.0, 4.0, 2.0])
+    added = torch.tensor([1, 3, 3, 1, 3])
+    kept = {budget: limit_growth(mask, statistic, added, budget).tolist() for budget in (0, 1, 3, 4, 7, 8)}
+    assert kept[0] == [False] * 5
+    assert kept[1] == kept[3] == [False, False, False, True, False]  # the next one would add 3
+    assert kept[4] == [False, True, False, True, False]
+    assert kept[7] == [False, True, False, True, True]
+    assert kept[8] == mask.tolist()
 
 
 def test_reset_lowers_opacities_and_never_raises_them() -> None:

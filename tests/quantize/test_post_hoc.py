@@ -59,6 +59,17 @@ def test_codes_are_kmeans_of_the_rows_that_are_encoded_whatever_came_before() ->
     assert torch.equal(hard, quantizer.decode(found))
 
 
+def test_rows_that_are_not_finite_have_no_part_in_the_codebook() -> None:
+    quantizer, _ = fitted()
+    rows = torch.randn(100, 3, generator=generator(5))
+    expected = kmeans(rows[2:], 16, generator(0), steps=10)
+    rows[0, 1], rows[1, 2] = torch.nan, torch.inf
+    codes = quantizer.encode(rows)
+    assert torch.equal(quantizer.codebook, expected)
+    assert torch.equal(codes[2:], torch.cdist(rows[2:].double(), expected.double()).argmin(1))
+    assert codes.shape == (100,)
+
+
 def test_frozen_codebook_is_trained_and_not_fitted_again() -> None:
     quantizer, x = fitted()
     codes = quantizer.encode(x)

@@ -226,3 +226,24 @@ def test_a_run_can_start_from_a_file(demo_scene: Path, tmp_path: Path) -> None:
     wrong = SplatModule(sh_degree=2, codebooks=None, init_from=str(tmp_path / "start.ply"))
     with pytest.raises(ValueError, match="set sh_degree=1"):
         fit(wrong, data, [PhaseSchedule()], 1)
+
+
+def test_splats_of_a_file_that_are_not_finite_are_left_out(
+    demo_scene: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    start = make_splats()
+    start.quats.data[7, 2] = torch.nan
+    monkeypatch.setattr("nsvq_lightning.module.load", lambda _: start)
+    data = ColmapDataModule(str(demo_scene), factor=4)
+
+    def fitted() -> SplatModule:
+        module = SplatModule(sh_degree=1, codebooks=None, init_from="a.ply", rates=LearningRates(1e-9, 1e-9))
+        fit(module, data, [PhaseSchedule()], 1)
+        return module
+
+    means = fitted().splats.means.detach()
+    torch.testing.assert_close(means, torch.cat([start.means[:7], start.means[8:]]).detach(), atol=1e-6, rtol=0)
+    assert "a.ply: dropped 1 of 30 splats with non-finite values: quats in 1 rows" in caplog.messages
+    start.means.data.fill_(torch.inf)
+    with pytest.raises(ValueError, match=r"a\.ply holds no splat with finite numbers \(means in 30 rows"):
+        fitted()

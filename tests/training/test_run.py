@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,24 @@ import torch
 from checkpoints import CheckpointAt, read
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from nsvq_lightning.callbacks import FiniteCodes, MetricReport, RunCheckpoint
+from nsvq_lightning.callbacks import (
+    CanonicalCovariance,
+    CodebookInit,
+    CodebookRefit,
+    CodebookReplacement,
+    ContributionPruning,
+    FiniteCodes,
+    MetricReport,
+    PhaseSchedule,
+    RunCheckpoint,
+)
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io.container import read_header, read_nsvq, write_nsvq
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.precision import Storage
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.optim import LearningRates, position_lr
+from nsvq_lightning.quantize import NSVQ, PostHoc, StraightThrough
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.schedule import Phase, Schedule
 
@@ -221,6 +232,27 @@ def test_learning_rates_can_follow_the_views_of_a_step(run: RunFactory, recipe: 
         assert groups["means"] == pytest.approx(factor * positions)
 
 
+def test_callbacks_of_an_earlier_fit_act_again(run: RunFactory, recipe: Recipe) -> None:
+    def stored(callbacks: Iterable[Callback]) -> bytes:
+        trainer, module = run(callbacks, max_steps=20)
+        assert all(bool(quantizer.codebook.any()) for quantizer in module.quantizers.values())
+        return scene_bytes(trainer)
+
+    def every_option() -> list[Callback]:
+        options = {"canonical": CanonicalCovariance("full"), "contribution": ContributionPruning(share=0.02)}
+        return list(recipe(**options).values())
+
+    callbacks = every_option()
+    assert stored(callbacks) == stored(callbacks) == stored(every_option())
+
+
+def test_codes_of_a_codebook_that_was_never_placed_are_not_frozen(run: RunFactory, recipe: Recipe) -> None:
+    callbacks = recipe()
+    del callbacks["codebook_init"]
+    with pytest.raises(RuntimeError, match="the codebook of scales has never been placed"):
+        run(callbacks.values(), max_steps=20)
+
+
 def test_a_run_without_codebooks_is_plain_splatting(run: RunFactory, recipe: Recipe, demo_scene: Path) -> None:
     trainer, module = run(recipe().values(), module={"codebooks": None, "storage": Storage("paper")})
     trainer.test(module, datamodule=ColmapDataModule(str(demo_scene), factor=2), verbose=False)
@@ -269,3 +301,79 @@ def test_a_run_whose_codes_turn_non_finite_goes_on(
     # Frozen codes are drawn: the loss shows a broken one at once, not only at the next check.
     assert [message.split(" codes")[0] for message in found] == ["step 32: 1 of 16", "step 59: 1 of 16"]
     assert 10 < module.history[-1]["psnr"] < 100
+
+
+class PlantSplats(Callback):
+    """Breaks an attribute of some splats at the end of an iteration."""
+
+    def __init__(self, attribute: str, iteration: int) -> None:
+        self.attribute, self.iteration = attribute, iteration
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        assert isinstance(pl_module, SplatModule)
+        if trainer.global_step == self.iteration:
+            pl_module.splats.attributes()[self.attribute].data[:20] = torch.nan
+
+
+def drops(caplog: pytest.LogCaptureFixture, attribute: str) -> list[str]:
+    """Where splats with a non-finite attribute were dropped, and how many."""
+    suffix = f"with non-finite values: {attribute} in 20 rows"
+    return [message.split(" of ")[0] for message in caplog.messages if message.endswith(suffix)]
+
+
+def test_splats_that_turn_non_finite_in_fine_tuning_are_dropped(
+    run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
+) -> None:
+    phases = PhaseSchedule(quantize_end=30_000, min_finetune=1)
+    callbacks = [*recipe(phases=phases).values(), PlantSplats("sh0", 15)]
+    _, module = run(callbacks, module={"codebooks": {"scales": 24}}, max_steps=20)
+    assert module.schedule.phase_at(15) is Phase.FINETUNE
+    assert drops(caplog, "sh0") == ["step 16: dropped 20"]
+    assert sum("no update" in message for message in caplog.messages) == 1
+    assert module.quantizers["scales"].codes.shape == (len(module.splats),)
+    assert 10 < module.history[-1]["psnr"] < 100
+
+
+@pytest.mark.parametrize("with_density", [True, False])
+def test_codebooks_are_placed_on_finite_splats(
+    with_density: bool, run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
+) -> None:
+    callbacks = recipe(codebook_init=CodebookInit(weights="contribution"))
+    if not with_density:
+        del callbacks["density"]
+    # After the search at the end of the prune phase, and before the form of the covariances is chosen.
+    late = [PlantSplats("quats", 9), CanonicalCovariance("auto")]
+    _, module = run([*callbacks.values(), *late], max_steps=20)
+    assert module.schedule.first_of(Phase.QUANTIZE) == 10
+    assert drops(caplog, "quats") == ["step 9: dropped 20"]
+    assert 10 < module.history[-1]["psnr"] < 100
+
+
+@pytest.mark.parametrize(
+    ("callbacks", "quantizer", "step"),
+    [
+        ({"refit": CodebookRefit()}, StraightThrough, 13),  # refits come at 14 and 19
+        ({"codebook_replacement": CodebookReplacement(jitter=0.5)}, NSVQ, 15),  # after 10 and 15
+    ],
+)
+def test_codes_move_to_finite_splats_only(
+    callbacks: dict[str, Callback],
+    quantizer: type,
+    step: int,
+    run: RunFactory,
+    recipe: Recipe,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    standard = [*recipe(**callbacks).values(), PlantSplats("quats", 13)]
+    _, module = run(standard, module={"quantizer": quantizer}, max_steps=20)
+    assert drops(caplog, "quats") == [f"step {step}: dropped 20"]
+    assert 10 < module.history[-1]["psnr"] < 100
+
+
+def test_post_hoc_codebooks_are_evaluated_although_splats_are_not_finite(run: RunFactory, recipe: Recipe) -> None:
+    callbacks = [*recipe(report=MetricReport(every=15)).values(), PlantSplats("quats", 15)]
+    _, module = run(callbacks, module={"quantizer": PostHoc}, max_steps=20)
+    assert 15 in [entry["iteration"] for entry in module.history]
+    assert all(10 < entry["psnr"] < 100 for entry in module.history if entry["iteration"] >= 15)
