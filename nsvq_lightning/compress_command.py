@@ -197,8 +197,16 @@ def _parser() -> argparse.ArgumentParser:
     aim.add_argument("--target-bytes", type=_positive(int), metavar="B", help="the best file of at most so many bytes")
     parser.add_argument("--level", choices=LEVELS, default=DEFAULT_LEVEL, help=f"{DEFAULT_LEVEL} by default")
     parser.add_argument("--seed", type=int, default=0, help="seed of k-means")
-    parser.add_argument("--data.root", dest="root", type=Path, metavar="FOLDER", help="COLMAP folder with the photos")
-    parser.add_argument("--max-steps", type=int, metavar="N", help="iterations with photos: 3000; 0 for none")
+    parser.add_argument(
+        "--data.root",
+        dest="root",
+        type=Path,
+        metavar="FOLDER",
+        help="COLMAP folder with the photos: errors are those in its views, and its photos train the codebooks",
+    )
+    parser.add_argument(
+        "--max-steps", type=int, metavar="N", help="iterations of that training: 3000 by default; 0 only measures"
+    )
     return parser
 
 
