@@ -15,7 +15,7 @@ from nsvq_lightning.io.atomic import atomic_path
 from nsvq_lightning.schedule import Schedule
 
 from .boundary import StepBoundary
-from .latch import StepLatch
+from .latch import LatchedCallback
 from .signals import HeldSignals
 
 __all__ = ["RunCheckpoint"]
@@ -23,7 +23,7 @@ __all__ = ["RunCheckpoint"]
 log = logging.getLogger(__name__)
 
 
-class RunCheckpoint(Checkpoint):
+class RunCheckpoint(LatchedCallback, Checkpoint):
     """Saves the whole state of the run in ``checkpoints/last.ckpt``: regularly, at ends of phases, and when it stops.
 
     ``fit --ckpt_path …/last.ckpt`` continues exactly where it was saved. Lightning calls checkpoint callbacks after all
@@ -47,6 +47,7 @@ class RunCheckpoint(Checkpoint):
     """
 
     def __init__(self, every: int | None = None, keep: bool = False, folder: str | None = None) -> None:
+        super().__init__()
         if every is not None and every < 0:
             raise ValueError(f"every must be None or at least 0, got {every}")
         self.every = every
@@ -54,7 +55,6 @@ class RunCheckpoint(Checkpoint):
         self.folder = folder
         self.last_path: Path | None = None
         """Checkpoint to continue from: the last one written, at first the one this run was continued from."""
-        self._latch = StepLatch()
         self._boundary = StepBoundary()
         self._signals = HeldSignals()
         self._saved = -1
@@ -68,6 +68,13 @@ class RunCheckpoint(Checkpoint):
         """
         every = max(1, schedule.total // 10) if self.every is None else self.every
         return every > 0 and (iteration % every == 0 or iteration in schedule.ends)
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Forget an earlier fit."""
+        super().setup(trainer, pl_module, stage)
+        if stage == "fit":
+            self.last_path, self._saved = None, -1
+            self._boundary.drop()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Begin to hold back signals."""
@@ -144,14 +151,6 @@ class RunCheckpoint(Checkpoint):
                 _write(trainer, folder / f"step-{trainer.global_step}.ckpt")
             _write(trainer, folder / "last.ckpt")
         self.last_path, self._saved = folder / "last.ckpt", trainer.global_step
-
-    def state_dict(self) -> dict[str, Any]:
-        """The last complete iteration."""
-        return {"last": self._latch.last}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Know the iteration that was loaded, so that a micro-batch of the next one is not taken for its end."""
-        self._latch.last = state_dict["last"]
 
 
 def _write(trainer: Trainer, path: Path) -> None:

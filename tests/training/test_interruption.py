@@ -375,6 +375,17 @@ main(sys.argv[1:])
 """
 
 
+def test_checkpoints_of_an_earlier_fit_hide_none_of_the_next(run: RunFactory, recipe: Recipe) -> None:
+    checkpoint = RunCheckpoint(every=0)
+    Runner(run, recipe, "defaults", max_steps=12)(checkpoint=checkpoint)
+    first = checkpoint.last_path
+    with pytest.raises(Broken):
+        Runner(run, recipe, "defaults", max_steps=20)(Trouble(13, fail), checkpoint=checkpoint)
+    assert checkpoint.last_path is not None
+    assert checkpoint.last_path != first
+    assert iteration_of(checkpoint.last_path) == 12
+
+
 @pytest.mark.parametrize(
     "iteration", [pytest.param(i, marks=[] if i == 9 else pytest.mark.slow) for i in (4, 6, 9, 12)]
 )
