@@ -197,7 +197,7 @@ def test_a_checkpoint_that_cannot_be_used_is_named_with_the_reason(
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ("--model.codebooks=null", "other codebooks or another quantizer: it has codebooks.scales"),
+        ("--model.codebooks=null", "the checkpoint has quantized with NSVQ (scales: 16, sh0: 8), and this run would"),
         ("--model.sh_degree=2", "a run with SH degree 1, this one has 2; pass --model.sh_degree=1"),
     ],
 )

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 HERE = Path(__file__).resolve().parent
-IN_QUANTIZE = 44
+IN_QUANTIZE = 42
 """Iteration of a checkpoint between two replacements of codes."""
 
 LOSSES, GRADIENTS = (7, 33), (12, 46)
