@@ -159,12 +159,8 @@ class Schedule:
         """The iteration of this run that stands for iteration ``reference`` of the reference run, at least 1."""
         return max(1, round(reference * self.scale))
 
-    def interval(self, reference: int, minimum: int = 1) -> int:
-        """The interval of this run that stands for ``reference`` iterations, at least ``minimum``."""
-        return max(minimum, self.iteration(reference)) if self.scale < 1 else self.iteration(reference)
-
     def stride(self, reference: int, minimum: int) -> float:
-        """The same interval in iterations of the reference run, which is not rounded."""
+        """The interval ``reference``, at least ``minimum`` iterations of this run, in those of the reference run."""
         return max(reference, minimum / self.scale) if self.scale < 1 else reference
 
     def times(self, start: float, last: float, every: int, minimum: int = 1) -> tuple[int, ...]:
@@ -192,9 +188,9 @@ class Schedule:
     ) -> tuple[int, ...]:
         """Iterations of the quantize phase at which inactive codes are replaced.
 
-        An early series from ``start`` to ``early_end``, a late one to ``end``. No window is shorter than
-        ``min_replacement_interval``, nor is the first, and what lies between ``end`` and the end of the phase stays
-        where a longer fine-tune phase moves that.
+        An early series from ``start`` to ``early_end``, a late one to ``end``. No window, the first included, is
+        shorter than ``min_replacement_interval``. Where a longer fine-tune phase moves the end of the quantize phase,
+        ``end`` keeps its distance to it.
         """
         minimum = self.min_replacement_interval
         first = max(start, self.prune_end + self.stride(1, minimum))
@@ -209,7 +205,7 @@ class Schedule:
 
     def sh_degree_at(self, iteration: int, every: int, highest: int) -> int:
         """SH degree in use at a 1-based iteration: one more every ``every`` reference iterations."""
-        return min(highest, iteration // self.interval(every))
+        return min(highest, iteration // self.iteration(every))
 
     def strength(self, reference: float) -> float:
         """The weight of a loss term whose effect adds up over a phase, for one of ``reference`` in the reference run.
