@@ -21,6 +21,7 @@ from nsvq_lightning.io.container import decode, encode
 from nsvq_lightning.io.frame import frame, unframe
 from nsvq_lightning.io.precision import Precision, Storage
 from nsvq_lightning.picture_error import decibels, picture_error, pictures
+from nsvq_lightning.pixel_size import scale_floor
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, Quantizer, codebook_sizes
 from nsvq_lightning.quantized import attribute_rows
 from nsvq_lightning.random import generator
@@ -90,8 +91,8 @@ class Candidate:
 class Compressor:
     """Compresses one scene at any rung, each at most once.
 
-    Before k-means, scales and rotations take the canonical form that suits the scene, and codes of rotations and
-    colours are placed by how much each splat contributes to the pictures.
+    Before k-means, scales too small to show are raised, scales and rotations take the canonical form that suits the
+    scene, and codes of rotations and colours are placed by how much each splat contributes to the pictures.
 
     Args:
         splats: The scene, finite.
@@ -115,6 +116,11 @@ class Compressor:
     def _weights(self) -> Tensor:
         """Weight of each splat ``[N]`` in k-means; only codebooks need it."""
         return row_weights(contributions(self._splats, self._cameras, render))
+
+    @cached_property
+    def _log_floor(self) -> float | None:
+        """Log-scale below which a splat's extent does not show."""
+        return scale_floor(self._splats.means, self._cameras)
 
     def at(self, rung: Rung) -> Candidate:
         """The scene at a rung."""
@@ -158,12 +164,13 @@ class Compressor:
         if not codes:
             return self._splats
         scales, quats = self._splats.scales, self._splats.quats
+        if "scales" in codes and self._log_floor is not None:
+            scales = scales.clamp(min=self._log_floor)
         errors = form_errors(scales, quats, codes, self._seed)
         form = min(errors, key=errors.__getitem__)
-        if form == "none":
-            return self._splats
-        new = canonical(scales, quats, form)
-        return self._splats._replace(scales=new.scales, quats=new.quats)
+        if form != "none":
+            scales, quats, *_ = canonical(scales, quats, form)
+        return self._splats._replace(scales=scales, quats=quats)
 
 
 def smallest_within(compressor: Compressor, error: float) -> Candidate:
