@@ -150,6 +150,7 @@ def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> i
         Exit status of ``nsvq fit``, which writes a run into ``folder``.
     """
     from nsvq_lightning.cli import main as run
+    from nsvq_lightning.pixel_size import INVISIBLE
 
     steps = 3000 if options.max_steps is None else options.max_steps
     precision = vars(candidate.storage.precision)
@@ -169,6 +170,7 @@ def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> i
             "--callbacks.phases.prune_end=0",
             "--callbacks.density=null",
             "--callbacks.canonical.mode=auto",
+            f"--callbacks.canonical.floor={INVISIBLE}",
             "--callbacks.codebook_init.weights=contribution",
             "--callbacks.export.formats=[nsvq]",
             f"--trainer.max_steps={steps}",

@@ -25,6 +25,7 @@ __all__ = [
     "finite_rows",
     "finite_splats",
     "keep_rows",
+    "raise_scales",
     "replace_attribute",
     "reset_moments",
 ]
@@ -125,6 +126,12 @@ def change_coordinates(splats: Splats, optimizer: Optimizer, name: str, values: 
         if key in state:
             factors = maps if key == FIRST_MOMENT else maps.square()
             state[key] = (factors * state[key][:, None, :]).sum(2)
+
+
+@torch.no_grad()
+def raise_scales(splats: Splats, floor: float) -> None:
+    """Raise all log-scales below ``floor`` to it, in place; the moments stay."""
+    splats.scales.clamp_(min=floor)
 
 
 def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -> None:

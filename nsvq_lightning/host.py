@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
@@ -34,6 +34,7 @@ __all__ = [
     "raw_optimizer",
     "splat_host",
     "sum_over_processes",
+    "train_cameras",
     "train_contributions",
 ]
 
@@ -162,8 +163,8 @@ def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:
     return cast(Tensor, reduced)
 
 
-def train_contributions(trainer: Trainer, host: SplatHost) -> Tensor:
-    """Blending weight ``[N]`` of each splat in all train views, see :func:`nsvq_lightning.importance.contributions`.
+def train_cameras(trainer: Trainer, host: SplatHost, *, share: bool = False) -> Iterator[Camera]:
+    """Cameras of the train views, on the device of the splats; with ``share`` only this process's part of them.
 
     Raises:
         ValueError: The trainer has no data module with a scene.
@@ -171,9 +172,18 @@ def train_contributions(trainer: Trainer, host: SplatHost) -> Tensor:
     scene = getattr(getattr(trainer, "datamodule", None), "scene", None)
     if scene is None:
         raise ValueError(
-            "contributions of splats need the train views: fit with a data module that has a scene, or leave "
-            "contribution pruning and weights by contribution off"
+            "contributions of splats and the floor of scales need the train views: fit with a data module that has a "
+            "scene, or leave contribution pruning, weights by contribution and the floor off"
         )
-    own = scene.train[trainer.global_rank :: trainer.world_size]
-    cameras = (scene.cameras[index].to(host.device) for index in own)
+    indices = scene.train[trainer.global_rank :: trainer.world_size] if share else scene.train
+    return (scene.cameras[index].to(host.device) for index in indices)
+
+
+def train_contributions(trainer: Trainer, host: SplatHost) -> Tensor:
+    """Blending weight ``[N]`` of each splat in all train views, see :func:`nsvq_lightning.importance.contributions`.
+
+    Raises:
+        ValueError: The trainer has no data module with a scene.
+    """
+    cameras = train_cameras(trainer, host, share=True)
     return sum_over_processes(trainer, contributions(host.splats, cameras, host.render_splats))

@@ -24,8 +24,11 @@ from nsvq_lightning.callbacks import (
 )
 from nsvq_lightning.cli import main
 from nsvq_lightning.covariance_error import covariances
+from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.module import SplatModule
+from nsvq_lightning.pixel_size import scale_floor
 from nsvq_lightning.quantize import NSVQ
+from nsvq_lightning.schedule import Phase
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 Recipe = Callable[..., dict[str, Callback]]
@@ -36,7 +39,7 @@ LAST_BEFORE_CODEBOOKS = 27
 
 def options(**replaced: Callback) -> dict[str, Callback]:
     return {
-        "canonical": CanonicalCovariance("full"),
+        "canonical": CanonicalCovariance("full", floor=0.8),
         "contribution": ContributionPruning(share=0.02),
         "codebook_init": CodebookInit(weights="contribution"),
         "codebook_replacement": CodebookReplacement(jitter=0.5, reset_moments=True, end=40_000),
@@ -118,6 +121,35 @@ def test_a_run_that_starts_with_codebooks_starts_canonical(
     assert caplog.text.count("iteration 0: canonical covariances, form full") == 1
 
 
+class Scales(Callback):
+    """Log-scales and centres as codes are searched in each iteration."""
+
+    def __init__(self) -> None:
+        self.scales: dict[int, Tensor] = {}
+        self.means: dict[int, Tensor] = {}
+
+    def on_before_zero_grad(self, trainer: Trainer, pl_module: LightningModule, optimizer: Any) -> None:
+        assert isinstance(pl_module, SplatModule)
+        iteration = trainer.global_step + 1
+        self.scales[iteration] = pl_module.splats.scales.detach().clone()
+        self.means[iteration] = pl_module.splats.means.detach().clone()
+
+
+def test_scales_too_small_to_show_are_one_value_throughout_the_quantize_phase(
+    run: RunFactory, recipe: Recipe, demo_scene: Path
+) -> None:
+    look = Scales()
+    _, module = run([look, *recipe(canonical=CanonicalCovariance(floor=0.8)).values()])
+    scene = ColmapDataModule(str(demo_scene), factor=2).scene
+    first, last = LAST_BEFORE_CODEBOOKS + 1, module.schedule.ends[Phase.QUANTIZE]
+    floor = scale_floor(look.means[first], [scene.cameras[index] for index in scene.train], 0.8)
+    for iteration in range(first, last + 1):
+        scales = look.scales[iteration]
+        assert scales.min() == torch.tensor(floor)
+        assert (scales == scales.min()).float().mean() > 0.05
+    assert (look.scales[LAST_BEFORE_CODEBOOKS] < floor).float().mean() > 0.05
+
+
 def test_contribution_pruning_removes_splats_before_the_codebooks(run: RunFactory, recipe: Recipe) -> None:
     _, reference = run(recipe().values())
     _, pruned = run(recipe(contribution=ContributionPruning(share=0.05)).values())
@@ -183,6 +215,8 @@ def test_moments_of_replaced_codes_are_reset(run: RunFactory, recipe: Recipe, mo
 def test_bad_options_are_refused() -> None:
     with pytest.raises(ValueError, match="mode must be one of none, sign, full, auto"):
         CanonicalCovariance("sorted")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="floor is a number of pixels and must be at least 0"):
+        CanonicalCovariance(floor=-1.0)
     with pytest.raises(ValueError, match="share must be at least 0 and below 1"):
         ContributionPruning(share=1.0)
     with pytest.raises(ValueError, match="at must be at least 1"):
@@ -199,7 +233,12 @@ def test_options_are_reached_from_the_command_line(capsys: pytest.CaptureFixture
     with pytest.raises(SystemExit):
         main(
             [
-                *("fit", f"--data.root={demo_scene}", "--callbacks.canonical.mode=sign"),
+                *(
+                    "fit",
+                    f"--data.root={demo_scene}",
+                    "--callbacks.canonical.mode=sign",
+                    "--callbacks.canonical.floor=0.3",
+                ),
                 *("--callbacks.contribution.share=0.25", "--callbacks.codebook_init.weights=contribution"),
                 *("--callbacks.codebook_init.weighted=[quats, sh0]", "--model.quantizer=NSVQ"),
                 "--model.quantizer.start=spread",
@@ -211,7 +250,7 @@ def test_options_are_reached_from_the_command_line(capsys: pytest.CaptureFixture
     config = yaml.safe_load(capsys.readouterr().out)
     found = {name: one["init_args"] for name, one in config["callbacks"].items() if "init_args" in one}
     assert config["model"]["quantizer"]["init_args"]["start"] == "spread"
-    assert found["canonical"] == {"mode": "sign"}
+    assert found["canonical"] == {"mode": "sign", "floor": 0.3}
     assert found["contribution"] == {"share": 0.25, "at": 18_500}
     assert found["codebook_init"] == {"weights": "contribution", "weighted": ["quats", "sh0"]}
     assert found["codebook_replacement"]["jitter"] == 0.25
