@@ -8,7 +8,7 @@ from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest, nearest_reference
 from nsvq_lightning.quantize.nsvq import NSVQ
 from nsvq_lightning.quantize.post_hoc import PostHoc
-from nsvq_lightning.quantize.straight_through import StraightThrough
+from nsvq_lightning.quantize.straight_through import StraightThrough, TrainedStraightThrough
 from nsvq_lightning.quantize.vector_quantize import VectorQuantizeAdapter
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "Quantizer",
     "Refittable",
     "StraightThrough",
+    "TrainedStraightThrough",
     "VectorQuantizeAdapter",
     "codebook_sizes",
     "kmeans",

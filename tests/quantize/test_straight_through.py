@@ -1,17 +1,21 @@
 from __future__ import annotations
 
+from typing import TypeVar
+
 import pytest
 import torch
 from torch import Tensor
 
-from nsvq_lightning.quantize import StraightThrough
+from nsvq_lightning.quantize import CodebookQuantizer, StraightThrough, TrainedStraightThrough
 from nsvq_lightning.quantize.base import Quantizer, Refittable
 from nsvq_lightning.random import generator
 
+Kind = TypeVar("Kind", bound=CodebookQuantizer)
 
-def fitted(dim: int = 3, count: int = 300) -> tuple[StraightThrough, Tensor]:
+
+def fitted(dim: int = 3, count: int = 300, kind: type[Kind] = StraightThrough) -> tuple[Kind, Tensor]:  # type: ignore[assignment]
     x = torch.randn(count, dim, generator=generator(0))
-    quantizer = StraightThrough(16, dim, kmeans_steps=2)
+    quantizer = kind(16, dim, kmeans_steps=2)
     quantizer.fit(x, generator=generator(1))
     return quantizer, x.requires_grad_()
 
@@ -24,12 +28,17 @@ def distortion(quantizer: StraightThrough, x: Tensor) -> float:
 def test_is_a_quantizer_that_is_refitted() -> None:
     assert isinstance(StraightThrough(4, 3), Quantizer)
     assert isinstance(StraightThrough(4, 3), Refittable)
+    assert isinstance(TrainedStraightThrough(4, 3), Quantizer)
+    assert not isinstance(TrainedStraightThrough(4, 3), Refittable)
 
 
+@pytest.mark.parametrize("kind", [StraightThrough, TrainedStraightThrough])
 @pytest.mark.parametrize("dim", [3, 45])
 @pytest.mark.parametrize("chosen", [None, [0, 3, 4, 299], []])
-def test_value_is_the_code_and_the_gradient_goes_to_the_rows(dim: int, chosen: list[int] | None) -> None:
-    quantizer, x = fitted(dim)
+def test_value_is_the_code_and_the_gradient_goes_to_the_rows(
+    dim: int, chosen: list[int] | None, kind: type[CodebookQuantizer]
+) -> None:
+    quantizer, x = fitted(dim, kind=kind)
     rows = None if chosen is None else torch.tensor(chosen, dtype=torch.int64)
     which = slice(None) if rows is None else rows
     x_q, codes = quantizer(x, generator(2), rows)
@@ -40,7 +49,11 @@ def test_value_is_the_code_and_the_gradient_goes_to_the_rows(dim: int, chosen: l
     expected = torch.zeros_like(x)
     expected[which] = grad
     assert torch.equal(x.grad, expected)
-    assert quantizer.codebook.grad is None
+    if kind is StraightThrough:
+        assert quantizer.codebook.grad is None
+    else:  # as of the codes themselves, which fine-tuning trains
+        (to_codes,) = torch.autograd.grad(quantizer.decode(codes), quantizer.codebook, grad)
+        assert torch.equal(quantizer.codebook.grad, to_codes)
 
 
 def test_refit_lowers_the_distortion_and_stays_where_rows_stay() -> None:

@@ -20,7 +20,7 @@ from nsvq_lightning.losses import photometric_loss, ssim
 from nsvq_lightning.optim import SplatAdam, build_adam, set_columns
 from nsvq_lightning.quantize.diveq import DiVeQ
 from nsvq_lightning.quantize.nsvq import NSVQ
-from nsvq_lightning.quantize.straight_through import StraightThrough
+from nsvq_lightning.quantize.straight_through import StraightThrough, TrainedStraightThrough
 from nsvq_lightning.quantize.sums import lookup, sum_by_code
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.kernels import kernels_for
@@ -103,7 +103,7 @@ def test_optimiser(launches: list[str], rows_only: bool) -> None:
 
 
 @pytest.mark.parametrize("dim", [3, 4, 45])
-@pytest.mark.parametrize("kind", [NSVQ, DiVeQ, StraightThrough])
+@pytest.mark.parametrize("kind", [NSVQ, DiVeQ, StraightThrough, TrainedStraightThrough])
 @pytest.mark.parametrize("some", [True, False])
 def test_quantizer(launches: list[str], dim: int, kind: type[Any], some: bool) -> None:
     x, rows = on_device(1000, dim).requires_grad_(), on_device(100, dtype=torch.int64)
@@ -114,8 +114,10 @@ def test_quantizer(launches: list[str], dim: int, kind: type[Any], some: bool) -
     assert x.grad is not None
     assert x.grad.shape == x.shape
     expected = ["nearest_kernel"]
+    if kind in (NSVQ, DiVeQ):
+        expected += ["substitute_kernel", "radial_kernel"]
     if kind is not StraightThrough:
-        expected += ["substitute_kernel", "radial_kernel", "sum_kernel"]
+        expected += ["sum_kernel"]
         assert quantizer.codebook.grad.shape == (64, dim)
     assert launches == expected
 

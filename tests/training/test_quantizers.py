@@ -16,7 +16,15 @@ from nsvq_lightning.callbacks import CodebookRefit, CodebookReplacement, MetricR
 from nsvq_lightning.io.container import read_nsvq
 from nsvq_lightning.io.precision import Storage
 from nsvq_lightning.module import SplatModule
-from nsvq_lightning.quantize import CodebookQuantizer, DiVeQ, PostHoc, StraightThrough, VectorQuantizeAdapter, kmeans
+from nsvq_lightning.quantize import (
+    CodebookQuantizer,
+    DiVeQ,
+    PostHoc,
+    StraightThrough,
+    TrainedStraightThrough,
+    VectorQuantizeAdapter,
+    kmeans,
+)
 from nsvq_lightning.random import generator
 from nsvq_lightning.schedule import Phase, Schedule
 
@@ -24,7 +32,7 @@ RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 Recipe = Callable[..., dict[str, Callback]]
 Quantizers = type[CodebookQuantizer]
 
-KINDS = [StraightThrough, DiVeQ, PostHoc, VectorQuantizeAdapter]
+KINDS = [StraightThrough, TrainedStraightThrough, DiVeQ, PostHoc, VectorQuantizeAdapter]
 PAPER = Storage("paper")  # stores codes and codebooks as they are
 STEPS, PRUNE_END, MIDDLE, QUANTIZE_END = 60, 27, 46, 57
 
