@@ -171,6 +171,7 @@ def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> i
             "--callbacks.density=null",
             "--callbacks.canonical.mode=auto",
             f"--callbacks.canonical.floor={INVISIBLE}",
+            "--model.quantizer=TrainedStraightThrough",
             "--callbacks.codebook_init.weights=contribution",
             "--callbacks.export.formats=[nsvq]",
             f"--trainer.max_steps={steps}",
