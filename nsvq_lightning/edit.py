@@ -174,13 +174,12 @@ def finite_splats(splats: Splats, source: str) -> Splats:
     Raises:
         ValueError: No finite splat is left.
     """
-    mask, culprits = finite_rows(splats)
-    if not culprits:
-        return splats
-    if not bool(mask.any()):
-        raise ValueError(f"{source} holds no splat with finite numbers ({_named(culprits)}); there is nothing to train")
-    _warn_of_dropped(source, mask, culprits)
-    return Splats.from_tensors(*(tensor.detach()[mask] for tensor in splats.raw()))
+    kept = _finite_or_warn(
+        splats,
+        source,
+        lambda found: ValueError(f"{source} holds no splat with finite numbers ({found}); there is nothing to train"),
+    )
+    return splats if bool(kept.all()) else Splats.from_tensors(*(tensor.detach()[kept] for tensor in splats.raw()))
 
 
 def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> Tensor:
@@ -192,25 +191,27 @@ def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> Tensor:
     Raises:
         FloatingPointError: No finite splat is left.
     """
-    mask, culprits = finite_rows(splats)
-    if not culprits:
-        return mask
-    if not bool(mask.any()):
-        raise FloatingPointError(
-            f"step {step}: all {len(splats)} splats are non-finite ({_named(culprits)}); lower the learning rates"
-        )
-    _warn_of_dropped(f"step {step}", mask, culprits)
-    keep_rows(splats, optimizer, mask)
-    return mask
+    kept = _finite_or_warn(
+        splats,
+        f"step {step}",
+        lambda found: FloatingPointError(
+            f"step {step}: all {len(splats)} splats are non-finite ({found}); lower the learning rates"
+        ),
+    )
+    keep_rows(splats, optimizer, kept)
+    return kept
 
 
-def _warn_of_dropped(where: str, kept: Tensor, culprits: Mapping[str, int]) -> None:
-    dropped, total, found = int((~kept).sum()), len(kept), _named(culprits)
-    log.warning("%s: dropped %d of %d splats with non-finite values: %s", where, dropped, total, found)
-
-
-def _named(culprits: Mapping[str, int]) -> str:
-    return ", ".join(f"{name} in {count} rows" for name, count in culprits.items())
+def _finite_or_warn(splats: Splats, where: str, none_left: Callable[[str], Exception]) -> Tensor:
+    """Mask ``[N]`` of :func:`finite_rows`, with a warning of the others; without any finite splat, the error."""
+    kept, culprits = finite_rows(splats)
+    if culprits:
+        found = ", ".join(f"{name} in {count} rows" for name, count in culprits.items())
+        if not bool(kept.any()):
+            raise none_left(found)
+        dropped = int((~kept).sum())
+        log.warning("%s: dropped %d of %d splats with non-finite values: %s", where, dropped, len(kept), found)
+    return kept
 
 
 def _rebind(
