@@ -162,6 +162,7 @@ def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> i
             f"--model.init_from={options.input}",
             f"--model.sh_degree={candidate.scene.sh_degree}",
             f"--model.codebooks={{{codebooks}}}",
+            "--model.quantizer=TrainedStraightThrough",
             "--model.rates.means=1.6e-6",  # a trained scene is past the decay of this rate
             f"--model.seed={options.seed}",
             f"--model.storage.level={candidate.storage.level}",
@@ -171,7 +172,6 @@ def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> i
             "--callbacks.density=null",
             "--callbacks.canonical.mode=auto",
             f"--callbacks.canonical.floor={INVISIBLE}",
-            "--model.quantizer=TrainedStraightThrough",
             "--callbacks.codebook_init.weights=contribution",
             "--callbacks.export.formats=[nsvq]",
             f"--trainer.max_steps={steps}",

@@ -54,6 +54,6 @@ def scale_floor(means: Tensor, cameras: Iterable[Camera], pixels: float = INVISI
     Returns:
         The floor, or None where no view sees a splat.
     """
-    sizes = pixel_sizes(means[:: math.ceil(len(means) / SAMPLE)] if len(means) else means, cameras)
+    sizes = pixel_sizes(means[:: 1 + len(means) // SAMPLE], cameras)
     sizes = sizes[sizes.isfinite()]
     return math.log(pixels * float(sizes.quantile(CLOSE))) if len(sizes) else None
