@@ -12,7 +12,7 @@ from lightning.pytorch import LightningModule, Trainer
 from nsvq_lightning.canonical import Form, canonical
 from nsvq_lightning.covariance_error import form_errors
 from nsvq_lightning.edit import change_coordinates, finite_rows, raise_scales
-from nsvq_lightning.host import SplatHost, as_host, next_iteration, raw_optimizer, train_cameras
+from nsvq_lightning.host import SplatHost, as_host, raw_optimizer, train_cameras
 from nsvq_lightning.pixel_size import scale_floor
 from nsvq_lightning.random import derive_seed
 from nsvq_lightning.schedule import Phase
@@ -81,13 +81,14 @@ class CanonicalCovariance(LatchedCallback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Act after the last iteration before the quantize phase, so before anything looks at its first one."""
-        self._act_if_due(trainer, as_host(pl_module))
+        """Act after the last iteration before the quantize phase, so before anything looks at its first one.
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Keep scales from falling below the floor: Adam moves what has hardly a gradient as far as all else."""
+        After those of the phase, keep scales from falling below the floor: Adam moves what has hardly a gradient as far
+        as all else.
+        """
         host = as_host(pl_module)
-        if self._log_floor is not None and host.schedule.phase_at(next_iteration(trainer)) is Phase.QUANTIZE:
+        self._act_if_due(trainer, host)
+        if self._log_floor is not None and host.schedule.phase_at(trainer.global_step) is Phase.QUANTIZE:
             raise_scales(host.splats, self._log_floor)
 
     def _act_if_due(self, trainer: Trainer, host: SplatHost) -> None:

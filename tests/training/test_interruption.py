@@ -90,7 +90,7 @@ KINDS: dict[str, tuple[Callable[[], None], type[BaseException], int]] = {
 
 def every_option() -> dict[str, Callback]:
     return {
-        "canonical": CanonicalCovariance("full"),
+        "canonical": CanonicalCovariance("full", floor=1.0),
         "contribution": ContributionPruning(share=0.02),
         "codebook_init": CodebookInit(weights="contribution"),
         "codebook_refit": CodebookRefit(),
