@@ -43,7 +43,7 @@ class SplatHost(Protocol):
     """A module that trains splats; :class:`nsvq_lightning.SplatModule` is one.
 
     Callbacks know each other only through this state, and take their decisions from ``schedule`` and the trainer's
-    step, so that the order of their list does not matter.
+    step, so that each works without the others.
     """
 
     splats: Splats

@@ -202,10 +202,11 @@ class CodebookQuantizer(nn.Module, ABC):
         Raises:
             ValueError: ``threshold`` is not in [0, 1].
         """
-        # A code that is not finite attracts no row and must not be copied.
-        inactive = inactive_codes(self.usage, self.window, threshold) | ~torch.isfinite(self.codebook).all(1)
-        replaced = inactive.nonzero()[:, 0]
-        active = self.codebook[~inactive]
+        # A code that is not finite must not be copied; it is left to `mend`, as its moments are not finite either.
+        finite = torch.isfinite(self.codebook).all(1)
+        inactive = inactive_codes(self.usage, self.window, threshold)
+        replaced = (inactive & finite).nonzero()[:, 0]
+        active = self.codebook[~inactive & finite]
         if len(replaced) and not len(active):
             _log.warning("no code was active in %d iterations; the codebook is left as it is", int(self.window))
             replaced = replaced[:0]

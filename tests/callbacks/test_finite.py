@@ -90,10 +90,13 @@ def test_what_cannot_be_mended_ends_the_run() -> None:
         FiniteCodes(0)
 
 
-def test_replacement_copies_no_broken_code() -> None:
+def test_replacement_neither_copies_a_broken_code_nor_hides_it_with_moments_that_break_it_again() -> None:
     quantizer = fitted()
     plant(quantizer, 2)
-    quantizer.usage.fill_(10)
+    quantizer.usage.copy_(torch.tensor([10, 0, 0, 10, 10, 10]))
     quantizer.window.fill_(10)
-    assert quantizer.replace_unused(generator(1)).tolist() == [2]
+    assert quantizer.replace_unused(generator(1)).tolist() == [1]
+    assert quantizer.codebook.isfinite().all(1).tolist() == [True, True, False, True, True, True]
+    moments = search(quantizer, QUANTIZE)
     assert quantizer.codebook.isfinite().all()
+    assert all(moment[2].eq(0).all() for moment in moments.values())
