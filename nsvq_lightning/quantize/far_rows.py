@@ -33,11 +33,15 @@ def draw_far_rows(rows: Tensor, codebook: Tensor, count: int, generator: torch.G
 def spread_rows(rows: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """``[count, D]`` of different rows ``[N, D]``, N ≥ count, that reach into all corners: a start for k-means.
 
-    An eighth is a random sample; then each round draws as many far rows as there are already.
+    An eighth is a random sample; then each round draws as many far rows as there are already. Rows too close to those
+    for their squared distance to be above 0 come last.
     """
-    first = torch.randperm(len(rows), generator=generator, device=generator.device)[: -(-count // 2**_ROUNDS)]
-    chosen = rows[first.to(rows.device)]
+    shuffled = torch.randperm(len(rows), generator=generator, device=generator.device).to(rows.device)
+    chosen = shuffled[: -(-count // 2**_ROUNDS)]
     while len(chosen) < count:
-        wanted = min(len(chosen), count - len(chosen))
-        chosen = torch.cat([chosen, rows[draw_far_rows(rows, chosen, wanted, generator)]])
-    return chosen
+        far = draw_far_rows(rows, rows[chosen], min(len(chosen), count - len(chosen)), generator)
+        if len(far) == 0:
+            rest = shuffled[~torch.isin(shuffled, chosen)]
+            return rows[torch.cat([chosen, rest[: count - len(chosen)]])]
+        chosen = torch.cat([chosen, far])
+    return rows[chosen]

@@ -33,6 +33,12 @@ def test_a_spread_start_is_different_rows(count: int) -> None:
     assert (matches.sum(0) <= 1).all()
 
 
+def test_a_spread_start_of_rows_too_close_to_tell_apart_ends() -> None:
+    rows = torch.arange(100.0)[:, None] * 1e-25  # squares below float32
+    chosen = spread_rows(rows, 90, generator(1))
+    assert len(chosen.unique()) == 90
+
+
 def lopsided() -> Tensor:
     """5000 rows in a point, 50 clusters of 4 rows far from it and from each other."""
     g = generator(3)
