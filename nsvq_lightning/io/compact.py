@@ -51,7 +51,7 @@ from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.header import AttributeEntry, Header, tile
 from nsvq_lightning.io.morton import AXIS_BITS, Grid, morton_keys, nearest_before, unmorton
 from nsvq_lightning.io.opacity import opacity_of
-from nsvq_lightning.io.precision import Precision
+from nsvq_lightning.io.precision import MOST_OPACITY_LEVELS, Precision
 
 __all__ = ["decode_compact", "encode_compact"]
 
@@ -181,7 +181,8 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
 
 def _check_finite(scene: CompressedScene) -> None:
     arrays = {"means": scene.means, "opacities": scene.opacities, **scene.raw}
-    arrays |= {f"codebook of {name}": codebook for name, codebook in scene.codebooks.items()}
+    # Rows out of use are not stored.
+    arrays |= {f"codebook of {name}": rows[_in_use(rows, scene.codes[name])] for name, rows in scene.codebooks.items()}
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise ValueError(
@@ -207,10 +208,15 @@ def _compacted(
     codebook: NDArray[np.float32], codes: NDArray[np.integer], normalise: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """The rows that are used, each once, and the codes into them."""
-    used, codes = np.unique(codes, return_inverse=True)
-    rows = codebook[used] if len(used) else codebook[:1]
+    used = _in_use(codebook, codes)
+    rows = codebook[used] if len(codes) else np.zeros_like(codebook[:1])
     rows, merged = np.unique(_normalised(rows) if normalise else rows, axis=0, return_inverse=True)
-    return rows, merged.reshape(-1)[codes]
+    return rows, merged.reshape(-1)[np.cumsum(used)[codes] - 1]
+
+
+def _in_use(codebook: NDArray[np.float32], codes: NDArray[np.integer]) -> NDArray[np.bool_]:
+    in_use: NDArray[np.bool_] = np.bincount(codes, minlength=len(codebook)) > 0
+    return in_use
 
 
 def _normalised(quats: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -357,6 +363,6 @@ def _possible(entry: AttributeEntry, lengths: Mapping[str, int]) -> bool:
     if not 1 <= entry.codes <= 1 << 32 or entry.bits != code_bits(entry.codes):
         return False
     if entry.name == "opacities":
-        return entry.storage == "levels" and entry.codes <= 1 << 20 and entry.step == 0
+        return entry.storage == "levels" and entry.codes <= MOST_OPACITY_LEVELS and entry.step == 0
     enough = entry.codes <= _MOST_A_BYTE * lengths.get(f"{entry.name}.codebook", 0)
     return entry.storage == "codes" and entry.step > 0 and enough and entry.dim > 0

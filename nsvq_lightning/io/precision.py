@@ -7,12 +7,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-__all__ = ["DEFAULT_LEVEL", "LEVELS", "Precision", "Storage", "check_level"]
+__all__ = ["DEFAULT_LEVEL", "LEVELS", "MOST_OPACITY_LEVELS", "OPACITY_ERRORS", "Precision", "Storage", "check_level"]
 
 LEVELS = ("compact", "paper")
 """Compression levels: ``compact`` is small, ``paper`` stores float32 and whole bits, as the paper counts."""
 
 DEFAULT_LEVEL = "compact"
+
+MOST_OPACITY_LEVELS = 1 << 20
+"""Readers refuse files with more."""
+
+OPACITY_ERRORS = 0.5 / MOST_OPACITY_LEVELS, 0.25
+"""Smallest and largest error that the opacity may have."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +29,7 @@ class Precision:
         position: Of each coordinate, as a share of the splat's size: the geometric mean of its axis lengths. Small
             splats get more digits than large ones, down to 2⁻²¹ of the extent of the scene; the smallest thousandth of
             them gets no more than the others.
-        opacity: Of the opacity, which is in [0, 1].
+        opacity: Of the opacity, which is in [0, 1]; at least 2⁻²¹.
         codebook: Of the numbers of a codebook, as a share of how much neighbouring codes typically differ.
         scales: Of logarithms of axis lengths without a codebook; 0.01 is one per cent of the length.
         quats: Of the components of normalised quaternions without a codebook.
@@ -31,7 +37,7 @@ class Precision:
         shN: Of higher colour coefficients without a codebook.
 
     Raises:
-        ValueError: A number is not positive and finite, or the opacity's is above 1/4.
+        ValueError: A number is not positive and finite, or the opacity's is above 1/4 or below 2⁻²¹.
     """
 
     position: float = 0.05
@@ -47,8 +53,9 @@ class Precision:
             value = getattr(self, entry.name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"precision: {entry.name} must be a positive number, got {value}")
-        if self.opacity > 0.25:
-            raise ValueError(f"precision: opacity must be at most 0.25, got {self.opacity}")
+        least, most = OPACITY_ERRORS
+        if not least <= self.opacity <= most:
+            raise ValueError(f"precision: opacity must be from {least:.3g} to {most:g}, got {self.opacity}")
 
     @property
     def opacity_levels(self) -> int:

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from nsvq_lightning.io import CompressedScene, FormatError, read_header, read_nsvq, write_nsvq
 from nsvq_lightning.io.arrays import SplatArrays
 from nsvq_lightning.io.compressed import attribute_dims
-from nsvq_lightning.io.precision import Precision
+from nsvq_lightning.io.container import encode
+from nsvq_lightning.io.formats import save
+from nsvq_lightning.io.precision import OPACITY_ERRORS, Precision
 
 SIZES = {"quats": 64, "scales": 100, "sh0": 33, "shN": 16}
 
@@ -160,6 +162,20 @@ def test_extreme_numbers_are_stored_or_refused_by_name(tmp_path: Path) -> None:
     assert len(read_nsvq(path)) == 20
 
 
+def test_a_code_that_no_splat_has_may_be_broken(tmp_path: Path) -> None:
+    original, path = scene(100, {"scales": 8, "quats": 16}), tmp_path / "x.nsvq"
+    codes = original.codes["scales"]
+    codes[codes == 3] = 0
+    whole = encode(original)[1]
+    original.codebooks["scales"][3] = np.nan
+    assert encode(original)[1] == whole
+    original.codes["scales"][7] = 3
+    with pytest.raises(ValueError, match="codebook of scales: 3 numbers are not finite"):
+        write_nsvq(path, original)
+    assert save(original, path) == path.stat().st_size
+    assert len(read_nsvq(path)) == 99
+
+
 def test_every_changed_byte_and_every_truncation_is_one_clear_error(tmp_path: Path) -> None:
     path = tmp_path / "x.nsvq"
     write_nsvq(path, scene(30))
@@ -208,10 +224,26 @@ def test_tables_that_do_not_fit_are_refused(tmp_path: Path, change: Any) -> None
         read_nsvq(path)
 
 
-@pytest.mark.parametrize("bad", [{"position": 0.0}, {"opacity": 0.5}, {"shN": float("nan")}, {"quats": -1.0}])
-def test_precision_must_be_positive(bad: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"position": 0.0},
+        {"opacity": 0.5},
+        {"opacity": 1e-7},
+        {"opacity": 1e-320},
+        {"shN": float("nan")},
+        {"quats": -1.0},
+    ],
+)
+def test_precision_must_be_positive_and_readable(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"precision: {next(iter(bad))} must be"):
         Precision(**bad)
+
+
+def test_the_finest_opacities_are_read_back(tmp_path: Path) -> None:
+    original, path = scene(30), tmp_path / "x.nsvq"
+    write_nsvq(path, original, precision=Precision(opacity=OPACITY_ERRORS[0]))
+    assert len(read_nsvq(path)) == 30
 
 
 def test_it_is_much_smaller_than_the_level_paper(tmp_path: Path) -> None:
