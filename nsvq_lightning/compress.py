@@ -27,7 +27,7 @@ DEFAULT_EXPORT = ("nsvq", "ply")
 
 
 @torch.no_grad()
-def compress(splats: RawSplats, quantizers: Mapping[str, Quantizer], config: Mapping[str, Any]) -> CompressedScene:
+def compress(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> CompressedScene:
     """The scene as it is stored: codes and codebooks where there are quantizers, plain float32 elsewhere.
 
     Splats with non-finite values are left out with a warning.
@@ -35,7 +35,6 @@ def compress(splats: RawSplats, quantizers: Mapping[str, Quantizer], config: Map
     Args:
         splats: Raw attributes.
         quantizers: Quantizer by attribute; empty stores everything as it is.
-        config: Settings of the run, JSON values; the same run must give the same ones.
     """
     finite = finite_rows({name: _numpy(tensor) for name, tensor in splats._asdict().items()})
     codes = {name: _numpy(codes_of(splats, name, quantizer)) for name, quantizer in quantizers.items()}
@@ -46,7 +45,6 @@ def compress(splats: RawSplats, quantizers: Mapping[str, Quantizer], config: Map
         codebooks={name: _numpy(quantizer.codebook) for name, quantizer in quantizers.items()},
         raw={name: _numpy(attribute_rows(splats, name))[finite] for name in QUANTIZABLE if name not in quantizers},
         sh_degree=sh_degree_of(splats.shN),
-        config=dict(config),
     )
 
 

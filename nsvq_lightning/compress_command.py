@@ -53,6 +53,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"{options.output}: the compressed scene is a .nsvq file; 'nsvq convert' writes other formats")
     if options.max_steps is not None and options.root is None:
         parser.error("--max-steps trains with photos: give their COLMAP folder with --data.root")
+    if options.max_steps is not None and options.max_steps < 0:
+        parser.error(f"--max-steps must be at least 0, got {options.max_steps}")
+    if options.max_steps and options.codebooks == "none":
+        parser.error("--max-steps trains codebooks, and there are none with --codebooks=none")
     logging.basicConfig(format="%(message)s")
     logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
     try:
@@ -78,30 +82,31 @@ class Result:
 
 
 def _compress(options: argparse.Namespace) -> int:
-    from nsvq_lightning.io.arrays import SplatArrays
-    from nsvq_lightning.io.formats import load
+    from nsvq_lightning.io.formats import read_scene
+    from nsvq_lightning.io.frame import with_origin
     from nsvq_lightning.picture_error import decibels
     from nsvq_lightning.posthoc import Compressor
     from nsvq_lightning.viewpoints import measuring_cameras
 
     source: Path = options.input
-    arrays = SplatArrays.from_splats(load(source)).finite()
+    scene = read_scene(source)
+    arrays = scene.finite().arrays()
     if len(arrays) == 0:
         raise ValueError(f"{source} holds no splat with finite numbers; there is nothing to compress")
     cameras = measuring_cameras(options.root, arrays.means)
-    candidate = _candidate(options, arrays, cameras)
+    candidate = _candidate(options, arrays, cameras, scene.origin)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     result = Result(candidate.rung.name, candidate.data, candidate.error)
     if options.root is not None and options.max_steps != 0:
         if not candidate.rung.codebooks:
-            log.info("nothing to train: %s is exact enough without codebooks", source)
+            log.info("nothing to train: %s has no codebooks", candidate.rung.name)
         else:
             folder = options.output.parent / f"{options.output.stem}_training"
             status = _train(options, candidate, folder)
             if status != 0:
                 return status
             (path,) = sorted(folder.glob("*/version_*/scene.nsvq"), key=lambda path: path.stat().st_mtime)[-1:]
-            data = path.read_bytes()
+            data = with_origin(path.read_bytes(), scene.origin)
             # Made anew: the pictures of the original would fill the memory while training.
             error = Compressor(arrays, cameras, candidate.storage).error(data)
             result = _within_aim(options, result, Result(f"{result.settings}, trained with photos", data, error), path)
@@ -131,16 +136,18 @@ def _within_aim(options: argparse.Namespace, untrained: Result, trained: Result,
     return replace(untrained, settings=f"{untrained.settings}, without training")
 
 
-def _candidate(options: argparse.Namespace, arrays: SplatArrays, cameras: list[Camera]) -> Candidate:
-    from nsvq_lightning.posthoc import RUNGS, Compressor, finest_within, smallest_within
+def _candidate(
+    options: argparse.Namespace, arrays: SplatArrays, cameras: list[Camera], origin: tuple[float, float, float]
+) -> Candidate:
+    from nsvq_lightning.posthoc import LADDER, PLAIN, Compressor, finest_within, smallest_within
 
-    compressor = Compressor(arrays, cameras, Storage(options.level), options.seed)
+    compressor = Compressor(arrays, cameras, Storage(options.level), options.seed, origin)
     if options.max_error is not None:
         return smallest_within(compressor, options.max_error)
     if options.target_bytes is not None:
         return finest_within(compressor, options.target_bytes)
-    rungs = {rung.name: rung for rung in RUNGS}
-    return compressor.at(rungs[options.codebooks] if options.codebooks != "none" else RUNGS[1])
+    rungs = {rung.name: rung for rung in LADDER} | {"none": PLAIN}
+    return compressor.at(rungs[options.codebooks])
 
 
 def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> int:
@@ -163,13 +170,13 @@ def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> i
             f"--model.sh_degree={candidate.scene.sh_degree}",
             f"--model.codebooks={{{codebooks}}}",
             "--model.quantizer=TrainedStraightThrough",
+            "--model.quantizer.start=spread",
             "--model.rates.means=1.6e-6",  # a trained scene is past the decay of this rate
             f"--model.seed={options.seed}",
             f"--model.storage.level={candidate.storage.level}",
             *(f"--model.storage.precision.{name}={value}" for name, value in precision.items()),
             "--callbacks.phases.warmup_end=0",
             "--callbacks.phases.prune_end=0",
-            "--callbacks.density=null",
             "--callbacks.canonical.mode=auto",
             f"--callbacks.canonical.floor={INVISIBLE}",
             "--callbacks.codebook_init.weights=contribution",

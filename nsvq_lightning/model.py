@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, cast
 
 import torch
@@ -162,7 +162,8 @@ class SplatModel(LightningModule):
         quantizers = self.quantizers if self.phase >= Phase.QUANTIZE else {}
         if self.quantizers and not quantizers:
             log.warning("the %s phase has no codebooks yet: the scene is stored unquantized", self.phase.name.lower())
-        return compress(self.splats.raw(), quantizers, self._settings(quantizers))
+        scene = compress(self.splats.raw(), quantizers)
+        return replace(scene, config=self._settings(quantizers))  # PostHoc places its codebooks while they are stored
 
     def forward(self, camera: Camera) -> Render:
         """Render what the current phase trains, or outside training what a file would hold."""

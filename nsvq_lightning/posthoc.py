@@ -19,7 +19,7 @@ from nsvq_lightning.io.arrays import SplatArrays
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.container import decode, encode
 from nsvq_lightning.io.frame import frame, unframe
-from nsvq_lightning.io.precision import Precision, Storage
+from nsvq_lightning.io.precision import OPACITY_ERRORS, Precision, Storage
 from nsvq_lightning.picture_error import decibels, picture_error, pictures
 from nsvq_lightning.pixel_size import scale_floor
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, Quantizer, codebook_sizes
@@ -29,14 +29,14 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats import RawSplats
 
-__all__ = ["RUNGS", "Candidate", "Compressor", "Rung", "finest_within", "smallest_within"]
+__all__ = ["LADDER", "PLAIN", "PLAINS", "Candidate", "Compressor", "Rung", "finest_within", "smallest_within"]
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Rung:
-    """One setting of the ladder from large and exact to small.
+    """One setting between large and exact, and small.
 
     Attributes:
         name: What messages call it.
@@ -53,15 +53,17 @@ def _sizes(codes: int) -> dict[str, int]:
     return {name: max(1, int(codes * attribute.code_share)) for name, attribute in QUANTIZED.items()}
 
 
-RUNGS: tuple[Rung, ...] = (
-    Rung("no codebooks, a quarter of the errors", {}, 0.25),
-    Rung("no codebooks", {}),
+PLAIN = Rung("no codebooks", {})
+PLAINS: tuple[Rung, ...] = (Rung("no codebooks, a quarter of the errors", {}, 0.25), PLAIN)
+"""Settings without codebooks. They need no k-means, and are the smaller ones where splats are few."""
+
+LADDER: tuple[Rung, ...] = (
     *(Rung(f"{codes // 1024}k", _sizes(codes), 0.5) for codes in (1 << 17, 1 << 16, 1 << 15)),
     *(Rung(name, codebook_sizes(name)) for name in ("16k", "8k", "4k", "2k", "1k", "0.5k")),
     Rung("0.5k, twice the errors", codebook_sizes("0.5k"), 2.0),
     Rung("0.25k, four times the errors", _sizes(256), 4.0),
 )
-"""Settings from the most exact to the smallest."""
+"""Settings with codebooks, from the most exact to the smallest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,17 +101,30 @@ class Compressor:
         cameras: Views that errors and contributions are measured in.
         storage: Level and precision, which rungs make coarser or finer.
         seed: Seed of k-means.
+        origin: World coordinates of the point (0, 0, 0) of the positions; files keep it.
 
     Raises:
-        ValueError: There are no splats, or no cameras.
+        ValueError: There are no splats, or no camera shows any of them.
     """
 
-    def __init__(self, splats: SplatArrays, cameras: Sequence[Camera], storage: Storage, seed: int = 0) -> None:
+    def __init__(
+        self,
+        splats: SplatArrays,
+        cameras: Sequence[Camera],
+        storage: Storage,
+        seed: int = 0,
+        origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
         if len(splats) == 0 or not cameras:
             raise ValueError(f"cannot compress {len(splats)} splats seen by {len(cameras)} cameras")
         self._splats = RawSplats(*(tensor.detach() for tensor in splats.to_splats().raw()))
-        self._cameras, self._storage, self._seed = cameras, storage, seed
+        self._cameras, self._storage, self._seed, self._origin = cameras, storage, seed, origin
         self._pictures = pictures(self._splats, cameras)
+        if not any(bool(picture.any()) for picture in self._pictures):
+            raise ValueError(
+                f"all {len(cameras)} pictures of the scene are black, so no error can be measured: photos "
+                "(--data.root) must be of this scene, in its coordinates"
+            )
         self._done: dict[str, Candidate] = {}
 
     @cached_property
@@ -138,7 +153,8 @@ class Compressor:
     def _compressed(self, rung: Rung) -> Candidate:
         scene = self._quantized(rung.codebooks)
         errors = {name: rung.coarseness * value for name, value in vars(self._storage.precision).items()}
-        errors["opacity"] = min(errors["opacity"], 0.25)
+        least, most = OPACITY_ERRORS
+        errors["opacity"] = min(max(errors["opacity"], least), most)
         storage = replace(self._storage, precision=Precision(**errors))
         data = b"".join(frame(*encode(scene, storage.level, storage.precision)))
         return Candidate(rung, scene, storage, data, self.error(data))
@@ -157,7 +173,8 @@ class Compressor:
             weight = None if scales else self._weights
             quantizer.fit(rows, weight, generator(self._seed, 0, "kmeans", name))
             quantizers[name] = cast(Quantizer, quantizer)
-        return compress(splats, quantizers, {"codebooks": {name: len(q.codebook) for name, q in quantizers.items()}})
+        config = {"codebooks": {name: len(q.codebook) for name, q in quantizers.items()}}
+        return replace(compress(splats, quantizers), config=config, origin=self._origin)
 
     def _canonical(self, codebooks: Mapping[str, int]) -> RawSplats:
         codes = {name: codebooks[name] for name in ("scales", "quats") if name in codebooks}
@@ -174,42 +191,50 @@ class Compressor:
 
 
 def smallest_within(compressor: Compressor, error: float) -> Candidate:
-    """The coarsest rung whose error is at most ``error``.
+    """The smallest file whose error is at most ``error``.
 
     Raises:
-        ValueError: Even the most exact rung has a larger one.
+        ValueError: Even the most exact one has a larger one.
     """
-    found = _last(lambda rung: compressor.at(rung).error <= error)
-    if found is None:
-        best = compressor.at(RUNGS[0])
+    last = _last(lambda rung: compressor.at(rung).error <= error)
+    candidates = [compressor.at(rung) for rung in (*PLAINS, last or LADDER[0])]
+    within = [candidate for candidate in candidates if candidate.error <= error]
+    if not within:
+        best = min(candidates, key=_error_first)
         raise ValueError(
             f"no setting has an error of at most {error:g}: the most exact one has {best.error:.3g} in "
             f"{len(best.data)} bytes; allow more, or use level 'paper' without codebooks, which loses nothing"
         )
-    return compressor.at(found)
+    return min(within, key=lambda candidate: len(candidate.data))
 
 
 def finest_within(compressor: Compressor, target: int) -> Candidate:
-    """The most exact rung whose file has at most ``target`` bytes.
+    """The most exact file of at most ``target`` bytes.
 
     Raises:
-        ValueError: Even the smallest rung has more.
+        ValueError: Even the smallest one has more.
     """
-    found = _last(lambda rung: len(compressor.at(rung).data) > target)
-    rest = RUNGS[RUNGS.index(found) + 1 :] if found is not None else RUNGS
-    if not rest:
-        least = len(compressor.at(RUNGS[-1]).data)
+    last = _last(lambda rung: len(compressor.at(rung).data) > target)
+    first = 0 if last is None else LADDER.index(last) + 1
+    candidates = [compressor.at(rung) for rung in (*PLAINS, *LADDER[first:][:1])]
+    within = [candidate for candidate in candidates if len(candidate.data) <= target]
+    if not within:
+        least = min(len(candidate.data) for candidate in (*candidates, compressor.at(LADDER[-1])))
         raise ValueError(
             f"the smallest file of this scene has {least} bytes, more than {target}; most of them are positions: "
             "train with fewer splats (--callbacks.contribution.share, --callbacks.density.max_splats)"
         )
-    return compressor.at(rest[0])
+    return min(within, key=_error_first)
+
+
+def _error_first(candidate: Candidate) -> tuple[float, int]:
+    return candidate.error, len(candidate.data)
 
 
 def _last(holds: Callable[[Rung], bool]) -> Rung | None:
-    """The last rung for which something holds that holds up to some rung and not after it; None if for none."""
-    low, high = -1, len(RUNGS)
+    """The last rung of the ladder for which something holds that holds up to some rung and not after it, or None."""
+    low, high = -1, len(LADDER)
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if holds(RUNGS[middle]) else (low, middle)
-    return RUNGS[low] if low >= 0 else None
+        low, high = (middle, high) if holds(LADDER[middle]) else (low, middle)
+    return LADDER[low] if low >= 0 else None

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.constants import NEAR
 
 __all__ = ["cameras_around", "look_at", "measuring_cameras", "middle_of"]
 
@@ -54,6 +55,8 @@ def middle_of(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
 def cameras_around(means: NDArray[np.float32], count: int, width: int = 800, height: int = 533) -> list[Camera]:
     """Cameras on a ring around a scene, alternately low and high, twice as far as four fifths of its splats reach.
 
+    They stand farther off, with a narrower view of the same, where the scene is so small that it would be too near.
+
     Args:
         means: Positions ``[N, 3]``, N > 0.
         count: Number of cameras.
@@ -61,11 +64,14 @@ def cameras_around(means: NDArray[np.float32], count: int, width: int = 800, hei
         height: Pixels.
     """
     middle, reach = middle_of(means)
+    usual = 2 * reach
+    distance = max(usual, reach + 2 * NEAR)
+    angle = 2 * math.atan(usual * math.tan(math.radians(30)) / distance)
     cameras = []
     for number in range(count):
         turn, rise = 2 * math.pi * number / count, ELEVATIONS[number % len(ELEVATIONS)]
         direction = (math.cos(rise) * math.sin(turn), -math.sin(rise), -math.cos(rise) * math.cos(turn))
-        cameras.append(look_at(middle, middle + 2 * reach * np.array(direction), width, height, math.radians(60)))
+        cameras.append(look_at(middle, middle + distance * np.array(direction), width, height, angle))
     return cameras
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,9 @@ import torch
 from nsvq_lightning.cli import main
 from nsvq_lightning.io import CompressedScene, read_header, read_nsvq, write_ply
 from nsvq_lightning.io.arrays import SplatArrays
-from nsvq_lightning.io.formats import load
+from nsvq_lightning.io.formats import load, save
 from nsvq_lightning.io.precision import Precision, Storage
-from nsvq_lightning.posthoc import RUNGS, Compressor, finest_within, smallest_within
+from nsvq_lightning.posthoc import LADDER, PLAINS, Compressor, finest_within, smallest_within
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.viewpoints import cameras_around, middle_of
 
@@ -56,7 +57,7 @@ def test_cameras_stand_around_and_look_at_the_middle() -> None:
 
 def test_a_candidate_is_what_its_bytes_hold(compressor: Compressor, tmp_path: Path) -> None:
     """Oracle: the file, read and rendered here."""
-    candidate = compressor.at(RUNGS[-3])
+    candidate = compressor.at(LADDER[-3])
     (tmp_path / "x.nsvq").write_bytes(candidate.data)
     decoded, original = load(tmp_path / "x.nsvq"), arrays().to_splats()
     squares = []
@@ -66,31 +67,39 @@ def test_a_candidate_is_what_its_bytes_hold(compressor: Compressor, tmp_path: Pa
         squares.append(float((pair[0] - pair[1]).square().mean()))
     assert candidate.error == pytest.approx(math.sqrt(np.mean(squares)), rel=1e-6)
     assert candidate.psnr == pytest.approx(-10 * math.log10(np.mean(squares)), rel=1e-6)
-    assert compressor.at(RUNGS[-3]) is candidate
+    assert compressor.at(LADDER[-3]) is candidate
 
 
-def test_rungs_go_from_exact_to_small() -> None:
+def test_the_ladder_goes_from_exact_to_small() -> None:
     scene = arrays(4000)
     ladder = Compressor(scene, cameras_around(scene.means, 2, 96, 64), Storage())
-    found = [
-        ladder.at(rung) for rung in RUNGS if rung.name in ("no codebooks", "4k", "1k", "0.5k") or rung is RUNGS[-1]
-    ]
+    found = [ladder.at(rung) for rung in LADDER]
     sizes, errors = [len(c.data) for c in found], [c.error for c in found]
     assert sizes == sorted(sizes, reverse=True)
     assert errors == sorted(errors)
 
 
 def test_the_smallest_file_within_an_error_and_the_best_within_bytes(compressor: Compressor) -> None:
-    middle = compressor.at(RUNGS[8])
-    found = smallest_within(compressor, middle.error)
-    assert found.error <= middle.error
-    after = RUNGS[RUNGS.index(found.rung) + 1]
-    assert compressor.at(after).error > middle.error
-    found = finest_within(compressor, len(middle.data))
-    assert len(found.data) <= len(middle.data)
-    assert found.rung is RUNGS[0] or len(compressor.at(RUNGS[RUNGS.index(found.rung) - 1]).data) > len(middle.data)
-    assert finest_within(compressor, 10**9).rung is RUNGS[0]
-    assert smallest_within(compressor, 10.0).rung is RUNGS[-1]
+    """Oracle: all settings. Those without codebooks are smaller here than the first rungs, and worse."""
+    every = [compressor.at(rung) for rung in (*PLAINS, *LADDER)]
+    for aim in every:
+        found = smallest_within(compressor, aim.error)
+        assert len(found.data) == min(len(c.data) for c in every if c.error <= aim.error)
+        found = finest_within(compressor, len(aim.data))
+        assert found.error == min(c.error for c in every if len(c.data) <= len(aim.data))
+    assert finest_within(compressor, 10**9).error == min(c.error for c in every)
+    assert smallest_within(compressor, 10.0).rung is LADDER[-1]
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.01, 100.0])
+def test_an_error_does_not_depend_on_the_unit_of_the_scene(scale: float) -> None:
+    scene, errors = arrays(300), []
+    for factor in (1.0, scale):
+        means, scales = scene.means * np.float32(factor), scene.scales + np.float32(math.log(factor))
+        scaled = replace(scene, means=means, scales=scales)
+        errors.append(Compressor(scaled, cameras_around(means, 2, 96, 64), Storage()).at(LADDER[-1]).error)
+    assert errors[0] > 0.01
+    assert errors[1] == pytest.approx(errors[0], rel=0.2)
 
 
 def test_what_cannot_be_reached_says_what_can(compressor: Compressor) -> None:
@@ -103,6 +112,10 @@ def test_what_cannot_be_reached_says_what_can(compressor: Compressor) -> None:
 def test_scenes_that_cannot_be_seen_are_refused() -> None:
     with pytest.raises(ValueError, match="cannot compress 5 splats seen by 0 cameras"):
         Compressor(arrays(5), [], Storage())
+    scene = arrays(5)
+    elsewhere = cameras_around(scene.means + np.float32(1e4), 2, 96, 64)
+    with pytest.raises(ValueError, match="all 2 pictures of the scene are black"):
+        Compressor(scene, elsewhere, Storage())
 
 
 def test_the_command_compresses_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -150,6 +163,8 @@ def test_bad_files_are_one_line_and_status_1(
         (["a.ply", "b.ply"], "is a .nsvq file"),
         (["a.ply", "b.nsvq", "--max-steps", "5"], "--data.root"),
         (["a.ply", "b.nsvq", "--max-error", "0"], "must be above 0"),
+        (["a.ply", "b.nsvq", "--data.root=x", "--max-steps=-1"], "--max-steps must be at least 0, got -1"),
+        (["a.ply", "b.nsvq", "--data.root=x", "--max-steps=5", "--codebooks=none"], "there are none"),
         (["a.ply", "b.nsvq", "--max-error", "1", "--target-bytes", "5"], "not allowed with"),
     ],
 )
@@ -173,6 +188,15 @@ def test_photos_train_the_codebooks(tmp_path: Path, demo_scene: Path, capsys: py
     assert "PSNR" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("steps", ["0", "4"])
+def test_the_origin_of_the_positions_stays(steps: str, tmp_path: Path, demo_scene: Path) -> None:
+    source, output, origin = tmp_path / "scene.nsvq", tmp_path / "out.nsvq", (500_000.0, 4.5e6, 30.0)
+    save(arrays(300, degree=0).to_splats(), source, origin=origin)
+    options = ["--codebooks=0.5k", f"--data.root={demo_scene}", f"--max-steps={steps}"]
+    assert main(["compress", str(source), str(output), *options]) == 0
+    assert read_nsvq(output).origin == origin
+
+
 @pytest.mark.parametrize("aim", ["--target-bytes", "--max-error"])
 def test_photos_keep_to_the_aim(
     aim: str,
@@ -183,7 +207,8 @@ def test_photos_keep_to_the_aim(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # One rung: a looser aim must not bring larger codebooks.
-    monkeypatch.setattr("nsvq_lightning.posthoc.RUNGS", tuple(rung for rung in RUNGS if rung.name == "0.5k"))
+    monkeypatch.setattr("nsvq_lightning.posthoc.PLAINS", ())
+    monkeypatch.setattr("nsvq_lightning.posthoc.LADDER", tuple(rung for rung in LADDER if rung.name == "0.5k"))
     source, output = tmp_path / "scene.ply", tmp_path / "out.nsvq"
     write_ply(source, arrays(400, degree=0))
 
@@ -219,6 +244,6 @@ def test_photos_keep_to_the_aim(
 def test_precision_of_a_rung_follows_that_of_the_user() -> None:
     scene = arrays(200)
     storage = Storage(precision=Precision(position=0.2, opacity=0.1))
-    found = Compressor(scene, cameras_around(scene.means, 1, 40, 30), storage).at(RUNGS[-1])
+    found = Compressor(scene, cameras_around(scene.means, 1, 40, 30), storage).at(LADDER[-1])
     assert found.storage.precision.position == pytest.approx(0.8)
     assert found.storage.precision.opacity == 0.25

@@ -20,13 +20,14 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Mapping
+from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
 
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.header import Header
 
-__all__ = ["MAGIC", "VERSION", "frame", "read_frame", "read_header", "unframe"]
+__all__ = ["MAGIC", "VERSION", "frame", "read_frame", "read_header", "unframe", "with_origin"]
 
 MAGIC = b"\x89NSVQ\r\n\x1a"
 VERSION = 1
@@ -49,6 +50,16 @@ def frame(header: Header, streams: Mapping[str, bytes]) -> list[bytes]:
     for part in parts:
         digest.update(part)
     return [MAGIC, digest.digest(), *parts]
+
+
+def with_origin(data: bytes, origin: tuple[float, float, float]) -> bytes:
+    """A whole file whose positions are relative to another point of the world; all else is as it was.
+
+    Raises:
+        FormatError: As of :func:`unframe`.
+    """
+    header, streams = unframe(data)
+    return b"".join(frame(replace(header, origin=origin), {name: bytes(part) for name, part in streams.items()}))
 
 
 def unframe(data: bytes) -> tuple[Header, dict[str, memoryview]]:

@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from nsvq_lightning.module import SplatModule
+from nsvq_lightning.quantize import PostHoc
+from nsvq_lightning.schedule import Phase
 from nsvq_lightning.splats import ATTRIBUTES, Splats
 
 
@@ -31,3 +33,12 @@ def test_before_the_codebooks_everything_is_stored_as_it_is(caplog: pytest.LogCa
 def test_nothing_to_store_names_the_checkpoint() -> None:
     with pytest.raises(ValueError, match="--ckpt_path"):
         SplatModule().compressed()
+
+
+def test_the_sizes_of_codebooks_that_storing_places_are_those_that_it_placed() -> None:
+    module = SplatModule(codebooks={"scales": 4096, "sh0": 8}, quantizer=PostHoc, splats=splats())
+    module.phase = Phase.QUANTIZE
+    for _ in range(2):
+        stored = module.compressed()
+        assert stored.config["codebooks"] == {"scales": 40, "sh0": 8}
+        assert {name: len(rows) for name, rows in stored.codebooks.items()} == stored.config["codebooks"]

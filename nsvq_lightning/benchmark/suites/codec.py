@@ -132,7 +132,7 @@ def compressed(workload: Workload, setting: str) -> CompressedScene:
         rows = QUANTIZED[name].rows(getattr(workload.splats, name))
         module.fit(rows, generator=generator(0, 0, "codec", name))
         quantizers[name] = module
-    return compress(splats.raw(), quantizers, {})
+    return compress(splats.raw(), quantizers)
 
 
 def read_errors(read: SplatArrays, stored: SplatArrays, original: SplatArrays) -> dict[str, float]:
