@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import struct
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +29,9 @@ _READ = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 _MOST_A_BYTE = 10_000
 """Pixels a byte of the file; no photo comes near, an empty PNG of one bit a pixel has 8000."""
 
+_TIFF_SIZE, _TIFF_ORIENTATION = (256, 257), 274
+_LIMIT = threading.Lock()
+
 
 def _undecodable(path: Path, reason: str) -> SceneError:
     return SceneError(f"image {path} cannot be decoded ({reason}): copy it again, or remove it and run COLMAP again")
@@ -39,13 +44,28 @@ def image_size(path: Path) -> tuple[int, int]:
         SceneError: The file is not an image, or its head announces more pixels than there can be.
     """
     try:
-        with PIL.Image.open(path) as image:
+        with _opened(path) as image:
             width, height = image.size
-    except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:
+            if image.format == "TIFF":  # Pillow turns their size
+                width, height = (int(image.getexif()[tag]) for tag in _TIFF_SIZE)
+    except (OSError, ValueError, SyntaxError, KeyError) as error:
         raise _undecodable(path, str(error)) from error
     if width * height > _MOST_A_BYTE * path.stat().st_size:
         raise _undecodable(path, f"its head announces {width}x{height} pixels in {path.stat().st_size} bytes")
     return width, height
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[PIL.Image.Image]:
+    """The head of a picture of any size: nothing is decoded, and phones take more pixels than Pillow's limit."""
+    with _LIMIT:
+        usual, PIL.Image.MAX_IMAGE_PIXELS = PIL.Image.MAX_IMAGE_PIXELS, None
+        try:
+            image = PIL.Image.open(path)
+        finally:
+            PIL.Image.MAX_IMAGE_PIXELS = usual
+    with image:
+        yield image
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -56,7 +76,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     """
     data = path.read_bytes()  # imread itself fails on names outside the locale's character set
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), _READ) if _is_whole(data) else None
+        image = cv2.imdecode(np.frombuffer(_unturned(data), np.uint8), _READ) if _is_whole(data) else None
     except cv2.error as error:  # a size beyond OpenCV's limits
         raise _undecodable(path, str(error)) from error
     if image is None:
@@ -66,6 +86,22 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     if image.dtype != np.uint8:
         raise _undecodable(path, f"its pixels are {image.dtype}, accepted are 8 and 16 bit integers")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)  # type: ignore[no-any-return]
+
+
+def _unturned(data: bytes) -> bytes:
+    """A TIFF whose orientation is the usual one, as OpenCV turns them whatever it is told; any other file as it is."""
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
+    if order is None:
+        return data
+    try:
+        (start,) = struct.unpack_from(f"{order}I", data, 4)
+        (count,) = struct.unpack_from(f"{order}H", data, start)
+        for entry in range(start + 2, start + 2 + 12 * count, 12):
+            if struct.unpack_from(f"{order}H", data, entry)[0] == _TIFF_ORIENTATION:
+                return data[: entry + 8] + struct.pack(f"{order}H", 1) + data[entry + 10 :]
+    except struct.error:
+        pass  # damaged, which the decoder will say
+    return data
 
 
 def _is_whole(data: bytes) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 import PIL.Image
 import pytest
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nsvq_lightning.data.images import ImageSource, ImageStore, image_size, read_image
@@ -53,6 +54,35 @@ def test_exif_orientation_is_ignored_as_colmap_does(tmp_path: Path) -> None:
     picture.save(tmp_path / "turned.jpg", quality=95, exif=exif)
     assert image_size(tmp_path / "turned.jpg") == (64, 48)
     assert read_image(tmp_path / "turned.jpg").shape == (48, 64, 3)
+
+
+def _tiff(picture: NDArray[np.uint8], orientation: int, order: str) -> bytes:
+    """A plain RGB TIFF, written here as no library at hand writes both byte orders."""
+    height, width, _ = picture.shape
+    shorts = {256: width, 257: height, 258: 8, 259: 1, 262: 2, 274: orientation, 277: 3, 278: height}
+    entries = [(tag, 3, struct.pack(f"{order}HH", value, 0)) for tag, value in shorts.items()]
+    start = 8 + 2 + 12 * (len(entries) + 2) + 4
+    entries += [(273, 4, struct.pack(f"{order}I", start)), (279, 4, struct.pack(f"{order}I", picture.nbytes))]
+    table = b"".join(struct.pack(f"{order}HHI", tag, kind, 1) + value for tag, kind, value in sorted(entries))
+    head = struct.pack(f"{order}2sHIH", b"II" if order == "<" else b"MM", 42, 8, len(entries))
+    return head + table + struct.pack(f"{order}I", 0) + picture.tobytes()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("order", "<>")
+def test_the_orientation_of_a_tiff_is_ignored_too(tmp_path: Path, orientation: int, order: str) -> None:
+    """OpenCV and Pillow turn TIFFs unless they are kept from it."""
+    path, picture = tmp_path / "x.tif", cv2.resize(RGB, (64, 48))
+    path.write_bytes(_tiff(picture, orientation, order))
+    assert image_size(path) == (64, 48)
+    np.testing.assert_array_equal(read_image(path), picture)
+
+
+def test_a_picture_may_be_larger_than_the_limit_of_pillow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    PIL.Image.fromarray(cv2.resize(RGB, (200, 150))).save(tmp_path / "x.jpg")
+    monkeypatch.setattr(PIL.Image, "MAX_IMAGE_PIXELS", 1000)
+    assert image_size(tmp_path / "x.jpg") == (200, 150)
+    assert PIL.Image.MAX_IMAGE_PIXELS == 1000
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.02, 0.5, 0.9])
