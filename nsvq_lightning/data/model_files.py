@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import re
 import struct
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-__all__ = ["ModelFiles", "SceneError", "check_binary_files", "find_model"]
+__all__ = ["ModelFiles", "SceneError", "check_binary_files", "find_model", "larger_models"]
 
 FOLDERS = ("sparse/0", "sparse", ".")
 """Where a model may stand inside a scene folder, in the order of preference."""
@@ -71,6 +72,24 @@ def find_model(root: Path) -> ModelFiles:
     raise SceneError(
         f"no COLMAP model in {root}: looked for cameras, images and points3D (.bin or .txt) in {looked}; {details}. "
         "Run COLMAP on the photos or copy the missing files"
+    )
+
+
+def larger_models(root: Path) -> str | None:
+    """Which models of a scene folder have more images than :func:`find_model`'s ``sparse/0``, and what to do; or None.
+
+    COLMAP numbers the parts of a scene that it could not join, not always by their size.
+    """
+    counts = {}
+    for path in sorted((root / "sparse").glob("*/images.bin")):
+        with path.open("rb") as file:
+            counts[path.parent.name] = int.from_bytes(file.read(_U64.size), "little")
+    larger = [f"sparse/{name} has {count}" for name, count in counts.items() if count > counts.get("0", math.inf)]
+    if not larger:
+        return None
+    return (
+        f"sparse/0 has {counts['0']} images, {', '.join(larger)}: COLMAP could not join them; to use another, let the "
+        "folders change their names"
     )
 
 

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,11 +17,11 @@ from torch import Tensor
 
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, read_model
 from nsvq_lightning.data.images import ImageSource, ImageStore, image_size
-from nsvq_lightning.data.model_files import SceneError
+from nsvq_lightning.data.model_files import SceneError, larger_models
 from nsvq_lightning.data.undistort import Pinhole, Undistortion, rectify
 from nsvq_lightning.rendering.camera import Camera
 
-__all__ = ["Factor", "Scene", "SceneError", "View", "load_scene"]
+__all__ = ["OTHER_SHAPE", "Factor", "Scene", "SceneError", "View", "load_scene", "same_shape"]
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +32,12 @@ _CAMERAS_WITH_KEPT_MAPS = 8
 """With more distorted cameras than this (each photo its own, say) the undistortion maps would outweigh the images."""
 _FARTHEST = 1e4
 """Distance of the cameras from the origin, in extents, beyond which rounding moves splats by a good part of a pixel."""
+_ROUNDED = 0.01
+"""Relative difference of aspect ratios that rounding explains."""
+OTHER_SHAPE = (
+    "have another aspect ratio than their camera: they were cropped, turned or mixed up after COLMAP ran; copy the "
+    "photos it ran on"
+)
 _AT_CAMERA = 1e-6
 """Distance from a camera's centre, in extents, within which a point is no surface but a failed triangulation."""
 
@@ -127,6 +133,9 @@ def load_scene(
     _check_arguments(factor, max_width, test_every)
     root = Path(root)
     model = read_model(root)
+    larger = larger_models(root)
+    if larger is not None:
+        log.warning("%s: %s", root, larger)
     train, test = split_views([image.name for image in model.images], test_every)
     folder, divisor = _image_folder(root, images_folder, factor)
     sources = _image_sources(model, _locate(model.images, folder), divisor, max_width if factor is None else None)
@@ -210,10 +219,18 @@ def _locate(images: Sequence[ColmapImage], folder: Path) -> list[Path]:
     return found
 
 
+def same_shape(camera: Any, width: int, height: int) -> bool:
+    """Whether a picture has the aspect ratio of its ``pycolmap.Camera``, but for what rounding of its size explains."""
+    return bool(abs(width * camera.height / (height * camera.width) - 1) < _ROUNDED)
+
+
 def _image_sources(model: ColmapModel, paths: list[Path], divisor: int, max_width: int | None) -> list[ImageSource]:
     """One source a view; views with one camera and one file size share their undistortion."""
     sizes = [image_size(path) for path in paths]
     kinds = [(image.camera_id, size) for image, size in zip(model.images, sizes, strict=True)]
+    others = sum(not same_shape(model.cameras[camera_id], *size) for camera_id, size in kinds)
+    if others:
+        log.warning("%d of %d photos %s", others, len(kinds), OTHER_SHAPE)
     rectified: dict[tuple[int, tuple[int, int]], tuple[Pinhole, Undistortion | None]] = {}
     keep_maps = len(Counter(kinds)) <= _CAMERAS_WITH_KEPT_MAPS
     for camera_id, size in dict.fromkeys(kinds):

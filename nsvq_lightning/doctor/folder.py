@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from nsvq_lightning.data.colmap import ColmapModel, read_model
+from nsvq_lightning.data.model_files import larger_models
 from nsvq_lightning.data.scene import Scene, load_scene
 from nsvq_lightning.doctor.budget import check_budget
 from nsvq_lightning.doctor.finding import Finding, good, note, problem, report
@@ -29,6 +30,9 @@ def check_folder(root: Path) -> Iterator[Finding]:
     yield from failures
     if model is None:
         return
+    larger = larger_models(root)
+    if larger is not None:
+        yield problem("model", larger)
     for subject, check in (("cameras", check_cameras), ("points", check_points), ("overlap", check_overlap)):
         yield from report(subject, lambda check=check: check(model))  # type: ignore[misc]
     scene, failures = _attempt("scene", lambda: load_scene(root))

@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nsvq_lightning.data.colmap import ColmapModel
-from nsvq_lightning.data.scene import Scene, SceneError
+from nsvq_lightning.data.scene import OTHER_SHAPE, Scene, SceneError, same_shape
 from nsvq_lightning.doctor.finding import Finding, good, note, problem
+from nsvq_lightning.rendering.camera import Camera
 
 __all__ = ["Photo", "check_exposure", "check_photos", "check_sizes", "exposure_of", "read_photos"]
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
-ASPECT = 0.01
-"""Relative difference of aspect ratios that rounding explains."""
 GAMMA = 2.2
 LOWEST = 4.0
 """Grey level below which noise and black clipping say nothing about exposure."""
@@ -54,7 +53,9 @@ def read_photos(scene: Scene, model: ColmapModel) -> list[Photo]:
             image = scene.images.sources[index].load()
         except (SceneError, OSError) as error:
             return Photo(error=str(error))
-        return Photo(None, float(image.float().mean()), exposure_of(image, scene, index, rows.get(index)))
+        return Photo(
+            None, float(image.float().mean()), exposure_of(image, scene.cameras[index], model, rows.get(index))
+        )
 
     rows = _rows_by_view(model)
     with ThreadPoolExecutor(max_workers=torch.get_num_threads()) as pool:
@@ -67,28 +68,28 @@ def _rows_by_view(model: ColmapModel) -> Mapping[int, NDArray[np.int64]]:
     return {view: model.observations[model.observations[:, 1] == view, 0] for view in range(len(model.images))}
 
 
-def exposure_of(image: Tensor, scene: Scene, index: int, rows: NDArray[np.int64] | None) -> float | None:
+def exposure_of(image: Tensor, camera: Camera, model: ColmapModel, rows: NDArray[np.int64] | None) -> float | None:
     """Median over points of log2(light in this photo / light of the point's colour, the mean of all photos of it).
 
     Args:
         image: The photo ``[H, W, 3]`` uint8 RGB.
-        scene: Its scene.
-        index: Its view.
-        rows: Points that it saw.
+        camera: Its camera.
+        model: The model that has the points.
+        rows: Points of the model that it saw.
 
     Returns:
         Stops; None if it saw too few points that are neither black nor outside the picture.
     """
     if rows is None:
         return None
-    camera, points = scene.cameras[index], scene.points[rows].double()
+    points = torch.from_numpy(model.points[rows]).double()
     local = points @ camera.viewmat[:3, :3].T.double() + camera.viewmat[:3, 3].double()
     fx, fy, cx, cy = camera.intrinsics
     local, rows = local[local[:, 2] > 0], rows[(local[:, 2] > 0).numpy()]
     x, y = (fx * local[:, 0] / local[:, 2] + cx).floor(), (fy * local[:, 1] / local[:, 2] + cy).floor()
     inside = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
     here = image[y[inside].long(), x[inside].long()].double().mean(1)
-    usual = 255 * scene.colors[rows[inside.numpy()]].double().mean(1)
+    usual = torch.from_numpy(model.colors[rows[inside.numpy()]]).double().mean(1)
     clear = (here > LOWEST) & (usual > LOWEST)
     if int(clear.sum()) < ENOUGH:
         return None
@@ -118,14 +119,11 @@ def check_sizes(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
     for image, source in zip(model.images, scene.images.sources, strict=True):
         camera, (width, height) = model.cameras[image.camera_id], source.size
         if (width, height) != (camera.width, camera.height):
-            same = abs(width * camera.height / (height * camera.width) - 1) < ASPECT
-            kinds["scaled" if same else "of another aspect ratio"] += 1
+            kinds["scaled" if same_shape(camera, width, height) else "of another aspect ratio"] += 1
     used = Counter(f"{source.pinhole.width}x{source.pinhole.height}" for source in scene.images.sources)
     text = f"trained at {', '.join(size for size, _ in used.most_common(2))}{' and others' if len(used) > 2 else ''}"
     if kinds["of another aspect ratio"]:
-        count = kinds["of another aspect ratio"]
-        help_ = "they were cropped, turned or mixed up after COLMAP ran; copy the photos it ran on"
-        yield note("sizes", f"{text}; {count} files have another aspect ratio than their camera: {help_}", **kinds)
+        yield problem("sizes", f"{text}; {kinds['of another aspect ratio']} {OTHER_SHAPE}", **kinds)
     elif kinds["scaled"]:
         yield good("sizes", f"{text}; {kinds['scaled']} files are scaled, cameras are scaled with them", **kinds)
     else:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ import torch
 from lightning.fabric.utilities import move_data_to_device
 
 from nsvq_lightning.data.colmap import import_pycolmap
+from nsvq_lightning.data.model_files import larger_models
 from nsvq_lightning.data.scene import SceneError, load_scene, split_views
 
 SceneFactory = Callable[..., Path]
@@ -27,6 +29,28 @@ def test_a_scene_far_from_the_origin_is_warned_of(
     load_scene(root)
     assert "times the extent of the scene: float32 positions there are" in caplog.text
     assert "move the origin near the cameras" in caplog.text
+
+
+def test_photos_of_another_shape_than_their_camera_are_warned_of(
+    make_scene: SceneFactory, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = make_scene()
+    load_scene(root)
+    assert not caplog.messages
+    path = sorted((root / "images").iterdir())[2]
+    assert cv2.imwrite(str(path), cv2.rotate(cv2.imread(str(path)), cv2.ROTATE_90_CLOCKWISE))
+    load_scene(root)
+    (message,) = caplog.messages
+    assert re.match(r"1 of \d+ photos have another aspect ratio than their camera: they were cropped, turned", message)
+
+
+def test_a_larger_model_beside_the_first_is_named(make_scene: SceneFactory, caplog: pytest.LogCaptureFixture) -> None:
+    root = make_scene(views=9)
+    shutil.copytree(make_scene("more", views=10) / "sparse/0", root / "sparse/1")
+    shutil.copytree(make_scene("equal", views=9) / "sparse/0", root / "sparse/2")
+    load_scene(root)
+    assert caplog.messages == [f"{root}: {larger_models(root)}"]
+    assert "sparse/0 has 9 images, sparse/1 has 10: COLMAP could not join them" in caplog.text
 
 
 def test_every_eighth_name_is_a_test_view(make_scene: SceneFactory) -> None:

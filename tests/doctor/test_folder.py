@@ -3,6 +3,7 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -80,13 +81,14 @@ def test_damage_is_a_problem_and_no_exception(
     assert words in finding.text
 
 
-def test_files_outside_the_model_and_of_another_shape_are_noted(scene: Path) -> None:
+def test_files_outside_the_model_and_of_another_shape_are_named(scene: Path) -> None:
     picture = cv2.imread(str(scene / "images/view_000.png"))
     assert cv2.imwrite(str(scene / "images/new.png"), picture)
     assert cv2.imwrite(str(scene / "images/view_001.png"), picture[:, :50])
     findings = _by_subject(scene)
     assert findings["registered"].values["files"] == ["new.png"]
     assert findings["sizes"].values == {"of another aspect ratio": 1}
+    assert findings["sizes"].verdict == "problem"
 
 
 def test_exposure_is_measured_in_stops_where_points_were_seen(scene: Path) -> None:
@@ -101,6 +103,29 @@ def test_exposure_is_measured_in_stops_where_points_were_seen(scene: Path) -> No
     # half the grey level is 2.2 stops under a gamma of 2.2
     assert after[4] - before[4] == pytest.approx(-2.2, abs=0.1)
     assert after[:4] + after[5:] == before[:4] + before[5:]
+
+
+def test_points_that_a_scene_leaves_out_shift_no_exposure(scene: Path) -> None:
+    """A point at a camera's centre is in the model and not in the scene."""
+    model = read_model(scene, observations=True)
+    before = [photo.exposure for photo in read_photos(load_scene(scene), model)]
+    view = model.images[3].viewmat
+    model.points[0] = -view[:3, :3].T @ view[:3, 3]
+    loaded = load_scene(scene)
+    shorter = replace(loaded, points=loaded.points[1:], colors=loaded.colors[1:])
+    after = [photo.exposure for photo in read_photos(shorter, model)]
+    assert after == pytest.approx(before, abs=0.02)
+
+
+def test_a_larger_model_beside_the_first_is_a_problem(scene: Path) -> None:
+    shutil.copytree(scene / "sparse/0", scene / "sparse/1")
+    images = scene / "sparse/0/images.bin"
+    assert "model" not in _by_subject(scene)
+    reconstruction = import_pycolmap().Reconstruction(str(scene / "sparse/1"))
+    reconstruction.deregister_frame(next(iter(reconstruction.frames)))
+    reconstruction.write_binary(str(images.parent))
+    finding = _by_subject(scene)["model"]
+    assert (finding.verdict, finding.text.partition(":")[0]) == ("problem", "sparse/0 has 8 images, sparse/1 has 9")
 
 
 def test_shared_points_are_those_of_both_views() -> None:
