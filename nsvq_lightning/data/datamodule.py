@@ -80,8 +80,14 @@ class ColmapDataModule(LightningDataModule):
             _ = self.scene
 
     def setup(self, stage: str | None = None) -> None:
-        """Load the scene; a second call does nothing."""
-        _ = self.scene
+        """Load the scene; a second call does nothing.
+
+        Raises:
+            SceneError: The folder cannot be used, or there are fewer test views than processes, which a run would
+                notice at its first evaluation.
+        """
+        if stage != "predict":
+            self._check_share(len(self.scene.test), "test views")
 
     def train_dataloader(self) -> DataLoader[View]:
         """Endless train views from the trainer's step on; limit the run with ``max_steps``."""
@@ -109,12 +115,13 @@ class ColmapDataModule(LightningDataModule):
         """Number of train views each process has drawn before the trainer's current step."""
         return self.trainer.global_step * self.trainer.accumulate_grad_batches if self.trainer is not None else 0
 
+    def _check_share(self, count: int, views: str) -> None:
+        if count < self.process[1]:
+            raise SceneError(f"{count} {views} cannot be shared by {self.process[1]} processes: use fewer devices")
+
     def _ordered(self, indices: Sequence[int]) -> DataLoader[View]:
         rank, world_size = self.process
-        if len(indices) < world_size:
-            raise SceneError(
-                f"{len(indices)} views cannot be shared by {world_size} processes: use at most {len(indices)} devices"
-            )
+        self._check_share(len(indices), "views")
         views = _OrderedViews(self.scene, indices, stride=world_size)
         # Lightning leaves a DistributedSampler alone, whatever use_distributed_sampler says; this one pads nothing.
         sampler = UnrepeatedDistributedSampler(views, num_replicas=world_size, rank=rank, shuffle=False)
