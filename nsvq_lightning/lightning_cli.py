@@ -55,13 +55,14 @@ TRAINER_DEFAULTS: dict[str, Any] = {
     "max_epochs": -1,  # the sampler is endless: steps end the run
     "limit_val_batches": 0,  # MetricReport evaluates, outside the training time
     "num_sanity_val_steps": 0,
+    "devices": 1,  # more are asked for, as what a step is changes with them
     "use_distributed_sampler": False,  # the sampler knows its rank
     "enable_model_summary": False,
     "default_root_dir": "runs",
 }
 
-NAMED_CHECKPOINTS = frozenset({"last", "best", "hpc", "registry"})
-"""What Lightning takes in place of the path of a checkpoint."""
+NAMED_CHECKPOINTS = frozenset({"hpc", "registry"})
+"""What Lightning takes in place of the path of a checkpoint; ``last`` and ``best`` are those of its own callback."""
 
 PARSER_TEXTS: dict[str, Any] = {
     "prog": "nsvq",
@@ -152,8 +153,6 @@ class SplatCLI(LightningCLI):
         # Export reads no scene: any data module that can be built without options will do.
         data = DemoDataModule if subcommand == "export" else ColmapDataModule
         parser.set_defaults({"data": {"class_path": f"{data.__module__}.{data.__qualname__}"}})
-        if subcommand == "validate":
-            parser.set_defaults({"trainer.limit_val_batches": 1.0})
         if subcommand == "predict":
             # RenderWriter has them on disk; a list of all pictures would only fill the memory.
             parser.set_defaults({"return_predictions": False})
@@ -195,6 +194,8 @@ class SplatCLI(LightningCLI):
         ]
         if settings.logger in (None, True) and self.subcommand != "export":
             kwargs["logger"] = default_loggers(settings.default_root_dir, self._run_name())
+        if self.subcommand == "validate" and settings.limit_val_batches == 0:
+            kwargs["limit_val_batches"] = 1.0  # 0 is of a config that `fit` has written
         return super().instantiate_trainer(**kwargs)
 
     def _run_name(self) -> str:

@@ -137,6 +137,8 @@ def test_a_checkpoint_of_another_phase_is_refused_with_the_way_out(
         (["fit", "--model.codebooks=3k"], "choose one of 0.5k"),
         (["fit", "--trainer.max_steps=0"], "set trainer.max_steps"),
         (["fit", "--ckpt_path=broken.ckpt"], "broken.ckpt: truncated, or not a checkpoint"),
+        (["fit", "--ckpt_path=last"], "last: no such checkpoint"),
+        (["test", "--ckpt_path=best"], "best: no such checkpoint"),
         (["test", "--ckpt_path=broken.ckpt"], "broken.ckpt: truncated, or not a checkpoint"),
         (["export", "--ckpt_path=broken.ckpt"], "broken.ckpt: truncated, or not a checkpoint"),
         (["fit", "--config=empty.yaml"], "config empty.yaml holds nothing: give settings by name"),
@@ -265,8 +267,10 @@ def test_validate_scores_the_test_views(
 ) -> None:
     checkpoint = finished / "checkpoints" / "last.ckpt"
     arguments = [f"--ckpt_path={checkpoint}", f"--data.root={demo_scene}", "--data.factor=2"]
-    assert main(["validate", *arguments, f"--trainer.default_root_dir={tmp_path}", "--callbacks.progress=null"]) == 0
-    assert "val/psnr" in capsys.readouterr().out
+    for config in ([], [f"--config={finished / 'config.yaml'}"]):
+        output = [f"--trainer.default_root_dir={tmp_path}", "--callbacks.progress=null"]
+        assert main(["validate", *config, *arguments, *output]) == 0
+        assert "val/psnr" in capsys.readouterr().out
 
 
 def test_callbacks_can_be_configured_exchanged_removed_and_added(
@@ -302,6 +306,7 @@ def test_every_config_parses_and_has_the_codebooks_it_names(
     config = yaml.safe_load(capsys.readouterr().out)
     assert codebook_sizes(config["model"]["codebooks"])["scales"] == codes
     assert config["trainer"]["max_steps"] == 45_000
+    assert config["trainer"]["devices"] == 1  # whatever the machine has
 
 
 def test_plain_and_demo_configs_parse(demo_scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
