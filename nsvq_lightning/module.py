@@ -85,6 +85,7 @@ class SplatModule(SplatModel):
         storage = Storage.from_dict(storage) if isinstance(storage, Mapping) else storage
         start = splats if splats is not None else Splats(sh_degree)
         super().__init__(start, quantizer, codebooks, background, dssim_weight, rates, backend, seed, storage)
+        self.active_sh_degree = 0 if splats is None else splats.sh_degree
         self.save_hyperparameters(ignore=["splats"])
         self.init_from = init_from
         self.view_metrics = image_metrics()
@@ -106,6 +107,11 @@ class SplatModule(SplatModel):
             self.state.extent = scene.extent
         if len(self.splats) == 0:
             self.splats = self._first_splats(scene).to(self.device)
+        if self.extent <= 0.0 and scene is not None:
+            raise ValueError(
+                f"the {len(scene.train)} train photos of {scene.root} are taken from one place, so nothing has a depth "
+                "or a size: move while taking photos"
+            )
         if self.extent <= 0.0:
             raise ValueError("the extent of the scene is unknown; fit with a data module that has a scene")
 

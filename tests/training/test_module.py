@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -122,7 +123,7 @@ def test_random_backgrounds_change_with_the_step_and_not_in_evaluation(module: S
     first = random.train()(camera()).image
     random._micro_batch = 1
     assert not torch.equal(first, random(camera()).image)
-    assert torch.equal(random.eval()(camera()).image, module(camera()).image) is False  # degree 0 against degree 1
+    assert torch.equal(random.eval()(camera()).image, module(camera()).image)  # black
     assert float(random(camera()).image[0, 0].detach().min()) >= 0.0
     white = SplatModule(sh_degree=1, codebooks=None, background="white", splats=make_splats())
     white._trainer = module._trainer
@@ -247,3 +248,17 @@ def test_splats_of_a_file_that_are_not_finite_are_left_out(
     start.means.data.fill_(torch.inf)
     with pytest.raises(ValueError, match=r"a\.ply holds no splat with finite numbers \(means in 30 rows"):
         fitted()
+
+
+def test_trained_splats_are_rendered_with_all_their_coefficients() -> None:
+    splats = Splats.from_points(torch.randn(5, 3), torch.rand(5, 3), 2)
+    assert SplatModule(splats=splats).active_sh_degree == 2
+    assert SplatModule(sh_degree=2).active_sh_degree == 0  # from points, the degree grows
+
+
+def test_photos_from_one_place_are_named(make_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    module, data = SplatModule(), ColmapDataModule(str(make_scene()))
+    monkeypatch.setattr("nsvq_lightning.data.scene._extent", lambda centres: 0.0)
+    trainer = Trainer(max_steps=1, logger=False, enable_checkpointing=False, enable_progress_bar=False)
+    with pytest.raises(ValueError, match=r"the 7 train photos of .* are taken from one place.* move while"):
+        trainer.fit(module, data)
