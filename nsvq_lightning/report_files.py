@@ -45,6 +45,7 @@ def summarize(
     """
     file_bytes = path.stat().st_size
     ends = _phase_ends(host.history)
+    pruned = next((end for end in ends if end["phase"] == Phase.PRUNE.name.lower()), None)
     return {
         "psnr": _mean([score.psnr for score in scores]),
         "ssim": _mean([score.ssim for score in scores]),
@@ -58,7 +59,7 @@ def summarize(
         "level": read_header(path).level,
         "paper_level": dict(paper),
         "train_seconds": host.train_seconds,
-        "before_quantization": next((end for end in ends if end["phase"] == Phase.PRUNE.name.lower()), None),
+        "before_quantization": pruned if scene.codebooks else None,
         "phases": ends,
     }
 

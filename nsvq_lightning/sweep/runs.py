@@ -117,7 +117,7 @@ def _names(run: Run) -> dict[str, Any]:
 def _row(run: Run, training: Training) -> Row:
     """The row of a finished run."""
     metrics, record = training.metrics, training.record or {}
-    before = metrics["before_quantization"] if run.codebooks else None
+    before = metrics["before_quantization"]
     return Row(
         **_names(run),
         psnr=metrics["psnr"],

@@ -144,7 +144,6 @@ def test_the_report_measures_the_decoded_file(whole: Whole, demo_scene: Path) ->
     assert [end["iteration"] for end in metrics["phases"]] == list(SCHEDULE.ends)
     assert metrics["before_quantization"] == metrics["phases"][1]
     assert 0 < metrics["phases"][0]["seconds"] <= metrics["train_seconds"]
-    # The end of the run was evaluated before the file was written: both must agree.
     # The last evaluation of the run is of the scene before it is stored.
     assert metrics["phases"][-1]["psnr"] == pytest.approx(metrics["psnr"], abs=0.05)
     rows = list(csv.DictReader((folder / "views.csv").open()))
