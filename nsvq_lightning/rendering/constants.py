@@ -6,9 +6,11 @@ __all__ = [
     "ALPHA_MAX",
     "ALPHA_MIN",
     "BLUR",
+    "FINITE",
     "FRUSTUM_MARGIN",
     "HUGE_FOOTPRINT",
     "HUGE_QUATERNION",
+    "LARGEST_FOOTPRINT",
     "MIN_SQUARED_NORM",
     "NEAR",
     "SHRINK",
@@ -38,6 +40,12 @@ MIN_SQUARED_NORM = 1e-24
 
 HUGE_QUATERNION, SHRINK = 1e18, 2.0**-66
 """Quaternions with a larger number are made smaller by this factor first: their squares would overflow in float32."""
+
+LARGEST_FOOTPRINT = 1e36
+"""Float32 back-ends cull splats whose sum of both variances is larger, square pixels: not even that is safe there."""
+
+FINITE = 1e30
+"""Float32 back-ends cull splats that have anything beyond this on the image plane: it comes from broken attributes."""
 
 HUGE_FOOTPRINT = 1e10
 """Where the sum of both variances is larger, square pixels, the determinant is taken in units of that sum: its terms

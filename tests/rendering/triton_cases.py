@@ -7,13 +7,16 @@ milliseconds for a splat in a tile, so scenes are tiny.
 
 from __future__ import annotations
 
+import math
 import sys
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from triton.runtime.interpreter import InterpreterBuilder
 
 from nsvq_lightning.rendering.cuda.binning import list_tiles
 from nsvq_lightning.rendering.cuda.blend import blend, tile_grid
@@ -28,6 +31,10 @@ from scenes import front_camera, random_splats
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 assert_same = partial(oracle.assert_same, "cuda")
+
+# On a GPU the larger of a number and NaN is the number; in the interpreter it is NaN, unless it is told.
+InterpreterBuilder.create_maxnumf = lambda self, a, b: self.binary_op(a, b, np.fmax)
+InterpreterBuilder.create_minnumf = lambda self, a, b: self.binary_op(a, b, np.fmin)
 
 
 def on_device(splats: RawSplats) -> RawSplats:
@@ -70,6 +77,37 @@ def test_tiny_and_huge_splats() -> None:
     scales = splats.scales.clone()
     scales[:8], scales[8:10], scales[10:16, 0] = -12.0, 1.0, 0.5
     assert_same(splats._replace(scales=scales), front_camera(20, 16))
+
+
+@pytest.mark.parametrize("axes", [(10.0, 0.01, 0.01), (100.0, 1e-4, 1e-4)])
+def test_needles_keep_the_digits_of_their_gradients(axes: tuple[float, float, float]) -> None:
+    splats = random_splats(16, sh_degree=0, seed=3)
+    noise = 0.1 * torch.randn(16, 3, generator=torch.Generator().manual_seed(0))
+    scales = torch.tensor([math.log(axis) for axis in axes]) + noise
+    assert_same(splats._replace(scales=scales, opacities=splats.opacities - 1), front_camera(32, 20))
+
+
+def test_nothing_overflows_that_the_cpu_can_draw() -> None:
+    splats, camera = random_splats(4, sh_degree=0, seed=1), front_camera(12, 9)
+    long = splats._replace(quats=splats.quats * 1e20)
+    assert_same(long, camera)
+    for scale in (1e7, 1e12):
+        large = splats._replace(scales=splats.scales + math.log(scale))
+        (ours, _), (expected, _) = run(large, camera, "cuda", torch.float32), run(large, camera, "cpu", torch.float32)
+        assert expected.radii.all()
+        assert torch.equal(ours.radii > 0, expected.radii > 0)
+        torch.testing.assert_close(ours.image, expected.image, atol=1e-3, rtol=0)
+
+
+def test_a_colour_that_is_no_number_shows() -> None:
+    splats, camera = random_splats(4, sh_degree=0, seed=1), front_camera(16, 12)
+    sh0 = splats.sh0.clone()
+    sh0[0, 0, 1] = math.nan
+    (ours, _), (expected, _) = (
+        run(splats._replace(sh0=sh0), camera, backend, torch.float32) for backend in ("cuda", "cpu")
+    )
+    assert expected.image.isnan().any()
+    assert ours.image[expected.image.isnan()].isnan().all()
 
 
 @pytest.mark.parametrize("count", [1, 129])

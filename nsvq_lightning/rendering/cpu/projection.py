@@ -89,11 +89,8 @@ NEAR = F(constants.NEAR)
 BLUR = F(constants.BLUR)
 BLUR_SQUARED = F(constants.BLUR**2)
 MIN_SQUARED_NORM = F(constants.MIN_SQUARED_NORM)
-FINITE = F(1e30)
-"""Anything beyond this on the image plane comes from broken attributes; the splat is culled."""
-HUGE_FOOTPRINT = F(constants.HUGE_FOOTPRINT)
-LARGEST_FOOTPRINT = F(1e36)
-"""Splats whose sum of both variances is larger, square pixels, are culled: not even that is safe from overflow."""
+FINITE = F(constants.FINITE)
+HUGE_FOOTPRINT, LARGEST_FOOTPRINT = F(constants.HUGE_FOOTPRINT), F(constants.LARGEST_FOOTPRINT)
 HUGE_QUATERNION, SHRINK = F(constants.HUGE_QUATERNION), F(constants.SHRINK)
 LN2 = F(np.log(2.0))
 COVARIANCE_SCALE = F(2 * np.log(2.0) ** 2)

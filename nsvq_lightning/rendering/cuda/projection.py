@@ -47,8 +47,10 @@ BLUR = tl.constexpr(constants.BLUR)
 BLUR_SQUARED = tl.constexpr(constants.BLUR**2)
 FRUSTUM_MARGIN = tl.constexpr(constants.FRUSTUM_MARGIN)
 MIN_SQUARED_NORM = tl.constexpr(constants.MIN_SQUARED_NORM)
-FINITE = tl.constexpr(1e30)
-"""Anything beyond this on the image plane comes from broken attributes; the splat is culled."""
+FINITE = tl.constexpr(constants.FINITE)
+HUGE_FOOTPRINT = tl.constexpr(constants.HUGE_FOOTPRINT)
+LARGEST_FOOTPRINT = tl.constexpr(constants.LARGEST_FOOTPRINT)
+HUGE_QUATERNION, SHRINK = tl.constexpr(constants.HUGE_QUATERNION), tl.constexpr(constants.SHRINK)
 
 BLOCK = 128
 """Splats a program."""
@@ -60,6 +62,18 @@ RADIUS_ONLY = -1
 def dot3(a, b):
     """Dot product of two triples."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@triton.jit
+def cross(a, b):
+    """Cross product of two triples."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@triton.jit
+def positive(x):
+    """max(x, 0) that keeps NaN, so that the loss shows it; ``tl.maximum`` drops it on a GPU."""
+    return tl.where(x < 0, 0.0, x)
 
 
 @triton.jit
@@ -89,13 +103,16 @@ def row_of(view, k):
 def axes_of(quat, log_scales):
     """Unit quaternion and its inverse norm, axis lengths, and the rows of M = R·diag(lengths)."""
     w, x, y, z = quat
+    largest = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
+    shrink = tl.where(largest > HUGE_QUATERNION, SHRINK, 1.0)
+    w, x, y, z = w * shrink, x * shrink, y * shrink, z * shrink
     inverse = 1 / tl.sqrt(tl.maximum(w * w + x * x + y * y + z * z, MIN_SQUARED_NORM))
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
     s0, s1, s2 = tl.exp2(log_scales[0] * LOG2_E), tl.exp2(log_scales[1] * LOG2_E), tl.exp2(log_scales[2] * LOG2_E)
     m0 = ((1 - 2 * (y * y + z * z)) * s0, 2 * (x * y - w * z) * s1, 2 * (x * z + w * y) * s2)
     m1 = (2 * (x * y + w * z) * s0, (1 - 2 * (x * x + z * z)) * s1, 2 * (y * z - w * x) * s2)
     m2 = (2 * (x * z - w * y) * s0, 2 * (y * z + w * x) * s1, (1 - 2 * (x * x + y * y)) * s2)
-    return (w, x, y, z), inverse, (s0, s1, s2), m0, m1, m2
+    return (w, x, y, z), inverse * shrink, (s0, s1, s2), m0, m1, m2
 
 
 @triton.jit
@@ -166,8 +183,10 @@ def project_kernel(
     u, v = image_axes(t0, m0, m1, m2), image_axes(t1, m0, m1, m2)
     xx, xy, yy = dot3(u, u), dot3(u, v), dot3(v, v)
     # |u|²|v|² - (u·v)² = |u × v|² (Lagrange): no cancellation for large splats.
-    normal = (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
-    determinant = dot3(normal, normal) + (xx + yy) * BLUR + BLUR_SQUARED
+    normal, size = cross(u, v), xx + yy
+    unit = tl.where(size > HUGE_FOOTPRINT, 1 / size, 1.0)
+    normal = (normal[0] * unit, normal[1] * unit, normal[2] * unit)
+    determinant = dot3(normal, normal) + (size * BLUR + BLUR_SQUARED) * unit * unit
     xx, yy = xx + BLUR, yy + BLUR
 
     px, py = fx * (x * inverse) + cx, fy * (y * inverse) + cy
@@ -179,7 +198,8 @@ def project_kernel(
     top, bottom = tl.maximum(tl.ceil(py - half_y - 0.5), 0.0), tl.floor(py + half_y - 0.5)
     right, bottom = tl.minimum(right, width - 1.0), tl.minimum(bottom, height - 1.0)
     seen = inside & (z > NEAR) & (reach > 0) & (left <= right) & (top <= bottom)
-    seen = seen & (determinant < FINITE) & (tl.abs(px) < FINITE) & (tl.abs(py) < FINITE) & (logit >= -FINITE)
+    seen = seen & (size < LARGEST_FOOTPRINT) & (determinant < FINITE)
+    seen = seen & (tl.abs(px) < FINITE) & (tl.abs(py) < FINITE) & (logit >= -FINITE)
     # A scale of -inf is a splat without extent, one of +inf or NaN is broken.
     seen = seen & (scale[0] + scale[1] + scale[2] < FINITE)
 
@@ -197,7 +217,7 @@ def project_kernel(
         tl.store(box + 3, y1 - y0 + 1, mask=seen)
         dx, dy, dz, _ = unit_direction(view, mean)
         red, green, blue = color(sh0, shN, row, row * stride, dx, dy, dz, seen, DEGREE)
-        a = tl.sqrt(yy / determinant) * FACTOR_SCALE
+        a = tl.sqrt(yy * unit / determinant * unit) * FACTOR_SCALE
         record = records + row * RECORD
         tl.store(record + X, px, mask=seen)
         tl.store(record + Y, py, mask=seen)
@@ -205,9 +225,9 @@ def project_kernel(
         tl.store(record + B, -(a * (xy / yy)), mask=seen)
         tl.store(record + C, 1 / tl.sqrt(yy) * FACTOR_SCALE, mask=seen)
         tl.store(record + LOG2_OPACITY, log2_opacity, mask=seen)
-        tl.store(record + RED, tl.maximum(red, 0.0), mask=seen)
-        tl.store(record + GREEN, tl.maximum(green, 0.0), mask=seen)
-        tl.store(record + BLUE, tl.maximum(blue, 0.0), mask=seen)
+        tl.store(record + RED, positive(red), mask=seen)
+        tl.store(record + GREEN, positive(green), mask=seen)
+        tl.store(record + BLUE, positive(blue), mask=seen)
         tl.store(record + DEPTH, z, mask=seen)
 
 
@@ -253,15 +273,22 @@ def project_backward_kernel(
     q, q_inverse, s, m0, m1, m2 = axes_of(quat, scale)
     u, v = image_axes(t0, m0, m1, m2), image_axes(t1, m0, m1, m2)
 
-    # dL/dΣ = ½ Fᵀ (Σ h uuᵀ) F, symmetric, F the factor of the exponent; doubled for both orders of U·Uᵀ.
+    # dL/dΣ = ½ Fᵀ S F with S = Σ h uuᵀ, so dL/dU = Fᵀ S (F U). The rows of F U are a·u + b·v and c·v; by Lagrange's
+    # identity the first is a·(v × (u × v) + blur·u)/|v|², which keeps its digits on needles.
     total, record = totals + rank * RECORD, records + rank * RECORD
     a, b, c = load3(record + A, seen)
     uu, uv, vv = load3(total + SUM_UU, seen)
-    uu, uv, vv = uu * COVARIANCE_SCALE, uv * COVARIANCE_SCALE, vv * COVARIANCE_SCALE
-    p0, p1, p2 = a * uu, b * uu + c * uv, b * uv + c * vv
-    gxx, gxy, gyy = 2 * (p0 * a), 2 * (p1 * a), 2 * (p1 * b + p2 * c)
-    gu = (gxx * u[0] + gxy * v[0], gxx * u[1] + gxy * v[1], gxx * u[2] + gxy * v[2])
-    gv = (gxy * u[0] + gyy * v[0], gxy * u[1] + gyy * v[1], gxy * u[2] + gyy * v[2])
+    uu, uv, vv = uu * (2 * COVARIANCE_SCALE), uv * (2 * COVARIANCE_SCALE), vv * (2 * COVARIANCE_SCALE)
+    per_yy = 1 / (dot3(v, v) + BLUR)
+    n = cross(u, v)
+    n = cross(v, (n[0] * per_yy, n[1] * per_yy, n[2] * per_yy))
+    blur = per_yy * BLUR
+    fu = (a * (blur * u[0] + n[0]), a * (blur * u[1] + n[1]), a * (blur * u[2] + n[2]))
+    fv = (c * v[0], c * v[1], c * v[2])
+    e = (uu * fu[0] + uv * fv[0], uu * fu[1] + uv * fv[1], uu * fu[2] + uv * fv[2])
+    f = (uv * fu[0] + vv * fv[0], uv * fu[1] + vv * fv[1], uv * fu[2] + vv * fv[2])
+    gu = (a * e[0], a * e[1], a * e[2])
+    gv = (b * e[0] + c * f[0], b * e[1] + c * f[1], b * e[2] + c * f[2])
 
     gm0, gm1, gm2 = (
         scaled_row(t0[0], t1[0], gu, gv),
@@ -270,9 +297,9 @@ def project_backward_kernel(
     )
     store3(
         g_scales + 3 * row,
-        m0[0] * gm0[0] + m1[0] * gm1[0] + m2[0] * gm2[0],
-        m0[1] * gm0[1] + m1[1] * gm1[1] + m2[1] * gm2[1],
-        m0[2] * gm0[2] + m1[2] * gm1[2] + m2[2] * gm2[2],
+        fu[0] * e[0] + fv[0] * f[0],
+        fu[1] * e[1] + fv[1] * f[1],
+        fu[2] * e[2] + fv[2] * f[2],
         seen,
     )
     gw, gx, gy, gz = quaternion_gradient(
