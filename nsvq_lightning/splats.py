@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from nsvq_lightning.sh_degree import sh_coefficients, shN_degree
 
-__all__ = ["ATTRIBUTES", "RawSplats", "SplatTensors", "Splats", "sh_degree_of"]
+__all__ = ["ATTRIBUTES", "RawSplats", "SplatTensors", "Splats", "check_shapes", "sh_degree_of"]
 
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 """Names of the raw attributes, in the order of :meth:`Splats.from_tensors`."""
@@ -70,7 +70,12 @@ def sh_degree_of(shN: Tensor) -> int:
     return shN_degree(shN.shape[1])
 
 
-def _check_shapes(tensors: Mapping[str, Tensor]) -> None:
+def check_shapes(tensors: Mapping[str, Tensor]) -> None:
+    """Refuse attributes whose shapes do not fit each other.
+
+    Raises:
+        ValueError: One does not fit.
+    """
     n = tensors["means"].shape[0]
     expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3)}
     for name, shape in expected.items():
@@ -129,7 +134,7 @@ class Splats(nn.Module):
             ValueError: A shape does not fit the others.
         """
         tensors = dict(zip(ATTRIBUTES, (means, quats, scales, opacities, sh0, shN), strict=True))
-        _check_shapes(tensors)
+        check_shapes(tensors)
         splats = cls(sh_degree_of(shN))
         for name, tensor in tensors.items():
             setattr(splats, name, nn.Parameter(tensor.detach().clone()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -21,7 +22,8 @@ class Camera:
         height: Image height in pixels.
 
     Raises:
-        ValueError: A matrix has another shape, the image is empty, or the focal lengths are not positive.
+        ValueError: A matrix has another shape, the image is empty, the focal lengths are not positive and finite, or
+            there is skew.
     """
 
     K: Tensor
@@ -41,8 +43,10 @@ class Camera:
         fx, fy = float(self.K[0, 0]), float(self.K[1, 1])
         # Kept as numbers: reading them from an accelerator would stall it at every render.
         object.__setattr__(self, "_intrinsics", (fx, fy, float(self.K[0, 2]), float(self.K[1, 2])))
-        if not (fx > 0 and fy > 0):
-            raise ValueError(f"Camera.K needs positive focal lengths, got fx={fx}, fy={fy}")
+        if not (0 < fx < math.inf and 0 < fy < math.inf):
+            raise ValueError(f"Camera.K needs positive, finite focal lengths, got fx={fx}, fy={fy}")
+        if self.K[0, 1] != 0:
+            raise ValueError(f"Camera.K must be without skew, got {float(self.K[0, 1])}: no back-end renders it")
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float]:

@@ -16,7 +16,7 @@ from nsvq_lightning.rendering.cuda import support as cuda_support
 from nsvq_lightning.rendering.gsplat import support as gsplat_support
 from nsvq_lightning.rendering.kernels import kernels_for
 from nsvq_lightning.rendering.reference import render_reference, visible_rows
-from nsvq_lightning.splats import SplatTensors, sh_degree_of
+from nsvq_lightning.splats import ATTRIBUTES, SplatTensors, check_shapes, sh_degree_of
 
 __all__ = ["BACKENDS", "Render", "fast_backends", "render", "resolve_backend", "visible"]
 
@@ -70,10 +70,11 @@ def render(
         Image, alpha, radii, projected centres and depth; see :class:`Render`.
 
     Raises:
-        ValueError: Unknown back-end, or a back-end that cannot take the device or type of the splats; ``sh_degree``
-        above
-            the stored degree; a background that is not ``[3]``.
+        ValueError: Unknown back-end, or a back-end that cannot take the device or type of the splats; attributes that
+            differ in device or type, or whose shapes do not fit; ``sh_degree`` above the stored degree; a background
+            that is not ``[3]``.
     """
+    _check_alike(splats)
     stored = sh_degree_of(splats.shN)
     degree = stored if sh_degree is None else sh_degree
     if not 0 <= degree <= stored:
@@ -83,7 +84,19 @@ def render(
         background = torch.zeros(3, dtype=means.dtype, device=means.device)
     elif tuple(background.shape) != (3,):
         raise ValueError(f"background must be one RGB colour of shape [3], got {list(background.shape)}")
+    background = background.to(means)
     return Render(*_rasterizer(resolve_backend(backend, means))(splats, camera, degree, background))
+
+
+def _check_alike(splats: SplatTensors) -> None:
+    """Kernels read the memory of all attributes as they read that of the means."""
+    tensors = {name: getattr(splats, name) for name in ATTRIBUTES}
+    check_shapes(tensors)
+    kinds = {name: (tensor.dtype, tensor.device) for name, tensor in tensors.items()}
+    for name, kind in kinds.items():
+        if kind != kinds["means"]:
+            expected = " on ".join(map(str, kinds["means"]))
+            raise ValueError(f"{name} must be {expected} as the means are, got {' on '.join(map(str, kind))}")
 
 
 @torch.no_grad()
@@ -94,7 +107,11 @@ def visible(splats: SplatTensors, camera: Camera, *, backend: str = "auto") -> T
         splats: Raw attributes; only means, quats, scales and opacities are read.
         camera: Where to look from.
         backend: One of :data:`BACKENDS`.
+
+    Raises:
+        ValueError: As of :func:`render`.
     """
+    _check_alike(splats)
     name = resolve_backend(backend, splats.means)
     if name == "reference":
         return visible_rows(splats, camera)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from functools import partial
 from pathlib import Path
@@ -10,7 +11,8 @@ import numba
 import pytest
 import torch
 
-from nsvq_lightning.rendering.cpu import rasterizer
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.cpu import dssim, jit, projection, rasterizer
 from nsvq_lightning.rendering.rasterize import _warn_of_plain_torch, render, resolve_backend, visible
 from nsvq_lightning.skips import switched
 from nsvq_lightning.splats import RawSplats, Splats
@@ -213,6 +215,42 @@ def test_bad_arguments_say_what_to_do() -> None:
         render(splats, camera, background=torch.zeros(4))
     with pytest.raises(ValueError, match="float64"):
         render(RawSplats(*(tensor.double() for tensor in splats.raw())), camera, backend="cpu")
+
+
+@pytest.mark.parametrize("name", ["quats", "scales", "opacities", "sh0", "shN"])
+def test_attributes_that_do_not_belong_together_are_refused(name: str) -> None:
+    """Kernels would read foreign memory."""
+    splats, camera = random_splats(20), front_camera()
+    for function in (render, visible):
+        with pytest.raises(ValueError, match=f"{name} must be torch.float32 on cpu as the means are"):
+            function(splats._replace(**{name: getattr(splats, name).double()}), camera)
+        with pytest.raises(ValueError, match=f"{name} must have shape"):
+            function(splats._replace(**{name: getattr(splats, name)[:5]}), camera)
+
+
+def test_a_background_of_another_type_is_the_same_colour() -> None:
+    splats, camera, background = random_splats(20), front_camera(), torch.tensor([0.25, 0.5, 1.0])
+    images = [render(splats, camera, background=colour).image for colour in (background, background.half())]
+    assert torch.equal(*images)
+
+
+def test_cameras_that_no_back_end_renders_are_refused() -> None:
+    camera = front_camera()
+    for entry, value, message in (
+        ((0, 1), 30.0, "without skew, got 30.0"),
+        ((0, 0), math.inf, "positive, finite focal"),
+    ):
+        K = camera.K.clone()
+        K[entry] = value
+        with pytest.raises(ValueError, match=message):
+            Camera(K, camera.viewmat, camera.width, camera.height)
+
+
+def test_the_stamp_of_stored_kernels_covers_the_constants_in_them() -> None:
+    package = Path(jit.__file__).parents[2]
+    source = Path(dssim.__file__).read_text()
+    assert package / "losses.py" in jit._imported(package, source)
+    assert package / "rendering/constants.py" in jit._imported(package, Path(projection.__file__).read_text())
 
 
 @pytest.mark.parametrize("name", ["blocks", "saturated", "sh_bands"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,16 +23,29 @@ _OPTIONS: dict[str, Any] = {
 
 
 def _stamp() -> str:
-    """Digest of all sources that kernels are made of: the files that import something of this folder, and its own."""
+    """Digest of all sources that kernels are made of: the files that import something of this folder, and its own.
+
+    What those import counts too, as the constants of a module are part of the kernels that name them.
+    """
     package = Path(__file__).parents[2]
+    files: set[Path] = set()
+    for path in [*Path(__file__).parent.glob("*.py"), *package.glob("*/*.py")]:
+        source = path.read_text(encoding="utf-8")
+        if path.parent == Path(__file__).parent or re.search(r"rendering\.cpu\.(jit|lanes) import", source):
+            files |= {path, *_imported(package, source)}
     digest = hashlib.sha256()
-    for path in sorted([*Path(__file__).parent.glob("*.py"), *package.glob("*/*.py")]):
-        source = path.read_bytes()
-        if path.parent == Path(__file__).parent or any(
-            name in source for name in (b"rendering.cpu.jit import", b"rendering.cpu.lanes import")
-        ):
-            digest.update(source)
+    for path in sorted(files):
+        digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def _imported(package: Path, source: str) -> list[Path]:
+    """The files of the package that a source imports."""
+    files = []
+    for module, names in re.findall(rf"^from {package.name}((?:\.\w+)*) import ([\w, ]*)", source, re.MULTILINE):
+        base = package.joinpath(*module.split("."))
+        files += [base.with_suffix(".py"), *(base / f"{name.strip()}.py" for name in names.split(","))]
+    return [path for path in files if path.is_file()]
 
 
 _STAMP = _stamp()
