@@ -29,12 +29,16 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Structural similarity as the splatting papers measure it: Gaussian window, σ 1.5, zero padding, mean over RGB.
 
     Args:
-        image: ``[H, W, 3]`` in [0, 1].
-        target: ``[H, W, 3]`` in [0, 1].
+        image: ``[H, W, 3]``, clamped to [0, 1].
+        target: ``[H, W, 3]``, uint8 or in [0, 1].
 
     Returns:
         Scalar, 1 for equal images (Wang et al. 2004, eq. 13; beyond the border the images count as 0).
+
+    Raises:
+        ValueError: The shapes differ.
     """
+    _check_pair(image, target)
     kernels = None if torch.is_grad_enabled() and image.requires_grad else _kernels(image, target)
     if kernels == "cpu":
         from nsvq_lightning.rendering.cpu.dssim import l1_dssim
@@ -44,6 +48,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
         from nsvq_lightning.rendering.cuda.dssim import l1_dssim as l1_dssim_cuda
 
         return 1 - l1_dssim_cuda(image.contiguous(), target.contiguous(), 1.0, derived=False)[0]
+    image, target = _in_range(image, target)
     planes = torch.cat([image, target, image * image, target * target, image * target], -1).movedim(-1, 0)[None]
     channels = planes.shape[1]
     taps = ssim_window().to(image).expand(channels, 1, -1)
@@ -70,16 +75,23 @@ def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2) -
     Raises:
         ValueError: The shapes differ.
     """
-    if image.shape != target.shape or image.dim() != 3 or image.shape[-1] != 3:
-        raise ValueError(f"image and target must both be [H, W, 3], got {list(image.shape)} and {list(target.shape)}")
+    _check_pair(image, target)
     kernels = _kernels(image, target)
     if kernels is not None:
         function = _CpuLoss if kernels == "cpu" else _CudaLoss
         loss: Tensor = function.apply(image, target, dssim_weight)  # type: ignore[no-untyped-call]
         return loss
-    image = image.clamp(0.0, 1.0)
-    target = target.to(image.dtype) / 255 if target.dtype == torch.uint8 else target
+    image, target = _in_range(image, target)
     return (1 - dssim_weight) * (image - target).abs().mean() + dssim_weight * (1 - ssim(image, target))
+
+
+def _check_pair(image: Tensor, target: Tensor) -> None:
+    if image.shape != target.shape or image.dim() != 3 or image.shape[-1] != 3:
+        raise ValueError(f"image and target must both be [H, W, 3], got {list(image.shape)} and {list(target.shape)}")
+
+
+def _in_range(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    return image.clamp(0.0, 1.0), target.to(image.dtype) / 255 if target.dtype == torch.uint8 else target
 
 
 def _kernels(image: Tensor, target: Tensor) -> Literal["cpu", "cuda"] | None:

@@ -97,3 +97,16 @@ def test_bytes_are_the_same_photo(dtype: torch.dtype) -> None:
 def test_shapes_must_agree() -> None:
     with pytest.raises(ValueError, match=r"\[H, W, 3\]"):
         photometric_loss(torch.zeros(4, 5, 3), torch.zeros(5, 4, 3))
+    for image, target in ((torch.rand(64, 64, 3), torch.zeros(4, 4, 3)), (torch.rand(64, 64), torch.rand(64, 64))):
+        with pytest.raises(ValueError, match=r"\[H, W, 3\]"):
+            ssim(image, target)
+
+
+def test_ssim_does_not_depend_on_who_computes_it() -> None:
+    image, target = pair(20, 20)
+    image = 1.5 * image - 0.2
+    photo = (255 * target).round().to(torch.uint8)
+    for other in (target, photo):
+        values = [ssim(tensor, other) for tensor in (image, image.clone().requires_grad_(), image.double())]
+        torch.testing.assert_close(values[1].detach(), values[0], atol=1e-5, rtol=0)
+        torch.testing.assert_close(values[2].float(), values[0], atol=1e-5, rtol=0)
