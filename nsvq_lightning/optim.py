@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.graph import increment_version
 
 from nsvq_lightning.rendering.kernels import kernels_for
 from nsvq_lightning.skips import is_on
@@ -199,6 +200,10 @@ class SplatAdam(torch.optim.Adam):
         ]
         for update in updates:
             update()
+        for group in self.param_groups:  # autograd does not see kernels write
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    increment_version([parameter, *(self.state[parameter][name] for name in ("exp_avg", "exp_avg_sq"))])
         return loss
 
     def _update_of(self, group: dict[str, Any], parameter: Tensor, gradient: Tensor) -> Callable[[], None]:

@@ -239,6 +239,16 @@ def test_parameters_of_another_type_are_left_to_torch() -> None:
         build_adam(groups)
 
 
+def test_autograd_sees_that_a_step_has_written() -> None:
+    parameter = torch.ones(4, 3, requires_grad=True)
+    optimizer = SplatAdam([{"params": [parameter], "lr": 0.1, "name": "means"}])
+    loss = parameter.square().sum()
+    loss.backward(retain_graph=True)
+    optimizer.step()
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
 def test_a_codebook_without_gradient_is_left_alone() -> None:
     book = Codebook()
     optimizer = build_adam(param_groups(splats(), {"scales": book}, LearningRates(), extent=1.0))
