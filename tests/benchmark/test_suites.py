@@ -347,6 +347,9 @@ def test_read_errors_follow_splats_to_their_new_order() -> None:
     fields = {field.name: getattr(arrays, field.name) for field in dataclasses.fields(arrays)}
     turned = SplatArrays(**{name: values[::-1].copy() for name, values in fields.items()})
     assert codec.read_errors(turned, arrays, arrays)["max error of the file"] == 0
+    arrays.means[3] = arrays.means[4] + 1e-4  # the file may move them past each other
+    turned.means[[46, 45]] = arrays.means[[4, 3]]
+    assert codec.read_errors(turned, arrays, arrays)["max error of the file"] == pytest.approx(1e-4, rel=0.01)
     turned.scales[7] += 0.5
     assert codec.read_errors(turned, arrays, arrays)["max error of the file"] == pytest.approx(0.5)
 

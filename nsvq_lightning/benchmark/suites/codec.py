@@ -31,6 +31,10 @@ from nsvq_lightning.splats import ATTRIBUTES, Splats, SplatTensors
 __all__ = ["Codec", "codecs", "compressed", "read_errors", "run"]
 
 
+_NEIGHBOURS = 12
+"""Splats among which one is looked for after a file has changed their order: those nearest to its place."""
+
+
 class Codec(NamedTuple):
     """One kind of file, bound to a scene.
 
@@ -138,15 +142,24 @@ def compressed(workload: Workload, setting: str) -> CompressedScene:
 def read_errors(read: SplatArrays, stored: SplatArrays, original: SplatArrays) -> dict[str, float]:
     """Largest difference of what was read to what was written, and to the scene before its quantization.
 
-    A file may keep the splats in another order; each is then compared with the one nearest to its place.
+    A file may keep the splats in another order; each is then compared with that of the nearest ones in its place that
+    has the most like attributes.
     """
     order = np.arange(len(stored))
     if not np.array_equal(read.means, stored.means):
-        order = cKDTree(read.means).query(stored.means)[1]
+        near = cKDTree(read.means).query(stored.means, k=min(_NEIGHBOURS, len(stored)))[1].reshape(len(stored), -1)
+        rows, wanted = _numbers(read), _numbers(stored)
+        distances = [np.square(rows[column] - wanted).sum(1) for column in near.T]
+        order = near[order, np.argmin(distances, 0)]
     return {
         "max error of the file": _largest_difference(read, stored, order),
         "max error with codebooks": _largest_difference(read, original, order),
     }
+
+
+def _numbers(arrays: SplatArrays) -> NDArray[np.float64]:
+    """All attributes of a splat in a row."""
+    return np.concatenate([getattr(arrays, name).reshape(len(arrays), -1) for name in ATTRIBUTES], 1).astype(np.float64)
 
 
 def _largest_difference(found: SplatArrays, expected: SplatArrays, order: NDArray[np.intp]) -> float:
