@@ -86,8 +86,9 @@ class ColmapDataModule(LightningDataModule):
             SceneError: The folder cannot be used, or there are fewer test views than processes, which a run would
                 notice at its first evaluation.
         """
+        count = len(self.scene.test)
         if stage != "predict":
-            self._check_share(len(self.scene.test), "test views")
+            self._check_share(count, "test views")
 
     def train_dataloader(self) -> DataLoader[View]:
         """Endless train views from the trainer's step on; limit the run with ``max_steps``."""
