@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from nsvq_lightning.rendering.kernels import kernels_for
 
-__all__ = ["SSIM_C1", "SSIM_C2", "SSIM_RADIUS", "photometric_loss", "ssim", "ssim_window"]
+__all__ = ["SSIM_C1", "SSIM_C2", "SSIM_RADIUS", "check_pair", "photometric_loss", "ssim", "ssim_window"]
 
 SSIM_RADIUS = 5
 SSIM_SIGMA = 1.5
@@ -38,7 +38,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     Raises:
         ValueError: The shapes differ.
     """
-    _check_pair(image, target)
+    check_pair(image, target)
     kernels = None if torch.is_grad_enabled() and image.requires_grad else _kernels(image, target)
     if kernels == "cpu":
         from nsvq_lightning.rendering.cpu.dssim import l1_dssim
@@ -75,7 +75,7 @@ def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2) -
     Raises:
         ValueError: The shapes differ.
     """
-    _check_pair(image, target)
+    check_pair(image, target)
     kernels = _kernels(image, target)
     if kernels is not None:
         function = _CpuLoss if kernels == "cpu" else _CudaLoss
@@ -85,7 +85,12 @@ def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2) -
     return (1 - dssim_weight) * (image - target).abs().mean() + dssim_weight * (1 - ssim(image, target))
 
 
-def _check_pair(image: Tensor, target: Tensor) -> None:
+def check_pair(image: Tensor, target: Tensor) -> None:
+    """Refuse pictures that cannot be compared.
+
+    Raises:
+        ValueError: They are not both ``[H, W, 3]``.
+    """
     if image.shape != target.shape or image.dim() != 3 or image.shape[-1] != 3:
         raise ValueError(f"image and target must both be [H, W, 3], got {list(image.shape)} and {list(target.shape)}")
 

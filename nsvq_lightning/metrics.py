@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric, MetricCollection
 
-from nsvq_lightning.losses import ssim
+from nsvq_lightning.losses import check_pair, ssim
 
 __all__ = ["PSNR", "SSIM", "build_lpips", "eight_bit", "image_metrics", "psnr"]
 
@@ -66,10 +66,7 @@ class _MeanOverImages(Metric):
         Raises:
             ValueError: The shapes differ.
         """
-        if image.shape != target.shape or image.dim() != 3 or image.shape[2] != 3:
-            raise ValueError(
-                f"image and target must both be [H, W, 3], got {list(image.shape)} and {list(target.shape)}"
-            )
+        check_pair(image, target)
         self.total += self._score(eight_bit(image), eight_bit(target))
         self.images += 1
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchmetrics import Metric
 
 from nsvq_lightning.branch import branch_checkpoint, can_branch, check_continuation
-from nsvq_lightning.data.scene import View
+from nsvq_lightning.data.scene import ONE_PLACE, View
 from nsvq_lightning.edit import finite_splats
 from nsvq_lightning.host import log_interval
 from nsvq_lightning.io.formats import load
@@ -108,10 +108,7 @@ class SplatModule(SplatModel):
         if len(self.splats) == 0:
             self.splats = self._first_splats(scene).to(self.device)
         if self.extent <= 0.0 and scene is not None:
-            raise ValueError(
-                f"the {len(scene.train)} train photos of {scene.root} are taken from one place, so nothing has a depth "
-                "or a size: move while taking photos"
-            )
+            raise ValueError(f"the {len(scene.train)} train photos of {scene.root} {ONE_PLACE}")
         if self.extent <= 0.0:
             raise ValueError("the extent of the scene is unknown; fit with a data module that has a scene")
 

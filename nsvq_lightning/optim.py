@@ -192,18 +192,12 @@ class SplatAdam(torch.optim.Adam):
             with torch.enable_grad():
                 loss = closure()
         # All are prepared before the first is done, see `adam_update`.
-        updates = [
-            self._update_of(group, parameter, parameter.grad)
-            for group in self.param_groups
-            for parameter in group["params"]
-            if parameter.grad is not None
-        ]
+        due = [(group, p) for group in self.param_groups for p in group["params"] if p.grad is not None]
+        updates = [self._update_of(group, parameter, parameter.grad) for group, parameter in due]
         for update in updates:
             update()
-        for group in self.param_groups:  # autograd does not see kernels write
-            for parameter in group["params"]:
-                if parameter.grad is not None:
-                    increment_version([parameter, *(self.state[parameter][name] for name in ("exp_avg", "exp_avg_sq"))])
+        for _, parameter in due:  # autograd does not see kernels write
+            increment_version([parameter, *(self.state[parameter][name] for name in ("exp_avg", "exp_avg_sq"))])
         return loss
 
     def _update_of(self, group: dict[str, Any], parameter: Tensor, gradient: Tensor) -> Callable[[], None]:

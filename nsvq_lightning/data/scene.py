@@ -21,7 +21,7 @@ from nsvq_lightning.data.model_files import SceneError, larger_models
 from nsvq_lightning.data.undistort import Pinhole, Undistortion, rectify
 from nsvq_lightning.rendering.camera import Camera
 
-__all__ = ["OTHER_SHAPE", "Factor", "Scene", "SceneError", "View", "load_scene", "same_shape"]
+__all__ = ["ONE_PLACE", "OTHER_SHAPE", "Factor", "Scene", "SceneError", "View", "load_scene", "same_shape"]
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +38,7 @@ OTHER_SHAPE = (
     "have another aspect ratio than their camera: they were cropped, turned or mixed up after COLMAP ran; copy the "
     "photos it ran on"
 )
+ONE_PLACE = "are taken from one place: without parallax there is no depth; move while taking photos"
 _AT_CAMERA = 1e-6
 """Distance from a camera's centre, in extents, within which a point is no surface but a failed triangulation."""
 

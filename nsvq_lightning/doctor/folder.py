@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from nsvq_lightning.data.colmap import ColmapModel, read_model
 from nsvq_lightning.data.model_files import larger_models
-from nsvq_lightning.data.scene import Scene, load_scene
+from nsvq_lightning.data.scene import ONE_PLACE, Scene, load_scene
 from nsvq_lightning.doctor.budget import check_budget
 from nsvq_lightning.doctor.finding import Finding, good, note, problem, report
 from nsvq_lightning.doctor.model_checks import check_cameras, check_overlap, check_points
@@ -66,8 +66,7 @@ def _check_split(scene: Scene) -> Iterator[Finding]:
 
 def _check_extent(scene: Scene) -> Iterator[Finding]:
     if not scene.extent > 0:
-        help_ = "without parallax there is no depth; move while taking photos"
-        yield problem("extent", f"all train photos are taken from one place: {help_}", extent=scene.extent)
+        yield problem("extent", f"all train photos {ONE_PLACE}", extent=scene.extent)
         return
     yield good(
         "extent", f"{scene.extent:.3g} scene units, 1.1 × the farthest camera from their mean", extent=scene.extent

@@ -102,7 +102,7 @@ def encode_compact(scene: CompressedScene, precision: Precision | None = None) -
         ValueError: A number is not finite, or so large that it has no step.
     """
     precision = precision or Precision()
-    _check_finite(scene)
+    _check_finite({"means": scene.means, "opacities": scene.opacities, **scene.raw})
     dims = attribute_dims(scene.sh_degree)
     stored = _all_of({name: _bind(_stored, scene, name, dim, precision) for name, dim in dims.items()})
     stored["opacities"] = _levels(scene.opacities, precision.opacity_levels)
@@ -179,10 +179,7 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
 # Attributes as integers
 
 
-def _check_finite(scene: CompressedScene) -> None:
-    arrays = {"means": scene.means, "opacities": scene.opacities, **scene.raw}
-    # Rows out of use are not stored.
-    arrays |= {f"codebook of {name}": rows[_in_use(rows, scene.codes[name])] for name, rows in scene.codebooks.items()}
+def _check_finite(arrays: Mapping[str, NDArray[np.float32]]) -> None:
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise ValueError(
@@ -196,7 +193,7 @@ def _stored(scene: CompressedScene, name: str, dim: int, precision: Precision) -
         step = 2 * getattr(precision, name)
         rows = _normalised(scene.raw[name]) if name == "quats" else scene.raw[name]
         return _Stored(AttributeEntry(name, dim, "steps", step=step), _integers(name, rows, step))
-    codebook, codes = _compacted(scene.codebooks[name], scene.codes[name], name == "quats")
+    codebook, codes = _compacted(name, scene.codebooks[name], scene.codes[name])
     order = tree_order(codebook)
     codebook, codes = codebook[order], np.argsort(order)[codes]
     step = 2 * precision.codebook * sibling_distance(codebook) or 2.0**-16
@@ -205,18 +202,14 @@ def _stored(scene: CompressedScene, name: str, dim: int, precision: Precision) -
 
 
 def _compacted(
-    codebook: NDArray[np.float32], codes: NDArray[np.integer], normalise: bool
+    name: str, codebook: NDArray[np.float32], codes: NDArray[np.integer]
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """The rows that are used, each once, and the codes into them."""
-    used = _in_use(codebook, codes)
+    used = np.bincount(codes, minlength=len(codebook)) > 0
     rows = codebook[used] if len(codes) else np.zeros_like(codebook[:1])
-    rows, merged = np.unique(_normalised(rows) if normalise else rows, axis=0, return_inverse=True)
+    _check_finite({f"codebook of {name}": rows})
+    rows, merged = np.unique(_normalised(rows) if name == "quats" else rows, axis=0, return_inverse=True)
     return rows, merged.reshape(-1)[np.cumsum(used)[codes] - 1]
-
-
-def _in_use(codebook: NDArray[np.float32], codes: NDArray[np.integer]) -> NDArray[np.bool_]:
-    in_use: NDArray[np.bool_] = np.bincount(codes, minlength=len(codebook)) > 0
-    return in_use
 
 
 def _normalised(quats: NDArray[np.float32]) -> NDArray[np.float32]:

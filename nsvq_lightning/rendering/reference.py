@@ -151,7 +151,7 @@ def render_reference(
         strips.append(torch.cat(tiles, 1))
     blended = torch.cat(strips, 0)
     transmittance = blended[..., 4]
-    image = blended[..., :3] + transmittance[..., None] * background.to(blended)
+    image = blended[..., :3] + transmittance[..., None] * background
     return image, 1 - transmittance, radii, means2d, blended[..., 3]
 
 
