@@ -76,6 +76,7 @@ class CanonicalCovariance(LatchedCallback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Act before the first iteration of a run that starts in the quantize phase."""
+        super().on_train_start(trainer, pl_module)
         self._act_if_due(trainer, as_host(pl_module))
 
     def on_train_batch_end(

@@ -78,6 +78,7 @@ class RunCheckpoint(LatchedCallback, Checkpoint):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Begin to hold back signals."""
+        super().on_train_start(trainer, pl_module)
         if trainer.ckpt_path is not None:
             self.last_path, self._saved = Path(trainer.ckpt_path), trainer.global_step
         self._training = True

@@ -176,6 +176,7 @@ class CodebookReplacement(LatchedCallback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Leave what a checkpoint has counted to the first process: it is the count of all."""
+        super().on_train_start(trainer, pl_module)
         if not trainer.is_global_zero:
             _forget_usage(as_host(pl_module))
 

@@ -52,6 +52,7 @@ class ContributionPruning(LatchedCallback):
         Raises:
             ValueError: It does not.
         """
+        super().on_train_start(trainer, pl_module)
         schedule = as_host(pl_module).schedule
         if self.share and schedule.phase_at(schedule.iteration(self.at) + 1) > Phase.PRUNE:
             raise ValueError(

@@ -6,17 +6,19 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
 
 from nsvq_lightning.compress import DEFAULT_EXPORT, EXPORT_FORMATS, export_scene
 from nsvq_lightning.host import as_host, is_trial, output_folder
+
+from .hosted import HostedCallback
 
 __all__ = ["ExportScene"]
 
 log = logging.getLogger(__name__)
 
 
-class ExportScene(Callback):
+class ExportScene(HostedCallback):
     """Writes ``scene.nsvq`` (the compressed scene) and ``scene.ply`` (its decoded splats, for any viewer), or others.
 
     Args:

@@ -11,7 +11,7 @@ from lightning.pytorch import LightningModule, Trainer
 from nsvq_lightning.edit import reset_moments
 from nsvq_lightning.host import SplatHost, as_host, raw_optimizer
 from nsvq_lightning.optim import codebook_group
-from nsvq_lightning.quantize.base import Mendable
+from nsvq_lightning.quantize.base import is_mendable
 from nsvq_lightning.random import generator
 from nsvq_lightning.schedule import Phase
 
@@ -61,7 +61,7 @@ class FiniteCodes(LatchedCallback):
             if len(broken) == 0:
                 continue
             found = f"step {iteration}: {len(broken)} of {len(quantizer.codebook)} codes of {name} are non-finite"
-            if len(broken) == len(quantizer.codebook) or not isinstance(quantizer, Mendable):
+            if len(broken) == len(quantizer.codebook) or not is_mendable(quantizer):
                 raise FloatingPointError(f"{found}; lower the learning rates")
             quantizer.mend(broken, host.rows(name), generator(host.seed, iteration, "mend", name))
             reset_moments(raw_optimizer(trainer), codebook_group(name), broken)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
+
+from .hosted import HostedCallback
 
 __all__ = ["LatchedCallback", "StepLatch"]
 
@@ -29,7 +31,7 @@ class StepLatch:
         return True
 
 
-class LatchedCallback(Callback):
+class LatchedCallback(HostedCallback):
     """Callback that acts at most once an iteration of a fit, also when the fit is resumed."""
 
     def __init__(self) -> None:
@@ -38,6 +40,7 @@ class LatchedCallback(Callback):
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Forget an earlier fit of the same callback; a checkpoint's state is loaded after this."""
+        super().setup(trainer, pl_module, stage)
         if stage == "fit":
             self._latch = StepLatch()
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
 
 from nsvq_lightning.host import as_host, next_iteration
 from nsvq_lightning.schedule import Phase
 
+from .hosted import HostedCallback
+
 __all__ = ["OpacityRegularization"]
 
 
-class OpacityRegularization(Callback):
+class OpacityRegularization(HostedCallback):
     """Adds λ · Σ opacity to the loss during the prune phase, so that needless splats fade and are pruned.
 
     It is a sum over the splats (paper, section 3.4), so its strength grows with their number. A shorter run has fewer

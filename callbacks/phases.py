@@ -5,17 +5,19 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
 
-from nsvq_lightning.host import as_host, next_iteration, splat_host
+from nsvq_lightning.host import as_host, next_iteration
 from nsvq_lightning.schedule import Phase, Schedule
+
+from .hosted import HostedCallback
 
 __all__ = ["PhaseSchedule"]
 
 log = logging.getLogger(__name__)
 
 
-class PhaseSchedule(Callback):
+class PhaseSchedule(HostedCallback):
     """Gives the module its schedule, and writes the phase of each iteration into its buffer.
 
     The ends of the phases are iterations of a reference run, the paper's of 45 000 iterations by default; a run of any
@@ -73,9 +75,10 @@ class PhaseSchedule(Callback):
         Raises:
             ValueError: ``trainer.max_steps`` is not set and neither is ``total``.
         """
+        super().setup(trainer, pl_module, stage)
         if stage != "fit":
             return
-        host = splat_host(pl_module)
+        host = as_host(pl_module)
         total = self.total if self.total is not None else trainer.max_steps
         if total < 1:
             raise ValueError(
@@ -98,6 +101,7 @@ class PhaseSchedule(Callback):
         Raises:
             ValueError: This schedule has the last trained iteration in another phase.
         """
+        super().on_train_start(trainer, pl_module)
         host = as_host(pl_module)
         step = trainer.global_step
         expected = host.schedule.phase_at(step) if step else Phase.WARMUP

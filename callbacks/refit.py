@@ -5,21 +5,22 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
 from torch.optim import Optimizer
 
 from nsvq_lightning.host import SplatHost, as_host, from_first_process, next_iteration
-from nsvq_lightning.quantize.base import Refittable
+from nsvq_lightning.quantize.base import Refittable, is_refittable
 from nsvq_lightning.schedule import Phase
 
 from .finite_search import keep_finite_splats
+from .hosted import HostedCallback
 
 __all__ = ["CodebookRefit"]
 
 log = logging.getLogger(__name__)
 
 
-class CodebookRefit(Callback):
+class CodebookRefit(HostedCallback):
     """Refits codebooks to the rows of all splats in the quantize phase, as CompGS does (Navaneet et al. 2024).
 
     Only quantizers that offer it (:class:`nsvq_lightning.quantize.base.Refittable`, such as ``StraightThrough``) are
@@ -70,4 +71,4 @@ class CodebookRefit(Callback):
 
 def _refittable(host: SplatHost) -> dict[str, Refittable]:
     """The quantizers that offer it, by attribute."""
-    return {name: quantizer for name, quantizer in host.quantizers.items() if isinstance(quantizer, Refittable)}
+    return {name: quantizer for name, quantizer in host.quantizers.items() if is_refittable(quantizer)}

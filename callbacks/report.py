@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor
 from torchmetrics import Metric
 
@@ -24,12 +24,14 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.report_files import paper_level, summarize, write_curve, write_curve_csv, write_metrics, write_views
 from nsvq_lightning.splats import RawSplats
 
+from .hosted import HostedCallback
+
 __all__ = ["MetricReport"]
 
 log = logging.getLogger(__name__)
 
 
-class MetricReport(Callback):
+class MetricReport(HostedCallback):
     """Writes what a run achieved into the trainer's log folder.
 
     While training: test PSNR and SSIM, number of splats and training seconds at the end of each phase and every

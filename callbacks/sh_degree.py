@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
 
 from nsvq_lightning.host import as_host, next_iteration
+
+from .hosted import HostedCallback
 
 __all__ = ["ShDegreeSchedule"]
 
 
-class ShDegreeSchedule(Callback):
+class ShDegreeSchedule(HostedCallback):
     """Starts with constant colours and adds a degree every ``every`` iterations, up to that of the splats.
 
     Args:

@@ -12,11 +12,13 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from nsvq_lightning.importance import contributions
+from nsvq_lightning.optim import codebook_group
+from nsvq_lightning.protocols import missing_members
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.schedule import Phase, Schedule
-from nsvq_lightning.splats import RawSplats, Splats, SplatTensors
+from nsvq_lightning.splats import ATTRIBUTES, RawSplats, Splats, SplatTensors
 from nsvq_lightning.state import Stopwatch
 
 if TYPE_CHECKING:
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = [
     "SplatHost",
     "as_host",
+    "check_optimizer",
     "from_first_process",
     "is_trial",
     "log_interval",
@@ -44,6 +47,18 @@ class SplatHost(Protocol):
 
     Callbacks know each other only through this state, and take their decisions from ``schedule`` and the trainer's
     step, so that each works without the others.
+
+    Besides the members below a host has
+
+    * one optimiser, with a parameter group of one parameter for each attribute of the splats, whose ``name`` is that of
+      the attribute, and for each codebook, named ``codebook_<attribute>``: :func:`nsvq_lightning.optim.param_groups`
+      makes them;
+    * a ``training_step`` that returns a dictionary with ``loss`` and, for density control, the ``render`` of the
+      splats, whose ``means2d`` retains its gradient while ``wants_screen_gradients`` is set; None where the step is
+      not to update anything;
+    * for reports, test and validation steps that return a dictionary with ``image``, ``psnr`` and ``ssim`` of a view.
+
+    Callbacks check members and groups before the first iteration (:func:`splat_host`, :func:`check_optimizer`).
     """
 
     splats: Splats
@@ -106,14 +121,31 @@ def splat_host(module: LightningModule) -> SplatHost:
     Raises:
         TypeError: It lacks something that :class:`SplatHost` names.
     """
-    names = {name for name in (*SplatHost.__annotations__, *vars(SplatHost)) if not name.startswith("_")}
-    missing = sorted(name for name in names if not hasattr(module, name))
+    missing = missing_members(module, SplatHost)
     if missing:
         raise TypeError(
             f"{type(module).__name__} cannot host the splat callbacks, it lacks: {', '.join(missing)}; "
             "use nsvq_lightning.SplatModule or offer the members of nsvq_lightning.host.SplatHost"
         )
     return as_host(module)
+
+
+def check_optimizer(trainer: Trainer, module: LightningModule) -> None:
+    """Check that the optimiser has the parameter groups that callbacks edit by their names.
+
+    Raises:
+        ValueError: It has not, or there are several optimisers.
+    """
+    groups = {group.get("name"): len(group["params"]) for each in trainer.optimizers for group in each.param_groups}
+    needed = (*ATTRIBUTES, *(codebook_group(name) for name in as_host(module).quantizers))
+    missing = [name for name in needed if groups.get(name) != 1]
+    if missing or len(trainer.optimizers) != 1:
+        raise ValueError(
+            f"{type(module).__name__} cannot host the splat callbacks: they need one optimiser with a parameter group "
+            f"of one parameter for each attribute and codebook, named after it; there are {len(trainer.optimizers)} "
+            f"optimisers, without groups for: {', '.join(missing) or 'none'}. Build the groups with "
+            "nsvq_lightning.optim.param_groups"
+        )
 
 
 def as_host(module: LightningModule) -> SplatHost:

@@ -9,7 +9,7 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.callbacks.progress.tqdm_progress import Tqdm
 
-from nsvq_lightning.host import as_host
+from nsvq_lightning.host import as_host, splat_host
 
 __all__ = ["SplatProgressBar"]
 
@@ -46,6 +46,7 @@ class SplatProgressBar(TQDMProgressBar):
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Refresh seldom where the output is a file."""
         super().setup(trainer, pl_module, stage)
+        splat_host(pl_module)
         if stage == "fit" and not sys.stdout.isatty() and self._refresh_rate > 0:
             self._refresh_rate = max(self._refresh_rate, trainer.max_steps // LOG_FILE_REFRESHES)
 

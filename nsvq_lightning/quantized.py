@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from nsvq_lightning.quantize.attributes import QUANTIZED, codebook_sizes
-from nsvq_lightning.quantize.base import Quantizer
+from nsvq_lightning.quantize.base import Quantizer, as_quantizer
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats import RawSplats, Splats
 from nsvq_lightning.subset import take_rows
@@ -43,11 +43,7 @@ def build_quantizers(
         if sizes[name] < 1:
             raise ValueError(f"codebooks: {name} needs at least 1 code, got {sizes[name]}")
         module = quantizer(sizes[name], dim)
-        if not isinstance(module, Quantizer):
-            raise TypeError(
-                f"{type(module).__name__} is no quantizer: it must be an nn.Module with the members of "
-                "nsvq_lightning.quantize.base.Quantizer"
-            )
+        as_quantizer(module)
         built[name] = module
     return built
 

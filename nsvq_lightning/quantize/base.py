@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeGuard, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-__all__ = ["Mendable", "Quantizer", "Refittable"]
+from nsvq_lightning.protocols import missing_members
+
+__all__ = ["Mendable", "Quantizer", "Refittable", "as_quantizer", "is_mendable", "is_refittable"]
 
 
-@runtime_checkable
 class Quantizer(Protocol):
     """Vector quantizer of one attribute: rows ``[N, D]`` to codes ``[N]`` into a codebook ``[K, D]``.
 
@@ -58,7 +59,6 @@ class Quantizer(Protocol):
         """Fix the codes ``[N]``; from now on only the codebook is trained."""
 
 
-@runtime_checkable
 class Refittable(Protocol):
     """Quantizer whose codebook gets no gradient in the quantize phase, but is moved to the rows now and then.
 
@@ -72,7 +72,6 @@ class Refittable(Protocol):
         """Move the codebook to the rows ``x [N, D]`` by ``steps`` steps of k-means from where it is; K stays."""
 
 
-@runtime_checkable
 class Mendable(Protocol):
     """Quantizer that can put codes back that have turned non-finite.
 
@@ -81,3 +80,34 @@ class Mendable(Protocol):
 
     def mend(self, broken: Tensor, rows: Tensor, generator: torch.Generator) -> None:
         """Give the codes ``broken [B]`` finite values again, where others are finite; the scene is ``rows [N, D]``."""
+
+
+def as_quantizer(module: object) -> Quantizer:
+    """The module as a quantizer.
+
+    Raises:
+        TypeError: It lacks something that :class:`Quantizer` names; the message says what.
+    """
+    lacks = missing_members(module, Quantizer)
+    if lacks:
+        raise TypeError(
+            f"{type(module).__name__} is no quantizer, it lacks: {', '.join(lacks)}; derive it from "
+            "nsvq_lightning.quantize.CodebookQuantizer, or offer the members of nsvq_lightning.quantize.Quantizer"
+        )
+    quantizer = cast(Quantizer, module)
+    if not isinstance(module, nn.Module) or not isinstance(quantizer.codebook, nn.Parameter):
+        raise TypeError(
+            f"{type(module).__name__} is no quantizer: it must be an nn.Module whose codebook is an nn.Parameter, so "
+            "that checkpoints carry it and the optimiser trains it"
+        )
+    return quantizer
+
+
+def is_refittable(quantizer: object) -> TypeGuard[Refittable]:
+    """Whether a quantizer has all of :class:`Refittable`."""
+    return not missing_members(quantizer, Refittable)
+
+
+def is_mendable(quantizer: object) -> TypeGuard[Mendable]:
+    """Whether a quantizer has all of :class:`Mendable`."""
+    return not missing_members(quantizer, Mendable)

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.quantize import DiVeQ, nearest
-from nsvq_lightning.quantize.base import Quantizer, Refittable
+from nsvq_lightning.quantize.base import as_quantizer, is_refittable
 from nsvq_lightning.quantize.nsvq import noise_substitution
 from nsvq_lightning.random import generator
 
@@ -28,8 +28,8 @@ def diveq(x: Tensor, codebook: Tensor, codes: Tensor, sigma: float, rows: Tensor
 
 
 def test_is_a_quantizer_that_gradients_train() -> None:
-    assert isinstance(DiVeQ(4, 3), Quantizer)
-    assert not isinstance(DiVeQ(4, 3), Refittable)
+    assert as_quantizer(DiVeQ(4, 3))
+    assert not is_refittable(DiVeQ(4, 3))
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.1])

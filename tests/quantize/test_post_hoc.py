@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.quantize import PostHoc, kmeans
-from nsvq_lightning.quantize.base import Quantizer, Refittable
+from nsvq_lightning.quantize.base import as_quantizer, is_refittable
 from nsvq_lightning.random import generator
 from nsvq_lightning.skips import switched
 
@@ -18,8 +18,8 @@ def fitted() -> tuple[PostHoc, Tensor]:
 
 
 def test_is_a_quantizer_without_refits() -> None:
-    assert isinstance(PostHoc(4, 3), Quantizer)
-    assert not isinstance(PostHoc(4, 3), Refittable)
+    assert as_quantizer(PostHoc(4, 3))
+    assert not is_refittable(PostHoc(4, 3))
 
 
 @pytest.mark.parametrize("chosen", [None, [0, 3, 199], []])

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.quantize import CodebookQuantizer, StraightThrough, TrainedStraightThrough
-from nsvq_lightning.quantize.base import Quantizer, Refittable
+from nsvq_lightning.quantize.base import as_quantizer, is_refittable
 from nsvq_lightning.random import generator
 
 Kind = TypeVar("Kind", bound=CodebookQuantizer)
@@ -26,10 +26,10 @@ def distortion(quantizer: StraightThrough, x: Tensor) -> float:
 
 
 def test_is_a_quantizer_that_is_refitted() -> None:
-    assert isinstance(StraightThrough(4, 3), Quantizer)
-    assert isinstance(StraightThrough(4, 3), Refittable)
-    assert isinstance(TrainedStraightThrough(4, 3), Quantizer)
-    assert not isinstance(TrainedStraightThrough(4, 3), Refittable)
+    assert as_quantizer(StraightThrough(4, 3))
+    assert is_refittable(StraightThrough(4, 3))
+    assert as_quantizer(TrainedStraightThrough(4, 3))
+    assert not is_refittable(TrainedStraightThrough(4, 3))
 
 
 @pytest.mark.parametrize("kind", [StraightThrough, TrainedStraightThrough])

@@ -23,6 +23,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.container import LEVELS, read_nsvq, write_nsvq
 from nsvq_lightning.io.ply import read_ply, write_ply
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, Quantizer
+from nsvq_lightning.quantize.base import as_quantizer
 from nsvq_lightning.quantized import build_quantizers
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render
@@ -131,11 +132,9 @@ def compressed(workload: Workload, setting: str) -> CompressedScene:
     splats = Splats.from_tensors(*workload.splats)
     quantizers: dict[str, Quantizer] = {}
     for name, module in build_quantizers(lambda k, d: NSVQ(k, d, kmeans_steps=1), setting, splats).items():
-        if not isinstance(module, Quantizer):
-            raise TypeError(f"{type(module).__name__} is no quantizer")
         rows = QUANTIZED[name].rows(getattr(workload.splats, name))
-        module.fit(rows, generator=generator(0, 0, "codec", name))
-        quantizers[name] = module
+        quantizers[name] = as_quantizer(module)
+        quantizers[name].fit(rows, generator=generator(0, 0, "codec", name))
     return compress(splats.raw(), quantizers)
 
 

@@ -1,0 +1,80 @@
+"""What an object lacks of a protocol, with members that only an nn.Module's ``__getattr__`` finds."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import Protocol
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import nsvq_lightning
+from nsvq_lightning.protocols import missing_members
+from nsvq_lightning.quantize import NSVQ, PostHoc, StraightThrough
+from nsvq_lightning.quantize.base import Quantizer, as_quantizer, is_mendable, is_refittable
+
+
+class Shape(Protocol):
+    weight: Tensor
+    area: float
+
+    def scaled(self, factor: float) -> Shape: ...
+
+
+class Held(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(2))
+        self.register_buffer("area", torch.zeros(()))
+
+
+def test_parameters_and_buffers_count_as_members() -> None:
+    assert missing_members(Held(), Shape) == ["scaled"]
+    assert missing_members(object(), Shape) == ["area", "scaled", "weight"]
+
+
+def test_what_a_quantizer_lacks_is_named() -> None:
+    class NearlyOne(NSVQ):
+        freeze = property()  # type: ignore[assignment]  # reading it raises AttributeError
+
+    assert as_quantizer(quantizer := NSVQ(4, 3)) is quantizer
+    with pytest.raises(TypeError, match=r"NearlyOne is no quantizer, it lacks: freeze; derive it from"):
+        as_quantizer(NearlyOne(4, 3))
+    with pytest.raises(TypeError, match=r"lacks: codebook, codes, decode, encode, fit, forward, freeze"):
+        as_quantizer(object())
+
+
+def test_a_codebook_that_nothing_trains_is_refused() -> None:
+    quantizer = NSVQ(4, 3)
+    del quantizer.codebook
+    quantizer.register_buffer("codebook", torch.zeros(4, 3))
+    with pytest.raises(TypeError, match=r"codebook is an nn\.Parameter"):
+        as_quantizer(quantizer)
+
+
+def test_what_quantizers_offer_beyond() -> None:
+    assert [is_refittable(q(4, 3)) for q in (NSVQ, StraightThrough, PostHoc)] == [False, True, False]
+    assert is_mendable(NSVQ(4, 3))
+    assert not is_mendable(nn.Linear(2, 2))
+
+
+def sources() -> list[Path]:
+    root = Path(nsvq_lightning.__file__).parent
+    return [*root.rglob("*.py"), *(root / "callbacks").glob("*.py")]  # rglob does not follow links
+
+
+def test_isinstance_meets_no_protocol() -> None:
+    """With one it finds no parameter or buffer of a module since Python 3.12."""
+    trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sources()}
+    names = [node for tree in trees.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    protocols = {node.name for node in names if any("Protocol" in ast.unparse(base) for base in node.bases)}
+    assert {Quantizer.__name__, "SplatHost"} <= protocols
+    for path, tree in trees.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("isinstance", "issubclass"):
+                asked = {name.id for name in ast.walk(node.args[1]) if isinstance(name, ast.Name)}
+                asked |= {name.attr for name in ast.walk(node.args[1]) if isinstance(name, ast.Attribute)}
+                assert not asked & protocols, f"{path}:{node.lineno}: {ast.unparse(node)}"
+        assert "runtime_checkable" not in path.read_text(encoding="utf-8"), path
