@@ -10,11 +10,13 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from torch.optim import Optimizer
 
-from nsvq_lightning.host import as_host, is_trial, output_folder
+from nsvq_lightning.host import as_host
 from nsvq_lightning.io.atomic import atomic_path
+from nsvq_lightning.run_folder import is_trial, run_folder
 from nsvq_lightning.schedule import Schedule
 
 from .boundary import StepBoundary
+from .hosted import WritingCallback
 from .latch import LatchedCallback
 from .signals import HeldSignals
 
@@ -23,7 +25,7 @@ __all__ = ["RunCheckpoint"]
 log = logging.getLogger(__name__)
 
 
-class RunCheckpoint(LatchedCallback, Checkpoint):
+class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
     """Saves the whole state of the run in ``checkpoints/last.ckpt``: regularly, at ends of phases, and when it stops.
 
     ``fit --ckpt_path …/last.ckpt`` continues exactly where it was saved. Lightning calls checkpoint callbacks after all
@@ -40,7 +42,7 @@ class RunCheckpoint(LatchedCallback, Checkpoint):
     Args:
         every: Iterations between two checkpoints; None is a tenth of the schedule, 0 saves at the end of the run only.
         keep: Keep each checkpoint as ``step-<iteration>.ckpt`` too, instead of only the last.
-        folder: Where; None is ``checkpoints`` in the trainer's log folder.
+        folder: Where; None is ``checkpoints`` in the folder of the run.
 
     Raises:
         ValueError: ``every`` is negative.
@@ -146,7 +148,7 @@ class RunCheckpoint(LatchedCallback, Checkpoint):
         if is_trial(trainer):
             return
         host = as_host(pl_module)
-        folder = output_folder(trainer) / "checkpoints" if self.folder is None else Path(self.folder)
+        folder = run_folder(trainer) / "checkpoints" if self.folder is None else Path(self.folder)
         with host.stopwatch.paused(host.device):
             if self.keep:
                 _write(trainer, folder / f"step-{trainer.global_step}.ckpt")

@@ -9,21 +9,22 @@ from pathlib import Path
 from lightning.pytorch import LightningModule, Trainer
 
 from nsvq_lightning.compress import DEFAULT_EXPORT, EXPORT_FORMATS, export_scene
-from nsvq_lightning.host import as_host, is_trial, output_folder
+from nsvq_lightning.host import as_host
+from nsvq_lightning.run_folder import is_trial, run_folder
 
-from .hosted import HostedCallback
+from .hosted import WritingCallback
 
 __all__ = ["ExportScene"]
 
 log = logging.getLogger(__name__)
 
 
-class ExportScene(HostedCallback):
+class ExportScene(WritingCallback):
     """Writes ``scene.nsvq`` (the compressed scene) and ``scene.ply`` (its decoded splats, for any viewer), or others.
 
     Args:
         formats: Suffixes without the dot; ``sog``, ``spz`` and ``splat`` are smaller files for viewers.
-        folder: Where; None is the trainer's log folder.
+        folder: Where; None is the folder of the run.
 
     Raises:
         ValueError: An unknown format.
@@ -38,7 +39,7 @@ class ExportScene(HostedCallback):
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write the files, on the first process."""
-        folder = output_folder(trainer) if self.folder is None else Path(self.folder)
+        folder = run_folder(trainer) if self.folder is None else Path(self.folder)
         if is_trial(trainer) or not trainer.is_global_zero:
             return
         host = as_host(pl_module)

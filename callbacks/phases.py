@@ -105,7 +105,8 @@ class PhaseSchedule(HostedCallback):
         host = as_host(pl_module)
         step = trainer.global_step
         expected = host.schedule.phase_at(step) if step else Phase.WARMUP
-        if host.phase is expected:
+        # A checkpoint may have been written when the next iteration had just begun.
+        if host.phase is expected or (step and host.phase is host.schedule.phase_at(step + 1)):
             return
         if step == 0:
             raise ValueError(

@@ -8,8 +8,8 @@ from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from nsvq_lightning.host import output_folder
 from nsvq_lightning.pictures import file_stem, write_png
+from nsvq_lightning.run_folder import run_folder
 
 __all__ = ["RenderWriter"]
 
@@ -20,16 +20,25 @@ class RenderWriter(Callback):
     """Writes every predicted view as a PNG named after its photo.
 
     Args:
-        folder: Where; None is ``predictions`` in the trainer's log folder.
+        folder: Where; None is ``predictions`` in the folder of the run.
     """
 
     def __init__(self, folder: str | None = None) -> None:
         self.folder = folder
         self._target = Path()
 
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Take the folder of the run.
+
+        Raises:
+            FileExistsError: It holds another run.
+        """
+        if stage == "predict" and self.folder is None:
+            run_folder(trainer)
+
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Make the folder, while all processes are together: some have fewer views than others."""
-        self._target = output_folder(trainer) / "predictions" if self.folder is None else Path(self.folder)
+        self._target = run_folder(trainer) / "predictions" if self.folder is None else Path(self.folder)
         self._target.mkdir(parents=True, exist_ok=True)
 
     def on_predict_batch_end(

@@ -15,31 +15,39 @@ from torchmetrics import Metric
 from nsvq_lightning.compress import export_scene
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.evaluation import ViewScore, evaluate
-from nsvq_lightning.host import SplatHost, as_host, is_trial, next_iteration, output_folder
+from nsvq_lightning.host import SplatHost, as_host, next_iteration
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.container import read_nsvq
 from nsvq_lightning.metrics import build_lpips, eight_bit
+from nsvq_lightning.picture_logs import log_pictures
 from nsvq_lightning.pictures import comparison, file_stem, write_png
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.report_files import paper_level, summarize, write_curve, write_curve_csv, write_metrics, write_views
+from nsvq_lightning.run_folder import is_trial, run_folder
 from nsvq_lightning.splats import RawSplats
 
-from .hosted import HostedCallback
+from .hosted import WritingCallback
+from .watchers import tell_watchers
 
 __all__ = ["MetricReport"]
 
 log = logging.getLogger(__name__)
 
 
-class MetricReport(HostedCallback):
-    """Writes what a run achieved into the trainer's log folder.
+class MetricReport(WritingCallback):
+    """Writes what a run achieved into its folder.
 
     While training: test PSNR and SSIM, number of splats and training seconds at the end of each phase and every
     ``every`` iterations, in ``curve.csv`` and ``curve.png``. An evaluation renders what a file written at that moment
     would decode to. Its time is not training time.
 
+    To Lightning an evaluation is what a validation is: ``report/psnr``, ``report/ssim`` and ``report/splats`` go to the
+    loggers and into ``trainer.callback_metrics``, and ``EarlyStopping(monitor="report/psnr", mode="max")`` or a
+    ``ModelCheckpoint`` that monitors one of them looks at it right away.
+
     In ``test``: writes ``scene.nsvq``, reads it back, and lets the module render the **decoded file**; then
-    ``metrics.json``, ``views.csv`` and a picture (photo, render, error) of each view in ``renders/``.
+    ``metrics.json``, ``views.csv`` and a picture (photo, render, error) of each view in ``renders/``. TensorBoard and
+    Weights & Biases show the pictures, too, when they are among the loggers.
 
     Args:
         every: Iterations of this run between two evaluations; None is a twentieth of the run, 0 only the phase ends.
@@ -49,6 +57,8 @@ class MetricReport(HostedCallback):
     Raises:
         ValueError: ``every`` is negative.
     """
+
+    stages = ("fit", "test")
 
     def __init__(self, every: int | None = None, lpips: bool = True, pictures: bool = True) -> None:
         if every is not None and every < 0:
@@ -74,13 +84,19 @@ class MetricReport(HostedCallback):
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         """Evaluate the last iteration, now that every callback has finished with it."""
-        self._evaluate_if_due(trainer, as_host(pl_module), next_iteration(trainer) - 1)
+        iteration = next_iteration(trainer) - 1
+        if self.is_due(as_host(pl_module), iteration):
+            self._evaluate_once(trainer, pl_module, iteration)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Evaluate the end of the run, before what Lightning does at the end of its only epoch."""
+        self._evaluate_once(trainer, pl_module, trainer.global_step)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Evaluate the end of the run."""
+        """Evaluate the end of the run where no epoch has ended, and draw the curve."""
         host = as_host(pl_module)
-        self._evaluate_if_due(trainer, host, trainer.global_step, always=True)
-        folder = output_folder(trainer)
+        self._evaluate_once(trainer, pl_module, trainer.global_step)
+        folder = run_folder(trainer)
         if trainer.is_global_zero and host.history and not is_trial(trainer):
             with host.stopwatch.paused(host.device):
                 write_curve(folder / "curve.png", host.history, host.schedule)
@@ -91,15 +107,18 @@ class MetricReport(HostedCallback):
         if trainer.global_step and (not history or history[-1]["iteration"] < trainer.global_step):
             self.on_train_end(trainer, pl_module)
 
-    def _evaluate_if_due(self, trainer: Trainer, host: SplatHost, iteration: int, always: bool = False) -> None:
+    def _evaluate_once(self, trainer: Trainer, module: LightningModule, iteration: int) -> None:
+        """Evaluate an iteration that was not evaluated yet, and let those who wait for it know."""
+        host = as_host(module)
         done = host.history[-1]["iteration"] if host.history else 0
-        if iteration <= done or not (always or self.is_due(host, iteration)) or is_trial(trainer):
+        if iteration <= done or is_trial(trainer):
             return
         datamodule = getattr(trainer, "datamodule", None)
         if datamodule is None or not datamodule.scene.test:
             return
         with host.stopwatch.paused(host.device):
             self._evaluate(trainer, host, iteration, datamodule.test_dataloader())
+            tell_watchers(trainer, module)
 
     @torch.no_grad()
     def _evaluate(self, trainer: Trainer, host: SplatHost, iteration: int, views: Any) -> None:
@@ -119,12 +138,13 @@ class MetricReport(HostedCallback):
             "seconds": host.train_seconds,
         }
         host.history.append(entry)
-        folder = output_folder(trainer)
+        folder = run_folder(trainer)
         if trainer.is_global_zero:
-            folder.mkdir(parents=True, exist_ok=True)
             write_curve_csv(folder / "curve.csv", host.history)
+        values = {f"report/{name}": float(entry[name]) for name in ("psnr", "ssim", "splats")}
+        trainer.callback_metrics.update({name: torch.tensor(value) for name, value in values.items()})
         for logger in trainer.loggers:
-            logger.log_metrics({f"report/{name}": entry[name] for name in ("psnr", "ssim", "splats")}, iteration)
+            logger.log_metrics(values, iteration)
 
     # In test
 
@@ -132,7 +152,7 @@ class MetricReport(HostedCallback):
         """Write the file, read it back, and let the module test what was read."""
         host = as_host(pl_module)
         # Here all processes are together; some have fewer views than others.
-        self._folder = output_folder(trainer)
+        self._folder = run_folder(trainer)
         path = self._folder / "scene.nsvq"
         if trainer.is_global_zero:
             scene = host.compressed()
@@ -162,9 +182,9 @@ class MetricReport(HostedCallback):
         score = ViewScore(batch.name, float(outputs["psnr"]), float(outputs["ssim"]))
         self._scores.append(replace(score, lpips=self._lpips_of(image, photo)))
         if self.pictures:
-            folder = self._folder / "renders"
-            folder.mkdir(parents=True, exist_ok=True)
-            write_png(folder / f"{file_stem(batch.name)}.png", comparison(image, photo))
+            path = _picture(self._folder, batch.name)
+            path.parent.mkdir(exist_ok=True)
+            write_png(path, comparison(image, photo))
 
     def _lpips_of(self, image: Tensor, photo: Tensor) -> float | None:
         if self._lpips is None:
@@ -183,7 +203,14 @@ class MetricReport(HostedCallback):
             metrics = summarize(folder / "scene.nsvq", self._scene, scores, lpips, host, self._paper_level)
             write_metrics(folder / "metrics.json", metrics)
             write_views(folder / "views.csv", scores)
+            if self.pictures:
+                log_pictures(trainer.loggers, [_picture(folder, score.name) for score in scores], trainer.global_step)
         self._scene, self._lpips = None, None
+
+
+def _picture(folder: Path, view: str) -> Path:
+    """File of the picture of a view."""
+    return folder / "renders" / f"{file_stem(view)}.png"
 
 
 def _mean(scores: list[ViewScore], name: str) -> float:

@@ -86,6 +86,7 @@ def _compress(options: argparse.Namespace) -> int:
     from nsvq_lightning.io.frame import with_origin
     from nsvq_lightning.picture_error import decibels
     from nsvq_lightning.posthoc import Compressor
+    from nsvq_lightning.run_folder import claim_version
     from nsvq_lightning.viewpoints import measuring_cameras
 
     source: Path = options.input
@@ -101,11 +102,11 @@ def _compress(options: argparse.Namespace) -> int:
         if not candidate.rung.codebooks:
             log.info("nothing to train: %s has no codebooks", candidate.rung.name)
         else:
-            folder = options.output.parent / f"{options.output.stem}_training"
+            folder = claim_version(options.output.parent / f"{options.output.stem}_training")
             status = _train(options, candidate, folder)
             if status != 0:
                 return status
-            (path,) = sorted(folder.glob("*/version_*/scene.nsvq"), key=lambda path: path.stat().st_mtime)[-1:]
+            path = folder / "scene.nsvq"
             data = with_origin(path.read_bytes(), scene.origin)
             # Made anew: the pictures of the original would fill the memory while training.
             error = Compressor(arrays, cameras, candidate.storage).error(data)
@@ -182,7 +183,7 @@ def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> i
             "--callbacks.codebook_init.weights=contribution",
             "--callbacks.export.formats=[nsvq]",
             f"--trainer.max_steps={steps}",
-            f"--trainer.default_root_dir={folder}",
+            f"--trainer.run_folder={folder}",
         ]
     )
 

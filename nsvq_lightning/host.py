@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import torch
@@ -30,10 +29,8 @@ __all__ = [
     "as_host",
     "check_optimizer",
     "from_first_process",
-    "is_trial",
     "log_interval",
     "next_iteration",
-    "output_folder",
     "raw_optimizer",
     "splat_host",
     "sum_over_processes",
@@ -163,22 +160,9 @@ def raw_optimizer(trainer: Trainer) -> Optimizer:
     return trainer.optimizers[0]
 
 
-def is_trial(trainer: Trainer) -> bool:
-    """Whether this is ``fast_dev_run``, which must leave no files."""
-    return bool(getattr(trainer, "fast_dev_run", False))
-
-
 def log_interval(trainer: Trainer) -> int:
     """Iterations between two lines of the loggers."""
     return max(1, int(getattr(trainer, "log_every_n_steps", 50)))
-
-
-def output_folder(trainer: Trainer) -> Path:
-    """Where a run writes its files: the logger's folder, without a logger the default root folder.
-
-    The first process says where: a collective, which every process must call.
-    """
-    return Path(trainer.log_dir or trainer.default_root_dir)
 
 
 def from_first_process(trainer: Trainer, tensor: Tensor) -> Tensor:

@@ -93,7 +93,7 @@ def fit(
 ) -> None:
     """Train without a word, with loggers that write into a folder that is removed afterwards."""
     with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder, quiet():
-        loggers = default_loggers(folder, "benchmark")
+        loggers = default_loggers(Path(folder, "benchmark"))
         trainer = quiet_trainer(
             folder,
             steps,

@@ -76,7 +76,8 @@ def resolve(arguments: Sequence[str]) -> Settings:
         settings = _Reader(["fit", *resolve_configs(arguments)]).settings
     if settings["ckpt_path"] is not None:
         raise ValueError(f"a sweep has checkpoints of its own; leave ckpt_path={settings['ckpt_path']} out")
-    del settings["trainer"]["default_root_dir"]
+    for name in ("default_root_dir", "run_folder"):
+        del settings["trainer"][name]
     settings["trainer"]["logger"] = False
     del settings["callbacks"]["progress"]
     return settings

@@ -77,10 +77,12 @@ class Training:
         Raises:
             TrainingError: The training has failed, or has left no metrics.
         """
+        if not self.checkpoint.is_file():
+            shutil.rmtree(self.folder, ignore_errors=True)  # what a training that failed early has left
         self.folder.mkdir(parents=True, exist_ok=True)
         config, log = self.folder / "config.yaml", self.folder / "log.txt"
         write_text(config, json.dumps(self.settings, indent=2) + "\n")  # JSON is YAML
-        arguments = ["fit", "--config", str(config), f"--trainer.default_root_dir={self.folder}"]
+        arguments = ["fit", "--config", str(config), f"--trainer.run_folder={self.folder}"]
         start = self.checkpoint if self.checkpoint.is_file() else start
         if start is not None:
             arguments.append(f"--ckpt_path={start}")

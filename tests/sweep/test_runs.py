@@ -89,10 +89,10 @@ def test_a_run_of_a_sweep_is_the_run_alone(
 ) -> None:
     _, _, rows = swept
     alone = ["fit", f"--config={configs[1]}", f"--data.root={demo_scene}", "--trainer.max_steps=60", *OPTIONS]
-    assert main([*alone, f"--trainer.default_root_dir={tmp_path}", "--trainer.logger=false"]) == 0
+    assert main([*alone, f"--trainer.run_folder={tmp_path / 'alone'}", "--trainer.logger=false"]) == 0
     folder = rows[1].folder
-    assert (folder / "scene.nsvq").read_bytes() == (tmp_path / "scene.nsvq").read_bytes()
-    assert metrics_of(folder) == metrics_of(tmp_path)
+    assert (folder / "scene.nsvq").read_bytes() == (tmp_path / "alone" / "scene.nsvq").read_bytes()
+    assert metrics_of(folder) == metrics_of(tmp_path / "alone")
 
 
 def test_what_the_runs_share_is_trained_once(swept: tuple[Sweep, InProcess, list[Row]]) -> None:

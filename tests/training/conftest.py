@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from lightning.pytorch import Callback, Trainer
+from lightning.pytorch.callbacks import Checkpoint
 
 from nsvq_lightning.benchmark.fitting import quiet_trainer
 from nsvq_lightning.callbacks import (
@@ -22,7 +23,6 @@ from nsvq_lightning.callbacks import (
     MetricReport,
     OpacityRegularization,
     PhaseSchedule,
-    RunCheckpoint,
     ShDegreeSchedule,
 )
 from nsvq_lightning.data.datamodule import ColmapDataModule
@@ -80,7 +80,7 @@ def run(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFactor
             tmp_path_factory.mktemp("run"),
             STEPS,
             limit_val_batches=0,
-            enable_checkpointing=any(isinstance(c, RunCheckpoint) for c in callbacks),
+            enable_checkpointing=any(isinstance(c, Checkpoint) for c in callbacks),
             callbacks=callbacks,
             **trainer_arguments,
         )

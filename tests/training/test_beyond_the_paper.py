@@ -28,6 +28,7 @@ from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.pixel_size import scale_floor
 from nsvq_lightning.quantize import NSVQ
+from nsvq_lightning.run_folder import run_folder
 from nsvq_lightning.schedule import Phase
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
@@ -48,7 +49,7 @@ def options(**replaced: Callback) -> dict[str, Callback]:
 
 
 def scene_bytes(trainer: Trainer) -> bytes:
-    return (Path(trainer.default_root_dir) / "scene.nsvq").read_bytes()
+    return (run_folder(trainer) / "scene.nsvq").read_bytes()
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +69,7 @@ def test_the_order_of_callbacks_does_not_matter(all_options: Trainer, run: RunFa
 def test_a_resumed_run_is_the_run_not_interrupted(
     all_options: Trainer, run: RunFactory, recipe: Recipe, interrupted_at: int
 ) -> None:
-    path = Path(all_options.default_root_dir) / "checkpoints" / f"step-{interrupted_at}.ckpt"
+    path = run_folder(all_options) / "checkpoints" / f"step-{interrupted_at}.ckpt"
     resumed, _ = run(recipe(**options(), checkpoint=RunCheckpoint(every=0)).values(), ckpt_path=path)
     assert scene_bytes(resumed) == scene_bytes(all_options)
 

@@ -23,6 +23,7 @@ from nsvq_lightning.branch import (
 from nsvq_lightning.callbacks import PhaseSchedule, RunCheckpoint
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.quantize import NSVQ, StraightThrough
+from nsvq_lightning.run_folder import run_folder
 from nsvq_lightning.schedule import Phase, Schedule
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
@@ -33,12 +34,12 @@ PRUNE_END = Schedule(total=60, **INTERVALS).ends[Phase.PRUNE]
 
 
 def checkpoint_of(trainer: Trainer) -> Path:
-    return Path(trainer.default_root_dir) / "checkpoints" / "last.ckpt"
+    return run_folder(trainer) / "checkpoints" / "last.ckpt"
 
 
 def outcome(trainer: Trainer, module: SplatModule) -> tuple[bytes, list[dict[str, Any]]]:
     """The file, and every evaluation without its time."""
-    scene = (Path(trainer.default_root_dir) / "scene.nsvq").read_bytes()
+    scene = (run_folder(trainer) / "scene.nsvq").read_bytes()
     return scene, [{name: value for name, value in entry.items() if name != "seconds"} for entry in module.history]
 
 

@@ -34,6 +34,7 @@ from nsvq_lightning.cli import main
 from nsvq_lightning.lightning_cli import continuation
 from nsvq_lightning.module import SplatModule
 from nsvq_lightning.quantize import StraightThrough
+from nsvq_lightning.run_folder import run_folder
 from nsvq_lightning.schedule import Schedule
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
@@ -114,7 +115,7 @@ class Runner:
     def __call__(self, *more: Callback, checkpoint: RunCheckpoint, ckpt_path: Path | None = None) -> Path:
         callbacks = self.recipe(**self.options(), checkpoint=checkpoint).values()
         trainer, _ = self.run([*callbacks, *more], ckpt_path, self.module, **self.trainer)
-        return Path(trainer.default_root_dir)
+        return run_folder(trainer)
 
     def whole(self) -> Path:
         return self(checkpoint=RunCheckpoint(every=10, keep=True))
@@ -301,7 +302,7 @@ def test_a_run_that_goes_on_past_its_schedule_keeps_its_checkpoints(run: RunFact
     def fit(checkpoint: RunCheckpoint, ckpt_path: Path | None = None) -> Path:
         callbacks = recipe(phases=PhaseSchedule(total=20, min_finetune=1), checkpoint=checkpoint)
         trainer, _ = run(callbacks.values(), ckpt_path, max_steps=27)
-        return Path(trainer.default_root_dir)
+        return run_folder(trainer)
 
     whole = fit(RunCheckpoint(every=6, keep=True))
     kept = {iteration_of(path) for path in (whole / "checkpoints").glob("step-*.ckpt")}

@@ -207,6 +207,7 @@ def test_a_paused_stopwatch_stands_still(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_a_trained_module_cannot_be_trained_from_the_start(module: SplatModule) -> None:
     module.phase = Phase.FINETUNE
+    module.trainer.optimizers = [module.configure_optimizers()]  # type: ignore[list-item]
     with pytest.raises(ValueError, match="already trained into its finetune phase"):
         PhaseSchedule().on_train_start(module.trainer, module)
 

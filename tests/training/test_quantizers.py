@@ -26,6 +26,7 @@ from nsvq_lightning.quantize import (
     kmeans,
 )
 from nsvq_lightning.random import generator
+from nsvq_lightning.run_folder import run_folder
 from nsvq_lightning.schedule import Phase, Schedule
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
@@ -61,7 +62,7 @@ class MiddleCheckpoint(RunCheckpoint):
 
 
 def scene_path(trainer: Trainer) -> Path:
-    return Path(trainer.default_root_dir) / "scene.nsvq"
+    return run_folder(trainer) / "scene.nsvq"
 
 
 def assert_nearest(codes: torch.Tensor, rows: torch.Tensor, book: torch.Tensor) -> None:
@@ -107,7 +108,7 @@ def test_a_resumed_run_is_the_run_not_interrupted(
     finished: Finished, run: RunFactory, quantized_recipe: Recipe
 ) -> None:
     kind, trainer, _, _ = finished
-    path = Path(trainer.default_root_dir) / "checkpoints" / f"step-{MIDDLE}.ckpt"
+    path = run_folder(trainer) / "checkpoints" / f"step-{MIDDLE}.ckpt"
     callbacks = quantized_recipe(checkpoint=RunCheckpoint(every=0)).values()
     resumed, _ = run(callbacks, ckpt_path=path, module={"quantizer": kind, "storage": PAPER})
     assert resumed.global_step == STEPS

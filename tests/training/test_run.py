@@ -36,6 +36,7 @@ from nsvq_lightning.module import SplatModule
 from nsvq_lightning.optim import LearningRates, position_lr
 from nsvq_lightning.quantize import NSVQ, PostHoc, StraightThrough
 from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.run_folder import run_folder
 from nsvq_lightning.schedule import Phase, Schedule
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
@@ -71,7 +72,7 @@ class Whole:
 
     @property
     def folder(self) -> Path:
-        return Path(self.trainer.default_root_dir)
+        return run_folder(self.trainer)
 
 
 SCHEDULE = Schedule(total=60, min_density_interval=4, min_reset_interval=11, min_replacement_interval=5, min_finetune=1)
@@ -85,7 +86,7 @@ def whole(run: RunFactory, recipe: Recipe) -> Whole:
 
 
 def scene_bytes(trainer: Trainer) -> bytes:
-    return (Path(trainer.default_root_dir) / "scene.nsvq").read_bytes()
+    return (run_folder(trainer) / "scene.nsvq").read_bytes()
 
 
 def test_a_run_passes_all_phases(whole: Whole) -> None:
@@ -255,7 +256,7 @@ def test_codes_of_a_codebook_that_was_never_placed_are_not_frozen(run: RunFactor
 def test_a_run_without_codebooks_is_plain_splatting(run: RunFactory, recipe: Recipe, demo_scene: Path) -> None:
     trainer, module = run(recipe().values(), module={"codebooks": None, "storage": Storage("paper")})
     trainer.test(module, datamodule=ColmapDataModule(str(demo_scene), factor=2), verbose=False)
-    folder = Path(trainer.default_root_dir)
+    folder = run_folder(trainer)
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics["level"] == "paper"
     assert metrics["paper_level"] == {"file_bytes": metrics["file_bytes"], "header_bytes": ANY, "matches_formula": True}
@@ -266,7 +267,7 @@ def test_a_run_without_codebooks_is_plain_splatting(run: RunFactory, recipe: Rec
 @pytest.mark.parametrize("codebooks", [{"scales": 8}, {"quats": 5, "shN": 3}])
 def test_any_subset_of_attributes_can_be_quantized(run: RunFactory, recipe: Recipe, codebooks: dict[str, int]) -> None:
     trainer, _ = run(recipe().values(), module={"codebooks": codebooks}, max_steps=20)
-    stored = read_nsvq(Path(trainer.default_root_dir) / "scene.nsvq")
+    stored = read_nsvq(run_folder(trainer) / "scene.nsvq")
     # Codes that no splat uses are not in the file.
     assert all(2 <= len(stored.codebooks[name]) <= count for name, count in codebooks.items())
     assert stored.codebooks.keys() == codebooks.keys()
@@ -275,7 +276,7 @@ def test_any_subset_of_attributes_can_be_quantized(run: RunFactory, recipe: Reci
 
 def test_more_codes_than_splats_are_no_problem(run: RunFactory, recipe: Recipe) -> None:
     trainer, module = run(recipe(density=Callback()).values(), module={"codebooks": "0.5k"}, max_steps=20)
-    stored = read_nsvq(Path(trainer.default_root_dir) / "scene.nsvq")
+    stored = read_nsvq(run_folder(trainer) / "scene.nsvq")
     assert all(len(book) <= len(module.splats) for book in stored.codebooks.values())
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.module import SplatModule
+from nsvq_lightning.run_folder import run_folder
 from nsvq_lightning.skips import SKIPS, switched
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
@@ -24,7 +24,7 @@ def decoded(run: RunFactory, recipe: Recipe, **switches: bool) -> dict[str, Tens
     """The splats of the file that a run leaves."""
     with switched(**switches):
         trainer, _ = run(recipe().values())
-    splats = load(Path(trainer.default_root_dir) / "scene.nsvq")
+    splats = load(run_folder(trainer) / "scene.nsvq")
     return {name: parameter.detach() for name, parameter in splats.attributes().items()}
 
 

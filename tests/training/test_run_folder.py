@@ -1,0 +1,134 @@
+"""A run has a folder of its own, whatever the logger, and overwrites no other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import RunFactory
+from lightning.pytorch import Callback, Trainer
+from lightning.pytorch.loggers import CSVLogger, Logger
+
+from nsvq_lightning.benchmark.fitting import quiet_trainer
+from nsvq_lightning.callbacks import ExportScene, MetricReport, PhaseSchedule, RunCheckpoint
+from nsvq_lightning.cli import main
+from nsvq_lightning.run_folder import claim_version, run_folder
+
+
+class Elsewhere(Logger):
+    """A logger that keeps its records somewhere else, as that of Weights & Biases does."""
+
+    name, version, save_dir = "elsewhere", "abc", "."
+
+    def log_hyperparams(self, *args: Any, **kwargs: Any) -> None: ...
+
+    def log_metrics(self, *args: Any, **kwargs: Any) -> None: ...
+
+
+def callbacks() -> list[Callback]:
+    return [PhaseSchedule(), ExportScene(), MetricReport(every=0), RunCheckpoint(every=2)]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("logger", [False, Elsewhere(), [Elsewhere(), Elsewhere()]], ids=["none", "own place", "two"])
+def test_every_run_gets_the_next_version_whatever_the_logger(
+    run: RunFactory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logger: Any, demo_scene: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)  # where loggers that know no better write
+    found = []
+    for version in range(2):
+        trainer, _ = run(
+            callbacks(), max_steps=3, default_root_dir=tmp_path / "runs", logger=logger, module={"seed": version}
+        )
+        folder = run_folder(trainer)
+        assert folder == tmp_path / "runs" / demo_scene.name / f"version_{version}"
+        assert {"scene.nsvq", "curve.csv", "checkpoints/last.ckpt"} <= contents(folder).keys()
+        found.append(contents(folder))
+    assert contents(tmp_path / "runs" / demo_scene.name / "version_0") == found[0]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["runs"]
+
+
+def test_a_folder_that_holds_a_run_is_refused(run: RunFactory, tmp_path: Path) -> None:
+    def fit(**more: Any) -> Trainer:
+        logger = CSVLogger(tmp_path, name="a", version="b", flush_logs_every_n_steps=1)
+        return run(callbacks(), logger=logger, log_every_n_steps=1, **({"max_steps": 4} | more))[0]
+
+    folder = run_folder(fit())
+    assert folder == tmp_path / "a" / "b"
+    before = contents(folder)
+    with pytest.raises(FileExistsError, match=r"b holds a run already, and no run is overwritten: name another"):
+        fit()
+    assert {k: v for k, v in contents(folder).items() if k != "metrics.csv"}.items() <= before.items()
+    # Only to go on from its own checkpoint is no other run.
+    again = fit(ckpt_path=folder / "checkpoints" / "last.ckpt", max_steps=4)
+    assert run_folder(again) == folder
+
+
+def test_what_callbacks_were_told_to_write_elsewhere_is_not_overwritten_either(run: RunFactory, tmp_path: Path) -> None:
+    def fit() -> None:
+        run([PhaseSchedule(), RunCheckpoint(folder=str(tmp_path / "kept"))], max_steps=2)
+
+    fit()
+    before = contents(tmp_path / "kept")
+    with pytest.raises(FileExistsError, match="kept holds a run already"):
+        fit()
+    assert contents(tmp_path / "kept") == before
+
+
+def test_a_trial_leaves_no_folder(run: RunFactory, tmp_path: Path) -> None:
+    run(callbacks(), default_root_dir=tmp_path / "runs", fast_dev_run=True)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_runs_that_start_together_get_different_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert [claim_version(tmp_path).name for _ in range(3)] == ["version_0", "version_1", "version_2"]
+    (tmp_path / "version_notes").mkdir()
+    monkeypatch.setattr(Path, "glob", lambda *_: iter(()))  # another run was faster between the look and the claim
+    assert claim_version(tmp_path).name == "version_3"
+
+
+def test_one_trainer_has_one_folder(tmp_path: Path) -> None:
+    trainer = quiet_trainer(tmp_path, 1)
+    assert run_folder(trainer) == run_folder(trainer) == tmp_path / "scene" / "version_0"
+    assert run_folder(quiet_trainer(tmp_path, 1)) == tmp_path / "scene" / "version_1"
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        ["--trainer.logger=CSVLogger", "--trainer.logger.save_dir=logs", "--trainer.logger.version=0"],
+        ["--trainer.logger=false", "--trainer.run_folder=mine"],
+    ],
+)
+def test_the_command_neither_overwrites_nor_loses_a_log(
+    place: list[str],
+    demo_scene: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arguments = ["fit", f"--data.root={demo_scene}", "--data.factor=2", "--trainer.accelerator=cpu", *place]
+    arguments += [
+        "--trainer.log_every_n_steps=1",
+        "--model.sh_degree=0",
+        "--model.codebooks=null",
+        "--callbacks.progress=null",
+    ]
+    assert main([*arguments, "--trainer.max_steps=3"]) == 0
+    (folder,) = {path.parent for path in tmp_path.rglob("scene.nsvq")}
+    before = contents(folder)
+    assert "config.yaml" in before
+    assert main([*arguments, "--trainer.max_steps=3"]) == 1
+    assert "holds a run already" in capsys.readouterr().err
+    assert contents(folder) == before
+    going_on = [f"--ckpt_path={folder / 'checkpoints' / 'last.ckpt'}", "--callbacks.phases.total=3"]
+    assert main([*arguments, "--trainer.max_steps=5", *going_on]) == 0
+    after = contents(folder)
+    assert after["scene.nsvq"] != before["scene.nsvq"]
+    if "metrics.csv" in before:
+        assert after["metrics_1.csv"] == before["metrics.csv"]

@@ -1,0 +1,76 @@
+"""Metrics of the report where Lightning looks for them, and what looks there."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import Recipe, RunFactory
+from lightning.pytorch import Callback
+from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from nsvq_lightning.callbacks import MetricReport, RunCheckpoint
+from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.run_folder import run_folder
+
+
+def curve(folder: Path) -> dict[int, float]:
+    with open(folder / "curve.csv", newline="") as file:
+        return {int(row["iteration"]): float(row["psnr"]) for row in csv.DictReader(file)}
+
+
+def test_the_report_is_in_the_callback_metrics(run: RunFactory, recipe: Recipe) -> None:
+    trainer, module = run(recipe().values(), max_steps=20)
+    last = module.history[-1]
+    assert last["iteration"] == 20
+    for name in ("psnr", "ssim", "splats"):
+        assert float(trainer.callback_metrics[f"report/{name}"]) == pytest.approx(last[name])
+
+
+def test_a_checkpoint_keeps_the_best_evaluation_and_continues_to_the_same_bits(
+    run: RunFactory, recipe: Recipe, tmp_path: Path
+) -> None:
+    best = ModelCheckpoint(tmp_path, "{step}", monitor="report/psnr", mode="max", save_top_k=-1)
+    trainer, _ = run([*recipe(report=MetricReport(every=10)).values(), best])
+    scores = curve(run_folder(trainer))
+    assert {10, 20, 27, 57, 60} <= scores.keys()  # ends of phases among them, where the next one has begun already
+    stored = {int(Path(path).stem.partition("=")[2]): float(score) for path, score in best.best_k_models.items()}
+    assert stored == pytest.approx(scores, abs=1e-3)
+    assert Path(best.best_model_path).stem == f"step={max(scores, key=scores.__getitem__)}"
+    expected = (run_folder(trainer) / "scene.nsvq").read_bytes()
+    for step in (20, 27, 57):
+        resumed, _ = run(recipe(checkpoint=RunCheckpoint(every=0)).values(), tmp_path / f"step={step}.ckpt")
+        assert (run_folder(resumed) / "scene.nsvq").read_bytes() == expected
+
+
+@pytest.mark.parametrize("at_epochs", [None, False])
+def test_early_stopping_ends_the_run(run: RunFactory, recipe: Recipe, at_epochs: bool | None) -> None:
+    stop = EarlyStopping(
+        "report/psnr", min_delta=100.0, patience=2, mode="max", check_on_train_epoch_end=at_epochs, verbose=False
+    )
+    trainer, module = run([*recipe(report=MetricReport(every=5)).values(), stop])
+    # The first evaluation is the best there was, two more are no better; what was begun is finished.
+    assert trainer.global_step == 16
+    assert [entry["iteration"] for entry in module.history] == [5, 10, 15, 16]
+    assert (run_folder(trainer) / "scene.nsvq").is_file()
+
+
+def test_tensorboard_gets_the_pictures_of_the_test(
+    run: RunFactory, recipe: Recipe, demo_scene: Path, tmp_path: Path
+) -> None:
+    events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    logger = TensorBoardLogger(tmp_path, "a", version="b")
+    callbacks: dict[str, Callback] = recipe()
+    trainer, module = run(callbacks.values(), max_steps=4, logger=logger)
+    trainer.test(module, datamodule=ColmapDataModule(str(demo_scene), factor=2), verbose=False)
+    record = events.EventAccumulator(str(tmp_path / "a" / "b")).Reload()
+    pictures = {path.stem for path in (tmp_path / "a" / "b" / "renders").iterdir()}
+    assert {tag.removeprefix("test/") for tag in record.Tags()["images"]} == pictures
+    (image,) = record.Images(f"test/{min(pictures)}")
+    assert (image.width, image.height) == (3 * 48, 36)
+    assert image.step == 4
+    assert "report/psnr" in record.Tags()["scalars"]
+    assert torch.isfinite(trainer.callback_metrics["test/psnr"])
