@@ -11,32 +11,17 @@ from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
+from typing import TextIO
+
+from nsvq_lightning import __version__
+from nsvq_lightning.commands import COMMANDS, overview
 
 __all__ = ["check_config", "find_config", "main", "resolve_configs"]
-
-OWN_COMMANDS = {
-    "info": "nsvq_lightning.info",
-    "benchmark": "nsvq_lightning.benchmark.cli",
-    "compress": "nsvq_lightning.compress_command",
-    "convert": "nsvq_lightning.convert_command",
-    "sweep": "nsvq_lightning.sweep.cli",
-    "doctor": "nsvq_lightning.doctor.cli",
-}
-"""Commands without a trainer: modules with a ``main(argv)``, which must not pay for Lightning's start."""
 
 CONFIG_OPTIONS = ("--config", "-c")
 
 TRACEBACK = "NSVQ_TRACEBACK"
 """Environment variable that makes errors show their traceback."""
-
-ENVIRONMENT = {
-    # Waiting OpenMP threads otherwise spin: as soon as anything else runs on the machine, the threads that have work
-    # wait for those that only spin, and a step takes several times as long.
-    "OMP_WAIT_POLICY": "passive",
-    # Large tensors in large pages: a step of 100k splats takes 3 % less time, one of 500k splats 4 %.
-    "THP_MEM_ALLOC_ENABLE": "1",
-}
-"""What torch and OpenMP read when they are loaded, unless the user has set it."""
 
 NOT_ACTIONABLE = (
     "does not have many workers",  # views come from a cache in memory; workers would each hold a copy
@@ -59,10 +44,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0, 1 after an error in the user's files or Ctrl-C, 143 after SIGTERM.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    for name, value in ENVIRONMENT.items():
-        os.environ.setdefault(name, value)
-    if arguments and arguments[0] in OWN_COMMANDS:
-        command: Callable[[Sequence[str]], int] = import_module(OWN_COMMANDS[arguments[0]]).main
+    if not arguments or arguments[0] in ("--help", "-h", "help"):
+        sys.stdout.write(overview())
+        return 0 if arguments else 2
+    if arguments[0] == "--version":
+        sys.stdout.write(f"nsvq {__version__}\n")
+        return 0
+    if arguments[0] in COMMANDS and (module := COMMANDS[arguments[0]].module) is not None:
+        command: Callable[[Sequence[str]], int] = import_module(module).main
         return command(arguments[1:])
     return _run_lightning(resolve_configs(arguments))
 
@@ -70,11 +59,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run_lightning(arguments: list[str]) -> int:
     for message in NOT_ACTIONABLE:
         warnings.filterwarnings("ignore", f".*{message}.*")
+    from lightning.fabric.utilities.exceptions import MisconfigurationException
     from lightning.pytorch.utilities.exceptions import SIGTERMException
 
     from nsvq_lightning.lightning_cli import SplatCLI
 
     _quiet_lightning()
+    sys.path.append(os.getcwd())  # as `python -m` does, but last: quantizers and callbacks of one's own
     configs = _config_values(arguments)
     try:
         for config in configs:
@@ -86,9 +77,10 @@ def _run_lightning(arguments: list[str]) -> int:
         if end.code == 2 and configs:  # the parser's messages name the option, not the file it came from
             sys.stderr.write(f"Settings came from {', '.join(configs)} and the command line\n")
         raise
-    except (ValueError, OSError) as error:
+    except Exception as error:
         names_file = isinstance(error, FileNotFoundError) or (isinstance(error, OSError) and error.filename is not None)
-        if os.environ.get(TRACEBACK) or not (names_file or _is_ours(error)):
+        speaks = names_file or isinstance(error, MisconfigurationException) or _is_ours(error)
+        if os.environ.get(TRACEBACK) or not speaks:
             raise
         sys.stderr.write(f"error: {error}\n({TRACEBACK}=1 shows where)\n")
         return 1
@@ -96,18 +88,36 @@ def _run_lightning(arguments: list[str]) -> int:
 
 
 def _is_ours(error: BaseException) -> bool:
-    """Whether this package raised the error: its message then says what to do, and a traceback would only hide it."""
+    """Whether this package raised the error: its message then says what to do, and a traceback would only hide it.
+
+    Errors of other kinds than these are mistakes of ours, whose place matters.
+    """
+    if not isinstance(error, ValueError | TypeError | OSError | RuntimeError | ArithmeticError | ImportError):
+        return False
     frame = error.__traceback__
     while frame is not None and frame.tb_next is not None:
         frame = frame.tb_next
     return frame is not None and Path(frame.tb_frame.f_code.co_filename).is_relative_to(Path(__file__).parent)
 
 
+class BarHandler(logging.StreamHandler[TextIO]):
+    """Writes to stderr, above a progress bar where there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record."""
+        from tqdm import tqdm
+
+        try:
+            tqdm.write(self.format(record), file=self.stream)
+        except Exception:
+            self.handleError(record)
+
+
 def _quiet_lightning() -> None:
     """Show our log messages, once; of Lightning's only those that are not advertisements."""
     from lightning.pytorch.utilities import rank_zero_only
 
-    logging.basicConfig(format="%(message)s")
+    logging.basicConfig(format="%(message)s", handlers=[BarHandler()])
     logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
     for handler in logging.getLogger().handlers:
         # Of several processes the first one speaks; what goes wrong on another is said there.

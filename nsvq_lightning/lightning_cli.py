@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -12,19 +13,20 @@ from types import NoneType
 from typing import Any, NoReturn
 
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import ProgressBar
+from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 import nsvq_lightning.callbacks as callbacks
 import nsvq_lightning.quantize  # noqa: F401  short class names resolve to what is imported
 from nsvq_lightning.checkpoint_file import read_checkpoint
-from nsvq_lightning.cli import OWN_COMMANDS
+from nsvq_lightning.commands import COMMANDS
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
-from nsvq_lightning.host import is_trial, output_folder
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.module import SplatModule
+from nsvq_lightning.option_help import class_help, command_help, first_sentence
 from nsvq_lightning.progress import SplatProgressBar
+from nsvq_lightning.run_folder import is_trial, reserve, run_folder
 from nsvq_lightning.skips import SKIPS, switch, switched
 from nsvq_lightning.trainer import SplatTrainer
 
@@ -66,19 +68,22 @@ NAMED_CHECKPOINTS = frozenset({"hpc", "registry"})
 
 PARSER_TEXTS: dict[str, Any] = {
     "prog": "nsvq",
-    "description": "Train 3D Gaussian splatting scenes and store them small. More commands have their own options: "
-    "'nsvq info FILE' describes a scene file, 'nsvq compress' makes one small, 'nsvq convert' writes it in another "
-    "format, 'nsvq sweep' trains many runs and compares them, 'nsvq benchmark' measures this machine, 'nsvq doctor' "
-    "says whether it and a folder are fit.",
-    "fit": {"description": "Train a scene, compress it, and measure the decoded file."},
-    "validate": {"description": "Measure the scene of a checkpoint."},
-    "test": {"description": "Write the compressed file of a checkpoint, read it back and measure it."},
-    "predict": {"description": "Render every view of a scene into a folder."},
+    **{name: {"description": command.summary} for name, command in COMMANDS.items() if command.module is None},
 }
 
 
 class QuietParser(LightningArgumentParser):
-    """Says what is wrong without the usage, which has some hundred lines."""
+    """Says what is wrong without the usage, which has some hundred lines, and lists options without their classes."""
+
+    def format_help(self, *args: Any) -> str:
+        """Help of a command, see :mod:`nsvq_lightning.option_help`."""
+        subcommand = self.prog.rpartition(" ")[2]
+        if subcommand not in COMMANDS:
+            return super().format_help(*args)
+        data = {} if subcommand == "export" else {"data": ColmapDataModule}
+        return command_help(
+            self, subcommand, data | {f"callbacks.{key}": kind for key, kind in DEFAULT_CALLBACKS.items()}
+        )
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Write the message to stderr and exit with status 2."""
@@ -89,21 +94,29 @@ class QuietParser(LightningArgumentParser):
         elif message.startswith('Parser key "data":') and Path(message.rpartition("Given value: ")[2]).is_dir():
             message = "--data takes the name of a data module; the folder of a scene is --data.root=path/to/scene"
         elif "subcommand: invalid choice" in message:
-            message = message.removesuffix(")") + "".join(f", '{name}'" for name in OWN_COMMANDS) + ")"
+            message = f"{message.partition(' (')[0]} (choose from {', '.join(COMMANDS)})"
         sys.stderr.write(f"error: {message}\nAll options: {program} --help\n")
         self.exit(2)
 
 
-class SaveConfig(SaveConfigCallback):
-    """Writes the settings of a run into ``config.yaml`` in its log folder, atomically."""
+class RunStart(SaveConfigCallback):
+    """Opens the run: its folder, the default loggers in it, and the settings in ``config.yaml``, written atomically."""
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Write, on the first process."""
-        folder = output_folder(trainer)  # asks all processes
-        if trainer.is_global_zero and not self.already_saved:
-            folder.mkdir(parents=True, exist_ok=True)
-            write_text(folder / self.config_filename, self.parser.dump(self.config, skip_none=False))
+        """Open it as soon as the scene has been loaded, before anything is logged."""
+        folder = run_folder(trainer)  # asks all processes
+        if self.already_saved or is_trial(trainer):
+            return
         self.already_saved = True
+        if self.config.trainer.logger in (None, True):
+            trainer.loggers = default_loggers(folder)
+            for logger in trainer.loggers:
+                _ = logger.experiment  # type: ignore[attr-defined]  # now, as the CSV logger warns of a folder with files
+        for callback in trainer.checkpoint_callbacks:
+            if isinstance(callback, ModelCheckpoint) and callback.dirpath is None:
+                callback.dirpath = str(folder / "checkpoints")
+        if trainer.is_global_zero:
+            write_text(folder / self.config_filename, self.parser.dump(self.config, skip_none=False))
 
 
 class SplatCLI(LightningCLI):
@@ -116,13 +129,18 @@ class SplatCLI(LightningCLI):
 
     def __init__(self, args: list[str]) -> None:
         self._arguments = args
+        for argument in args:
+            asked = re.fullmatch(r"--callbacks\.(\w+)\.help", argument)
+            if asked and asked[1] in DEFAULT_CALLBACKS:
+                sys.stdout.write(class_help(f"callbacks.{asked[1]}", DEFAULT_CALLBACKS[asked[1]]))
+                raise SystemExit(0)
         with switched():  # they hold for this command only
             super().__init__(
                 SplatModule,
                 ColmapDataModule,
                 trainer_class=SplatTrainer,
                 trainer_defaults=TRAINER_DEFAULTS,
-                save_config_callback=SaveConfig,
+                save_config_callback=RunStart,
                 seed_everything_default=False,  # every draw has its own generator
                 parser_class=QuietParser,
                 parser_kwargs=PARSER_TEXTS,
@@ -144,7 +162,7 @@ class SplatCLI(LightningCLI):
             key = f"callbacks.{name}"
             path = f"{kind.__module__}.{kind.__qualname__}"
             parser.add_argument(
-                f"--{key}", type=Callback | None, default={"class_path": path}, help=_first_sentence(kind)
+                f"--{key}", type=Callback | None, default={"class_path": path}, help=first_sentence(kind.__doc__)
             )
             parser.callback_keys.append(key)
 
@@ -183,27 +201,41 @@ class SplatCLI(LightningCLI):
             kwargs.pop("datamodule", None)
         return kwargs
 
+    def instantiate_classes(self) -> None:
+        """Make trainer, module and data.
+
+        Raises:
+            ValueError: One of them cannot be made of these settings; the message is that of the cause.
+        """
+        try:
+            super().instantiate_classes()
+        except Exception as error:
+            cause: BaseException = error
+            while cause.__cause__ is not None:  # the parser adds what it tried besides
+                cause = cause.__cause__
+            raise ValueError(" ".join(str(cause).split())) from error
+
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """The trainer with default loggers, without the callbacks that are null or switched off with the bar."""
+        """The trainer without the callbacks that are null, or switched off with the bar or with checkpoints."""
         parser = self._parser(self.subcommand)
         settings = self._get(self.config_init, "trainer")
-        # Lightning refuses the callback beside the flag, and the default callbacks hold one.
-        unwanted = (NoneType, ProgressBar) if settings.enable_progress_bar is False else NoneType
+        # Lightning refuses a callback beside the flag, and the default callbacks hold one of each kind.
+        unwanted: list[type] = [NoneType]
+        unwanted += [ProgressBar] if settings.enable_progress_bar is False else []
+        unwanted += [Checkpoint] if settings.enable_checkpointing is False else []
         parser.callback_keys = [
-            key for key in parser.callback_keys if not isinstance(self._get(self.config_init, key), unwanted)
+            key for key in parser.callback_keys if not isinstance(self._get(self.config_init, key), tuple(unwanted))
         ]
-        if settings.logger in (None, True) and self.subcommand != "export":
-            kwargs["logger"] = default_loggers(settings.default_root_dir, self._run_name())
+        if settings.logger in (None, True):
+            kwargs["logger"] = False  # until the run has a folder: see RunStart
         if self.subcommand == "validate" and settings.limit_val_batches == 0:
             kwargs["limit_val_batches"] = 1.0  # 0 is of a config that `fit` has written
         return super().instantiate_trainer(**kwargs)
 
-    def _run_name(self) -> str:
-        root = getattr(self.datamodule, "root", None)
-        return Path(root).resolve().name if root is not None else "scene"
-
     def _run_subcommand(self, subcommand: str) -> None:
         """Run it; say how to continue a training that was stopped by whatever it was."""
+        if subcommand != "export":
+            reserve(self.trainer, self.config[subcommand].get("ckpt_path") if subcommand == "fit" else None)
         try:
             super()._run_subcommand(subcommand)
         except BaseException:
@@ -230,7 +262,7 @@ class SplatCLI(LightningCLI):
         self._print_summary()
 
     def _print_summary(self) -> None:
-        path = output_folder(self.trainer) / "metrics.json"
+        path = run_folder(self.trainer) / "metrics.json"
         if self.trainer.is_global_zero and path.is_file():
             sys.stdout.write(summary(path.parent, json.loads(path.read_text())))
 
@@ -274,18 +306,14 @@ def summary(folder: Path, metrics: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def default_loggers(root: str | None, name: str) -> list[Logger]:
-    """A CSV logger in ``root/name/version_k``, and a TensorBoard logger in the same folder where it is installed."""
-    csv = CSVLogger(root or "runs", name)
-    loggers: list[Logger] = [csv]
+def default_loggers(folder: Path) -> list[Logger]:
+    """A CSV logger that writes into ``folder``, and a TensorBoard logger where that is installed."""
+    place: dict[str, Any] = {"save_dir": folder.parent, "name": "", "version": folder.name}
+    loggers: list[Logger] = [CSVLogger(**place)]
     if find_spec("tensorboard") is not None:
-        loggers.append(TensorBoardLogger(root or "runs", name, version=csv.version, default_hp_metric=False))
+        loggers.append(TensorBoardLogger(**place, default_hp_metric=False))
     return loggers
 
 
 def _number(value: float | None, form: str) -> str:
     return "infinite" if value is None else format(value, form)
-
-
-def _first_sentence(kind: type) -> str:
-    return (kind.__doc__ or "").strip().split("\n")[0]

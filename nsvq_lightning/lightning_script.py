@@ -11,22 +11,9 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 
-__all__ = ["COMMANDS", "main"]
+from nsvq_lightning.commands import COMMANDS
 
-COMMANDS = (
-    "fit",
-    "validate",
-    "test",
-    "predict",
-    "export",
-    "info",
-    "compress",
-    "convert",
-    "benchmark",
-    "sweep",
-    "doctor",
-)
-"""Subcommands of ``nsvq``, named here so that foreign words do not import torch."""
+__all__ = ["main"]
 
 _OURS = "nsvq-lightning"
 

@@ -96,8 +96,13 @@ class SplatModule(SplatModel):
         """Fill empty splats from ``init_from`` or the scene's points; take over the extent of the scene.
 
         Raises:
-            ValueError: There is nothing to start from.
+            ValueError: There is nothing to start from, or the trainer has another precision than ``32-true``.
         """
+        if self.trainer.precision != "32-true":
+            raise ValueError(
+                f"splats train in float32, trainer.precision is {self.trainer.precision}: kernels compute in float32 "
+                "whatever it says, and a scaled loss would grow splats without need; leave it at 32-true"
+            )
         # An evaluation that was interrupted may have left its splats.
         self.evaluation_splats = None
         if stage != "fit":
@@ -142,6 +147,15 @@ class SplatModule(SplatModel):
         if can_branch(checkpoint, self.codebooks):
             branch_checkpoint(checkpoint, self.codebooks, self.configure_optimizers())
         check_continuation(checkpoint, self)
+
+    def on_fit_start(self) -> None:
+        """Say so where the splats are trained on a GPU."""
+        if self.device.type == "cuda":
+            log.warning(
+                "training on %s with kernels that are tested under Triton's interpreter, but have never run on a GPU: "
+                "--trainer.accelerator=cpu trains without them, and docs/backends.md says more",
+                torch.cuda.get_device_name(self.device),
+            )
 
     def on_train_start(self) -> None:
         """Take the learning rates of this run, not those of a checkpoint; start counting the training time."""

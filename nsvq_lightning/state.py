@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from nsvq_lightning.compilation import compile_seconds
 from nsvq_lightning.schedule import Phase
 
 __all__ = ["RunState", "Stopwatch"]
@@ -91,7 +92,7 @@ def _refresh(state: RunState, _: Any) -> None:
 
 
 class Stopwatch:
-    """Adds the time between two laps to ``state.train_seconds``, pauses left out.
+    """Adds the time between two laps to ``state.train_seconds``; pauses and the compilation of kernels are left out.
 
     Args:
         state: Where the seconds go.
@@ -103,12 +104,12 @@ class Stopwatch:
 
     def start(self) -> None:
         """Start counting now; time before is forgotten."""
-        self._since = time.perf_counter()
+        self._since = _working_time()
 
     def lap(self) -> None:
         """Add the time since the last lap; nothing when the watch does not run."""
         if self._since is not None:
-            now = time.perf_counter()
+            now = _working_time()
             self._state.train_seconds += now - self._since
             self._since = now
 
@@ -130,3 +131,8 @@ class Stopwatch:
             if running:
                 torch.get_device_module(device).synchronize()
                 self.start()
+
+
+def _working_time() -> float:
+    """Seconds on a clock that stands still while kernels are compiled."""
+    return time.perf_counter() - compile_seconds()

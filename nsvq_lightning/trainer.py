@@ -8,6 +8,7 @@ from typing import Any
 
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch import Trainer
+from lightning.pytorch.strategies import DDPStrategy
 
 from nsvq_lightning.checkpoint_file import PlainCheckpointIO, read_checkpoint
 from nsvq_lightning.compress import save_as_stored
@@ -23,10 +24,20 @@ class SplatTrainer(Trainer):
     """:class:`lightning.pytorch.Trainer`; every public method below is a subcommand of ``nsvq``.
 
     Checkpoints are read by :class:`~nsvq_lightning.checkpoint_file.PlainCheckpointIO` unless a plugin does it.
+
+    Where several devices or machines are asked for and no strategy is, it takes ``view_parallel``: DDP, which Lightning
+    would choose, cannot follow a changing number of splats.
+
+    Args:
+        run_folder: Folder for all files of the run; None is that of the logger if it has one for each run, else a new
+            ``<default_root_dir>/<scene>/version_<n>``. A run that is there already is not overwritten.
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, run_folder: str | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        if kwargs.get("strategy", "auto") == "auto" and isinstance(self.strategy, DDPStrategy):
+            super().__init__(*args, **(kwargs | {"strategy": "view_parallel"}))
+        self.run_folder = run_folder
         if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # Lightning's own
             self.strategy.checkpoint_io = PlainCheckpointIO()
 

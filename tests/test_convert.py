@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nsvq_lightning.cli import OWN_COMMANDS
+from nsvq_lightning.commands import COMMANDS
 from nsvq_lightning.compress import export_scene
 from nsvq_lightning.convert_command import main
 from nsvq_lightning.io import FORMATS, read_scene, save
@@ -25,7 +25,7 @@ def test_every_readable_format_becomes_every_writable_one(tmp_path: Path, capsys
             assert main([str(tmp_path / f"a{source}"), str(output)]) == 0
             assert f"30 splats in {output.stat().st_size:,} bytes" in capsys.readouterr().out
             nearest_in(read_scene(output).arrays(), scene.arrays())
-    assert OWN_COMMANDS["convert"] == main.__module__
+    assert COMMANDS["convert"].module == main.__module__
 
 
 def test_codebooks_survive_where_the_format_has_them(tmp_path: Path) -> None:

@@ -49,10 +49,10 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
 
 
 def test_the_words_are_those_of_the_front_end() -> None:
-    from nsvq_lightning.cli import OWN_COMMANDS
+    from nsvq_lightning.commands import COMMANDS
     from nsvq_lightning.lightning_cli import SplatCLI
 
-    assert set(lightning_script.COMMANDS) == {*SplatCLI.subcommands(), *OWN_COMMANDS}
+    assert {name for name, command in COMMANDS.items() if command.module is None} == set(SplatCLI.subcommands())
 
 
 @pytest.mark.parametrize("arguments", [["fit", "--config", "a.yaml"], ["info", "x.ply"], ["validate"], ["--help"], []])
@@ -88,5 +88,5 @@ def test_without_another_distribution_the_known_words_are_listed(
     assert lightning_script.main(["login"]) == 2
     message = capsys.readouterr().err
     assert "unknown command 'login'" in message
-    assert "fit, validate, test, predict" in message
+    assert "fit, test, validate, predict" in message
     assert message.count("\n") == 1

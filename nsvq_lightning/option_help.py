@@ -1,0 +1,123 @@
+"""What ``nsvq fit --help`` prints: every option once, with its default and a sentence on it.
+
+The parser's own help lists all classes that any option might take, those of torch included, and none of the options
+that the default callbacks have.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+import shutil
+import textwrap
+from argparse import SUPPRESS, ArgumentParser
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any, NamedTuple
+
+import docstring_parser
+
+__all__ = ["class_help", "command_help", "first_sentence"]
+
+WIDEST = 100
+"""Columns that text is wrapped to on a wider terminal."""
+
+
+class Option(NamedTuple):
+    """An option of the command line."""
+
+    name: str
+    default: Any
+    text: str
+
+
+def command_help(parser: ArgumentParser, command: str, classes: Mapping[str, type]) -> str:
+    """Help of a command.
+
+    Args:
+        parser: Its parser, with options named ``group.name``.
+        command: Its name.
+        classes: Class whose constructor's arguments are options, too, by their prefix.
+    """
+    groups: dict[str, list[Option]] = {"run": [], "model": [], "skips": [], "trainer": []}
+    for action in parser._actions:
+        name = (action.option_strings or [""])[-1].lstrip("-").removesuffix("+")
+        group = name.partition(".")[0] if "." in name else "run"
+        if name and group in groups and name not in groups and not name.endswith((".help", "model.splats")):
+            default = inspect.Parameter.empty if action.default == SUPPRESS else action.default
+            groups[group].append(Option(name, default, first_sentence(action.help)))
+    return "\n".join(
+        [
+            f"usage: nsvq {command} [--config NAME] [--OPTION=VALUE ...]\n\n{parser.description}\n",
+            _section("run", groups["run"]),
+            *(class_help(prefix, kind) for prefix, kind in classes.items()),
+            _section("model", groups["model"]),
+            _section("skips", groups["skips"]),
+            _section("trainer", groups["trainer"]),
+            "--model.quantizer.help=CLASS lists the options of a quantizer; another class for a callback is\n"
+            "--callbacks.density=my_package.Class, and null leaves one out.\n",
+        ]
+    )
+
+
+def class_help(prefix: str, kind: type) -> str:
+    """Help of the options of a class, all named ``prefix.…``."""
+    return _section(prefix, _class_options(prefix, kind), f"{first_sentence(kind.__doc__)}.")
+
+
+def first_sentence(text: str | None) -> str:
+    """The first sentence of a docstring or help text, in plain words."""
+    plain = re.sub(r":\w+:`~?(?:[\w.]*\.)?(\w+)`", r"\1", text or "").replace("``", "")
+    plain = re.sub(r"\s+", " ", plain.replace("%%", "%")).strip()
+    return re.split(r"(?<=[a-z0-9)\]]{2}[.:]) (?=[A-Z*])", plain)[0].rstrip(".:") if plain else ""
+
+
+def _class_options(prefix: str, kind: type) -> Iterator[Option]:
+    """The options of a class from its constructor and its docstring, those of dataclasses among them in their place.
+
+    Args:
+        prefix: Name in front, such as ``callbacks.density``.
+        kind: The class.
+    """
+    texts = _texts(kind)
+    for name, parameter in inspect.signature(kind).parameters.items():
+        if is_dataclass(parameter.default):
+            inner = _texts(type(parameter.default))
+            for field in fields(parameter.default):
+                value = getattr(parameter.default, field.name)
+                yield Option(f"{prefix}.{name}.{field.name}", value, inner.get(field.name, ""))
+        elif parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
+            yield Option(f"{prefix}.{name}", parameter.default, texts.get(name, ""))
+
+
+def _section(title: str, options: Iterable[Option], introduction: str = "") -> str:
+    """A section of the help: the title, and for each option a line with its default and its text below."""
+    lines = [f"{title}:", *_wrapped(introduction, "  ")]
+    for option in options:
+        lines.append(f"  --{option.name}{_default(option.default)}")
+        lines += _wrapped(option.text, " " * 8)
+    return "\n".join(lines) + "\n"
+
+
+def _texts(kind: type) -> Mapping[str, str]:
+    """First sentence on each argument or attribute by name, from the docstring."""
+    found = docstring_parser.parse(inspect.getdoc(kind) or "", docstring_parser.DocstringStyle.GOOGLE).params
+    return {each.arg_name.lstrip("*"): first_sentence(each.description) for each in found}
+
+
+def _wrapped(text: str, indent: str) -> list[str]:
+    width = min(shutil.get_terminal_size().columns, WIDEST)
+    return textwrap.wrap(text, width, initial_indent=indent, subsequent_indent=indent)
+
+
+def _default(value: Any) -> str:
+    """``=default`` as one would type it; nothing where there is none."""
+    if value is inspect.Parameter.empty:
+        return ""
+    if value is None or isinstance(value, bool):
+        return f"={'null' if value is None else str(value).lower()}"
+    if isinstance(value, type):
+        return f"={value.__name__}"
+    if isinstance(value, tuple | list):
+        return f"=[{','.join(map(str, value))}]"
+    return f"={value}" if isinstance(value, int | float | str) else ""

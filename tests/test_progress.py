@@ -1,0 +1,82 @@
+"""The progress of a run: lines in a file, a bar of 80 columns on a terminal, and a time without compilation."""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch.callbacks.progress.tqdm_progress import Tqdm
+from numba import njit
+
+from nsvq_lightning import compilation, progress
+from nsvq_lightning.compilation import compile_seconds, compile_watcher
+from nsvq_lightning.progress import SplatProgressBar
+from nsvq_lightning.state import RunState, Stopwatch
+
+
+def compiled() -> Callable[[float], float]:
+    """A kernel that nobody has called yet."""
+
+    @njit
+    def add(x: float) -> float:
+        return x + 1.0
+
+    kernel: Callable[[float], float] = add
+    return kernel
+
+
+def test_the_clock_counts_compilation_and_tells_those_who_watch() -> None:
+    seen: list[bool] = []
+    kernel, before = compiled(), compile_seconds()
+    with compile_watcher(seen.append):
+        assert kernel(1.0) == 2.0
+    took = compile_seconds() - before
+    assert took > 0
+    assert seen == [True, False]
+    kernel(2.0)
+    assert compile_seconds() - before == took
+    assert kernel(np.float32(1.0)) == 2.0  # other types are another compilation, and nobody watches any more
+    assert compile_seconds() - before > took
+    assert seen == [True, False]
+
+
+def test_training_time_leaves_compilation_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0, 0.0]
+    monkeypatch.setattr("nsvq_lightning.state.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("nsvq_lightning.state.compile_seconds", lambda: now[1])
+    watch = Stopwatch(state := RunState())
+    watch.start()
+    now[:] = [100.0, 93.0]
+    watch.lap()
+    assert state.train_seconds == 7.0
+    with watch.paused(torch.device("cpu")):
+        now[:] = [120.0, 103.0]
+    now[:] = [121.0, 103.0]
+    watch.stop()
+    assert state.train_seconds == 8.0
+
+
+@pytest.mark.parametrize("hours", [0, 20])
+def test_a_bar_of_the_longest_run_fits_80_columns(hours: int) -> None:
+    out = io.StringIO()
+    bar = Tqdm(total=45_000, bar_format=SplatProgressBar.BAR_FORMAT, file=out, ncols=80, smoothing=0)
+    bar.start_t -= 3600 * hours
+    bar.n = 45_000 // 2
+    bar.set_postfix_str(f"quantize {progress._rounded(1_234_567)} splats 31.3 dB test 31.64")
+    (line,) = [part for part in out.getvalue().split("\r") if "quantize" in part]
+    assert len(line.rstrip()) <= 80
+    assert line.rstrip().endswith("quantize 1.23M splats 31.3 dB test 31.64")
+    bar.close()
+
+
+def test_what_is_no_terminal_gets_lines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    with open(tmp_path / "log.txt", "w") as file:
+        monkeypatch.setattr(sys, "stdout", file)
+        assert not progress._shows_bars()
+        monkeypatch.setitem(sys.modules, "ipykernel", compilation)
+        assert progress._shows_bars()
