@@ -438,3 +438,28 @@ def test_info_starts_without_torch(finished: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "splats" in done.stdout
+
+
+def test_only_float32_trains(demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for precision in ("bf16-mixed", "64-true"):
+        assert main(fit(demo_scene, tmp_path, f"--trainer.precision={precision}")) == 1
+        assert f"trainer.precision is {precision}: " in capsys.readouterr().err
+
+
+def test_a_run_without_checkpoints_or_bar_leaves_none(demo_scene: Path, tmp_path: Path) -> None:
+    assert main(fit(demo_scene, tmp_path, *CODES, "--trainer.enable_checkpointing=false", steps=3)) == 0
+    folder = tmp_path / demo_scene.name / "version_0"
+    assert (folder / "scene.nsvq").is_file()
+    assert not (folder / "checkpoints").exists()
+
+
+def test_a_quantizer_of_the_current_folder_trains(
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "quantizers.md").read_text(encoding="utf-8")
+    (source,) = re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+    (tmp_path / "my_quantizers.py").write_text(source)
+    monkeypatch.chdir(tmp_path)
+    assert main(fit(demo_scene, tmp_path, *CODES, "--model.quantizer=my_quantizers.Halfway", steps=4)) == 0
+    stored = read_nsvq(tmp_path / demo_scene.name / "version_0" / "scene.nsvq")
+    assert stored.config["quantizers"] == {"scales": "Halfway", "sh0": "Halfway"}

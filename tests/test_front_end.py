@@ -1,0 +1,135 @@
+"""The ``nsvq`` command before anything runs: version, help, and settings that cannot be."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import re
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import torch
+
+import nsvq_lightning
+from nsvq_lightning.cli import main
+from nsvq_lightning.commands import COMMANDS
+from nsvq_lightning.lightning_cli import DEFAULT_CALLBACKS
+from nsvq_lightning.option_help import first_sentence
+from nsvq_lightning.trainer import SplatTrainer
+
+
+@pytest.mark.parametrize(("argument", "said"), [("--version", nsvq_lightning.__version__), ("--help", "benchmark")])
+def test_version_and_overview_come_without_torch(argument: str, said: str) -> None:
+    code = "import sys; from nsvq_lightning.cli import main; s = main(sys.argv[1:]); exit(s or 'torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code, argument], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert said in done.stdout
+    if argument == "--help":
+        assert all(
+            re.search(rf"^  {name} +{re.escape(command.summary)}$", done.stdout, re.M)
+            for name, command in COMMANDS.items()
+        )
+
+
+def test_no_command_is_an_error_that_shows_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 2
+    assert "nsvq COMMAND --help" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def fit_help() -> str:
+    environment = os.environ | {"COLUMNS": "80"}
+    command = [sys.executable, "-m", "nsvq_lightning", "fit", "--help"]
+    return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
+
+
+def test_help_has_every_option_of_the_default_callbacks_and_none_of_torchs_classes(fit_help: str) -> None:
+    for key, kind in DEFAULT_CALLBACKS.items():
+        for name in inspect.signature(kind).parameters:
+            assert f"--callbacks.{key}.{name}" in fit_help
+    assert "--callbacks.density.max_splats=null\n        " in fit_help
+    assert "--data.root\n        Scene folder" in fit_help
+    assert "--trainer.max_steps=45000" in fit_help
+    assert "torch.nn" not in fit_help
+    assert len(fit_help.splitlines()) < 500
+    assert max(len(line) for line in fit_help.splitlines() if line.startswith("        ")) <= 80
+
+
+def test_options_that_the_readme_names_are_in_the_help(fit_help: str) -> None:
+    root = Path(__file__).resolve().parents[1]
+    if not (root / "README.md").exists():
+        pytest.skip("a source distribution has no README beside the tests")
+    pages = "".join(path.read_text(encoding="utf-8") for path in (root / "README.md", root / "docs" / "your_photos.md"))
+    named = {
+        name
+        for name in re.findall(r"--((?:callbacks|data|model|trainer)\.[\w.]*\w)", pages)
+        if "quantizer." not in name
+    }
+    assert {"data.root", "trainer.max_steps"} <= named
+    assert {name for name in named if f"--{name}" not in fit_help} == set()
+
+
+def test_one_callback_says_what_it_takes(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["fit", "--callbacks.density.help"])
+    assert end.value.code == 0
+    out = capsys.readouterr().out
+    assert out.startswith("callbacks.density:\n  Clones, splits and prunes splats")
+    assert "--callbacks.density.rules.grad_threshold=0.0002\n" in out
+
+
+def test_the_first_sentence_is_plain_text() -> None:
+    text = "Fits :class:`~a.b.C` (see 3.2) with ``x = 1.5``; \n  more.\n\nNot this."
+    assert first_sentence(text) == "Fits C (see 3.2) with x = 1.5; more"
+    assert first_sentence(None) == ""
+
+
+SCENE = ["--data.root=no_scene", "--callbacks.progress=null"]
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("--trainer.accelerator=tpu", "torch_xla"),
+        ("--trainer.devices=0", "devices='0'"),
+        ("--trainer.strategy=nothing", "strategy='nothing'"),
+        ("--callbacks.density.max_splats=1", "max_splats must be at least min_splats=10, got 1"),
+        ("--callbacks.report.every=-1", "every must be None or at least 0, got -1"),
+        ("--trainer.logger=MLFlowLogger", "mlflow"),
+        ("--trainer.accelerator=gpu", "No supported gpu backend found"),
+        ("--model.quantizer=nn_modules.NoQuantizer", "NoQuantizer is no quantizer, it lacks: codebook, codes, decode"),
+    ],
+)
+def test_settings_that_cannot_be_are_one_line(
+    option: str, message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    if option.endswith("gpu") and (torch.cuda.is_available() or torch.backends.mps.is_available()):
+        pytest.skip("this machine has a GPU")
+    if "mlflow" in message and (find_spec("mlflow") or find_spec("mlflow_skinny")):
+        pytest.skip("MLflow is installed")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "nn_modules", raising=False)
+    Path("nn_modules.py").write_text("import torch\nclass NoQuantizer(torch.nn.Linear): ...\n")
+    assert main(["fit", *SCENE, option]) == 1
+    lines = [line for line in capsys.readouterr().err.splitlines() if "available" not in line and "Tip" not in line]
+    assert [line.partition(":")[0] for line in lines] == ["error", "(NSVQ_TRACEBACK=1 shows where)"]
+    assert message in lines[0]
+    assert sorted(path.name for path in tmp_path.iterdir() if path.name != "__pycache__") == ["nn_modules.py"]
+
+
+def test_several_devices_are_view_parallel_unless_told_otherwise(tmp_path: Path) -> None:
+    settings = {"accelerator": "cpu", "logger": False, "enable_checkpointing": False, "default_root_dir": tmp_path}
+    assert type(SplatTrainer(devices=2, **settings).strategy).__name__ == "ViewParallelStrategy"
+    assert type(SplatTrainer(devices=2, strategy="ddp", **settings).strategy).__name__ == "DDPStrategy"
+    assert type(SplatTrainer(devices=1, **settings).strategy).__name__ == "SingleDeviceStrategy"
+
+
+def test_the_environment_is_set_by_the_import_unless_the_user_has() -> None:
+    code = "import os, nsvq_lightning; print(os.environ['OMP_WAIT_POLICY'], os.environ['THP_MEM_ALLOC_ENABLE'])"
+    for given, expected in (({}, "passive 1\n"), ({"OMP_WAIT_POLICY": "active"}, "active 1\n")):
+        environment = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"} | given
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+        assert done.stdout == expected
