@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import signal
@@ -9,8 +10,9 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
-from importlib.resources import files
-from pathlib import Path
+from pathlib import Path, PurePath
+
+from nsvq_lightning.top_level import folder_of
 
 __all__ = ["check_config", "find_config", "main", "resolve_configs"]
 
@@ -61,6 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a pipe on Windows, say, can take only the letters of the locale
+        sys.stdout.reconfigure(errors="replace")
     if arguments and arguments[0] in OWN_COMMANDS:
         command: Callable[[Sequence[str]], int] = import_module(OWN_COMMANDS[arguments[0]]).main
         return command(arguments[1:])
@@ -100,7 +104,7 @@ def _is_ours(error: BaseException) -> bool:
     frame = error.__traceback__
     while frame is not None and frame.tb_next is not None:
         frame = frame.tb_next
-    return frame is not None and Path(frame.tb_frame.f_code.co_filename).is_relative_to(Path(__file__).parent)
+    return frame is not None and str(frame.tb_frame.f_globals.get("__name__")).startswith(f"{__package__}.")
 
 
 def _quiet_lightning() -> None:
@@ -171,9 +175,12 @@ def find_config(name: str) -> str:
     """
     if Path(name).exists():
         return name
-    shipped = files("nsvq_lightning") / "configs"
-    plain = name.removeprefix("configs/")
-    for candidate in (plain, f"{plain}.yaml"):
-        if (shipped / candidate).is_file():
-            return str(shipped / candidate)
+    plain = _without_folder(Path(name))
+    for shipped in (folder_of("configs") / plain, folder_of("configs") / f"{plain}.yaml"):
+        if shipped.is_file():
+            return str(shipped)
     return name
+
+
+def _without_folder(path: PurePath) -> str:
+    return path.as_posix().removeprefix("configs/")

@@ -6,7 +6,7 @@ import json
 import re
 import subprocess
 import sys
-from pathlib import Path
+from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import pytest
@@ -341,6 +341,11 @@ def test_configs_of_other_quantizers_differ_from_nsvq_in_that_alone(
         assert ours["callbacks"]["phases"]["init_args"].pop("quantize_end") == 45_000
         assert theirs["callbacks"]["phases"]["init_args"].pop("quantize_end") == 43_000
     assert ours == theirs
+
+
+@pytest.mark.parametrize("path", [PurePosixPath("configs/data/demo.yaml"), PureWindowsPath(r"configs\data\demo.yaml")])
+def test_names_of_configs_are_those_of_any_system(path: PurePath) -> None:
+    assert _without_folder(path) == "data/demo.yaml"
 
 
 def test_configs_are_found_as_files_first_then_by_name(tmp_path: Path) -> None:
