@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
@@ -49,7 +50,9 @@ def check_threads() -> Iterator[Finding]:
     torchs, numbas = torch.get_num_threads(), int(numba.config.NUMBA_NUM_THREADS)
     values = {"cores": cores, "torch": torchs, "numba": numbas, "used": used}
     counts = f"{used} used of {cores} cores (torch {torchs}, numba {numbas})"
-    if used < cores:
+    if used < cores and _is_apple_silicon() and not {"OMP_NUM_THREADS", "NUMBA_NUM_THREADS"} & os.environ.keys():
+        yield good("threads", f"{counts}: those that are fast; the slow ones would hold them up", **values)
+    elif used < cores:
         yield note("threads", f"{counts}: raise or unset OMP_NUM_THREADS and NUMBA_NUM_THREADS to use all", **values)
     elif used > cores:
         yield note("threads", f"{counts}: more threads than cores wait for each other; lower OMP_NUM_THREADS", **values)
@@ -64,6 +67,11 @@ def check_threads() -> Iterator[Finding]:
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     if load > BUSY * cores:
         yield note("load", f"{load:.1f} processes were running in the last minute: times will be longer", load=load)
+
+
+def _is_apple_silicon() -> bool:
+    """Whether torch leaves out the efficiency cores on its own."""
+    return (platform.system(), platform.machine()) == ("Darwin", "arm64")
 
 
 def check_memory() -> Iterator[Finding]:
