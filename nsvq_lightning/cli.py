@@ -65,10 +65,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.environ.setdefault(name, value)
     if isinstance(sys.stdout, io.TextIOWrapper):  # a pipe on Windows, say, can take only the letters of the locale
         sys.stdout.reconfigure(errors="replace")
-    if arguments and arguments[0] in OWN_COMMANDS:
-        command: Callable[[Sequence[str]], int] = import_module(OWN_COMMANDS[arguments[0]]).main
-        return command(arguments[1:])
-    return _run_lightning(resolve_configs(arguments))
+    try:
+        if arguments and arguments[0] in OWN_COMMANDS:
+            command: Callable[[Sequence[str]], int] = import_module(OWN_COMMANDS[arguments[0]]).main
+            return command(arguments[1:])
+        return _run_lightning(resolve_configs(arguments))
+    except ModuleNotFoundError as error:
+        if error.name != "cv2":
+            raise
+        sys.stderr.write("error: there is no OpenCV (cv2): pip install opencv-contrib-python-headless, or any other\n")
+        return 1
 
 
 def _run_lightning(arguments: list[str]) -> int:

@@ -19,7 +19,18 @@ def test_json_has_every_finding_and_the_verdict(capsys: pytest.CaptureFixture[st
     document = json.loads(capsys.readouterr().out)
     subjects = {finding["subject"] for finding in document["findings"]}
     assert document["ok"]
-    assert subjects >= {"versions", "cpu", "gpu", "lpips", "tensorboard", "threads", "memory", "disk", "self-test"}
+    assert subjects >= {
+        "versions",
+        "opencv",
+        "cpu",
+        "gpu",
+        "lpips",
+        "tensorboard",
+        "threads",
+        "memory",
+        "disk",
+        "self-test",
+    }
 
 
 def test_a_bad_folder_gives_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -56,6 +67,19 @@ def test_the_slow_cores_of_a_mac_are_not_missed(monkeypatch: pytest.MonkeyPatch)
     assert next(machine.check_threads()).verdict == "good"
     monkeypatch.setenv("OMP_NUM_THREADS", "4")
     assert next(machine.check_threads()).verdict == "note"
+
+
+def test_one_opencv_of_any_name_is_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    versions: dict[str, str] = {"opencv-python": "5.0"}
+    monkeypatch.setattr(machine, "_version", versions.get)
+    (finding,) = machine.check_opencv()
+    assert (finding.verdict, finding.values["packages"]) == ("good", ["opencv-python"])
+    versions["opencv-contrib-python-headless"] = "5.0"
+    (finding,) = machine.check_opencv()
+    assert (finding.verdict, "uninstall" in finding.text) == ("note", True)
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    (finding,) = machine.check_opencv()
+    assert (finding.verdict, "pip install opencv" in finding.text) == ("problem", True)
 
 
 def test_neon_is_no_reason_to_look_for_another_processor(monkeypatch: pytest.MonkeyPatch) -> None:
