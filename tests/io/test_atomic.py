@@ -110,9 +110,8 @@ def _modules() -> Iterator[tuple[str, ast.Module]]:
     """Name and syntax of every file of the package."""
     package = Path(nsvq_lightning.__file__).parent
     callbacks = {f"callbacks/{path.name}": path for path in folder_of("callbacks").glob("*.py")}
-    for name, path in (
-        {path.relative_to(package).as_posix(): path for path in package.rglob("*.py")} | callbacks
-    ).items():
+    others = {path.relative_to(package).as_posix(): path for path in package.rglob("*.py")}
+    for name, path in (others | callbacks).items():
         yield name, ast.parse(path.read_text(encoding="utf-8"))
 
 
@@ -124,11 +123,8 @@ def test_text_files_are_utf_8_whatever_the_locale() -> None:
             function = ast.unparse(call.func)
             binary = any(isinstance(a, ast.Constant) and "b" in str(a.value) for a in call.args)
             reads = function.endswith(".read_text") or (function == "open" and not binary)
-            if (
-                reads
-                and function != "reconstruction.read_text"
-                and not any(keyword.arg == "encoding" for keyword in call.keywords)
-            ):
+            named = any(keyword.arg == "encoding" for keyword in call.keywords)
+            if reads and not named and function != "reconstruction.read_text":  # that one is COLMAP's
                 bare.append(f"{name}:{call.lineno} {ast.unparse(call)}")
     assert bare == []
 

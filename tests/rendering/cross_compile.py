@@ -1,7 +1,7 @@
 """Compile CPU kernels for a processor that need not be there: ``TRIPLE PROCESSOR KERNEL…`` on the command line.
 
-Prints as JSON, by kernel: its machine instructions, how many of them move vectors from or to the stack, the bytes of its
-stack, and the names of what it calls. Loops run on one thread here, as only the code inside them is looked at.
+Prints as JSON, by kernel: its machine instructions, how many of them move vectors from or to the stack, the bytes of
+its stack, and the names of what it calls. Loops run on one thread here, as only the code inside them is looked at.
 """
 
 from __future__ import annotations

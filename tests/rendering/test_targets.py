@@ -16,10 +16,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 from cross_compile import SIGNATURES
 
 ARM, INTEL = "aarch64-unknown-linux-gnu", "x86_64-unknown-linux-gnu"
-PROCESSORS = {"generic": ARM, "apple-m1": ARM, "haswell": INTEL, "x86-64": INTEL, "skylake-avx512": INTEL}
+PROCESSORS = {"generic": ARM, "apple-m1": ARM, "haswell": INTEL, "nehalem": INTEL, "skylake-avx512": INTEL}
 """Target by processor: 128 bits a vector twice, 256 bits, 128 bits without fused multiply-add, 512 bits."""
 RUNTIME = {"NRT_incref", "NRT_decref", "memset"}
-"""What a kernel may call: reference counts of arrays, and to clear a number of its locals."""
+"""What a kernel may call beside functions of Numba itself: reference counts of arrays, and to clear its locals."""
 LONGEST = 20_000
 """Instructions; a kernel that takes its vectors apart, lane by lane, has several times as many."""
 
@@ -43,7 +43,7 @@ def _compiled(processor: str, *kernels: str) -> dict[str, Any]:
     [
         ("generic", MAIN),
         ("haswell", MAIN),
-        ("x86-64", MAIN[:1]),
+        ("nehalem", MAIN[:1]),
         *(pytest.param(processor, tuple(SIGNATURES), marks=pytest.mark.slow) for processor in PROCESSORS),
     ],
 )
@@ -53,4 +53,4 @@ def test_kernels_stay_vectors_and_call_no_library(processor: str, kernels: tuple
     assert compiled.keys() == set(kernels)
     for name, code in compiled.items():
         assert 100 < code["instructions"] < LONGEST, name
-        assert set(code["calls"]) <= RUNTIME, name
+        assert {call for call in code["calls"] if not call.startswith("_ZN5numba")} <= RUNTIME, name
