@@ -9,6 +9,8 @@ import importlib
 import os
 from typing import TYPE_CHECKING, Any
 
+from nsvq_lightning.top_level import find_callbacks
+
 __version__ = "0.1.0"
 
 _ENVIRONMENT = {
@@ -43,6 +45,8 @@ if TYPE_CHECKING:
     from nsvq_lightning.splats import Splats
 
 __all__ = ["Camera", "ColmapDataModule", "Render", "SplatModule", "Splats", "load", "render", "save"]
+
+find_callbacks()
 
 
 def __getattr__(name: str) -> Any:

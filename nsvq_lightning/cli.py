@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import signal
@@ -9,12 +10,12 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
-from importlib.resources import files
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TextIO
 
 from nsvq_lightning import __version__
 from nsvq_lightning.commands import COMMANDS, overview
+from nsvq_lightning.top_level import folder_of
 
 __all__ = ["check_config", "find_config", "main", "resolve_configs"]
 
@@ -50,10 +51,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments[0] == "--version":
         sys.stdout.write(f"nsvq {__version__}\n")
         return 0
-    if arguments[0] in COMMANDS and (module := COMMANDS[arguments[0]].module) is not None:
-        command: Callable[[Sequence[str]], int] = import_module(module).main
-        return command(arguments[1:])
-    return _run_lightning(resolve_configs(arguments))
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a pipe on Windows, say, can take only the letters of the locale
+        sys.stdout.reconfigure(errors="replace")
+    try:
+        if arguments[0] in COMMANDS and (module := COMMANDS[arguments[0]].module) is not None:
+            command: Callable[[Sequence[str]], int] = import_module(module).main
+            return command(arguments[1:])
+        return _run_lightning(resolve_configs(arguments))
+    except ModuleNotFoundError as error:
+        if error.name != "cv2":
+            raise
+        sys.stderr.write("error: there is no OpenCV (cv2): pip install opencv-contrib-python-headless, or any other\n")
+        return 1
 
 
 def _run_lightning(arguments: list[str]) -> int:
@@ -97,7 +106,7 @@ def _is_ours(error: BaseException) -> bool:
     frame = error.__traceback__
     while frame is not None and frame.tb_next is not None:
         frame = frame.tb_next
-    return frame is not None and Path(frame.tb_frame.f_code.co_filename).is_relative_to(Path(__file__).parent)
+    return frame is not None and str(frame.tb_frame.f_globals.get("__name__")).startswith(f"{__package__}.")
 
 
 class BarHandler(logging.StreamHandler[TextIO]):
@@ -181,9 +190,12 @@ def find_config(name: str) -> str:
     """
     if Path(name).exists():
         return name
-    shipped = files("nsvq_lightning") / "configs"
-    plain = name.removeprefix("configs/")
-    for candidate in (plain, f"{plain}.yaml"):
-        if (shipped / candidate).is_file():
-            return str(shipped / candidate)
+    plain = _without_folder(Path(name))
+    for shipped in (folder_of("configs") / plain, folder_of("configs") / f"{plain}.yaml"):
+        if shipped.is_file():
+            return str(shipped)
     return name
+
+
+def _without_folder(path: PurePath) -> str:
+    return path.as_posix().removeprefix("configs/")

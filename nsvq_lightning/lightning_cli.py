@@ -264,7 +264,7 @@ class SplatCLI(LightningCLI):
     def _print_summary(self) -> None:
         path = run_folder(self.trainer) / "metrics.json"
         if self.trainer.is_global_zero and path.is_file():
-            sys.stdout.write(summary(path.parent, json.loads(path.read_text())))
+            sys.stdout.write(summary(path.parent, json.loads(path.read_text(encoding="utf-8"))))
 
 
 def _options_of(group: str, arguments: Sequence[str]) -> list[str]:

@@ -6,9 +6,12 @@ import importlib.metadata
 import importlib.util
 import os
 import re
+import shutil
 import subprocess
+import sys
 import tomllib
-from importlib.resources import files
+import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +19,11 @@ import pytest
 from packaging.requirements import Requirement
 
 import nsvq_lightning
+from nsvq_lightning.top_level import folder_of
 
 ROOT = Path(__file__).resolve().parents[1]
+TOP_LEVEL = ("callbacks", "configs")
+"""Folders of the package that stand at the top level of the repository."""
 
 
 def _project() -> dict[str, Any]:
@@ -70,22 +76,69 @@ def test_constraints_start_with_torch_and_name_no_host() -> None:
     assert [line for line in text.splitlines() if not line.startswith("#") and not pattern.fullmatch(line)] == []
 
 
-@pytest.mark.parametrize("folder", ["callbacks", "configs"])
-def test_top_level_folder_is_part_of_the_package_by_a_relative_link(folder: str) -> None:
-    if not (ROOT / folder).exists():
-        pytest.skip("a source distribution has the folder in the package only")
+@pytest.mark.parametrize("folder", TOP_LEVEL)
+def test_type_checkers_find_top_level_folders_by_a_relative_link(folder: str) -> None:
     link = ROOT / "nsvq_lightning" / folder
-    assert link.is_symlink(), "check the repository out with symbolic links"
+    if not link.is_symlink():
+        pytest.skip("no links here: git could not make any, or this is a source distribution")
     assert os.readlink(link) == f"../{folder}"
 
 
+@pytest.fixture
+def without_links(tmp_path: Path) -> Path:
+    """The repository as git checks it out where there are no symbolic links: text files in their place."""
+    for folder in ("nsvq_lightning", *TOP_LEVEL):
+        shutil.copytree(ROOT / folder, tmp_path / folder, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, tmp_path)
+    for folder in TOP_LEVEL:
+        link = tmp_path / "nsvq_lightning" / folder
+        link.unlink(missing_ok=True)
+        link.write_text(f"../{folder}", encoding="utf-8")
+    return tmp_path
+
+
+def test_wheel_is_whole_without_links(without_links: Path) -> None:
+    pytest.importorskip("hatchling", reason="builds the wheel; it is in the test extra")
+    subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", "wheel"], cwd=without_links, check=True)
+    (wheel,) = (without_links / "dist").glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        packed = {name: archive.read(name) for name in archive.namelist() if name.startswith("nsvq_lightning/")}
+    expected = {f"nsvq_lightning/{path.relative_to(ROOT).as_posix()}": path for path in _files(*TOP_LEVEL)}
+    expected |= {path.relative_to(ROOT).as_posix(): path for path in _files("nsvq_lightning")}
+    assert packed == {name: path.read_bytes() for name, path in expected.items()}
+
+
+def _files(*folders: str) -> Iterator[Path]:
+    """Files of the package and of the folders at the top level, none of them twice."""
+    for folder in folders:
+        for path in (ROOT / folder).rglob("*"):
+            inside = path.relative_to(ROOT).parts
+            linked = inside[0] == "nsvq_lightning" and inside[1] in TOP_LEVEL
+            if path.is_file() and "__pycache__" not in inside and not linked:
+                yield path
+
+
+def test_checkout_runs_without_links(without_links: Path) -> None:
+    """Class paths, relative imports and pickles of callbacks, configs by name, and nothing else of the top level."""
+    lines = [
+        "import importlib.util, os, pickle",
+        "from nsvq_lightning.callbacks.density import DensityControl",
+        "from nsvq_lightning.cli import find_config",
+        "assert pickle.loads(pickle.dumps(DensityControl)) is DensityControl",
+        "assert DensityControl.__module__ == 'nsvq_lightning.callbacks.density'",
+        "assert os.path.samefile(find_config('demo'), 'configs/demo.yaml')",
+        "assert importlib.util.find_spec('nsvq_lightning.configs') is None",
+    ]
+    subprocess.run([sys.executable, "-c", "\n".join(lines)], cwd=without_links, check=True)
+
+
 def test_callbacks_configs_and_type_marker_are_found_in_the_package() -> None:
-    package = files("nsvq_lightning")
     specification = importlib.util.find_spec("nsvq_lightning.callbacks")
     assert specification is not None
-    assert specification.origin == str(package / "callbacks" / "__init__.py")
-    assert (package / "py.typed").is_file()
-    assert any(entry.name.endswith(".yaml") for entry in (package / "configs").iterdir())
+    assert specification.origin == str(folder_of("callbacks") / "__init__.py")
+    assert (Path(nsvq_lightning.__file__).parent / "py.typed").is_file()
+    assert any(entry.suffix == ".yaml" for entry in folder_of("configs").iterdir())
 
 
 def test_scripts_point_to_modules_of_the_package() -> None:

@@ -36,7 +36,7 @@ NOTABLE = (
 
 def describe_machine() -> dict[str, Any]:
     """Processor, vector width, versions and how busy the machine was, as JSON values."""
-    features = {name for name, present in binding.get_host_cpu_features().items() if present}
+    features = _cpu_features()
     simd = next(((name, bits) for name, bits in SIMD_BITS if name in features), ("none", 32))
     return {
         "cpu": _cpu_model(),
@@ -54,6 +54,12 @@ def describe_machine() -> dict[str, Any]:
             **{name: importlib.metadata.version(name) for name in ("numpy", "torch", "numba", "llvmlite")},
         },
     }
+
+
+def _cpu_features() -> set[str]:
+    """What LLVM knows of the processor; on a Mac that may be nothing, but 64-bit ARM always has NEON."""
+    always = {"neon"} if platform.machine().lower() in ("arm64", "aarch64") else set()
+    return always | {name for name, present in binding.get_host_cpu_features().items() if present}
 
 
 def _cpu_model() -> str:

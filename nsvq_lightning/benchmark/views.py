@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from nsvq_lightning.benchmark.workloads import Workload
 from nsvq_lightning.data.colmap import import_pycolmap
+from nsvq_lightning.pictures import write_pixels
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render
 
@@ -49,8 +49,7 @@ def write_views(workload: Workload, root: Path, views: int = VIEWS) -> Path:
         name = f"view_{number:03d}.png"
         image = render(workload.splats, Camera(camera.K, viewmat, camera.width, camera.height)).image
         photo = (255 * FADING * image.clamp(0, 1)).round().byte().numpy()
-        if not cv2.imwrite(str(root / "images" / name), cv2.cvtColor(photo, cv2.COLOR_RGB2BGR)):
-            raise OSError(f"cannot write {root / 'images' / name}")
+        write_pixels(root / "images" / name, photo)
         pose = pycolmap.Rigid3d(viewmat[:3].double().numpy())
         model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=number), pose)
     for point in workload.splats.means[:POINTS].double().numpy():

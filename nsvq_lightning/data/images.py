@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import struct
+import io
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
@@ -15,6 +15,8 @@ import numpy as np
 import PIL.Image
 import torch
 from numpy.typing import NDArray
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
 from torch import Tensor
 
 from nsvq_lightning.data.model_files import SceneError
@@ -29,8 +31,14 @@ _READ = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 _MOST_A_BYTE = 10_000
 """Pixels a byte of the file; no photo comes near, an empty PNG of one bit a pixel has 8000."""
 
+_DAMAGED = (OSError, ValueError, SyntaxError, KeyError)
+"""What Pillow raises for a file that is damaged or no picture."""
+
 _TIFF_SIZE, _TIFF_ORIENTATION = (256, 257), 274
 _LIMIT = threading.Lock()
+
+_MIRRORED = {2: (1,), 3: (0, 1), 4: (0,), 6: (0,), 7: (0, 1), 8: (1,)}
+"""By orientation, the axes to mirror; from 5 on rows and columns change places first."""
 
 
 def _undecodable(path: Path, reason: str) -> SceneError:
@@ -48,7 +56,7 @@ def image_size(path: Path) -> tuple[int, int]:
             width, height = image.size
             if image.format == "TIFF":  # Pillow turns their size
                 width, height = (int(image.getexif()[tag]) for tag in _TIFF_SIZE)
-    except (OSError, ValueError, SyntaxError, KeyError) as error:
+    except _DAMAGED as error:
         raise _undecodable(path, str(error)) from error
     if width * height > _MOST_A_BYTE * path.stat().st_size:
         raise _undecodable(path, f"its head announces {width}x{height} pixels in {path.stat().st_size} bytes")
@@ -76,7 +84,10 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     """
     data = path.read_bytes()  # imread itself fails on names outside the locale's character set
     try:
-        image = cv2.imdecode(np.frombuffer(_unturned(data), np.uint8), _READ) if _is_whole(data) else None
+        orientation = _orientation(data)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), _READ)
+    except _DAMAGED:
+        image = None
     except cv2.error as error:  # a size beyond OpenCV's limits
         raise _undecodable(path, str(error)) from error
     if image is None:
@@ -85,52 +96,33 @@ def read_image(path: Path) -> NDArray[np.uint8]:
         image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if image.dtype != np.uint8:
         raise _undecodable(path, f"its pixels are {image.dtype}, accepted are 8 and 16 bit integers")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)  # type: ignore[no-any-return]
+    return _turned_back(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), orientation)
 
 
-def _unturned(data: bytes) -> bytes:
-    """A TIFF whose orientation is the usual one, as OpenCV turns them whatever it is told; any other file as it is."""
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
-    if order is None:
-        return data
-    try:
-        (start,) = struct.unpack_from(f"{order}I", data, 4)
-        (count,) = struct.unpack_from(f"{order}H", data, start)
-        for entry in range(start + 2, start + 2 + 12 * count, 12):
-            if struct.unpack_from(f"{order}H", data, entry)[0] == _TIFF_ORIENTATION:
-                return data[: entry + 8] + struct.pack(f"{order}H", 1) + data[entry + 10 :]
-    except struct.error:
-        pass  # damaged, which the decoder will say
-    return data
+def _orientation(data: bytes) -> int:
+    """How OpenCV turns the picture; also refuses what it would not notice to be missing.
+
+    Raises:
+        OSError: The file is not whole; so do the other errors of ``_DAMAGED``.
+    """
+    file = io.BytesIO(data)
+    if data.startswith(b"\x89PNG"):
+        PngImageFile(file).verify()  # OpenCV allocates the lengths of chunks, up to 2 GB, before it looks for them
+    elif data.startswith(b"\xff\xd8"):
+        JpegImageFile(file)  # up to the first scan
+        if b"\xff\xd9" not in data[file.tell() :]:
+            raise OSError("there is no end marker")  # OpenCV 4 would fill what is missing with grey
+    elif data.startswith((b"II", b"MM")):
+        tags = PIL.Image.Exif()  # the tags of a TIFF, whatever its pixels are
+        tags.load(data)
+        return int(tags.get(_TIFF_ORIENTATION, 1))
+    return 1
 
 
-def _is_whole(data: bytes) -> bool:
-    """Whether nothing is missing at the end, as far as the format tells without decoding."""
-    if data.startswith(b"\xff\xd8"):
-        return _is_whole_jpeg(data)
-    if data.startswith(b"\x89PNG\r\n\x1a\n"):
-        return _is_whole_png(data)
-    return len(data) > 0
-
-
-def _is_whole_jpeg(data: bytes) -> bool:
-    """Whether there is an end marker behind the first scan: OpenCV 4 would fill what is missing with grey."""
-    position = 2
-    while data[position : position + 1] == b"\xff":
-        if data[position + 1 : position + 2] == b"\xda":
-            return b"\xff\xd9" in data[position:]
-        position += 2 + max(2, int.from_bytes(data[position + 2 : position + 4], "big"))
-    return True
-
-
-def _is_whole_png(data: bytes) -> bool:
-    """Whether all chunks up to the last one are there: OpenCV allocates their lengths, up to 2 GB, before it looks."""
-    position = 8
-    while position + 12 <= len(data):
-        if data[position + 4 : position + 8] == b"IEND":
-            return True
-        position += 12 + int.from_bytes(data[position : position + 4], "big")
-    return False
+def _turned_back(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
+    """A TIFF as it is stored: OpenCV turns it, whatever it is told."""
+    stored = pixels.transpose(1, 0, 2) if orientation >= 5 else pixels
+    return np.ascontiguousarray(np.flip(stored, _MIRRORED.get(orientation, ())))
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from nsvq_lightning.data.colmap import import_pycolmap
 from nsvq_lightning.data.demo_room import demo_poses, demo_room, to_srgb
 from nsvq_lightning.data.raytrace import Room
 from nsvq_lightning.data.surfaces import Array
+from nsvq_lightning.pictures import write_pixels
 from nsvq_lightning.random import generator
 
 __all__ = ["render_view", "write_synthetic_scene"]
@@ -105,7 +105,7 @@ def write_synthetic_scene(
         names = [f"view_{i:03d}.png" for i in range(views)]
         (scene / "images").mkdir(parents=True)
         for name, pose in zip(names, poses, strict=True):
-            _write_png(scene / "images" / name, render_view(room, pose, width, height))
+            write_pixels(scene / "images" / name, render_view(room, pose, width, height))
         _write_model(scene / "sparse" / "0", lens, names, poses, _surface_points(room, lens, poses, points, seed))
         scene.rename(root)
     return root
@@ -120,11 +120,6 @@ def render_view(room: Room, pose: NDArray[np.float64], width: int, height: int) 
 
 def _centre(pose: NDArray[np.float64]) -> Array:
     return (-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32)
-
-
-def _write_png(path: Path, image: NDArray[np.uint8]) -> None:
-    if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
-        raise OSError(f"cannot write {path}")
 
 
 def _surface_points(room: Room, lens: _Lens, poses: NDArray[np.float64], count: int, seed: int) -> _Points:

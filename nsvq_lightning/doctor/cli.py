@@ -61,10 +61,11 @@ def _findings(folder: Path | None) -> Iterator[Finding]:
     # Imported here so that --help and wrong arguments answer at once.
     from nsvq_lightning.doctor.backends import check_backends, check_extras
     from nsvq_lightning.doctor.finding import report
-    from nsvq_lightning.doctor.machine import check_disk, check_memory, check_threads, check_versions
+    from nsvq_lightning.doctor.machine import check_disk, check_memory, check_opencv, check_threads, check_versions
     from nsvq_lightning.doctor.self_test import check_rendering
 
     yield from report("versions", check_versions)
+    yield from report("opencv", check_opencv)
     yield from report("cpu", check_backends)
     yield from report("extras", check_extras)
     yield from report("threads", check_threads)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
@@ -13,13 +14,24 @@ import torch
 
 from nsvq_lightning.benchmark.machine import describe_machine
 from nsvq_lightning.benchmark.settings import usable_cores
-from nsvq_lightning.doctor.finding import Finding, good, note
+from nsvq_lightning.doctor.finding import Finding, good, note, problem
 from nsvq_lightning.rendering.cpu import jit  # this way this file is not taken for one with kernels
 
-__all__ = ["available_memory", "check_disk", "check_memory", "check_threads", "check_versions", "readable_bytes"]
+__all__ = [
+    "available_memory",
+    "check_disk",
+    "check_memory",
+    "check_opencv",
+    "check_threads",
+    "check_versions",
+    "readable_bytes",
+]
 
-PACKAGES = ("lightning", "torchmetrics", "jsonargparse", "scipy", "opencv-contrib-python-headless", "pycolmap")
+PACKAGES = ("lightning", "torchmetrics", "jsonargparse", "scipy", "pycolmap")
 """What is used beside the packages that :func:`describe_machine` names."""
+
+OPENCV = tuple(f"opencv-{part}python{screen}" for part in ("contrib-", "") for screen in ("-headless", ""))
+"""Packages that bring ``cv2``; any of them will do."""
 
 SMALL_MEMORY, SMALL_DISK = 4 << 30, 2 << 30
 """Bytes below which a run of usual size may not fit: pictures, splats and moments; checkpoints, report and exports."""
@@ -43,13 +55,30 @@ def _version(name: str) -> str | None:
         return None
 
 
+def check_opencv() -> Iterator[Finding]:
+    """Whether there is an OpenCV, and only one: several overwrite each other's files."""
+    installed = [name for name in OPENCV if _version(name) is not None]
+    try:
+        import cv2
+    except ImportError as error:
+        yield problem("opencv", f"cannot be loaded ({error}): pip install {OPENCV[0]}", packages=installed)
+        return
+    if len(installed) > 1:
+        help_ = f"they overwrite each other's files: uninstall all of them, then pip install {OPENCV[0]}"
+        yield note("opencv", f"{' and '.join(installed)} are installed: {help_}", packages=installed)
+    else:
+        yield good("opencv", f"{cv2.__version__} ({', '.join(installed) or 'not from pip'})", packages=installed)
+
+
 def check_threads() -> Iterator[Finding]:
     """Whether the kernels use all cores, and do not wait for each other by spinning."""
     cores, used = usable_cores(), jit.thread_count()
     torchs, numbas = torch.get_num_threads(), int(numba.config.NUMBA_NUM_THREADS)
     values = {"cores": cores, "torch": torchs, "numba": numbas, "used": used}
     counts = f"{used} used of {cores} cores (torch {torchs}, numba {numbas})"
-    if used < cores:
+    if used < cores and _is_apple_silicon() and not {"OMP_NUM_THREADS", "NUMBA_NUM_THREADS"} & os.environ.keys():
+        yield good("threads", f"{counts}: those that are fast; the slow ones would hold them up", **values)
+    elif used < cores:
         yield note("threads", f"{counts}: raise or unset OMP_NUM_THREADS and NUMBA_NUM_THREADS to use all", **values)
     elif used > cores:
         yield note("threads", f"{counts}: more threads than cores wait for each other; lower OMP_NUM_THREADS", **values)
@@ -64,6 +93,11 @@ def check_threads() -> Iterator[Finding]:
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     if load > BUSY * cores:
         yield note("load", f"{load:.1f} processes were running in the last minute: times will be longer", load=load)
+
+
+def _is_apple_silicon() -> bool:
+    """Whether torch leaves out the efficiency cores on its own."""
+    return (platform.system(), platform.machine()) == ("Darwin", "arm64")
 
 
 def check_memory() -> Iterator[Finding]:

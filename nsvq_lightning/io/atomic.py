@@ -40,7 +40,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = target.parent / f".{secrets.token_hex(8)}.tmp"
     try:
         yield temporary
-        _sync(temporary)
+        _sync(temporary, os.O_RDWR)  # not read-only: Windows brings only what may be written to the disk
         with suppress(FileNotFoundError):
             temporary.chmod(target.stat().st_mode & 0o7777)
         os.replace(temporary, target)
@@ -49,7 +49,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
     # Make the new name itself survive a power failure, where the system can open folders.
     with suppress(OSError):
-        _sync(target.parent)
+        _sync(target.parent, os.O_RDONLY)
 
 
 @contextmanager
@@ -71,9 +71,9 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         file.write(text.encode())
 
 
-def _sync(path: Path) -> None:
+def _sync(path: Path, access: int) -> None:
     """Bring a file or folder to the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
+    descriptor = os.open(path, access)
     try:
         os.fsync(descriptor)
     finally:

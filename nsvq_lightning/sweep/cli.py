@@ -128,7 +128,7 @@ def _train(sweep: Sweep, runs: Sequence[Run]) -> int:
         return INTERRUPTED
     finally:
         signal.signal(signal.SIGTERM, before)
-    sys.stdout.write((sweep.folder / "results.md").read_text())
+    sys.stdout.write((sweep.folder / "results.md").read_text(encoding="utf-8"))
     return int(any(row.error for row in rows))
 
 

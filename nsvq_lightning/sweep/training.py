@@ -56,7 +56,7 @@ class Training:
     def record(self) -> dict[str, Any] | None:
         """What was noted at the end; None while the training is not finished."""
         try:
-            record: dict[str, Any] = json.loads(self._record_path.read_text())
+            record: dict[str, Any] = json.loads(self._record_path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return None
         return record
@@ -64,7 +64,7 @@ class Training:
     @property
     def metrics(self) -> dict[str, Any]:
         """The numbers of ``metrics.json``."""
-        metrics: dict[str, Any] = json.loads((self.folder / "metrics.json").read_text())
+        metrics: dict[str, Any] = json.loads((self.folder / "metrics.json").read_text(encoding="utf-8"))
         return metrics
 
     def run(self, runner: Runner, start: Path | None = None) -> None:
@@ -113,7 +113,7 @@ def run_subprocess(arguments: Sequence[str], log: Path) -> int:
             stdin=subprocess.DEVNULL,
             stdout=file,
             stderr=subprocess.STDOUT,
-            env=os.environ | {"PYTHONUNBUFFERED": "1"},
+            env=os.environ | {"PYTHONUNBUFFERED": "1", "PYTHONIOENCODING": "utf-8"},
         )
         try:
             return process.wait()
@@ -139,6 +139,6 @@ def _reason(status: int, log: Path) -> str:
     """Why a process has failed, from the last lines of what it said."""
     if status < 0:
         return f"killed by signal {-status}{', perhaps for want of memory' * (status == -9)}"
-    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     errors = [line for line in lines if line.startswith("error: ")]
     return (errors or lines or [f"exit status {status}"])[-1].removeprefix("error: ")

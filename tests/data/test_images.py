@@ -95,6 +95,17 @@ def test_damaged_pictures_are_named(tmp_path: Path, suffix: str, kept: float) ->
         read_image(path)
 
 
+def test_the_end_of_a_thumbnail_is_not_that_of_the_picture(tmp_path: Path) -> None:
+    path = tmp_path / "broken.jpg"
+    PIL.Image.fromarray(cv2.resize(RGB, (200, 150))).save(
+        path, exif=b"Exif\0\0II*\0\x08\0\0\0\0\0\0\0\0\0\xff\xda \xff\xd9"
+    )
+    assert read_image(path).shape == (150, 200, 3)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(SceneError, match=r"broken\.jpg cannot be decoded \(truncated"):
+        read_image(path)
+
+
 def test_what_is_no_picture_is_found_by_its_head(tmp_path: Path) -> None:
     (tmp_path / "text.jpg").write_text("no picture")
     with pytest.raises(SceneError, match=r"text\.jpg cannot be decoded"):

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import json
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nsvq_lightning import cli
 from nsvq_lightning.info import main
 from nsvq_lightning.io import CompressedScene, SplatArrays, write_nsvq, write_ply
 
@@ -40,6 +42,15 @@ def test_text_for_a_compressed_scene(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert ["codes", "bits", "1,750", f"{100 * 1750 / path.stat().st_size:.1f}", "%"] in lines
     assert '"seed": 42' in text
     assert '"psnr": 25.5' in text
+
+
+def test_names_that_the_output_cannot_show_are_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_ply(tmp_path / "höhle.ply", _arrays(3))
+    printed = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(printed, encoding="ascii"))
+    assert cli.main(["info", str(tmp_path / "höhle.ply")]) == 0
+    sys.stdout.flush()
+    assert b"h?hle.ply" in printed.getvalue()
 
 
 def test_streams_add_up_to_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,14 +6,15 @@ import json
 import re
 import subprocess
 import sys
-from pathlib import Path
+from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import pytest
 import torch
 import yaml
 
-from nsvq_lightning.cli import check_config, find_config, main, resolve_configs
+from nsvq_lightning import cli
+from nsvq_lightning.cli import _without_folder, check_config, find_config, main, resolve_configs
 from nsvq_lightning.io.container import read_nsvq
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.module import SplatModule
@@ -344,6 +345,20 @@ def test_configs_of_other_quantizers_differ_from_nsvq_in_that_alone(
         assert ours["callbacks"]["phases"]["init_args"].pop("quantize_end") == 45_000
         assert theirs["callbacks"]["phases"]["init_args"].pop("quantize_end") == 43_000
     assert ours == theirs
+
+
+@pytest.mark.parametrize("path", [PurePosixPath("configs/data/demo.yaml"), PureWindowsPath(r"configs\data\demo.yaml")])
+def test_names_of_configs_are_those_of_any_system(path: PurePath) -> None:
+    assert _without_folder(path) == "data/demo.yaml"
+
+
+def test_a_missing_opencv_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def without_opencv(name: str) -> None:
+        raise ModuleNotFoundError("No module named 'cv2'", name="cv2")
+
+    monkeypatch.setattr(cli, "import_module", without_opencv)
+    assert main(["compress"]) == 1
+    assert capsys.readouterr().err.startswith("error: there is no OpenCV (cv2): pip install opencv-")
 
 
 def test_configs_are_found_as_files_first_then_by_name(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
@@ -28,10 +28,6 @@ WIDTH = 16
 _f32, _i1, _i8, _i16, _i32, _i64 = ir.FloatType(), *(ir.IntType(bits) for bits in (1, 8, 16, 32, 64))
 _VF, _VI, _VM = (ir.VectorType(kind, WIDTH) for kind in (_f32, _i32, _i1))
 _CONTRACT = ("contract", "nsz")
-
-_FEATURES = binding.get_host_cpu_features()
-HAS_FMA = bool(_FEATURES.get("fma", True)) or not any(name in _FEATURES for name in ("sse2", "avx"))
-"""Whether a fused multiply-add is one instruction here; without it LLVM would call a library function a lane."""
 
 
 class _VectorType(types.Type):
@@ -111,9 +107,9 @@ def _llvm(builder: Any, name: str, result: Any, values: Sequence[Any]) -> Any:
 
 
 def _fused(builder: Any, x: Any, y: Any, z: Any) -> Any:
-    if HAS_FMA:
-        return _llvm(builder, "llvm.fma.v16f32", _VF, [x, y, z])
-    return builder.fadd(builder.fmul(x, y, flags=_CONTRACT), z, flags=_CONTRACT)
+    # Not llvm.fma: where the processor that is compiled for has no such instruction, that calls a library function for
+    # every lane. This one then multiplies and adds.
+    return _llvm(builder, "llvm.fmuladd.v16f32", _VF, [x, y, z])
 
 
 def _polynomial(builder: Any, x: Any, coefficients: Sequence[float]) -> Any:
@@ -208,13 +204,13 @@ def fetch_add(context, builder, sig, values):
 
 @_function(Lanes, 3)
 def fma(context, builder, sig, values):
-    """``x * y + z`` in one rounding."""
+    """``x * y + z`` in one rounding, where the processor has that."""
     return _fused(builder, *values)
 
 
 @_function(Lanes, 3)
 def fnma(context, builder, sig, values):
-    """``z - x * y`` in one rounding."""
+    """``z - x * y`` in one rounding, where the processor has that."""
     return _fused(builder, builder.fneg(values[0]), values[1], values[2])
 
 

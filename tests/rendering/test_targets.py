@@ -1,0 +1,56 @@
+"""The machine code of the CPU kernels for processors that are not here; see cross_compile.py."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding as llvm
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from cross_compile import SIGNATURES
+
+ARM, INTEL = "aarch64-unknown-linux-gnu", "x86_64-unknown-linux-gnu"
+PROCESSORS = {"generic": ARM, "apple-m1": ARM, "haswell": INTEL, "nehalem": INTEL, "skylake-avx512": INTEL}
+"""Target by processor: 128 bits a vector twice, 256 bits, 128 bits without fused multiply-add, 512 bits."""
+RUNTIME = {"NRT_incref", "NRT_decref", "memset"}
+"""What a kernel may call beside functions of Numba itself: reference counts of arrays, and to clear its locals."""
+LONGEST = 20_000
+"""Instructions; a kernel that takes its vectors apart, lane by lane, has several times as many."""
+
+MAIN = ("blend.blend", "blend.blend_backward")
+
+
+def _compiled(processor: str, *kernels: str) -> dict[str, Any]:
+    llvm.initialize_all_targets()
+    try:
+        llvm.Target.from_triple(PROCESSORS[processor])
+    except RuntimeError as error:
+        pytest.skip(f"this llvmlite was built without that target: {error}")
+    script = Path(__file__).with_name("cross_compile.py")
+    command = [sys.executable, str(script), PROCESSORS[processor], processor, *kernels]
+    measured: dict[str, Any] = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    return measured
+
+
+@pytest.mark.parametrize(
+    ("processor", "kernels"),
+    [
+        ("generic", MAIN),
+        ("haswell", MAIN),
+        ("nehalem", MAIN[:1]),
+        *(pytest.param(processor, tuple(SIGNATURES), marks=pytest.mark.slow) for processor in PROCESSORS),
+    ],
+)
+def test_kernels_stay_vectors_and_call_no_library(processor: str, kernels: tuple[str, ...]) -> None:
+    """Above all no ``fmaf``, which would be called for each lane where one instruction is not to be had."""
+    compiled = _compiled(processor, *kernels)
+    assert compiled.keys() == set(kernels)
+    for name, code in compiled.items():
+        assert 100 < code["instructions"] < LONGEST, name
+        assert {call for call in code["calls"] if not call.startswith("_ZN5numba")} <= RUNTIME, name
