@@ -12,6 +12,7 @@ from torch import Tensor
 
 from nsvq_lightning.io.arrays import finite_rows
 from nsvq_lightning.io.compressed import QUANTIZABLE, CompressedScene
+from nsvq_lightning.io.container import decode, encode
 from nsvq_lightning.io.formats import FORMATS, save
 from nsvq_lightning.io.precision import Storage
 from nsvq_lightning.quantize.base import Quantizer
@@ -60,23 +61,39 @@ def export_scene(
         ValueError: A format is not one of :data:`EXPORT_FORMATS`.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    paths = {}
     for suffix in formats:
         if suffix not in EXPORT_FORMATS:
             raise ValueError(f"unknown export format {suffix!r}; choose from {', '.join(EXPORT_FORMATS)}")
-        paths[suffix] = folder / f"scene.{suffix}"
-        save_as_stored(scene, paths[suffix], storage)
+    paths = {suffix: folder / f"scene.{suffix}" for suffix in formats}
+    stored = decoded(scene, storage) if set(formats) - {"nsvq"} else scene
+    for suffix, path in paths.items():
+        if suffix == "nsvq":
+            save_as_stored(scene, path, storage)
+        else:
+            save(stored, path)
     return paths
 
 
 def save_as_stored(scene: CompressedScene, path: Path, storage: Storage) -> int:
-    """Save a scene in the format of the suffix: ``.nsvq`` as a run stores it, any other as the format has it.
+    """Save a scene in the format of the suffix: ``.nsvq`` as a run stores it, any other from what that file decodes to.
 
     Returns:
         Bytes of the file.
     """
-    options = {"level": storage.level, "precision": storage.precision} if path.suffix.lower() == ".nsvq" else {}
-    return save(scene, path, **options)
+    if path.suffix.lower() == ".nsvq":
+        return save(scene, path, level=storage.level, precision=storage.precision)
+    return save(decoded(scene, storage), path)
+
+
+def decoded(scene: CompressedScene, storage: Storage) -> CompressedScene:
+    """What a run's ``.nsvq`` file decodes to, so that all files of a scene hold the same splats.
+
+    A scene without codebooks stays as it is: rounding it would only cost quality, and its record is the ``.ply``.
+    """
+    if not scene.codes:
+        return scene
+    header, streams = encode(scene, storage.level, storage.precision)
+    return decode(header, {name: memoryview(data) for name, data in streams.items()})
 
 
 def formula_bytes(scene: CompressedScene, header_bytes: int) -> int:

@@ -9,14 +9,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from nsvq_lightning.io.attribute_error import attribute_errors
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import FORMATS, read_scene, save
 from nsvq_lightning.io.precision import LEVELS
-from nsvq_lightning.io.sog import DEFAULT_PALETTE
+from nsvq_lightning.io.sog import PALETTE_LIMIT
+from nsvq_lightning.io.spz import DEFAULT_VERSION
+from nsvq_lightning.io.spz_frame import SPZ_VERSIONS
 
 __all__ = ["main"]
 
-_OPTIONS = {"level": ".nsvq", "palette": ".sog", "seed": ".sog"}
-"""Options of a writer, and its format."""
+_OPTIONS = {"level": ("--level", ".nsvq"), "palette": ("--palette", ".sog"), "version": ("--spz-version", ".spz")}
+"""Options of a writer: what they are called here, and its format."""
 
 EPILOG = """\
 The codebooks of a .nsvq file are used: as the palette of .sog, and to make .spz smaller. To make a .ply small, with
@@ -24,6 +28,7 @@ codebooks found for it, use 'nsvq compress'.
 
 examples:
   nsvq convert scene.nsvq scene.sog
+  nsvq convert scene.ply scene.sog --palette 4096
   nsvq convert scene.ply scene.spz --measure
 """
 
@@ -40,9 +45,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(argv)
     chosen = {name: getattr(options, name) for name in _OPTIONS if getattr(options, name) is not None}
-    for name in chosen:
-        if options.output.suffix.lower() != _OPTIONS[name]:
-            parser.error(f"--{name} is an option of {_OPTIONS[name]} files, and the output is {options.output}")
+    for flag, suffix in (_OPTIONS[name] for name in chosen):
+        if options.output.suffix.lower() != suffix:
+            parser.error(f"{flag} is an option of {suffix} files, and the output is {options.output}")
     if options.root is not None and not options.measure:
         parser.error("--data.root says where to measure: add --measure")
     logging.basicConfig(format="%(message)s")
@@ -62,7 +67,17 @@ def _convert(source: Path, output: Path, options: dict[str, Any]) -> None:
     output.parent.mkdir(parents=True, exist_ok=True)
     size = save(scene, output, **options)
     each = f", {size / len(scene):.1f} a splat" if len(scene) else ""
-    sys.stdout.write(f"{output}: {len(scene):,} splats in {size:,} bytes{each}\n")
+    sys.stdout.write(f"{output}: {len(scene):,} splats in {size:,} bytes{each}\n{_errors(scene, output)}")
+
+
+def _errors(scene: CompressedScene, output: Path) -> str:
+    """A line that says how far the numbers of the file are from those of the scene; nothing where none are lost."""
+    in_order = FORMATS[output.suffix.lower()].in_order
+    if in_order is None:
+        return ""
+    errors = attribute_errors(read_scene(output).arrays(), in_order(scene).arrays())
+    listed = ", ".join(f"{name} {error:.2g}{'°' * (name == 'rotation')}" for name, error in errors.items())
+    return f"  root mean square errors: {listed}\n"
 
 
 def _measure(source: Path, output: Path, root: Path | None) -> None:
@@ -96,9 +111,16 @@ def _parser() -> argparse.ArgumentParser:
         "--palette",
         type=int,
         metavar="ROWS",
-        help=f"rows of the .sog palette of a scene without an SH codebook, by k-means; {DEFAULT_PALETTE} by default",
+        help="most rows of the .sog palette of a scene without an SH codebook; "
+        f"{PALETTE_LIMIT} by default, 4096 to 16384 make a smaller file",
     )
-    parser.add_argument("--seed", type=int, help="seed of that k-means; 0 by default")
+    parser.add_argument(
+        "--spz-version",
+        dest="version",
+        type=int,
+        choices=SPZ_VERSIONS,
+        help=f"version of .spz; {DEFAULT_VERSION} by default, which more viewers open",
+    )
     parser.add_argument("--level", choices=LEVELS, help="level of .nsvq")
     parser.add_argument("--measure", action="store_true", help="render both files and say how they differ")
     parser.add_argument(

@@ -63,8 +63,12 @@ def _text(facts: dict[str, Any]) -> str:
     if "attributes" in facts:
         entries = ((a["name"], a["storage"], a["dim"], a["codes"], a["bits"]) for a in facts["attributes"])
         parts.append(_table(("attribute", "storage", "D", "K", "bits"), entries))
-    shares = ((s["name"], s["encoding"], s["bytes"], f"{100 * s['bytes'] / whole:.1f} %") for s in facts["streams"])
-    parts.append(_table(("stream", "encoding", "bytes", "share"), shares))
+    splats = max(1, facts["splats"])
+    shares = (
+        (s["name"], s["encoding"], s["bytes"], f"{8 * s['bytes'] / splats:.2f}", f"{100 * s['bytes'] / whole:.1f} %")
+        for s in facts["streams"]
+    )
+    parts.append(_table(("stream", "encoding", "bytes", "bits a splat", "share"), shares))
     parts += [f"{key}\n{_indented(facts[key])}" for key in ("metrics", "config") if facts.get(key)]
     return "\n\n".join(parts)
 

@@ -219,6 +219,13 @@ def _build_viewer(folder: Path, suffix: str) -> list[Path]:
     return [path]
 
 
+def _build_spz4(folder: Path) -> list[Path]:
+    from nsvq_lightning.io.formats import save
+
+    save(_scene(40), folder / "scene.spz", version=4)  # type: ignore[arg-type]
+    return [folder / "scene.spz"]
+
+
 def _read_viewer(path: Path) -> object:
     from nsvq_lightning.io.describe import describe
     from nsvq_lightning.io.errors import FormatError
@@ -380,6 +387,7 @@ def targets() -> dict[str, Target]:
         "ply": Target(_build_ply, _read_ply, (FormatError,)),
         "nsvq": Target(_build_nsvq, _read_nsvq, (FormatError,), _mend_nsvq),
         "spz": Target(lambda folder: _build_viewer(folder, ".spz"), _read_viewer, (FormatError,), _mend_spz),
+        "spz4": Target(_build_spz4, _read_viewer, (FormatError,)),
         "sog": Target(lambda folder: _build_viewer(folder, ".sog"), _read_viewer, (FormatError,), _mend_sog),
         "splat": Target(lambda folder: _build_viewer(folder, ".splat"), _read_viewer, (FormatError,)),
         "colmap-bin": Target(lambda folder: _build_colmap(folder, ".bin"), _read_colmap, (SceneError,)),

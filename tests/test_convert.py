@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -10,10 +11,11 @@ from nsvq_lightning.commands import COMMANDS
 from nsvq_lightning.compress import export_scene
 from nsvq_lightning.convert_command import main
 from nsvq_lightning.io import FORMATS, read_scene, save
-from nsvq_lightning.io.precision import Storage
+from nsvq_lightning.io.precision import LEVELS, Storage
+from nsvq_lightning.io.spz_frame import read_spz_header
 
 sys.path.insert(0, str(Path(__file__).parent / "io"))
-from viewer_scenes import coded_scene, nearest_in
+from viewer_scenes import coded_scene, nearest_in, needs_zstd, plain_scene
 
 
 def test_every_readable_format_becomes_every_writable_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -45,9 +47,59 @@ def test_a_run_exports_its_codes_as_labels(tmp_path: Path) -> None:
     assert [path.name for path in paths.values()] == ["scene.nsvq", "scene.sog", "scene.spz"]
     sog, plain = read_scene(paths["sog"]), read_scene(paths["nsvq"])
     order = nearest_in(sog.arrays(), plain.arrays())
-    np.testing.assert_array_equal(np.unique(scene.codes["shN"])[sog.codes["shN"]], plain.codes["shN"][order])
+    pairs = set(zip(sog.codes["shN"].tolist(), plain.codes["shN"][order].tolist(), strict=True))
+    assert len(pairs) == len(np.unique(scene.codes["shN"]))
     with pytest.raises(ValueError, match=r"unknown export format 'obj'; choose from ply, nsvq, sog, spz, splat"):
         export_scene(scene, tmp_path, Storage(), ("obj",))
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("suffix", [".sog", ".spz", ".splat"])
+def test_exports_and_conversions_of_a_scene_are_the_same_file(tmp_path: Path, suffix: str, level: str) -> None:
+    formats = ("nsvq", "ply", suffix[1:])
+    paths = export_scene(coded_scene(300), tmp_path, Storage(level), formats)
+    assert main([str(paths["nsvq"]), str(tmp_path / f"converted{suffix}")]) == 0
+    expected = paths[suffix[1:]].read_bytes()
+    assert (tmp_path / f"converted{suffix}").read_bytes() == expected
+    assert main([str(paths["nsvq"]), str(tmp_path / "converted.ply")]) == 0
+    assert (tmp_path / "converted.ply").read_bytes() == paths["ply"].read_bytes()
+    if suffix != ".spz":  # which is ordered by the codes, and a .ply has none
+        assert main([str(paths["ply"]), str(tmp_path / f"plain{suffix}")]) == 0
+        assert (tmp_path / f"plain{suffix}").read_bytes() == expected
+
+
+def test_a_plain_scene_is_exported_as_it_is(tmp_path: Path) -> None:
+    scene = plain_scene(40, 1)
+    paths = export_scene(scene, tmp_path, Storage(), ("nsvq", "ply", "sog"))
+    for name, values in vars(scene.arrays()).items():
+        np.testing.assert_array_equal(getattr(read_scene(paths["ply"]).arrays(), name), values, err_msg=name)
+    assert main([str(paths["ply"]), str(tmp_path / "converted.sog")]) == 0
+    assert (tmp_path / "converted.sog").read_bytes() == paths["sog"].read_bytes()
+
+
+@pytest.mark.parametrize(("suffix", "shown"), [(".sog", True), (".spz", True), (".splat", True), (".ply", False)])
+def test_a_conversion_says_what_it_lost(
+    tmp_path: Path, suffix: str, shown: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save(coded_scene(30, 1), tmp_path / "a.nsvq")
+    assert main([str(tmp_path / "a.nsvq"), str(tmp_path / f"b{suffix}")]) == 0
+    found = re.search(
+        r"errors: position (\S+), rotation (\S+)°, log-scale \S+, opacity (\S+), sh0", capsys.readouterr().out
+    )
+    assert (found is not None) == shown
+    if found is not None:
+        position, degrees, opacity = map(float, found.groups())
+        assert position < 0.001
+        assert 0 < degrees < 1
+        assert 0 < opacity <= 0.5 / 255
+
+
+@needs_zstd
+def test_the_version_of_spz_is_chosen(tmp_path: Path) -> None:
+    save(coded_scene(30, 1), tmp_path / "a.nsvq")
+    for options, version in (([], 3), (["--spz-version", "3"], 3), (["--spz-version", "4"], 4)):
+        assert main([str(tmp_path / "a.nsvq"), str(tmp_path / "b.spz"), *options]) == 0
+        assert read_spz_header(tmp_path / "b.spz")[0].version == version
 
 
 def test_measuring_says_how_the_pictures_differ(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -88,6 +140,7 @@ def test_errors_in_files_are_one_line_and_status_1(
     [
         (["a.nsvq", "b.ply", "--palette", "8"], "--palette is an option of .sog files"),
         (["a.nsvq", "b.sog", "--level", "paper"], "--level is an option of .nsvq files"),
+        (["a.nsvq", "b.sog", "--spz-version", "4"], "--spz-version is an option of .spz files"),
         (["a.nsvq", "b.sog", "--data.root", "x"], "add --measure"),
     ],
 )

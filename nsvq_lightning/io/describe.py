@@ -14,9 +14,9 @@ from nsvq_lightning.io.frame import MAGIC, read_header
 from nsvq_lightning.io.ply import plain_ply_bytes, read_ply_size
 from nsvq_lightning.io.ply_header import PLY_MAGIC, attribute_of
 from nsvq_lightning.io.sog import read_sog_header
-from nsvq_lightning.io.sog_archive import ZIP_MAGIC
+from nsvq_lightning.io.sog_archive import META, ZIP_MAGIC
 from nsvq_lightning.io.splat import SPLAT_LAYOUT, count_splats
-from nsvq_lightning.io.spz import SPZ_MAGICS, read_spz_header
+from nsvq_lightning.io.spz_frame import SPZ_MAGICS, read_spz_header
 
 __all__ = ["describe"]
 
@@ -79,8 +79,10 @@ def _describe_sog(path: Path) -> dict[str, Any]:
 
 
 def _describe_spz(path: Path) -> dict[str, Any]:
-    header, total = read_spz_header(path), path.stat().st_size
-    return _facts(f"spz, version {header.version}", header.count, header.sh_degree, total, {"all": total}, "gzip")
+    header, streams = read_spz_header(path)
+    encoding = "zstd" if header.version == 4 else "gzip"
+    total = path.stat().st_size
+    return _facts(f"spz, version {header.version}", header.count, header.sh_degree, total, streams, encoding)
 
 
 def _describe_splat(path: Path) -> dict[str, Any]:
@@ -97,9 +99,15 @@ def _facts(
         "splats": splats,
         "sh_degree": sh_degree,
         "bytes": total,
-        "streams": [{"name": stream, "encoding": encoding, "bytes": size} for stream, size in streams.items()],
+        "streams": [
+            {"name": stream, "encoding": _OUTSIDE.get(stream, encoding), "bytes": size}
+            for stream, size in streams.items()
+        ],
     }
 
+
+_OUTSIDE = {"header": "plain", META: "json", "zip": "zip"}
+"""What is around the streams, and how it is encoded."""
 
 _DESCRIBERS: tuple[tuple[bytes | tuple[bytes, ...], Callable[[Path], dict[str, Any]]], ...] = (
     (MAGIC, _describe_nsvq),

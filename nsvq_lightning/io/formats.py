@@ -14,9 +14,9 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.container import read_nsvq, write_nsvq
 from nsvq_lightning.io.ply import read_ply, write_ply
 from nsvq_lightning.io.precision import DEFAULT_LEVEL, Precision
-from nsvq_lightning.io.sog import read_sog, write_sog
+from nsvq_lightning.io.sog import in_sog_order, read_sog, write_sog
 from nsvq_lightning.io.splat import read_splat, write_splat
-from nsvq_lightning.io.spz import read_spz, write_spz
+from nsvq_lightning.io.spz import in_spz_order, read_spz, write_spz
 
 if TYPE_CHECKING:
     from nsvq_lightning.splats import Splats, SplatTensors
@@ -35,12 +35,15 @@ class Format:
         read: Scene from a file; None if the format is only written. Codebooks are kept where the format has them.
         write: ``write(path, scene, **options) -> bytes written``; None if the format is only read.
         keeps_origin: Whether the file holds the origin that positions are relative to.
+        in_order: The splats of a scene that a file holds, in its order, to be compared with what is read from it; None
+            if the format loses nothing, or states its errors itself.
     """
 
     description: str
     read: Callable[[Path], CompressedScene] | None
     write: Callable[..., int] | None
     keeps_origin: bool = False
+    in_order: Callable[[CompressedScene], CompressedScene] | None = None
 
 
 def load(path: str | os.PathLike[str]) -> Splats:
@@ -80,8 +83,9 @@ def save(splats: SplatTensors | CompressedScene, path: str | os.PathLike[str], *
         path: File to write, replaced atomically; its suffix names the format.
         options: For ``.ply``: ``normals`` (bool, default True). For ``.nsvq``: ``config``, ``metrics``, ``origin``,
             ``level`` and ``precision``; plain splats have no codebooks, so level ``paper`` stores all attributes as
-            they are, and ``compact`` within its precision and in another order. For ``.sog``: ``palette`` (rows of the
-            palette of spherical harmonics without a codebook, default 4096) and ``seed``.
+            they are, and ``compact`` within its precision and in another order. For ``.sog``: ``palette`` (most rows of
+            the palette of spherical harmonics without a codebook, default 65536). For ``.spz``: ``version`` (3 or 4,
+            default 3).
 
     Returns:
         Bytes of the file.
@@ -131,8 +135,13 @@ def _write_nsvq(
 FORMATS: dict[str, Format] = {
     ".ply": Format("3D Gaussian Splatting", _read_ply, _write_ply),
     ".nsvq": Format("compressed scene of this package", read_nsvq, _write_nsvq, keeps_origin=True),
-    ".sog": Format("PlayCanvas, SuperSplat", read_sog, write_sog),
-    ".spz": Format("Niantic", read_spz, write_spz),
-    ".splat": Format("first viewers on the web, without spherical harmonics", read_splat, write_splat),
+    ".sog": Format("PlayCanvas, SuperSplat", read_sog, write_sog, in_order=in_sog_order),
+    ".spz": Format("Niantic", read_spz, write_spz, in_order=in_spz_order),
+    ".splat": Format(
+        "first viewers on the web, without spherical harmonics",
+        read_splat,
+        write_splat,
+        in_order=CompressedScene.finite,
+    ),
 }
 """Formats by suffix; a new format is one more entry."""

@@ -12,12 +12,12 @@ picture             texel
 ``shN_centroids``   64 rows of the palette a line, a texel a coefficient: numbers of levels
 ==================  ===========================================================================================
 
-The palette is what an SH codebook is, so a scene with one needs no clustering: codes become labels.
+The palette is what an SH codebook is, so a scene with one needs no clustering: codes become labels. What is in the file
+follows from the decoded splats alone: a scene gives the same file with its codebooks and without them.
 """
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 from collections.abc import Mapping
@@ -36,12 +36,8 @@ from nsvq_lightning.io.sog_archive import META, SogArchive, picture_shape, write
 from nsvq_lightning.io.splat_order import spatial_order
 from nsvq_lightning.sh_degree import sh_coefficients
 
-__all__ = ["DEFAULT_PALETTE", "PALETTE_LIMIT", "read_sog", "read_sog_header", "write_sog"]
+__all__ = ["PALETTE_LIMIT", "in_sog_order", "read_sog", "read_sog_header", "write_sog"]
 
-logger = logging.getLogger(__name__)
-
-DEFAULT_PALETTE = 4096
-"""Rows of the palette of a scene whose spherical harmonics have no codebook."""
 PALETTE_LIMIT = 1 << 16
 """Rows that a label of 16 bits can name."""
 _ROWS_A_LINE = 64
@@ -49,20 +45,25 @@ _LEVELS = 256
 _FARTHEST = math.log1p(float(np.finfo(np.float32).max))
 
 
-def write_sog(
-    path: str | os.PathLike[str], scene: CompressedScene, *, palette: int = DEFAULT_PALETTE, seed: int = 0
-) -> int:
-    """Write a scene as ``.sog``, in Morton order of the positions.
+def in_sog_order(scene: CompressedScene) -> CompressedScene:
+    """The splats that a file holds, in its order: Morton order of the positions."""
+    scene = scene.finite()
+    return scene.take(spatial_order(scene.means))
 
-    A codebook of the spherical harmonics becomes the palette and its codes the labels, renumbered where rows are not
-    used. A scene without one, or with more rows in use than a label can name, gets a palette by k-means. Splats with a
-    non-finite value are left out with a warning.
+
+def write_sog(path: str | os.PathLike[str], scene: CompressedScene, *, palette: int = PALETTE_LIMIT) -> int:
+    """Write a scene as ``.sog``.
+
+    A codebook of the spherical harmonics becomes the palette and its codes the labels, renumbered in the order of their
+    first use. A scene without one, or with more rows in use than a label can name, gets a palette of means of like
+    rows, in which opaque and large splats count more; it is exact where there are no more distinct rows than it may
+    have. Splats with a non-finite value are left out with a warning.
 
     Args:
         path: File to write, replaced atomically.
         scene: The scene.
-        palette: Rows of a palette by k-means.
-        seed: Seed of k-means.
+        palette: Most rows of a palette that must be found: fewer make a smaller file, and colours that follow the view
+            less closely.
 
     Returns:
         Bytes of the file.
@@ -72,8 +73,7 @@ def write_sog(
     """
     if not 1 <= palette <= PALETTE_LIMIT:
         raise ValueError(f"palette must be in 1..{PALETTE_LIMIT}, got {palette}")
-    scene = scene.finite()
-    scene = _with_palette(scene.take(spatial_order(scene.means)), palette, seed)
+    scene = _with_palette(in_sog_order(scene), palette)
     count = len(scene)
     low, high, means = _packed_means(scene.means)
     scales, scale_levels = _leveled(scene, "scales")
@@ -102,18 +102,16 @@ def write_sog(
     return write_archive(path, meta, pictures)
 
 
-def _with_palette(scene: CompressedScene, palette: int, seed: int) -> CompressedScene:
+def _with_palette(scene: CompressedScene, most: int) -> CompressedScene:
     """The scene with an SH codebook, all of whose rows are in use; of one row if there is no splat."""
     if scene.sh_degree == 0:
         return scene
-    rows, codes = scene.table("shN")
-    if codes is not None:
-        used, codes = np.unique(codes, return_inverse=True)
-        rows = rows[used]
-    if len(scene) == 0:
-        rows, codes = np.zeros((1, rows.shape[1]), np.float32), np.zeros(0, np.int64)
-    elif codes is None or len(rows) > PALETTE_LIMIT:
-        rows, codes = _clustered(rows, codes, palette, seed)
+    if len(scene):
+        from nsvq_lightning.io.palette import in_order_of_use
+
+        rows, codes = in_order_of_use(*_palette(scene, most))
+    else:
+        rows, codes = np.zeros((1, 3 * sh_coefficients(scene.sh_degree)), np.float32), np.zeros(0, np.int64)
     raw = {name: values for name, values in scene.raw.items() if name != "shN"}
     return replace(
         scene,
@@ -124,23 +122,28 @@ def _with_palette(scene: CompressedScene, palette: int, seed: int) -> Compressed
     )
 
 
-def _clustered(
-    rows: NDArray[np.float32], codes: NDArray[np.integer] | None, palette: int, seed: int
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Palette ``[K, D]`` of rows ``[M, D]``, and label ``[N]`` of each splat; without codes row i is splat i's."""
-    import torch
+def _palette(scene: CompressedScene, most: int) -> tuple[NDArray[np.float32], NDArray[np.integer]]:
+    """Rows of spherical harmonics ``[K, D]``, and the row of each splat ``[N]``."""
+    from nsvq_lightning.io.palette import find_palette  # brings Numba, which readers do without
 
-    from nsvq_lightning.quantize.kmeans import kmeans
-    from nsvq_lightning.quantize.nearest import nearest
-    from nsvq_lightning.random import generator
+    rows, codes = scene.table("shN")
+    if codes is None:
+        return find_palette(rows, _visibility(scene), most)
+    used, codes = np.unique(codes, return_inverse=True)
+    if len(used) <= PALETTE_LIMIT:
+        return rows[used], codes
+    rows, labels = find_palette(rows[used], np.bincount(codes, _visibility(scene)), most)
+    return rows, labels[codes]
 
-    logger.info("clustering the spherical harmonics of %d splats into %d rows", len(rows), palette)
-    x = torch.from_numpy(np.ascontiguousarray(rows))
-    weight = None if codes is None else torch.from_numpy(np.bincount(codes, minlength=len(rows)))
-    centroids = kmeans(x, palette, generator(seed, 0, "sog", "shN"), weight)
-    labels: NDArray[np.int64] = nearest(x, centroids).numpy()
-    used, labels = np.unique(labels, return_inverse=True)
-    return centroids.numpy()[used], labels if codes is None else labels[codes]
+
+def _visibility(scene: CompressedScene) -> NDArray[np.float64]:
+    """How much the colour of each splat matters ``[N]``, where no view is known: opacity times width.
+
+    Every splat counts a little, however small it is beside the largest.
+    """
+    sizes = scene.spread("scales", lambda rows, _: np.sort(rows, axis=1)[:, 1:].mean(1)).astype(np.float64)
+    weight: NDArray[np.float64] = opacity_of(scene.opacities) * np.exp(sizes - sizes.max())
+    return weight / float(weight.mean()) + 0.01
 
 
 def _packed_means(

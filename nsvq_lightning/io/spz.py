@@ -1,11 +1,11 @@
-"""The ``.spz`` file of Niantic: 65 bytes a splat, 12 to 25 after gzip. Version 3 is written, versions 1 to 3 are read.
+"""The ``.spz`` file of Niantic: 65 bytes a splat, 12 to 25 compressed. Versions 3 and 4 are written, 1 to 4 read.
 
-A gzip stream of a header and six arrays, each of all splats; integers are little-endian.
+Six arrays, each of all splats; :mod:`~nsvq_lightning.io.spz_frame` says what is around them. Integers are
+little-endian.
 
 ===========  =================  =============================================================================
 array        bytes a splat      content
 ===========  =================  =============================================================================
-header       16 in all          ``NGSP``, version (4), N (4), SH degree, bits after the point, flags, 0
 positions    9                  3 fixed-point numbers of 24 bits; version 1: 3 float16
 opacities    1                  255ths
 colours      3                  127.5 + 255 · 0.15 · sh0
@@ -15,8 +15,8 @@ rotations    4                  smallest three: 2 bits say which component of xy
 SH           3 (d² + 2d)        128 + 128 x, coefficient by coefficient, three colours each
 ===========  =================  =============================================================================
 
-Niantic's writer rounds spherical harmonics to 5 and 4 bits before, for gzip's sake; that took a trained scene down to
-31 dB, so all 8 bits are used here.
+Niantic's writer rounds spherical harmonics to 5 and 4 bits before, for a smaller file; that took a trained scene down
+to 31 dB, so all 8 bits are used here.
 
 Axes are right, up, back; ours are right, down, forward, so y and z change their signs, and with them the coefficients
 of odd functions of either.
@@ -24,39 +24,28 @@ of odd functions of either.
 
 from __future__ import annotations
 
-import gzip
 import math
 import os
-import struct
-import zlib
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.arrays import SplatArrays
-from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.clamping import Clamped
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
 from nsvq_lightning.io.rotation import from_smallest_three, smallest_three, unit
 from nsvq_lightning.io.splat_order import spatial_order
+from nsvq_lightning.io.spz_frame import MOST_FRACTION, SPZ_VERSIONS, SpzHeader, read_frame, write_frame
 from nsvq_lightning.sh_degree import sh_coefficients
 
-__all__ = ["SPZ_MAGICS", "SpzHeader", "read_spz", "read_spz_header", "write_spz"]
+__all__ = ["DEFAULT_VERSION", "in_spz_order", "read_spz", "write_spz"]
 
-_MAGIC = b"NGSP"
-SPZ_MAGICS = (b"\x1f\x8b", _MAGIC)
-"""First bytes: of gzip up to version 3, of the plain header from version 4 on."""
-
-_HEADER = struct.Struct("<4sIIBBBB")
-_MOST_A_BYTE = 1032
-"""Bytes that one byte of a deflate stream can become."""
+DEFAULT_VERSION = 3
+"""The version that every reader of the format opens."""
 _POSITION = 24
-_USUAL_FRACTION, _MOST_FRACTION = 12, 30
+_USUAL_FRACTION = 12
 _POSITION_ERROR = 0.05
 """Largest error of a coordinate as a share of the splat's size, of all but the thousandth with the smallest splats."""
 _COLOR = 0.15
@@ -69,69 +58,50 @@ _FLIPPED_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np
 """Signs of the real spherical harmonics of degree 1 to 3 when y and z change theirs, ``[15, 1]``."""
 
 
-@dataclass(frozen=True)
-class SpzHeader:
-    """What the first bytes of the stream say.
+def in_spz_order(scene: CompressedScene) -> CompressedScene:
+    """The splats that a file holds, in its order: that of their codes, then of their place.
 
-    Attributes:
-        version: 1 to 3.
-        count: Number of splats N.
-        sh_degree: Degree of the spherical harmonics, 0 to 3.
-        fraction_bits: Bits of the positions after the point.
-    """
-
-    version: int
-    count: int
-    sh_degree: int
-    fraction_bits: int
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Bytes a splat of each array, in file order."""
-        means, quats = (6 if self.version == 1 else 9), (4 if self.version == 3 else 3)
-        sh = 3 * sh_coefficients(self.sh_degree)
-        return {"means": means, "opacities": 1, "sh0": 3, "scales": 3, "quats": quats, "shN": sh}
-
-    @property
-    def stream_bytes(self) -> int:
-        """Bytes of header and arrays."""
-        return _HEADER.size + self.count * sum(self.sizes.values())
-
-
-def write_spz(path: str | os.PathLike[str], scene: CompressedScene) -> int:
-    """Write a scene as ``.spz``, version 3.
-
-    Positions get as many bits after the point as the smallest splats need. Splats are in the order of their codes,
-    those of the spherical harmonics first, because gzip finds equal rows only where they are near, and then of their
-    place. Splats with a non-finite value are left out and values out of the format's range are clamped, each with a
-    warning.
-
-    Returns:
-        Bytes of the file.
+    The codes of the spherical harmonics come first, because gzip finds equal rows only where they are near.
     """
     scene = scene.finite()
     scene = scene.take(spatial_order(scene.means))
     codes = [scene.codes[name] for name in _ORDER if name in scene.codes]
-    scene = scene.take(np.lexsort([np.arange(len(scene)), *codes]))
+    return scene.take(np.lexsort([np.arange(len(scene)), *codes]))
+
+
+def write_spz(path: str | os.PathLike[str], scene: CompressedScene, *, version: int = DEFAULT_VERSION) -> int:
+    """Write a scene as ``.spz``.
+
+    Positions get as many bits after the point as the smallest splats need. Splats with a non-finite value are left out
+    and values out of the format's range are clamped, each with a warning.
+
+    Args:
+        path: File to write, replaced atomically.
+        scene: The scene.
+        version: 3, or 4, which is compressed with Zstandard.
+
+    Returns:
+        Bytes of the file.
+
+    Raises:
+        ValueError: Another version.
+        FormatError: Version 4 needs Zstandard, and it is not installed.
+    """
+    if version not in SPZ_VERSIONS:
+        raise ValueError(f"version of .spz must be {' or '.join(map(str, SPZ_VERSIONS))}, got {version}")
+    scene = in_spz_order(scene)
     clamped = Clamped()
-    fraction = _fraction_bits(scene)
-    header = _HEADER.pack(_MAGIC, 3, len(scene), scene.sh_degree, fraction, 0, 0)
-    arrays = (
-        _packed_means(scene, fraction, clamped),
-        np.rint(255 * opacity_of(scene.opacities)).astype(np.uint8),
-        _packed(scene, "sh0", _COLOR * 255, 127.5, clamped),
-        _packed(scene, "scales", 16, 160, clamped),
-        scene.spread("quats", lambda rows, _: _packed_quats(rows)),
-        scene.spread("shN", lambda rows, uses: _packed_sh(rows, uses, scene.sh_degree, clamped)),
-    )
+    header = SpzHeader(version, len(scene), scene.sh_degree, _fraction_bits(scene))
+    arrays: dict[str, NDArray[Any]] = {
+        "means": _packed_means(scene, header.fraction_bits, clamped),
+        "opacities": np.rint(255 * opacity_of(scene.opacities)).astype(np.uint8),
+        "sh0": _packed(scene, "sh0", _COLOR * 255, 127.5, clamped),
+        "scales": _packed(scene, "scales", 16, 160, clamped),
+        "quats": scene.spread("quats", lambda rows, _: _packed_quats(rows)),
+        "shN": scene.spread("shN", lambda rows, uses: _packed_sh(rows, uses, scene.sh_degree, clamped)),
+    }
     clamped.warn(path, len(scene))
-    with atomic_write(path) as file:
-        # No name and no time: the same scene gives the same bytes.
-        with gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as stream:
-            stream.write(header)
-            for array in arrays:
-                stream.write(np.ascontiguousarray(array).data)
-        return file.tell()
+    return write_frame(path, header, arrays)
 
 
 def _fraction_bits(scene: CompressedScene) -> int:
@@ -145,7 +115,7 @@ def _fraction_bits(scene: CompressedScene) -> int:
     needed = math.ceil(-(math.log2(2 * _POSITION_ERROR) + float(np.quantile(sizes, 0.001)) / math.log(2)))
     farthest, far = np.abs(scene.means).max(), np.quantile(np.abs(scene.means).max(1), 0.999)
     fits, mostly_fits = (_POSITION - 1 - math.frexp(float(reach))[1] for reach in (farthest, far))
-    return min(max(min(needed, fits), min(_USUAL_FRACTION, mostly_fits), 0), _MOST_FRACTION)
+    return min(max(min(needed, fits), min(_USUAL_FRACTION, mostly_fits), 0), MOST_FRACTION)
 
 
 def _packed_means(scene: CompressedScene, fraction: int, clamped: Clamped) -> NDArray[np.uint8]:
@@ -183,79 +153,13 @@ def _packed_sh(
 
 
 def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
-    """Read a ``.spz`` file of version 1 to 3; its extensions are left out.
+    """Read a ``.spz`` file of version 1 to 4; its extensions are left out.
 
     Raises:
-        FormatError: The file is truncated, altered, of another version, or no ``.spz`` file.
+        FormatError: The file is truncated, altered, of another version, or no ``.spz`` file; or version 4 needs
+            Zstandard, and it is not installed.
     """
-    data = Path(path).read_bytes()
-    with naming_file(path):
-        header, stream = _unzip(data)
-        arrays: dict[str, NDArray[np.uint8]] = {}
-        start = _HEADER.size
-        for name, size in header.sizes.items():
-            end = start + header.count * size
-            arrays[name] = np.frombuffer(stream, np.uint8, header.count * size, start).reshape(header.count, size)
-            start = end
-        return CompressedScene.from_arrays(_unpacked(header, arrays))
-
-
-def read_spz_header(path: str | os.PathLike[str]) -> SpzHeader:
-    """Header of a ``.spz`` file; the arrays are not looked at.
-
-    Raises:
-        FormatError: The file is of another version, or no ``.spz`` file.
-    """
-    with naming_file(path), open(path, "rb") as file:
-        return _parse(_start(zlib.decompressobj(wbits=31), file.read(1 << 12)), os.path.getsize(path))
-
-
-def _unzip(data: bytes) -> tuple[SpzHeader, bytes]:
-    gunzip = zlib.decompressobj(wbits=31)
-    start = _start(gunzip, data)
-    header = _parse(start, len(data))
-    # What follows the arrays are extensions; reading on to the end of the stream checks its sum.
-    stream = start + _inflate(gunzip, gunzip.unconsumed_tail, header.stream_bytes - len(start))
-    if len(stream) < header.stream_bytes:
-        raise FormatError(f"truncated: {header.count} splats need {header.stream_bytes} bytes, got {len(stream)}")
-    while not gunzip.eof:
-        if not _inflate(gunzip, gunzip.unconsumed_tail, 1 << 16) and not gunzip.eof:
-            raise FormatError("truncated: the gzip stream has no end")
-    return header, stream
-
-
-def _start(gunzip: zlib._Decompress, data: bytes) -> bytes:
-    if data.startswith(_MAGIC):
-        raise FormatError(
-            "version 4 or later of the format; this release reads 1 to 3", "save it as version 3 or as .ply"
-        )
-    return _inflate(gunzip, data, _HEADER.size)
-
-
-def _inflate(gunzip: zlib._Decompress, data: bytes, most: int) -> bytes:
-    """At most so many bytes of the stream; 0 must not reach zlib, which takes it for no limit."""
-    try:
-        return gunzip.decompress(data, most) if most else b""
-    except zlib.error as error:
-        raise FormatError(f"damaged, or not a .spz file: no valid gzip stream ({error})") from None
-
-
-def _parse(start: bytes, file_bytes: int) -> SpzHeader:
-    if len(start) < _HEADER.size or start[:4] != _MAGIC:
-        raise FormatError("not a .spz file: the gzip stream does not start with a header 'NGSP'")
-    _, version, count, sh_degree, fraction_bits, _, _ = _HEADER.unpack(start)
-    if not 1 <= version <= 3:
-        raise FormatError(
-            f"version {version} of the format; this release reads 1 to 3", "save it as version 3 or as .ply"
-        )
-    if sh_degree > 3:
-        raise FormatError(f"damaged, or of a degree that this release does not read: SH degree {sh_degree}, not 0 to 3")
-    if fraction_bits > _MOST_FRACTION:
-        raise FormatError(f"damaged: {fraction_bits} bits after the point, more than {_MOST_FRACTION}")
-    header = SpzHeader(version, count, sh_degree, fraction_bits)
-    if header.stream_bytes > _MOST_A_BYTE * file_bytes:
-        raise FormatError(f"truncated or damaged: {count} splats cannot be in {file_bytes} bytes")
-    return header
+    return CompressedScene.from_arrays(_unpacked(*read_frame(path)))
 
 
 def _unpacked(header: SpzHeader, arrays: dict[str, NDArray[np.uint8]]) -> SplatArrays:

@@ -39,7 +39,7 @@ def test_text_for_a_compressed_scene(tmp_path: Path, capsys: pytest.CaptureFixtu
     lines = [line.split() for line in text.splitlines()]
     assert ["splats", "1,000"] in lines
     assert ["shN", "codes", "45", "16,384", "14"] in lines
-    assert ["codes", "bits", "1,750", f"{100 * 1750 / path.stat().st_size:.1f}", "%"] in lines
+    assert ["codes", "bits", "1,750", "14.00", f"{100 * 1750 / path.stat().st_size:.1f}", "%"] in lines
     assert '"seed": 42' in text
     assert '"psnr": 25.5' in text
 

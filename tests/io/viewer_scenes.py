@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+from pathlib import Path
+
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from nsvq_lightning.io import CompressedScene, SplatArrays
+
+HAS_ZSTD = any(find_spec(parent) and find_spec(f"{parent}.zstd") for parent in ("compression", "backports"))
+needs_zstd = pytest.mark.skipif(not HAS_ZSTD, reason="no Zstandard: pip install 'nsvq-lightning[spz]'")
 
 
 def plain_scene(n: int, degree: int = 3, seed: int = 0) -> CompressedScene:
@@ -58,4 +65,47 @@ def sigmoid(logits: NDArray[np.float32]) -> NDArray[np.float64]:
     return 1 / (1 + np.exp(-logits.astype(np.float64)))
 
 
-__all__ = ["angles", "coded_scene", "nearest_in", "plain_scene", "sigmoid"]
+def read_table(path: Path) -> SplatArrays:
+    """The scene of a .csv file of splat-transform, by the names of its columns."""
+    names = path.read_text().partition("\n")[0].split(",")
+    values = np.genfromtxt(path, np.float64, delimiter=",", skip_header=1, ndmin=2)
+    columns = dict(zip(names, values.T, strict=True))
+
+    def stacked(*wanted: str) -> NDArray[np.float32]:
+        return np.stack([columns.pop(name) for name in wanted], axis=1).astype(np.float32)
+
+    rest = sum(name.startswith("f_rest_") for name in names)
+    sh = stacked(*(f"f_rest_{i}" for i in range(rest))) if rest else np.zeros((len(values), 0), np.float32)
+    arrays = SplatArrays(
+        means=stacked("x", "y", "z"),
+        quats=stacked("rot_0", "rot_1", "rot_2", "rot_3"),
+        scales=stacked("scale_0", "scale_1", "scale_2"),
+        opacities=stacked("opacity")[:, 0],
+        sh0=stacked("f_dc_0", "f_dc_1", "f_dc_2")[:, None],
+        shN=np.ascontiguousarray(sh.reshape(len(values), 3, rest // 3).transpose(0, 2, 1)),
+    )
+    assert set(columns) <= {"nx", "ny", "nz"}, "a column of no known meaning"
+    return arrays
+
+
+def assert_same(theirs: SplatArrays, ours: SplatArrays, rotation: float = 2e-6) -> None:
+    """Two readers found the same numbers, row for row, up to their floating-point arithmetic."""
+    np.testing.assert_allclose(theirs.means, ours.means, rtol=2e-6, atol=2e-6)
+    np.testing.assert_allclose(theirs.scales, ours.scales, rtol=0, atol=2e-6)
+    np.testing.assert_allclose(theirs.sh0, ours.sh0, rtol=0, atol=2e-6)
+    np.testing.assert_allclose(sigmoid(theirs.opacities), sigmoid(ours.opacities), rtol=0, atol=2e-6)
+    np.testing.assert_allclose(theirs.shN, ours.shN, rtol=0, atol=1e-6)
+    assert angles(theirs.quats, ours.quats).max() <= rotation
+
+
+__all__ = [
+    "HAS_ZSTD",
+    "angles",
+    "assert_same",
+    "coded_scene",
+    "nearest_in",
+    "needs_zstd",
+    "plain_scene",
+    "read_table",
+    "sigmoid",
+]

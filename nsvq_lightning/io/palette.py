@@ -1,0 +1,141 @@
+"""A palette for many rows: cells of like rows, found by cutting the cell in two where that gains most."""
+
+from __future__ import annotations
+
+import heapq
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nsvq_lightning.rendering.cpu.jit import kernel
+
+__all__ = ["find_palette", "in_order_of_use"]
+
+_ITERATIONS = 4
+"""Steps of the power iteration for the direction of a cut, which need not be exact."""
+
+
+def find_palette(
+    rows: NDArray[np.float32], weight: NDArray[np.number[Any]], count: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Few rows that stand for many with a small weighted square distance; rows as they are where they are few enough.
+
+    All rows are one cell, which is cut across the direction in which they differ most, where the sum of squares along
+    it falls most; then whichever cell gains most, until there are enough. A cell of equal rows is never cut. The time
+    hardly depends on the number of cells, that of k-means grows with it: 65 536 cells of 100 000 rows take 3 s, not
+    ten minutes.
+
+    Args:
+        rows: ``[N, D]``, finite.
+        weight: How much each row matters ``[N]``, positive.
+        count: Largest number of cells.
+
+    Returns:
+        The mean of each cell ``[K, D]`` with K at most ``count``, and the cell of each row ``[N]``.
+    """
+    wide = weight.astype(np.float64)
+    labels = _labels(rows, wide, count)
+    mass = np.bincount(labels, wide)
+    sums = (np.bincount(labels, wide * column) for column in rows.T)
+    return np.stack([total / mass for total in sums], axis=1).astype(np.float32), labels
+
+
+def in_order_of_use(
+    rows: NDArray[np.float32], labels: NDArray[np.integer]
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """The distinct rows in use, in the order of the splats that use them first, and the row of each splat.
+
+    Neighbours then have like labels. Where each splat has its own row, labels count up and cost next to nothing.
+
+    Args:
+        rows: ``[K, D]``.
+        labels: Row of each splat ``[N]``.
+    """
+    used, labels = np.unique(labels, return_inverse=True)
+    distinct, same = np.unique(rows[used], axis=0, return_inverse=True)
+    labels = same.reshape(-1)[labels]  # its shape was not the same in all releases of NumPy
+    _, first = np.unique(labels, return_index=True)
+    order = first.argsort()
+    return distinct[order], order.argsort()[labels]
+
+
+def _labels(rows: NDArray[np.float32], weight: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    cells = _Cells(rows, weight)
+    gain, cut = cells.best_cut(0, len(rows))
+    heap = [(-gain, 0, cut, len(rows))]
+    while len(heap) < count and heap[0][0] < 0:
+        _, start, cut, end = heapq.heappop(heap)
+        for first, last in ((start, cut), (cut, end)):
+            gain, inner = cells.best_cut(first, last)
+            heapq.heappush(heap, (-gain, first, inner, last))
+    labels = np.empty(len(rows), np.int64)
+    for number, (_, start, _, end) in enumerate(heap):
+        labels[cells.order[start:end]] = number
+    return labels
+
+
+class _Cells:
+    """Runs of ``order [N]``, the numbers of the rows, each run a cell."""
+
+    def __init__(self, rows: NDArray[np.float32], weight: NDArray[np.float64]) -> None:
+        self._rows, self._weight = rows, weight
+        self.order = np.arange(len(rows))
+
+    def best_cut(self, start: int, end: int) -> tuple[float, int]:
+        """Sort a cell along its direction; how much the sum of squares falls if it is cut in two, and where."""
+        if end - start < 2:
+            return 0.0, start
+        numbers = self.order[start:end]
+        along = np.empty(end - start)
+        _place_along(self._rows, self._weight, numbers, along)
+        ranks = along.argsort(kind="stable")
+        numbers[:] = numbers[ranks]
+        mass = self._weight[numbers].cumsum()
+        total = (self._weight[numbers] * along[ranks]).cumsum()
+        left, right = mass[:-1], mass[-1] - mass[:-1]
+        gains = np.square(total[:-1] / left - (total[-1] - total[:-1]) / right) * (left * right / mass[-1])
+        best = int(gains.argmax())
+        return float(gains[best]), start + 1 + best
+
+
+@partial(kernel, parallel=False)
+def _place_along(rows, weight, numbers, along):  # type: ignore[no-untyped-def]
+    """Where some rows lie along the direction in which they differ most; 0 if they are equal."""
+    dim = rows.shape[1]
+    along[:] = 0
+    mean, product, direction = np.zeros(dim), np.zeros(dim), np.zeros(dim)
+    equal, mass = True, 0.0
+    for i in numbers:
+        mass += weight[i]
+        for j in range(dim):
+            mean[j] += weight[i] * rows[i, j]
+            equal &= rows[i, j] == rows[numbers[0], j]
+    if equal:
+        return
+    # The column that varies most is where the search for the direction starts.
+    widest = 0
+    for j in range(dim):
+        mean[j] /= mass
+        for i in numbers:
+            product[j] += weight[i] * (rows[i, j] - mean[j]) ** 2
+        if product[j] > product[widest]:
+            widest = j
+    direction[widest] = 1
+    for _ in range(_ITERATIONS):
+        length = 0.0
+        product[:] = 0
+        for n, i in enumerate(numbers):
+            along[n] = 0
+            for j in range(dim):
+                along[n] += (rows[i, j] - mean[j]) * direction[j]
+            for j in range(dim):
+                product[j] += weight[i] * along[n] * (rows[i, j] - mean[j])
+        for j in range(dim):
+            length += product[j] ** 2
+        length = np.sqrt(length)
+        if not length > 0:
+            return
+        for j in range(dim):
+            direction[j] = product[j] / length

@@ -1,0 +1,258 @@
+"""The outside of a ``.spz`` file: one gzip stream up to version 3, a Zstandard stream an array in version 4.
+
+Integers are little-endian. Up to version 3 the gzip stream holds the first 16 bytes below, the arrays, and perhaps
+extensions. Version 4:
+
+============  ==================  ==================================================================================
+offset        bytes               content
+============  ==================  ==================================================================================
+0             16                  header: ``NGSP``, version (4), N (4), SH degree, bits after the point, flags, and S:
+                                  number of streams (0 up to version 3)
+16            4                   offset T of the table
+20            12                  0
+32            T - 32              extensions, each type (4), length (4), content
+T             16 S                table: compressed and uncompressed bytes of each stream, 8 bytes each
+T + 16 S      rest                streams: the arrays that are not empty
+============  ==================  ==================================================================================
+"""
+
+from __future__ import annotations
+
+import gzip
+import os
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nsvq_lightning.io import zstd
+from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.errors import FormatError, naming_file
+from nsvq_lightning.sh_degree import sh_coefficients
+
+__all__ = ["MOST_FRACTION", "SPZ_MAGICS", "SPZ_VERSIONS", "SpzHeader", "read_frame", "read_spz_header", "write_frame"]
+
+_MAGIC = b"NGSP"
+SPZ_MAGICS = (b"\x1f\x8b", _MAGIC)
+"""First bytes: of gzip up to version 3, of the plain header from version 4 on."""
+SPZ_VERSIONS = (3, 4)
+"""Versions that are written."""
+MOST_FRACTION = 30
+"""Bits after the point that a position may have."""
+
+_HEADER = struct.Struct("<4sIIBBBB")
+_TABLE_OFFSET = struct.Struct("<I12x")
+_HEAD = _HEADER.size + _TABLE_OFFSET.size
+_ENTRY = struct.Struct("<QQ")
+_MOST_A_BYTE = 1032
+"""Bytes that one byte of a deflate stream can become."""
+_EXTENDED = 2
+"""The flag of extensions."""
+_EXTENSION = struct.Struct("<II")
+_AXES, _RIGHT_UP_BACK = 0xADBE0003, (0, 4)
+"""The extension that names the axes, and what it says of those that files without it have."""
+
+
+@dataclass(frozen=True)
+class SpzHeader:
+    """What the first bytes say.
+
+    Attributes:
+        version: 1 to 4.
+        count: Number of splats N.
+        sh_degree: Degree of the spherical harmonics, 0 to 3.
+        fraction_bits: Bits of the positions after the point.
+        flags: 1 for a scene trained with antialiasing, 2 where extensions follow.
+    """
+
+    version: int
+    count: int
+    sh_degree: int
+    fraction_bits: int
+    flags: int = 0
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Bytes a splat of each array, in file order."""
+        means, quats = (6 if self.version == 1 else 9), (4 if self.version >= 3 else 3)
+        sh = 3 * sh_coefficients(self.sh_degree)
+        return {"means": means, "opacities": 1, "sh0": 3, "scales": 3, "quats": quats, "shN": sh}
+
+    @property
+    def streams(self) -> dict[str, int]:
+        """Bytes of each array that is not empty, in file order: what version 4 has streams of."""
+        return {name: self.count * size for name, size in self.sizes.items() if self.count * size}
+
+    def pack(self) -> bytes:
+        """The 16 bytes that all versions have."""
+        streams = len(self.streams) if self.version == 4 else 0
+        fields = (self.version, self.count, self.sh_degree, self.fraction_bits, self.flags, streams)
+        return _HEADER.pack(_MAGIC, *fields)
+
+
+def write_frame(path: str | os.PathLike[str], header: SpzHeader, arrays: Mapping[str, NDArray[Any]]) -> int:
+    """Write the file, replaced atomically; the same content gives the same bytes.
+
+    Args:
+        path: File to write.
+        header: Of one of :data:`SPZ_VERSIONS`.
+        arrays: By the names of :attr:`SpzHeader.sizes`, ``[N, ...]`` of so many bytes a splat.
+
+    Returns:
+        Bytes of the file.
+
+    Raises:
+        FormatError: Version 4 needs Zstandard, and it is not installed.
+    """
+    contents = [np.ascontiguousarray(arrays[name]).data.cast("B") for name in header.streams]
+    with atomic_write(path) as file:
+        if header.version == 4:
+            with naming_file(path):
+                streams = [zstd.compress(content) for content in contents]
+            table = (_ENTRY.pack(len(s), len(c)) for s, c in zip(streams, contents, strict=True))
+            file.writelines([header.pack(), _TABLE_OFFSET.pack(_HEAD), *table, *streams])
+        else:
+            # No name and no time: the same scene gives the same bytes.
+            with gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as stream:
+                stream.writelines([header.pack(), *contents])
+        return file.tell()
+
+
+def read_frame(path: str | os.PathLike[str]) -> tuple[SpzHeader, dict[str, NDArray[np.uint8]]]:
+    """Header and arrays ``[N, bytes a splat]`` by name; extensions are left out.
+
+    Raises:
+        FormatError: The file is truncated, altered, of another version, or no ``.spz`` file; or version 4 needs
+            Zstandard, and it is not installed.
+    """
+    data = Path(path).read_bytes()
+    with naming_file(path):
+        header, contents = _unpack(data) if data.startswith(_MAGIC) else _unzip(data)
+        shapes = {name: (header.count, size) for name, size in header.sizes.items()}
+        return header, {
+            name: np.frombuffer(contents.get(name, b""), np.uint8).reshape(shape) for name, shape in shapes.items()
+        }
+
+
+def read_spz_header(path: str | os.PathLike[str]) -> tuple[SpzHeader, dict[str, int]]:
+    """Header, and bytes in the file by what they hold; the arrays are not looked at.
+
+    Raises:
+        FormatError: The file is truncated, of another version, or no ``.spz`` file.
+    """
+    total = os.path.getsize(path)
+    with naming_file(path), open(path, "rb") as file:
+        start = file.read(1 << 12)
+        if not start.startswith(_MAGIC):
+            return _parse_stream(zlib.decompressobj(wbits=31), start, total), {"all": total}
+        header, offset = _parse_head(start, total)
+        file.seek(offset)
+        lengths = _lengths(header, file.read(_ENTRY.size * len(header.streams)), total - offset)
+    return header, {"header": total - sum(lengths.values()), **lengths}
+
+
+def _unpack(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
+    """Version 4."""
+    header, offset = _parse_head(data, len(data))
+    if header.flags & _EXTENDED:
+        _check_axes(data[_HEAD:offset])
+    start = offset + _ENTRY.size * len(header.streams)
+    contents = {}
+    for name, length in _lengths(header, data[offset:start], len(data) - offset).items():
+        contents[name] = zstd.decompress(memoryview(data)[start : start + length], header.streams[name])
+        start += length
+    return header, contents
+
+
+def _parse_head(start: bytes, file_bytes: int) -> tuple[SpzHeader, int]:
+    """Header of version 4 and offset of its table, which lies in the file as a whole."""
+    header = _parse(start[: _HEADER.size])
+    if header.version < 4 or len(start) < _HEAD:
+        raise FormatError(f"truncated or damaged: version {header.version} in {file_bytes} bytes without gzip")
+    streams, (offset,) = start[_HEADER.size - 1], _TABLE_OFFSET.unpack_from(start, _HEADER.size)
+    if streams != len(header.streams):
+        raise FormatError(f"damaged: {streams} streams where there must be {len(header.streams)}")
+    if not _HEAD <= offset <= file_bytes - _ENTRY.size * streams:
+        raise FormatError(f"truncated or damaged: a table of {streams} streams at {offset}, of {file_bytes} bytes")
+    return header, offset
+
+
+def _lengths(header: SpzHeader, table: bytes, rest: int) -> dict[str, int]:
+    """Compressed bytes of each stream; table and streams must fill the ``rest`` of the file."""
+    entries = dict(zip(header.streams, _ENTRY.iter_unpack(table), strict=True))
+    for name, (length, size) in entries.items():
+        if size != header.streams[name] or size > length * zstd.MOST_A_BYTE:
+            raise FormatError(f"damaged: {name} of {header.count} splats cannot be {size} bytes in {length}")
+    lengths = {name: length for name, (length, _) in entries.items()}
+    if len(table) + sum(lengths.values()) != rest:
+        raise FormatError(f"truncated or damaged: streams of {sum(lengths.values())} bytes in {rest - len(table)}")
+    return lengths
+
+
+def _check_axes(extensions: bytes) -> None:
+    """Refuse a file that says that its axes are not right, up, back."""
+    start = 0
+    while start + _EXTENSION.size <= len(extensions):
+        kind, length = _EXTENSION.unpack_from(extensions, start)
+        content = extensions[start + _EXTENSION.size :][:length]
+        if kind == _AXES and int.from_bytes(content, "little") not in _RIGHT_UP_BACK:
+            raise FormatError(
+                f"coordinate system {int.from_bytes(content, 'little')} of the extension for axes; this release reads "
+                "right, up, back",
+                "save it in those, or as .ply",
+            )
+        start += _EXTENSION.size + length
+
+
+def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
+    """Versions 1 to 3."""
+    gunzip = zlib.decompressobj(wbits=31)
+    header = _parse_stream(gunzip, data, len(data))
+    contents = {}
+    for name, size in header.streams.items():
+        contents[name] = _inflate(gunzip, gunzip.unconsumed_tail, size)
+        if len(contents[name]) < size:
+            raise FormatError(f"truncated: {name} of {header.count} splats has {len(contents[name])} of {size} bytes")
+    # What follows the arrays are extensions; reading on to the end of the stream checks its sum.
+    while not gunzip.eof:
+        if not _inflate(gunzip, gunzip.unconsumed_tail, 1 << 16) and not gunzip.eof:
+            raise FormatError("truncated: the gzip stream has no end")
+    return header, contents
+
+
+def _parse_stream(gunzip: zlib._Decompress, data: bytes, file_bytes: int) -> SpzHeader:
+    """Header of versions 1 to 3, whose arrays the file can hold."""
+    header = _parse(_inflate(gunzip, data, _HEADER.size))
+    if header.version > 3:
+        raise FormatError(f"damaged: version {header.version} in a gzip stream, which only versions 1 to 3 are")
+    if sum(header.streams.values()) > _MOST_A_BYTE * file_bytes:
+        raise FormatError(f"truncated or damaged: {header.count} splats cannot be in {file_bytes} bytes")
+    return header
+
+
+def _inflate(gunzip: zlib._Decompress, data: bytes, most: int) -> bytes:
+    """At most so many bytes of the stream, which are more than 0: zlib takes that for no limit."""
+    try:
+        return gunzip.decompress(data, most)
+    except zlib.error as error:
+        raise FormatError(f"damaged, or not a .spz file: no valid gzip stream ({error})") from None
+
+
+def _parse(start: bytes) -> SpzHeader:
+    if len(start) < _HEADER.size or start[:4] != _MAGIC:
+        raise FormatError("not a .spz file: it does not start with a whole header 'NGSP'")
+    _, version, count, sh_degree, fraction_bits, flags, _ = _HEADER.unpack(start)
+    if not 1 <= version <= 4:
+        raise FormatError(
+            f"version {version} of the format; this release reads 1 to 4", "save it as version 3 or as .ply"
+        )
+    if sh_degree > 3:
+        raise FormatError(f"damaged, or of a degree that this release does not read: SH degree {sh_degree}, not 0 to 3")
+    if fraction_bits > MOST_FRACTION:
+        raise FormatError(f"damaged: {fraction_bits} bits after the point, more than {MOST_FRACTION}")
+    return SpzHeader(version, count, sh_degree, fraction_bits, flags)

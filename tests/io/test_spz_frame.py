@@ -1,0 +1,125 @@
+"""Version 4 of ``.spz``: a file of another tool, and what damage leads to."""
+
+from __future__ import annotations
+
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nsvq_lightning.io import FormatError, read_scene, save
+from nsvq_lightning.io.describe import describe
+from nsvq_lightning.io.spz_frame import read_spz_header
+
+sys.path.insert(0, str(Path(__file__).parent))
+from viewer_scenes import assert_same, coded_scene, needs_zstd, plain_scene, read_table
+
+HEAD = struct.Struct("<4sIIBBBBI12x")
+ENTRY = struct.Struct("<QQ")
+THEIRS = Path(__file__).with_name("splat_transform_v4.spz")
+
+
+@needs_zstd
+def test_a_file_of_splat_transform_is_read_as_it_reads_it() -> None:
+    """Oracle: the table that splat-transform 2.7.1 made of its own file."""
+    assert_same(read_table(THEIRS.with_suffix(".csv")), read_scene(THEIRS).arrays())
+
+
+def test_what_a_file_holds_is_said_without_zstandard(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nsvq_lightning.io.zstd.import_module", None)
+    facts = describe(THEIRS)
+    assert (facts["format"], facts["splats"], facts["sh_degree"]) == ("spz, version 4", 12, 3)
+    sizes = {stream["name"]: stream["bytes"] for stream in facts["streams"]}
+    assert list(sizes) == ["header", "means", "opacities", "sh0", "scales", "quats", "shN"]
+    assert sizes["header"] == 32 + 6 * 16
+    assert sum(sizes.values()) == THEIRS.stat().st_size
+
+
+@needs_zstd
+def test_extensions_are_passed_over_unless_they_turn_the_axes(tmp_path: Path) -> None:
+    def extended(kind: int, content: bytes) -> Path:
+        magic, version, count, degree, bits, flags, streams, _ = HEAD.unpack_from(data)
+        record = struct.pack("<II", kind, len(content)) + content
+        head = HEAD.pack(magic, version, count, degree, bits, flags | 2, streams, HEAD.size + len(record))
+        (tmp_path / "x.spz").write_bytes(head + record + data[HEAD.size :])
+        return tmp_path / "x.spz"
+
+    data = THEIRS.read_bytes()
+    for kind, content in ((0xADBE0002, bytes(12)), (0xADBE0003, struct.pack("<I", 4)), (7, b"")):
+        assert len(read_scene(extended(kind, content))) == 12
+    with pytest.raises(FormatError, match=r"coordinate system 6 .* right, up, back; save it in those"):
+        read_scene(extended(0xADBE0003, struct.pack("<I", 6)))
+
+
+@needs_zstd
+def test_truncated_and_altered_streams_are_refused_or_read_as_they_were(tmp_path: Path) -> None:
+    path = tmp_path / "bad.spz"
+    save(coded_scene(12, 1), path, version=4)
+    data, expected = path.read_bytes(), vars(read_scene(path).arrays())
+    for length in range(1, len(data)):
+        path.write_bytes(data[:length])
+        with pytest.raises(FormatError, match=r"bad\.spz: "):
+            read_scene(path)
+    rng, start, refused = np.random.default_rng(5), HEAD.size + 6 * ENTRY.size, 0
+    for position in rng.integers(start, len(data), 200):
+        path.write_bytes(data[:position] + bytes([data[position] ^ (1 << rng.integers(8))]) + data[position + 1 :])
+        try:
+            read = vars(read_scene(path).arrays())  # a Zstandard frame has a bit without a meaning
+        except FormatError:
+            refused += 1
+        else:
+            for name, values in expected.items():
+                np.testing.assert_array_equal(read[name], values)
+    assert refused > 190
+
+
+@pytest.mark.parametrize(
+    ("offset", "number", "message"),
+    [
+        (4, struct.pack("<I", 5), "version 5 of the format"),
+        (4, struct.pack("<I", 3), "version 3 .* without gzip"),
+        (8, struct.pack("<I", 1 << 31), "means of 2147483648 splats cannot be"),
+        (12, bytes([4]), "SH degree 4"),
+        (13, bytes([31]), "31 bits after the point"),
+        (15, bytes([5]), "5 streams where there must be 6"),
+        (16, struct.pack("<I", 16), "a table of 6 streams at 16"),
+        (16, struct.pack("<I", 1 << 31), "a table of 6 streams at 2147483648"),
+        (32, ENTRY.pack(1 << 62, 108), "truncated or damaged: streams of"),
+        (32, ENTRY.pack(10, 1 << 62), "means of 12 splats cannot be 4611686018427387904 bytes"),
+    ],
+)
+def test_a_wrong_header_or_table(tmp_path: Path, offset: int, number: bytes, message: str) -> None:
+    path, data = tmp_path / "x.spz", THEIRS.read_bytes()
+    path.write_bytes(data[:offset] + number + data[offset + len(number) :])
+    for read in (read_scene, read_spz_header):
+        with pytest.raises(FormatError, match=rf"x\.spz: .*{message}"):
+            read(path)
+
+
+@needs_zstd
+@pytest.mark.parametrize(("count", "degree", "streams"), [(0, 3, 0), (5, 0, 5), (5, 1, 6)])
+def test_there_is_a_stream_for_each_array_that_is_not_empty(
+    tmp_path: Path, count: int, degree: int, streams: int
+) -> None:
+    path = tmp_path / "x.spz"
+    save(plain_scene(count, degree), path, version=4)
+    assert HEAD.unpack_from(path.read_bytes()) == (b"NGSP", 4, count, degree, 12, 0, streams, 32)
+    assert len(read_scene(path)) == count
+
+
+@needs_zstd
+def test_both_versions_hold_the_same_splats_and_the_same_scene_gives_the_same_bytes(tmp_path: Path) -> None:
+    paths = [tmp_path / name for name in ("a.spz", "b.spz", "c.spz")]
+    for path, version in zip(paths, (3, 4, 4), strict=True):
+        save(coded_scene(80), path, version=version)
+    old, new = (vars(read_scene(path).arrays()) for path in paths[:2])
+    for name, values in old.items():
+        np.testing.assert_array_equal(new[name], values, err_msg=name)
+    assert paths[1].read_bytes() == paths[2].read_bytes()
+
+
+def test_only_known_versions_are_written(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"version of \.spz must be 3 or 4, got 2"):
+        save(plain_scene(3), tmp_path / "x.spz", version=2)
