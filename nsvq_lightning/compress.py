@@ -65,7 +65,7 @@ def export_scene(
         if suffix not in EXPORT_FORMATS:
             raise ValueError(f"unknown export format {suffix!r}; choose from {', '.join(EXPORT_FORMATS)}")
     paths = {suffix: folder / f"scene.{suffix}" for suffix in formats}
-    stored = decoded(scene, storage) if set(formats) - {"nsvq"} else scene
+    stored = _as_stored(scene, storage) if set(formats) - {"nsvq"} else scene
     for suffix, path in paths.items():
         if suffix == "nsvq":
             save_as_stored(scene, path, storage)
@@ -82,10 +82,10 @@ def save_as_stored(scene: CompressedScene, path: Path, storage: Storage) -> int:
     """
     if path.suffix.lower() == ".nsvq":
         return save(scene, path, level=storage.level, precision=storage.precision)
-    return save(decoded(scene, storage), path)
+    return save(_as_stored(scene, storage), path)
 
 
-def decoded(scene: CompressedScene, storage: Storage) -> CompressedScene:
+def _as_stored(scene: CompressedScene, storage: Storage) -> CompressedScene:
     """What a run's ``.nsvq`` file decodes to, so that all files of a scene hold the same splats.
 
     A scene without codebooks stays as it is: rounding it would only cost quality, and its record is the ``.ply``.

@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _convert(source: Path, output: Path, options: dict[str, Any]) -> None:
-    scene = read_scene(source)
+    scene = read_scene(source).finite()
     output.parent.mkdir(parents=True, exist_ok=True)
     size = save(scene, output, **options)
     each = f", {size / len(scene):.1f} a splat" if len(scene) else ""

@@ -24,8 +24,8 @@ def find_palette(
 
     All rows are one cell, which is cut across the direction in which they differ most, where the sum of squares along
     it falls most; then whichever cell gains most, until there are enough. A cell of equal rows is never cut. The time
-    hardly depends on the number of cells, that of k-means grows with it: 65 536 cells of 100 000 rows take 3 s, not
-    ten minutes.
+    hardly depends on the number of cells, and that of k-means grows with it: 65 536 cells of 100 000 rows take seconds,
+    not minutes.
 
     Args:
         rows: ``[N, D]``, finite.

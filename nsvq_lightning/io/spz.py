@@ -61,7 +61,7 @@ _FLIPPED_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np
 def in_spz_order(scene: CompressedScene) -> CompressedScene:
     """The splats that a file holds, in its order: that of their codes, then of their place.
 
-    The codes of the spherical harmonics come first, because gzip finds equal rows only where they are near.
+    The codes of the spherical harmonics come first: equal rows compress best where they are near, in both versions.
     """
     scene = scene.finite()
     scene = scene.take(spatial_order(scene.means))
