@@ -10,6 +10,10 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="the memory of a case is limited in the way of Linux"
+)
+
 ROOT = Path(__file__).resolve().parents[1]
 CASES = {
     "ply": 300,
