@@ -13,6 +13,10 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent / "io"))
 from viewer_scenes import HAS_ZSTD
 
+pytestmark = pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="the memory of a case is limited in the way of Linux"
+)
+
 ROOT = Path(__file__).resolve().parents[1]
 CASES = {
     "ply": 300,

@@ -98,15 +98,30 @@ def without_links(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_wheel_is_whole_without_links(without_links: Path) -> None:
+def _built(root: Path, kind: str) -> dict[str, bytes]:
+    """Files of the package in a wheel, ``standard`` or ``editable``."""
     pytest.importorskip("hatchling", reason="builds the wheel; it is in the test extra")
-    subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", "wheel"], cwd=without_links, check=True)
-    (wheel,) = (without_links / "dist").glob("*.whl")
+    function = "build_wheel" if kind == "standard" else "build_editable"
+    call = f"from hatchling.build import {function} as build; build('dist')"
+    subprocess.run([sys.executable, "-c", call], cwd=root, check=True)
+    (wheel,) = (root / "dist").glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
-        packed = {name: archive.read(name) for name in archive.namelist() if name.startswith("nsvq_lightning/")}
+        return {name: archive.read(name) for name in archive.namelist() if name.startswith("nsvq_lightning/")}
+
+
+@pytest.mark.parametrize("links", [False, True])
+def test_wheel_is_whole_with_links_and_without(without_links: Path, links: bool) -> None:
+    for folder in TOP_LEVEL if links else ():
+        (without_links / "nsvq_lightning" / folder).unlink()
+        (without_links / "nsvq_lightning" / folder).symlink_to(f"../{folder}")
     expected = {f"nsvq_lightning/{path.relative_to(ROOT).as_posix()}": path for path in _files(*TOP_LEVEL)}
     expected |= {path.relative_to(ROOT).as_posix(): path for path in _files("nsvq_lightning")}
-    assert packed == {name: path.read_bytes() for name, path in expected.items()}
+    assert _built(without_links, "standard") == {name: path.read_bytes() for name, path in expected.items()}
+
+
+def test_editable_install_copies_nothing(without_links: Path) -> None:
+    """Type checkers would find a copy before the links."""
+    assert _built(without_links, "editable") == {}
 
 
 def _files(*folders: str) -> Iterator[Path]:

@@ -219,6 +219,7 @@ def test_a_process_that_fails_says_why(tmp_path: Path) -> None:
     assert training.record is None
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs a pipe with a name to hold a process up, and an alarm")
 def test_an_interrupted_sweep_leaves_no_process_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[subprocess.Popen[bytes]] = []
 
