@@ -14,6 +14,7 @@ from torch import Tensor
 from nsvq_lightning.quantize.cuda.noise import normal
 from nsvq_lightning.quantize.cuda.sums import sum_rows
 from nsvq_lightning.rendering.cuda.records import COMPILE
+from nsvq_lightning.rendering.cuda.tensors import check_tensor
 
 __all__ = ["substitute", "substitute_backward"]
 
@@ -81,6 +82,13 @@ def _tile(dim: int) -> dict[str, int]:
     return {"DIM": dim, "WIDTH": width, "ROWS": max(1, BLOCK // width)}
 
 
+def _check(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor) -> None:
+    check_tensor("x", x, (len(x), codebook.shape[-1]), x.device)
+    check_tensor("rows", rows, (rows.numel(),), x.device, torch.int64)
+    check_tensor("codebook", codebook, (len(codebook), x.shape[1]), x.device)
+    check_tensor("codes", codes, (len(rows),), x.device, torch.int64)
+
+
 def substitute(
     seed: int, x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor, *, aim: float = 0.0, spread: float = 1.0
 ) -> Tensor:
@@ -94,7 +102,12 @@ def substitute(
         codes: Code of each chosen row, ``[V]`` int64.
         aim: Weight of the way to the code in the direction d.
         spread: Weight of the noise in it.
+
+    Raises:
+        ValueError: The tensors do not fit together, or one has gaps.
+        TypeError: A type differs.
     """
+    _check(x, rows, codebook, codes)
     out = x.new_empty(len(rows), x.shape[1])
     tile = _tile(x.shape[1])
     if len(rows):
@@ -111,7 +124,14 @@ def substitute_backward(
     """Gradients of ``x [N, D]`` and ``codebook [K, D]`` from that of the result, ``grad [V, D]``.
 
     ``out [V, D]`` is the result of :func:`substitute`; the ``rows [V]`` must all be different here.
+
+    Raises:
+        ValueError: As of :func:`substitute`.
+        TypeError: A type differs.
     """
+    _check(x, rows, codebook, codes)
+    for name, table in (("grad", grad), ("out", out)):
+        check_tensor(name, table, (len(rows), x.shape[1]), x.device)
     grad_x, radials = torch.zeros_like(x), torch.empty_like(out)
     tile = _tile(x.shape[1])
     if len(rows):
