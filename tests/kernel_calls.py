@@ -12,6 +12,7 @@ import importlib
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,10 +59,11 @@ def _tensor(*shape: int, seed: int = 0) -> Tensor:
     return torch.from_numpy(_normal(*shape, seed=seed))
 
 
-def _camera() -> Camera:
+def _camera(width: int = 36, height: int = 28) -> Camera:
     viewmat = torch.eye(4)
     viewmat[2, 3] = 4.0
-    return Camera(torch.tensor([[30.0, 0, 18], [0, 30, 14], [0, 0, 1]]), viewmat, 36, 28)
+    K = torch.tensor([[30.0, 0, 0.5 * width], [0, 30.0, 0.5 * height], [0, 0, 1]])
+    return Camera(K, viewmat, width, height)
 
 
 def _splats() -> RawSplats:
@@ -276,9 +278,10 @@ SCALAR = [
 def _lens() -> Any:
     from nsvq_lightning.rendering.cuda.projection import Lens
 
-    return Lens.of(_camera(), torch.device("cpu"))
+    return Lens.of(_camera(16, 12), torch.device("cpu"))  # one tile: the interpreter is slow
 
 
+@cache
 def _projected() -> Any:
     from nsvq_lightning.rendering.cuda.projection import project
 
@@ -294,7 +297,7 @@ def _blending() -> dict[str, Any]:
     from nsvq_lightning.rendering.cuda.blend import tile_grid
 
     projected = _projected()
-    tiles = list_tiles(projected.boxes, *tile_grid(36, 28))
+    tiles = list_tiles(projected.boxes, *tile_grid(16, 12))
     return {"lens": _lens(), "records": projected.records, "tiles": tiles, "background": _tensor(3)}
 
 
@@ -304,13 +307,17 @@ class _Pictures(NamedTuple):
     depth: Tensor
 
 
-def _blending_backward() -> dict[str, Any]:
+@cache
+def _blended() -> Any:
     from nsvq_lightning.rendering.cuda.blend import blend
 
-    arguments = _blending()
-    image, transmittance, depth, ends = blend(**arguments)
+    return blend(**_blending())
+
+
+def _blending_backward() -> dict[str, Any]:
+    arguments, (image, transmittance, depth, ends) = _blending(), _blended()
     del arguments["background"]
-    gradients = _Pictures(_tensor(28, 36, 3), _tensor(28, 36, seed=1), _tensor(28, 36, seed=2))
+    gradients = _Pictures(_tensor(12, 16, 3), _tensor(12, 16, seed=1), _tensor(12, 16, seed=2))
     outputs = _Pictures(image, transmittance, depth)
     return arguments | {"ids": _projected().ids, "n": 70, "ends": ends, "outputs": outputs, "gradients": gradients}
 
@@ -324,11 +331,15 @@ def _projection_backward() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _pictures_backward() -> dict[str, Any]:
+@cache
+def _derivatives() -> Any:
     from nsvq_lightning.rendering.cuda.dssim import l1_dssim
 
-    pictures = _pictures()
-    derivatives = l1_dssim(**pictures)[1]
+    return l1_dssim(**_pictures())[1]
+
+
+def _pictures_backward() -> dict[str, Any]:
+    pictures, derivatives = _pictures(), _derivatives()
     return {
         "image": pictures["image"],
         "target": pictures["target"],
@@ -458,7 +469,7 @@ def _calls(case: Case) -> Iterator[_Call]:
             free = (case.rows, _ROWS), (case.columns, _COLUMNS), (case.types, _TYPES)
             others = {way for names, ways in free if argument in names for way in ways}
             for way, make in (_WRONG | (_MISSING if argument in case.numbers else {})).items():
-                if array.ndim == 1 and way in _COLUMNS:
+                if (array.ndim < 2 and way in _COLUMNS) or (array.ndim == 0 and way in _ROWS):
                     continue
                 arguments = case.arguments()
                 arguments[argument] = _replaced(arguments[argument], argument, path, make(array))

@@ -76,7 +76,8 @@ def _named(module: ModuleType) -> dict[str, set[str]]:
     definitions: dict[str, ast.AST] = {}
     for node in ast.parse(inspect.getsource(module)).body:
         if isinstance(node, ast.FunctionDef):
-            if not isinstance(vars(module)[node.name], CPUDispatcher):
+            value = vars(module)[node.name]
+            if not isinstance(value, CPUDispatcher) and _compiler(value) is None:
                 definitions[node.name] = node
         elif isinstance(node, ast.ClassDef):
             definitions |= {f"{node.name}.{m.name}": m for m in node.body if isinstance(m, ast.FunctionDef)}
