@@ -10,6 +10,7 @@ import pytest
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
+from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.edit import append_rows, keep_rows
 from nsvq_lightning.host import as_host, raw_optimizer
 from nsvq_lightning.module import SplatModule
@@ -47,7 +48,9 @@ def test_splats_may_change_at_the_end_of_a_step(
     kind: str, place: str, run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
 ) -> None:
     edit = EditRows(kind)
-    callbacks = list(recipe().values())
+    # A fine-tune phase from iteration 48 on, in which splats change, too.
+    phases = PhaseSchedule(quantize_end=35_000, min_density_interval=4, min_replacement_interval=5, min_finetune=1)
+    callbacks = list(recipe(phases=phases).values())
     callbacks.insert(0 if place == "first" else len(callbacks), edit)
     with caplog.at_level(logging.WARNING):
         _, module = run(callbacks)
