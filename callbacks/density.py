@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -46,6 +47,9 @@ class DensityControl(LatchedCallback):
     iterations splats above the threshold are cloned or split, transparent and huge ones pruned, and opacities reset. In
     the prune phase transparent splats are pruned and none are added. Non-finite splats are searched in every phase.
 
+    Callbacks that remove or add splats may stand before or after it. A view whose splats were changed before its end is
+    left out of the statistics, with a warning: the norms belong to rows that are others now.
+
     Args:
         rules: All numbers.
         max_splats: Never grow beyond this many; those with the largest statistic go first. None for no limit, as in the
@@ -69,6 +73,7 @@ class DensityControl(LatchedCallback):
         self.rules = rules
         self.max_splats = max_splats
         self._search = FiniteSearch(finite_every, "finite_every")
+        self._warned = False
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Refuse strategies that would lose the replaced parameters.
@@ -77,6 +82,8 @@ class DensityControl(LatchedCallback):
             ValueError: The strategy wraps the module in ``DistributedDataParallel``.
         """
         super().setup(trainer, pl_module, stage)
+        if stage == "fit":
+            self._warned = False
         # A strategy that follows parameters when they are replaced says so with this attribute.
         follows = getattr(trainer.strategy, "follows_replaced_parameters", False)
         if stage == "fit" and isinstance(trainer.strategy, DDPStrategy) and not follows:
@@ -99,7 +106,7 @@ class DensityControl(LatchedCallback):
         """Add the statistics of this view; after a complete step do what is due."""
         host = as_host(pl_module)
         if host.wants_screen_gradients:
-            self._observe(trainer, host, outputs.get("render") if outputs else None)
+            self._observe(trainer, host, self._view(trainer, host, outputs or {}))
         iteration = trainer.global_step
         if iteration == 0 or not self._latch.first_time(iteration):
             return
@@ -110,6 +117,23 @@ class DensityControl(LatchedCallback):
             self._warmup_step(trainer, host, iteration)
         elif phase is Phase.PRUNE:
             self._prune_step(trainer, host, iteration)
+
+    def _view(self, trainer: Trainer, host: SplatHost, outputs: Mapping[str, Any]) -> Render | None:
+        """What the step has rendered; None without it, and where other splats are there now."""
+        splats, render = host.splats, outputs.get("render")
+        if render is None or (len(render.radii) == len(splats) and outputs.get("edits", splats.edits) == splats.edits):
+            return render
+        if not self._warned:
+            self._warned = True
+            log.warning(
+                "iteration %d: another callback has removed or added splats (%d were rendered, now %d) before density "
+                "control took the statistics of the view; they are left out, here and from now on. List that callback "
+                "after DensityControl to have all views counted",
+                trainer.global_step,
+                len(render.radii),
+                len(splats),
+            )
+        return None
 
     def _observe(self, trainer: Trainer, host: SplatHost, render: Render | None) -> None:
         """Add one view (of each process) to the statistics; None, a view without a loss, adds nothing."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterable
 from typing import Any
 
 from lightning.pytorch import LightningModule, Trainer
+from torch import Tensor
 
-from nsvq_lightning.host import as_host, from_first_process, next_iteration
+from nsvq_lightning.host import SplatHost, as_host, from_first_process, next_iteration
 from nsvq_lightning.replicas import check_replicas
 from nsvq_lightning.schedule import Phase
 
@@ -15,31 +18,81 @@ from .latch import LatchedCallback
 
 __all__ = ["FreezeCodes"]
 
+log = logging.getLogger(__name__)
+
 
 class FreezeCodes(LatchedCallback):
     """At the first iteration of fine-tuning, search the nearest code of every splat once and keep it from then on.
 
     A quantizer that says whether its codebook has been placed, by an attribute ``fitted``, must have one by then.
+
+    Where another callback removes or adds splats in fine-tuning without their codes, the codes are searched once more,
+    with a warning: those that were frozen belong to other rows.
     """
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._forget()
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Forget an earlier fit of the same callback."""
+        super().setup(trainer, pl_module, stage)
+        if stage == "fit":
+            self._forget()
+
+    def _forget(self) -> None:
+        self._edits: int | None = None
+        self._codes: dict[str, Tensor] = {}
+        self._warned = False
+
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Freeze when fine-tuning starts.
+        """Freeze when fine-tuning starts, and where splats have changed since.
 
         Raises:
             RuntimeError: A codebook has never been placed.
         """
         host = as_host(pl_module)
-        iteration = next_iteration(trainer)
-        if iteration != host.schedule.first_of(Phase.FINETUNE) or not self._latch.first_time(iteration):
+        iteration, first = next_iteration(trainer), host.schedule.first_of(Phase.FINETUNE)
+        if first is None or iteration < first:
             return
+        if iteration == first and self._latch.first_time(iteration):
+            self._freeze(trainer, host, host.quantizers)
+        elif stale := self._stale(host):
+            self._warn(iteration, stale)
+            self._freeze(trainer, host, stale)
+        self._edits = host.splats.edits
+        self._codes = {name: quantizer.codes for name, quantizer in host.quantizers.items()}
+
+    def _stale(self, host: SplatHost) -> list[str]:
+        """Attributes with frozen codes of other rows; who edits rows and freezes their codes leaves other tensors."""
+        edited = self._edits not in (None, host.splats.edits)
+        return [
+            name
+            for name, quantizer in host.quantizers.items()
+            if len(quantizer.codes) > 0
+            and (len(quantizer.codes) != len(host.splats) or (edited and quantizer.codes is self._codes[name]))
+        ]
+
+    def _warn(self, iteration: int, stale: list[str]) -> None:
+        if not self._warned:
+            self._warned = True
+            log.warning(
+                "iteration %d: another callback has removed or added splats after codes were frozen; the nearest codes "
+                "of %s are searched again, here and from now on. Let that callback act before the fine-tune phase",
+                iteration,
+                ", ".join(stale),
+            )
+
+    def _freeze(self, trainer: Trainer, host: SplatHost, names: Iterable[str]) -> None:
         keep_finite_splats(trainer, host)
-        for name, quantizer in host.quantizers.items():
+        for name in names:
+            quantizer = host.quantizers[name]
             codes = quantizer.encode(host.rows(name))
             # Only now: some place their codebooks where rows are encoded.
             if not getattr(quantizer, "fitted", True):
                 raise RuntimeError(
-                    f"iteration {iteration}: the codebook of {name} has never been placed, its codes cannot be frozen; "
-                    "fit with CodebookInit among the callbacks"
+                    f"iteration {next_iteration(trainer)}: the codebook of {name} has never been placed, its codes "
+                    "cannot be frozen; fit with CodebookInit among the callbacks"
                 )
             quantizer.freeze(from_first_process(trainer, codes))
         check_replicas(trainer, "freezing the codes")

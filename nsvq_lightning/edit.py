@@ -229,5 +229,7 @@ def _rebind(
 
 
 def _edit_tables(splats: Splats, edit: Callable[[Tensor], Tensor]) -> None:
+    """Edit the rows of the side tables, the last of what an edit changes, and count it."""
+    splats.edits += 1
     for name, table in splats.tables().items():
         setattr(splats, name, edit(table))

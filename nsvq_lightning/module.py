@@ -180,9 +180,11 @@ class SplatModule(SplatModel):
         """Loss of one view: (1 - w)·L1 + w·(1 - SSIM) + λ·Σ opacity (paper, section 3.3).
 
         Returns:
-            ``loss`` and the attached ``render``. When the loss is not finite, the step will update nothing: then None,
-            or with several processes, which go through the backward pass together, the loss alone.
+            ``loss``, the attached ``render`` and the ``edits`` that its splats had seen. When the loss is not finite,
+            the step will update nothing: then None, or with several processes, which go through the backward pass
+            together, the loss alone.
         """
+        edits = self.splats.edits
         rendered = self(batch.camera)
         if self.wants_screen_gradients:
             rendered.means2d.retain_grad()
@@ -195,7 +197,7 @@ class SplatModule(SplatModel):
             log.warning("step %d: the loss of %s is %s, no update", self.global_step + 1, batch.name, loss.item())
             self._updates = False
             return {"loss": loss} if self.trainer.world_size > 1 else None
-        return {"loss": loss, "render": rendered}
+        return {"loss": loss, "render": rendered, "edits": edits}
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Drop the gradients of a step that must not update; of several processes the strategy has done so."""

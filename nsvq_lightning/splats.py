@@ -93,6 +93,10 @@ class Splats(nn.Module):
     Side tables (:meth:`add_table`) hold one row a splat, for example the statistics of density control; they are
     buffers, so checkpoints carry them, and :mod:`nsvq_lightning.edit` keeps their rows together with the attributes.
 
+    Attributes:
+        edits: How often rows were added or removed. What belongs to the rows of one count fits those of another no
+            more, even where there are as many.
+
     Args:
         sh_degree: Highest degree of the spherical harmonics, 0 to 3.
 
@@ -115,6 +119,7 @@ class Splats(nn.Module):
             self.register_parameter(name, nn.Parameter(torch.zeros(shape)))
         self.register_parameter("shN", nn.Parameter(torch.zeros(0, coefficients, 3)))
         self._tables: list[str] = []
+        self.edits = 0
 
     @classmethod
     def from_tensors(

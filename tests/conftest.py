@@ -2,11 +2,12 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 
 # Before torch loads OpenMP: threads that wait by spinning slow everything down where cores are shared.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,9 @@ import pytest
 from nsvq_lightning.data.colmap import import_pycolmap
 from nsvq_lightning.data.synthetic import write_synthetic_scene
 
+sys.path.insert(0, str(Path(__file__).parent))  # guards, which tests of several folders share
+from guards import guarded
+
 SceneFactory = Callable[..., Path]
 
 
@@ -24,6 +28,13 @@ def ctrl_c() -> None:
     """A shell starts what it puts into the background (``pytest &``) with SIGINT ignored; tests of Ctrl-C need it."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
+def guard_words() -> Iterator[None]:
+    """In every test kernels work between guard words; where they are timed, they are not."""
+    with guarded():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -19,6 +19,7 @@ from hashlib import blake2b
 from pathlib import Path
 
 import numpy as np
+from guards import guarded
 
 SECONDS = 20
 """A case that takes longer hangs."""
@@ -400,5 +401,6 @@ def targets() -> dict[str, Target]:
 
 if __name__ == "__main__":
     name, place, count, *rest = sys.argv[1:]
-    read, refused_ = run(targets()[name], Path(place), int(count), int(rest[0]) if rest else 0)
+    with guarded():
+        read, refused_ = run(targets()[name], Path(place), int(count), int(rest[0]) if rest else 0)
     sys.stdout.write(f"{read} read, {refused_} refused\n")

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from nsvq_lightning.rendering.cpu.arrays import check_table
 from nsvq_lightning.rendering.cpu.jit import kernel
 
 __all__ = ["leaf_paths", "sibling_distance", "tree_order"]
@@ -20,7 +21,12 @@ def tree_order(codebook: NDArray[np.float32]) -> NDArray[np.int64]:
 
     The rows are cut in two halves across the direction in which they differ most, each half again, and so on; of an
     odd number the first half gets one more.
+
+    Raises:
+        ValueError: It has another shape, or gaps.
+        TypeError: It is not float32.
     """
+    check_table("codebook", codebook)
     order = np.arange(len(codebook))
     _cut(codebook.astype(np.float64), order)
     return order

@@ -22,6 +22,7 @@ from nsvq_lightning.io.range_coder import (
     encode_plain,
     new_contexts,
 )
+from nsvq_lightning.rendering.cpu.arrays import INT32, INT64, UINT64, check_array, outside
 from nsvq_lightning.rendering.cpu.jit import inline, kernel
 
 __all__ = [
@@ -40,11 +41,14 @@ KEY_BITS = 63
 _MODELLED_BITS = 16
 """Decisions of a path that have contexts; those below are written plain."""
 
+_LONGEST_PATH = 32
+
 _RELATIONS = 9
 """What two neighbours say about a decision: each one took another way before, takes 0 now, or takes 1 now."""
 
 _START = uint64(0xFFFFFFFFFFFFFFFF)
 _WORD_BITS = 32
+_TOO_LARGE = 1 << 62
 _KEY_MASK = uint64((1 << KEY_BITS) - 1)
 
 
@@ -57,10 +61,24 @@ def encode_paths(paths: NDArray[np.int64], bits: int, neighbours: NDArray[np.int
         paths: The paths, in [0, 2^bits).
         bits: Length of each, 0 to 32.
         neighbours: Two earlier rows ``[N, 2]`` that are likely to be alike, -1 where there is none.
+
+    Raises:
+        ValueError: The arrays do not fit together, one has gaps, or a number is out of its range.
+        TypeError: The numbers have other types.
     """
+    check_array("paths", paths, (len(neighbours),), INT64)
+    _check_paths(bits, neighbours)
     words = _room(len(paths) * bits)
     used = _write_paths(paths, bits, neighbours, words, new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
     return _bytes(words, used)
+
+
+def _check_paths(bits: int, neighbours: NDArray[np.int32]) -> None:
+    if not 0 <= bits <= _LONGEST_PATH:
+        raise ValueError(f"a path must have 0 to {_LONGEST_PATH} bits, got {bits}")
+    check_array("neighbours", neighbours, (len(neighbours), 2), INT32)
+    if neighbours.size and (neighbours.min() < -1 or neighbours.max() >= len(neighbours)):
+        raise ValueError(f"neighbours must be in [-1, {len(neighbours)}), got {neighbours.min()} to {neighbours.max()}")
 
 
 def decode_paths(data: bytes | memoryview, bits: int, neighbours: NDArray[np.int32]) -> NDArray[np.int64]:
@@ -68,7 +86,10 @@ def decode_paths(data: bytes | memoryview, bits: int, neighbours: NDArray[np.int
 
     Raises:
         FormatError: There are more or fewer bytes than N paths have.
+        ValueError: As of :func:`encode_paths`.
+        TypeError: The numbers have other types.
     """
+    _check_paths(bits, neighbours)
     paths, words = np.empty(len(neighbours), np.int64), _words(data)
     used = _read_paths(words, bits, neighbours, paths, new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
     _check_used(words, used)
@@ -81,9 +102,23 @@ def encode_keys(keys: NDArray[np.uint64], depths: NDArray[np.int64]) -> bytes:
     Written is the difference to the key before, in units of the key's own depth: how many bits it has by an adaptive
     model, those after the first plain. So the order of N points, which nobody needs, costs nothing: about log2(N!) bits
     fewer than the keys as they are.
+
+    Raises:
+        ValueError: The arrays do not fit together, one has gaps, or the numbers do not ascend or are out of range.
+        TypeError: The numbers have other types.
     """
+    _check_depths(depths)
+    check_array("keys", keys, (len(depths),), UINT64)
+    if bool((keys[1:] < keys[:-1]).any()) or (len(keys) and keys[-1] > _KEY_MASK):
+        raise ValueError(f"keys must ascend and be below 2^{KEY_BITS}, got {keys}; sort them")
     words = _room(int(depths.sum()) + 8 * len(keys))
     return _bytes(words, _write_keys(keys, depths, words, new_contexts(_KEY_CONTEXTS)))
+
+
+def _check_depths(depths: NDArray[np.int64]) -> None:
+    check_array("depths", depths, (depths.size,), INT64)
+    if depths.size and (depths.min() < 0 or depths.max() > KEY_BITS):
+        raise outside("depths", depths, KEY_BITS + 1)
 
 
 def decode_keys(data: bytes | memoryview, depths: NDArray[np.int64]) -> NDArray[np.uint64]:
@@ -91,7 +126,10 @@ def decode_keys(data: bytes | memoryview, depths: NDArray[np.int64]) -> NDArray[
 
     Raises:
         FormatError: There are more or fewer bytes than N keys have.
+        ValueError: As of :func:`encode_keys`.
+        TypeError: The depths are not int64.
     """
+    _check_depths(depths)
     keys, words = np.empty(len(depths), np.uint64), _words(data)
     _check_used(words, _read_keys(words, depths, keys, new_contexts(_KEY_CONTEXTS)))
     return keys
@@ -103,7 +141,14 @@ def encode_integers(values: NDArray[np.int64]) -> bytes:
     Each column is written as it is or as differences from row to row, whichever is smaller; one byte a column says so.
     Of a number is written how many bits it has, by an adaptive model of its column, its sign, the bit after the leading
     one by a model, and the others plain.
+
+    Raises:
+        ValueError: The values are not ``[N, D]``, have gaps, or one is too large.
+        TypeError: They are not int64.
     """
+    check_array("values", values, values.shape, INT64)
+    if values.ndim != 2 or (values.size and max(-int(values.min()), int(values.max())) >= _TOO_LARGE):
+        raise ValueError(f"values must have shape [N, D] and be below 2^62 in size, got {list(values.shape)}")
     steps = np.diff(values, axis=0, prepend=0)
     by_steps = _size(steps) < _size(values)
     chosen = np.where(by_steps, steps, values)

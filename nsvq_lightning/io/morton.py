@@ -8,6 +8,7 @@ import numpy as np
 from numba import prange, uint64
 from numpy.typing import NDArray
 
+from nsvq_lightning.rendering.cpu.arrays import INT64, check_array
 from nsvq_lightning.rendering.cpu.jit import kernel, thread_count
 
 __all__ = ["AXIS_BITS", "Grid", "morton_keys", "nearest_before", "unmorton"]
@@ -111,7 +112,12 @@ def nearest_before(cells: NDArray[np.int64]) -> NDArray[np.int32]:
     """The two nearest ``[N, 2]`` of the 16 rows before each row of ``cells [N, 3]``, nearest first; -1 where none is.
 
     Distances are integers, and of equal ones the earlier row counts: every machine finds the same rows.
+
+    Raises:
+        ValueError: ``cells`` is not ``[N, 3]``, or has gaps.
+        TypeError: It is not int64.
     """
+    check_array("cells", cells, (len(cells), 3), INT64)
     found = np.empty((len(cells), 2), np.int32)
     thread_count()
     _search_before(cells, found)

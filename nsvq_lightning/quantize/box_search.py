@@ -20,8 +20,9 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from nsvq_lightning.quantize.boxes import NO_CODE, Boxes
+from nsvq_lightning.quantize.boxes import NO_CODE, Boxes, check_boxes
 from nsvq_lightning.quantize.kernels import lane_min
+from nsvq_lightning.rendering.cpu.arrays import FLOAT32, FLOAT64, INT32, INT64, check_array, check_table, outside
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
 from nsvq_lightning.rendering.cpu.lanes import (
     fma,
@@ -36,6 +37,7 @@ from nsvq_lightning.rendering.cpu.lanes import (
     vmax,
     vmin,
 )
+from nsvq_lightning.rendering.cpu.rows import count_outside
 
 __all__ = ["MAX_DIM", "ROUNDING", "UNKNOWN", "BoxMemory", "box_search", "empty_memory"]
 
@@ -232,20 +234,23 @@ def _search_kernel(dim: int) -> Any:
     """The search for one dimension: a constant for the compiler, so that short loops over it disappear."""
 
     def search(x, rows, codebook, codes, labels, leaves, nodes, memory, travelled, result):  # type: ignore[no-untyped-def]
-        total, bounded = result.shape[0], memory[0].shape[0] > 0
+        total, bounded, missing = result.shape[0], memory[0].shape[0] > 0, 0
         for block in prange((total + _ROWS - 1) // _ROWS):
             best, label, second = np.empty(_ROWS, np.float32), np.empty(_ROWS, np.int32), np.empty(_ROWS, np.float32)
             guess, tasks = np.empty(_ROWS, np.int64), np.empty(2 * _TASKS, np.int64)
             state = best, label, second, guess, tasks, np.empty(16, np.float32), bounded
             tree, queries = (codes, labels, leaves, nodes), np.empty(_ROWS * dim, np.float32)
             places = np.empty(_ROWS, np.int64)
-            count = 0
-            for i in range(block * _ROWS, min(total, (block + 1) * _ROWS)):
+            count, first, stop = 0, block * _ROWS, min(total, (block + 1) * _ROWS)
+            found_outside = count_outside(rows, first, stop, x.shape[0] // dim)
+            missing += found_outside
+            for i in range(first, stop if found_outside == 0 else first):
                 row = get(rows, i)
                 last = np.int64(get(memory[0], row)) if bounded else np.int64(UNKNOWN)
                 put(result, i, last)
                 put(places, count, i)
-                count += not (last >= 0 and _prove(dim, codebook, x, row, last, memory, travelled))
+                known = last >= 0 and last < codebook.shape[0] // dim
+                count += not (known and _prove(dim, codebook, x, row, last, memory, travelled))
             for i in range(count):
                 row = get(rows, get(places, i))
                 for j in range(dim):
@@ -258,6 +263,7 @@ def _search_kernel(dim: int) -> Any:
                 if bounded:
                     found = get(best, i), nearest, get(second, i)
                     _remember(dim, queries, i * dim, found, memory, get(rows, get(places, i)), travelled)
+        return missing
 
     return kernel(search)
 
@@ -279,12 +285,32 @@ def box_search(
         rows: Which queries, ``[V]``, all different; all of them by default.
         memory: What earlier searches have left, updated; without it every query is searched.
         travelled: Farthest that any code can have moved since ``memory`` was empty, in all.
+
+    Raises:
+        ValueError: The arrays do not fit together, one has gaps, there is no such row, or no code.
+        TypeError: The numbers have other types.
     """
+    check_table("x", x)
     rows = np.arange(len(x)) if rows is None else rows
     memory = empty_memory(0, x.shape[1]) if memory is None else memory
+    check_array("rows", rows, (rows.size,), INT64)
+    check_array("codebook", codebook, (len(codebook), x.shape[1]), FLOAT32)
+    check_boxes(boxes, codebook)
+    _check_memory(memory, x)
     result = np.empty(len(rows), np.int64)
     thread_count()
     tree = (part.ravel() for part in boxes[:4])
     flat = memory.last, memory.anchors.ravel(), memory.lone
-    _search_kernel(x.shape[1])(x.ravel(), rows, codebook.ravel(), *tree, flat, travelled, result)
+    if _search_kernel(x.shape[1])(x.ravel(), rows, codebook.ravel(), *tree, flat, float(travelled), result):
+        raise outside("rows", rows, len(x))
     return result
+
+
+def _check_memory(memory: BoxMemory, x: NDArray[np.float32]) -> None:
+    """Memory of no row, or at least of all; there may be more since the scene was larger."""
+    count = len(memory.last)
+    if 0 < count < len(x):
+        raise ValueError(f"memory must have the {len(x)} rows of x, got {count}")
+    check_array("memory.last", memory.last, (count,), INT32)
+    check_array("memory.anchors", memory.anchors, (count, x.shape[1]), FLOAT32)
+    check_array("memory.lone", memory.lone, (count,), FLOAT64)

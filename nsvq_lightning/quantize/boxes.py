@@ -9,9 +9,10 @@ from numba import prange
 from numpy.typing import NDArray
 
 from nsvq_lightning.quantize.kernels import aligned_empty
+from nsvq_lightning.rendering.cpu.arrays import FLOAT32, INT32, check_array, check_table, outside
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
 
-__all__ = ["NO_CODE", "Boxes", "build_boxes"]
+__all__ = ["NO_CODE", "Boxes", "build_boxes", "check_boxes"]
 
 NO_CODE = np.int32(np.iinfo(np.int32).max)
 """Label of a lane without a code."""
@@ -126,8 +127,15 @@ def build_boxes(codebook: NDArray[np.float32], order: NDArray[np.int32] | None =
     """Put the codes ``[K, D]`` into boxes. Codes that are not a number are put at infinity and never chosen.
 
     ``order`` is that of earlier boxes: good as long as codes have moved little, right in any case, and much faster.
+
+    Raises:
+        ValueError: There is no code, the codebook has gaps, or ``order`` is not ``[K]`` numbers of codes.
+        TypeError: The numbers have other types.
     """
+    check_table("codebook", codebook)
     count, dim = codebook.shape
+    if count == 0:
+        raise ValueError(f"the codebook must have a code, got shape {list(codebook.shape)}; fit it first")
     points = np.ascontiguousarray(codebook.T)
     points[np.isnan(points)] = np.inf
     nodes = -(-count // 4096) * 16
@@ -135,6 +143,10 @@ def build_boxes(codebook: NDArray[np.float32], order: NDArray[np.int32] | None =
     if order is None:
         order = np.arange(count, dtype=np.int32)
         _order_codes(points, order, np.array([0, count]))
+    else:
+        check_array("order", order, (count,), INT32)
+        if order.min() < 0 or order.max() >= count:
+            raise outside("order", order, count)
     boxes = Boxes(
         aligned_empty((nodes * 16, dim, 16)),
         np.empty((nodes * 16, 16), np.int32),
@@ -144,3 +156,20 @@ def build_boxes(codebook: NDArray[np.float32], order: NDArray[np.int32] | None =
     )
     _pack(points, order, *boxes[:4])
     return boxes
+
+
+def check_boxes(boxes: Boxes, codebook: NDArray[np.float32]) -> None:
+    """Refuse boxes that are not those of so many codes ``[K, D]``, K at least 1.
+
+    Raises:
+        ValueError: There is no code, or an array has another shape or gaps.
+        TypeError: Its numbers have another type.
+    """
+    count, dim = codebook.shape
+    nodes = -(-count // 4096) * 16
+    if count == 0:
+        raise ValueError(f"the codebook must have a code, got shape {list(codebook.shape)}; fit it first")
+    check_array("boxes.codes", boxes.codes, (nodes * 16, dim, 16), FLOAT32)
+    check_array("boxes.labels", boxes.labels, (nodes * 16, 16), INT32)
+    check_array("boxes.leaves", boxes.leaves, (nodes, dim, 2, 16), FLOAT32)
+    check_array("boxes.nodes", boxes.nodes, (nodes // 16, dim, 2, 16), FLOAT32)

@@ -232,12 +232,16 @@ class CodebookQuantizer(nn.Module, ABC):
             broken: The codes ``[B]`` int64.
             rows: Rows of the scene ``[N, D]``.
             generator: Source of the choice.
+
+        Raises:
+            ValueError: Codes are frozen for another number of rows.
         """
         finite = self.codebook[torch.isfinite(self.codebook).all(1)]
         self.codebook[broken] = copy_codes(finite, len(broken), generator)
         if self.frozen:
-            sums = sum_by_code(rows, self.codes, self.num_codes, torch.float64)
-            counts = torch.bincount(self.codes, minlength=self.num_codes)
+            codes = self._frozen_codes(len(rows), None)
+            sums = sum_by_code(rows, codes, self.num_codes, torch.float64)
+            counts = torch.bincount(codes, minlength=self.num_codes)
             owned = broken[counts[broken] > 0]
             self.codebook[owned] = (sums[owned] / counts[owned, None]).to(self.codebook)
         self._tracker.forget()

@@ -108,7 +108,12 @@ def distinct_rows(x: Tensor) -> Tensor:
 
     Rows are compared by a 64-bit hash of their bits, which is then verified, because sorting rows of 45 numbers would
     take longer than k-means itself.
+
+    Raises:
+        ValueError: ``x`` is not ``[N, D]``.
     """
+    if x.dim() != 2:
+        raise ValueError(f"rows must have shape [N, D], got {list(x.shape)}")
     rows = (x.detach().cpu() + 0.0).contiguous().numpy()  # + 0.0 makes -0 and 0 the same bits
     hashes = np.empty(len(rows), np.uint64)
     thread_count()

@@ -86,7 +86,11 @@ def _normal_kernel(seed, out):  # type: ignore[no-untyped-def]
 
 
 def normal_vectors(seed: int, vectors: int) -> NDArray[np.float32]:
-    """The first ``vectors`` (an even number) vectors of 16 standard normal numbers of a seed, ``[vectors · 16]``."""
+    """The first ``vectors`` (an even number) vectors of 16 standard normal numbers of a seed, ``[vectors · 16]``.
+
+    Raises:
+        ValueError: ``vectors`` is negative or odd.
+    """
     if vectors < 0 or vectors % 2:
         raise ValueError(f"vectors must be an even number that is not negative, got {vectors}")
     out = np.empty(vectors * 16, np.float32)

@@ -18,6 +18,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from nsvq_lightning.quantize.kernels import aligned_empty, lane_min
+from nsvq_lightning.rendering.cpu.arrays import FLOAT32, check_array, check_table
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
 from nsvq_lightning.rendering.cpu.lanes import fma, fnma, get, load, lowest_bit, mask_bits, put, splat, store, vmin
 
@@ -77,7 +78,15 @@ def _lay_out(codebook, centre, blocks, halves):  # type: ignore[no-untyped-def]
 
 
 def centre_codes(codebook: NDArray[np.float32]) -> CentredCodes:
-    """Centre the codes ``[K, D]`` and lay them out in blocks of 32."""
+    """Centre the codes ``[K, D]`` and lay them out in blocks of 32.
+
+    Raises:
+        ValueError: There is no code, or the codebook has gaps.
+        TypeError: It is not float32.
+    """
+    check_table("codebook", codebook)
+    if len(codebook) == 0:
+        raise ValueError(f"the codebook must have a code, got shape {list(codebook.shape)}; fit it first")
     count, dim = codebook.shape
     with np.errstate(invalid="ignore"):
         centre = codebook.mean(0, dtype=np.float64).astype(np.float32)
@@ -274,8 +283,14 @@ def score_search(
         Codes ``[N]``; a list of the nearest codes ``[N, LIST]`` int32, filled up with the first where there are fewer;
         and distances ``[2, N]``: below the first there is no code outside the list, below the second none but the
         nearest. The last two are empty unless asked for.
+
+    Raises:
+        ValueError: Rows and codes do not fit together, or an array has gaps.
+        TypeError: One is not float32.
     """
+    check_table("x", x)
     count, dim = x.shape
+    _check_codes(codes, dim)
     result = np.empty(count, np.int64)
     lists = np.empty((count if with_lists else 0, LIST), np.int32)
     distances = np.empty((2, count if with_lists else 0), np.float32)
@@ -292,3 +307,14 @@ def score_search(
         distances.ravel(),
     )
     return result, lists, distances
+
+
+def _check_codes(codes: CentredCodes, dim: int) -> None:
+    """Arrays of one number of codes; no row comes near the codes that fill up the last block."""
+    count, blocks = len(codes.codebook), -(-len(codes.codebook) // 32)
+    check_array("codes.codebook", codes.codebook, (count, dim), FLOAT32)
+    check_array("codes.centre", codes.centre, (dim,), FLOAT32)
+    check_array("codes.blocks", codes.blocks, (blocks, dim, 32), FLOAT32)
+    check_array("codes.halves", codes.halves, (32 * blocks,), FLOAT32)
+    if count == 0 or not np.isposinf(codes.halves[count:]).all():
+        raise ValueError(f"codes must be those of `centre_codes` for a codebook, got {count} codes of another origin")

@@ -19,10 +19,11 @@ from numba import prange
 from numpy.typing import NDArray
 
 from nsvq_lightning.quantize.noise import fill_normal
+from nsvq_lightning.rendering.cpu.arrays import FLOAT32, INT64, check_array, check_table, outside
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
 from nsvq_lightning.rendering.cpu.lanes import fma, get, lane_sum, load, put, select, splat, store, vsqrt
 from nsvq_lightning.rendering.cpu.projection import clear
-from nsvq_lightning.rendering.cpu.rows import clear_between
+from nsvq_lightning.rendering.cpu.rows import clear_between, count_outside
 from nsvq_lightning.rendering.cpu.workspace import recycled
 
 __all__ = ["substitute", "substitute_backward"]
@@ -45,6 +46,27 @@ def _copy_in(dim, source, rows, first, count, group):  # type: ignore[no-untyped
         start = get(rows, first + lane) * dim
         for j in range(dim):
             put(group, j * 16 + lane, get(source, start + j))
+
+
+@inline
+def _block(dim, x, rows, codebook, codes, block):  # type: ignore[no-untyped-def]
+    """First and last row of a block, and how many of their numbers are no row of the table or no code.
+
+    A block that has such numbers ends where it begins.
+    """
+    begin, stop = block * _ROWS, min(codes.shape[0], (block + 1) * _ROWS)
+    found = count_outside(rows, begin, stop, x.shape[0] // dim)
+    found += count_outside(codes, begin, stop, codebook.shape[0] // dim)
+    return begin, stop if found == 0 else begin, found
+
+
+@inline
+def _part(dim, x, rows, codebook, codes, part, parts):  # type: ignore[no-untyped-def]
+    """The same of a part; the row before its first one says where to begin to clear."""
+    begin, stop = codes.shape[0] * part // parts, codes.shape[0] * (part + 1) // parts
+    found = count_outside(rows, begin - 1, stop, x.shape[0] // dim)
+    found += count_outside(codes, begin, stop, codebook.shape[0] // dim)
+    return begin, stop if found == 0 else begin, found
 
 
 @inline
@@ -102,12 +124,14 @@ def _inverse(squared):  # type: ignore[no-untyped-def]
 
 def _short_forward(dim: int) -> Any:
     def forward(seed, aim, spread, x, rows, codebook, codes, out):  # type: ignore[no-untyped-def]
-        count = codes.shape[0]
+        count, missing = codes.shape[0], 0
         for block in prange((count + _ROWS - 1) // _ROWS):
+            begin, stop, found = _block(dim, x, rows, codebook, codes, block)
+            missing += found
             noise, radius, angle = np.empty(_ROWS * dim, np.float32), np.empty(16, np.float32), np.empty(16, np.float32)
             values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
             fill_normal(seed, block * _ROWS // 16 * dim, _ROWS // 16 * dim, noise, radius, angle)
-            for first in range(block * _ROWS, min(count, (block + 1) * _ROWS), 16):
+            for first in range(begin, stop, 16):
                 valid = min(16, count - first)
                 _copy_in(dim, x, rows, first, valid, values)
                 _copy_in(dim, codebook, codes, first, valid, chosen)
@@ -124,6 +148,7 @@ def _short_forward(dim: int) -> Any:
                 for lane in range(valid):
                     for j in range(dim):
                         put(out, (first + lane) * dim + j, get(values, j * 16 + lane))
+        return missing
 
     return kernel(forward)
 
@@ -132,12 +157,14 @@ def _long_forward(dim: int) -> Any:
     vectors = -(-dim // 16)
 
     def forward(seed, aim, spread, x, rows, codebook, codes, out):  # type: ignore[no-untyped-def]
-        count = codes.shape[0]
+        count, missing = codes.shape[0], 0
         for block in prange((count + _ROWS - 1) // _ROWS):
+            begin, stop, found = _block(dim, x, rows, codebook, codes, block)
+            missing += found
             radius, angle, keep = np.empty(16, np.float32), np.empty(16, np.float32), np.ones(16, np.float32)
             keep[: vectors * 16 - dim] = 0
             noise, direction = np.empty(2 * vectors * 16, np.float32), np.empty(vectors * 16, np.float32)
-            for i in range(block * _ROWS, min(count, (block + 1) * _ROWS)):
+            for i in range(begin, stop):
                 start = i % 2 * vectors * 16
                 if start == 0:
                     fill_normal(seed, i * vectors, 2 * vectors, noise, radius, angle)
@@ -155,20 +182,22 @@ def _long_forward(dim: int) -> Any:
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
                     store(out, i * dim + place, fma(length, load(direction, place), load(x, at + place)))
+        return missing
 
     return kernel(forward)
 
 
 def _short_backward(dim: int) -> Any:
     def backward(grad, x, rows, codebook, codes, out, grad_x, sums):  # type: ignore[no-untyped-def]
-        count, parts = codes.shape[0], sums.shape[0]
+        count, parts, missing = codes.shape[0], sums.shape[0], 0
         for part in prange(parts):
             values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
             moved, slope = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
             total = sums[part]
             clear(total, 0, total.shape[0])
-            stop = count * (part + 1) // parts
-            for first in range(count * part // parts, stop, 16):
+            begin, stop, found = _part(dim, x, rows, codebook, codes, part, parts)
+            missing += found
+            for first in range(begin, stop, 16):
                 valid = min(16, stop - first)
                 _copy_in(dim, x, rows, first, valid, values)
                 _copy_in(dim, codebook, codes, first, valid, chosen)
@@ -190,8 +219,9 @@ def _short_backward(dim: int) -> Any:
                     for j in range(dim):
                         put(grad_x, at + j, get(slope, j * 16 + lane))
                         put(total, code + j, get(total, code + j) - get(chosen, j * 16 + lane))
-            if part == parts - 1:
+            if part == parts - 1 and found == 0:
                 clear_between(rows, count, dim, grad_x)
+        return missing
 
     return kernel(backward)
 
@@ -200,13 +230,15 @@ def _long_backward(dim: int) -> Any:
     vectors = -(-dim // 16)
 
     def backward(grad, x, rows, codebook, codes, out, grad_x, sums):  # type: ignore[no-untyped-def]
-        count, parts = codes.shape[0], sums.shape[0]
+        count, parts, missing = codes.shape[0], sums.shape[0], 0
         for part in prange(parts):
             keep = np.ones(16, np.float32)
             keep[: vectors * 16 - dim] = 0
             total = sums[part]
             clear(total, 0, total.shape[0])
-            for i in range(count * part // parts, count * (part + 1) // parts):
+            begin, stop, found = _part(dim, x, rows, codebook, codes, part, parts)
+            missing += found
+            for i in range(begin, stop):
                 at, code = get(rows, i) * dim, get(codes, i) * dim
                 scale = _dot_difference(dim, grad, i * dim, out, i * dim, x, at, keep)
                 scale *= _inverse(_residual_squared(dim, x, at, codebook, code, keep))
@@ -219,8 +251,9 @@ def _long_backward(dim: int) -> Any:
                     store(grad_x, at + place, load(grad, i * dim + place) + radial)
                     before = last if j == vectors - 1 else load(total, code + place)
                     store(total, code + place, before - radial)
-            if part == parts - 1:
+            if part == parts - 1 and found == 0:
                 clear_between(rows, count, dim, grad_x)
+        return missing
 
     return kernel(backward)
 
@@ -256,12 +289,31 @@ def substitute(
         codes: Code of each chosen row, ``[V]``.
         aim: Weight of the way to the code in the direction d.
         spread: Weight of the noise in it.
+
+    Raises:
+        ValueError: The arrays do not fit together, one has gaps, or there is no such row or code.
+        TypeError: The numbers have other types.
     """
+    _check(x, rows, codebook, codes)
     out = recycled((len(rows), x.shape[1])).numpy()
     thread_count()
     flat = x.ravel(), rows, codebook.ravel(), codes, out.ravel()
-    _kernels(x.shape[1])[0](seed, np.float32(aim), np.float32(spread), *flat)
+    if _kernels(x.shape[1])[0](seed, np.float32(aim), np.float32(spread), *flat):
+        raise _missing(x, rows, codebook, codes)
     return out
+
+
+def _check(x: Floats, rows: Integers, codebook: Floats, codes: Integers) -> None:
+    check_table("x", x)
+    check_array("rows", rows, (rows.size,), INT64)
+    check_array("codebook", codebook, (len(codebook), x.shape[1]), FLOAT32)
+    check_array("codes", codes, (len(rows),), INT64)
+
+
+def _missing(x: Floats, rows: Integers, codebook: Floats, codes: Integers) -> ValueError:
+    """The error for a row or a code that is not there."""
+    wrong_row = bool(((rows < 0) | (rows >= len(x))).any())
+    return outside("rows", rows, len(x)) if wrong_row else outside("codes", codes, len(codebook))
 
 
 def substitute_backward(
@@ -270,12 +322,20 @@ def substitute_backward(
     """Gradients of ``x [N, D]`` and ``codebook [K, D]`` from that of the result, ``grad [V, D]``.
 
     ``out [V, D]`` is the result of :func:`substitute`; ``rows [V]`` must be ascending and all different here.
+
+    Raises:
+        ValueError: As of :func:`substitute`.
+        TypeError: The numbers have other types.
     """
+    _check(x, rows, codebook, codes)
+    for name, table in (("grad", grad), ("out", out)):
+        check_array(name, table, (len(rows), x.shape[1]), FLOAT32)
     grad_x, grad_codebook = recycled(x.shape).numpy(), recycled(codebook.shape).numpy()
     parts = max(_LEAST_PARTS, min(_MOST_PARTS, len(rows) // (4 * len(codebook))))
     sums = recycled((parts, codebook.size)).numpy()
     thread_count()
     flat = grad.ravel(), x.ravel(), rows, codebook.ravel(), codes, out.ravel()
-    _kernels(x.shape[1])[1](*flat, grad_x.ravel(), sums)
+    if _kernels(x.shape[1])[1](*flat, grad_x.ravel(), sums):
+        raise _missing(x, rows, codebook, codes)
     _add_parts(sums, grad_codebook.ravel())
     return grad_x, grad_codebook

@@ -11,6 +11,7 @@ from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from nsvq_lightning.rendering.cpu.arrays import INT64, flat_checked, outside
 from nsvq_lightning.rendering.cpu.jit import kernel, thread_count
 from nsvq_lightning.rendering.kernels import kernels_for
 
@@ -34,17 +35,26 @@ def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtyp
 
     Args:
         values: Rows ``[N, D]``.
-        codes: Codes ``[N]`` int64 in [0, K); not checked.
+        codes: Codes ``[N]`` int64; a row whose code is not in [0, K) is in no sum.
         num_codes: K.
         dtype: Dtype of the sums, that of ``values`` by default.
 
     Returns:
         Sums ``[K, D]``; 0 for a code without rows.
+
+    Raises:
+        ValueError: The values are not ``[N, D]``, or there is not one code a row.
+        TypeError: The codes are not int64.
     """
+    if values.dim() != 2 or codes.shape != values.shape[:1]:
+        raise ValueError(
+            f"values must have shape [N, D] and codes [N], got {list(values.shape)} and {list(codes.shape)}"
+        )
     values, dtype = values.detach(), dtype or values.dtype
-    if values.device.type == "cpu":
+    if values.device.type == "cpu" and values.dtype in (torch.float32, torch.float64):
         sums = torch.zeros(num_codes, values.shape[1], dtype=dtype)
-        _sum_rows(values.contiguous().numpy(), codes.contiguous().numpy(), sums.numpy(), thread_count())
+        numbers = flat_checked("codes", codes.contiguous(), (len(values),), INT64)
+        _sum_rows(values.contiguous().numpy(), numbers, sums.numpy(), thread_count())
         return sums
     if kernels_for(values) == "cuda":
         from nsvq_lightning.quantize.cuda.sums import sum_rows
@@ -62,17 +72,29 @@ def _sum_segments(values: Tensor, codes: Tensor, num_codes: int) -> Tensor:
 
 @partial(kernel, parallel=False)
 def _count_hits(codes, usage):  # type: ignore[no-untyped-def]
-    hit = np.zeros(usage.shape[0], np.uint8)
+    """Count what was hit, unless a number is no code; returns how many are none."""
+    hit, missing = np.zeros(usage.shape[0], np.uint8), 0
     for i in range(codes.shape[0]):
-        hit[codes[i]] = 1
-    for code in range(usage.shape[0]):
+        if 0 <= codes[i] < usage.shape[0]:
+            hit[codes[i]] = 1
+        else:
+            missing += 1
+    for code in range(usage.shape[0] if missing == 0 else 0):
         usage[code] += hit[code]
+    return missing
 
 
 def count_hits(codes: Tensor, usage: Tensor) -> None:
-    """Add 1 to ``usage [K]`` (int64, in place) for every code that is among ``codes [N]``, however often."""
+    """Add 1 to ``usage [K]`` (int64, in place) for every code that is among ``codes [N]``, however often.
+
+    Raises:
+        ValueError: ``codes`` is not ``[N]``, ``usage`` has gaps, or there is no such code.
+        TypeError: A type differs.
+    """
     if usage.device.type == "cpu":
-        _count_hits(codes.contiguous().numpy(), usage.numpy())
+        numbers = flat_checked("codes", codes.contiguous(), (codes.numel(),), INT64)
+        if _count_hits(numbers, flat_checked("usage", usage, (usage.numel(),), INT64)):
+            raise outside("codes", numbers, len(usage))
     else:
         hit = torch.zeros_like(usage)
         hit[codes] = 1

@@ -25,6 +25,7 @@ from nsvq_lightning.quantize.boxes import build_boxes
 from nsvq_lightning.quantize.kernels import lane_min
 from nsvq_lightning.quantize.nearest import check_rows, nearest
 from nsvq_lightning.quantize.scores import LIST, centre_codes, score_search, true_distance
+from nsvq_lightning.rendering.cpu.arrays import INT64, check_array
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
 from nsvq_lightning.rendering.cpu.lanes import (
     fma,
@@ -220,7 +221,7 @@ class NearestTracker:
 
         Raises:
             ValueError: The shapes do not fit together, or rows are not ascending numbers of rows.
-            TypeError: The dtypes differ or are not floating point.
+            TypeError: The dtypes differ or are not floating point, or rows are not int64.
         """
         check_rows(x, codebook)
         if rows is not None and rows.dim() != 1:
@@ -229,6 +230,7 @@ class NearestTracker:
             return nearest(x if rows is None else x.index_select(0, rows), codebook)
         values, codes = x.detach().contiguous().numpy(), codebook.detach().contiguous().numpy()
         chosen = np.arange(len(values)) if rows is None else rows.contiguous().numpy()
+        check_array("rows", chosen, (len(chosen),), INT64)
         if not _ascending(chosen, len(values)):
             raise ValueError(f"rows must be ascending numbers in [0, {len(values)}), all different")
         if self._codebook_shape != codes.shape:

@@ -12,6 +12,7 @@ import torch
 from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 
 from nsvq_lightning.callbacks import DensityControl, DensityRules
+from nsvq_lightning.edit import append_rows, keep_rows
 from nsvq_lightning.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.rendering.rasterize import Render
@@ -63,12 +64,12 @@ class Stage:
             optimizers=[optimizer], global_step=0, world_size=1, accumulate_grad_batches=micro
         )
 
-    def end_batch(self, iteration: int, render: Render | None = None) -> None:
-        """End a step with a view, or one without an update."""
+    def end_batch(self, iteration: int, render: Render | None = None, **beside: Any) -> None:
+        """End a step with a view and what the step returns beside it, or one without an update."""
         self.trainer.global_step = iteration
         for parameter in self.host.splats.parameters():
             parameter.grad = None if render is None else torch.zeros_like(parameter)
-        outputs = {} if render is None else {"loss": torch.tensor(0.0), "render": render}
+        outputs = {} if render is None else {"loss": torch.tensor(0.0), "render": render, **beside}
         self.control.on_train_batch_end(self.trainer, self.host, outputs, None, 0)
 
     @property
@@ -83,6 +84,36 @@ def test_the_statistic_is_the_mean_over_the_views_that_saw_the_splat() -> None:
     tables = stage.host.splats.tables()
     assert tables["gradient_sum"].tolist() == pytest.approx([6e-4, 1e-4, 0.0])
     assert tables["view_count"].tolist() == [2.0, 1.0, 0.0]
+
+
+def swap_first(stage: Stage) -> None:
+    """Remove the first splat and add one at the end."""
+    splats, optimizer = stage.host.splats, stage.trainer.optimizers[0]
+    keep_rows(splats, optimizer, torch.arange(len(splats)) > 0)
+    append_rows(splats, optimizer, {name: value.detach()[:1] for name, value in splats.attributes().items()})
+
+
+@pytest.mark.parametrize("edit", ["removed", "added", "swapped"])
+def test_a_view_of_splats_that_changed_since_is_left_out_with_one_warning(
+    edit: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    stage = Stage(make_splats([SMALL] * 3, [0.5] * 3), DensityControl())
+    stage.end_batch(1, view([4e-4, 1e-4, 2e-4], [True] * 3), edits=0)
+    rendered = {"removed": 4, "added": 2, "swapped": 3}[edit]
+    if edit == "swapped":
+        swap_first(stage)
+    with caplog.at_level(logging.WARNING):
+        for iteration in (2, 3):
+            stage.end_batch(iteration, view([9e-4] * rendered, [True] * rendered), edits=0)
+    tables = stage.host.splats.tables()
+    sums = [1e-4, 2e-4, 0.0] if edit == "swapped" else [4e-4, 1e-4, 2e-4]  # rows take theirs along
+    assert tables["gradient_sum"].tolist() == pytest.approx(sums)
+    assert tables["view_count"].tolist() == [float(value > 0) for value in sums]
+    assert [record.message.partition(":")[0] for record in caplog.records] == ["iteration 2"]
+    assert f"({rendered} were rendered, now 3)" in caplog.text
+    assert "List that callback after DensityControl" in caplog.text
+    stage.end_batch(4, view([1e-4] * 3, [True] * 3), edits=stage.host.splats.edits)
+    assert tables["gradient_sum"].tolist() == pytest.approx([value + 1e-4 for value in sums])
 
 
 def test_clone_split_and_prune_at_the_scheduled_iteration() -> None:

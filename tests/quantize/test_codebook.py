@@ -223,3 +223,10 @@ def test_refusals() -> None:
         quantizer.freeze(torch.tensor([0], dtype=torch.int32))
     with pytest.raises(ValueError, match="share"):
         quantizer.replace_unused(generator(0), threshold=1.5)
+
+
+def test_codes_are_not_mended_by_rows_that_they_do_not_belong_to() -> None:
+    quantizer = NSVQ(3, 2)
+    quantizer.freeze(torch.tensor([0, 1, 2, 2]))
+    with pytest.raises(ValueError, match="codes are frozen for 4 rows, got 3"):
+        quantizer.mend(torch.tensor([1]), torch.zeros(3, 2), generator(0))

@@ -264,3 +264,34 @@ def test_what_the_rasterizer_skips_changes_no_bit(name: str, sh_degree: int) -> 
     assert torch.equal(everything.image, standard.image)
     assert torch.equal(everything.depth, standard.depth)
     assert [key for key in gradients if not torch.equal(gradients[key], all_gradients[key])] == []
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_the_largest_image_is_right_and_a_larger_one_refused(upright: bool) -> None:
+    """Against a small image of the same view by the oracle. More tiles have no place in a record of 16 bits."""
+    splats, largest, small = random_splats(5, seed=8, log_scale=0.0), rasterizer.MAX_SIDE, 2048
+
+    def camera(side: int) -> Camera:
+        width, height = (1, side) if upright else (side, 1)
+        K = torch.tensor([[width, 0, 0.5 * width], [0, height, 0.5 * height], [0, 0, 1]])
+        return Camera(K, front_camera().viewmat, width, height)
+
+    image = render(splats, camera(largest), backend="cpu").image.reshape(largest, 3)
+    expected = render(splats, camera(small), backend="reference").image.reshape(small, 3)
+    assert expected.amax(1).count_nonzero() > small // 4
+    middles = ((torch.arange(small) + 0.5) * (largest / small)).long()
+    assert (image[middles] - expected).abs().max() < 1e-2
+    for function in (render, visible):
+        with pytest.raises(ValueError, match=f"may have {largest} pixels along a side.*render it in parts"):
+            function(splats, camera(largest + 1), backend="cpu")
+
+
+@pytest.mark.parametrize("name", RawSplats._fields)
+def test_data_exchanged_before_the_backward_pass_are_refused(name: str) -> None:
+    """Autograd does not see an assignment to ``.data``; the gradients would be written over other memory."""
+    leaves = RawSplats(*(tensor.requires_grad_() for tensor in random_splats(50)))
+    image = render(leaves, front_camera(), backend="cpu").image
+    tensor = getattr(leaves, name)
+    tensor.data = tensor.data[:20]
+    with pytest.raises(ValueError, match=rf"{name} had shape \[50.*change the rows of splats after it"):
+        image.sum().backward()

@@ -17,6 +17,7 @@ import triton.language as tl
 from torch import Tensor
 
 from nsvq_lightning.rendering.cuda.records import COMPILE
+from nsvq_lightning.rendering.cuda.tensors import check_tensor
 
 __all__ = ["nearest_codes"]
 
@@ -58,7 +59,13 @@ def nearest_codes(x: Tensor, codebook: Tensor) -> Tensor:
     Args:
         x: float32 rows ``[N, D]`` on a CUDA device.
         codebook: Codes ``[K, D]`` there.
+
+    Raises:
+        ValueError: Rows and codes do not fit together, or one has gaps.
+        TypeError: A type differs.
     """
+    check_tensor("x", x, (len(x), codebook.shape[-1]), x.device)
+    check_tensor("codebook", codebook, (len(codebook), x.shape[1]), x.device)
     result = torch.empty(len(x), dtype=torch.int64, device=x.device)
     if len(x):
         rows, codes = _by_column(x, ROWS), _by_column(codebook, CODES)

@@ -14,6 +14,7 @@ from torch import Tensor
 from nsvq_lightning.quantize.cuda.noise import normal
 from nsvq_lightning.quantize.cuda.sums import sum_rows
 from nsvq_lightning.rendering.cuda.records import COMPILE
+from nsvq_lightning.rendering.cuda.tensors import check_tensor
 
 __all__ = ["substitute", "substitute_backward"]
 
@@ -23,16 +24,22 @@ TINY = tl.constexpr(torch.finfo(torch.float32).tiny)
 
 
 @triton.jit
-def chosen_rows(x, rows, codebook, codes, count, DIM: tl.constexpr, ROWS: tl.constexpr, WIDTH: tl.constexpr):
-    """Number of each row in the table, place among the chosen ones, which numbers there are, rows and their codes."""
+def chosen_rows(
+    x, rows, codebook, codes, count, height, num_codes, DIM: tl.constexpr, ROWS: tl.constexpr, WIDTH: tl.constexpr
+):
+    """Number of each row in the table, place among the chosen ones, which numbers there are, rows and their codes.
+
+    A row that the table does not have, or whose code the codebook does not have, is NaN; nobody waits here to say so.
+    """
     i = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)[:, None]
     column = tl.arange(0, WIDTH)[None, :]
     inside = (i < count) & (column < DIM)
     row = tl.load(rows + i, mask=i < count, other=0)
     code = tl.load(codes + i, mask=i < count, other=0)
-    value = tl.load(x + row * DIM + column, mask=inside, other=0.0)
-    centre = tl.load(codebook + code * DIM + column, mask=inside, other=0.0)
-    return i, column, row, inside, value, centre
+    there = inside & (row >= 0) & (row < height) & (code >= 0) & (code < num_codes)
+    value = tl.load(x + row * DIM + column, mask=there, other=float("nan"))
+    centre = tl.load(codebook + code * DIM + column, mask=there, other=float("nan"))
+    return i, column, row, inside, there, value, centre
 
 
 @triton.jit
@@ -43,11 +50,13 @@ def inverses(squared):
 
 @triton.jit(do_not_specialize=["seed"])
 def substitute_kernel(
-    seed, aim, spread, x, rows, codebook, codes, out, count, DIM: tl.constexpr, ROWS: tl.constexpr,
+    seed, aim, spread, x, rows, codebook, codes, out, count, height, num_codes, DIM: tl.constexpr, ROWS: tl.constexpr,
     WIDTH: tl.constexpr,
 ):  # fmt: skip
     """``x + ‖x − c‖·d/‖d‖`` with ``d = aim·(c − x) + spread·v`` of some rows."""
-    i, column, _, inside, value, centre = chosen_rows(x, rows, codebook, codes, count, DIM, ROWS, WIDTH)
+    i, column, _, inside, _, value, centre = chosen_rows(
+        x, rows, codebook, codes, count, height, num_codes, DIM, ROWS, WIDTH
+    )
     # The order of the CPU's vectors of 16: short rows one a lane, long ones along the vectors.
     if DIM < 16:
         noise = normal(seed, i // 16 * DIM + column, (i % 16).to(tl.int32))
@@ -62,23 +71,32 @@ def substitute_kernel(
 
 @triton.jit
 def radial_kernel(
-    grad, x, rows, codebook, codes, out, grad_x, radials, count, DIM: tl.constexpr, ROWS: tl.constexpr,
-    WIDTH: tl.constexpr,
+    grad, x, rows, codebook, codes, out, grad_x, radials, count, height, num_codes, DIM: tl.constexpr,
+    ROWS: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
     """Gradient of the rows into the table of all rows, and minus its radial term into ``radials``."""
-    i, column, row, inside, value, centre = chosen_rows(x, rows, codebook, codes, count, DIM, ROWS, WIDTH)
+    i, column, row, inside, there, value, centre = chosen_rows(
+        x, rows, codebook, codes, count, height, num_codes, DIM, ROWS, WIDTH
+    )
     slope = tl.load(grad + i * DIM + column, mask=inside, other=0.0)
-    moved = tl.load(out + i * DIM + column, mask=inside, other=0.0) - value
-    residual = value - centre
+    moved = tl.where(inside, tl.load(out + i * DIM + column, mask=inside, other=0.0) - value, 0.0)
+    residual = tl.where(inside, value - centre, 0.0)
     scale = tl.sum(slope * moved, 1)[:, None] * inverses(tl.sum(residual * residual, 1)[:, None])
     radial = residual * scale
-    tl.store(grad_x + row * DIM + column, slope + radial, mask=inside)
+    tl.store(grad_x + row * DIM + column, slope + radial, mask=there)
     tl.store(radials + i * DIM + column, -radial, mask=inside)
 
 
 def _tile(dim: int) -> dict[str, int]:
     width = triton.next_power_of_2(dim)
     return {"DIM": dim, "WIDTH": width, "ROWS": max(1, BLOCK // width)}
+
+
+def _check(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor) -> None:
+    check_tensor("x", x, (len(x), codebook.shape[-1]), x.device)
+    check_tensor("rows", rows, (rows.numel(),), x.device, torch.int64)
+    check_tensor("codebook", codebook, (len(codebook), x.shape[1]), x.device)
+    check_tensor("codes", codes, (len(rows),), x.device, torch.int64)
 
 
 def substitute(
@@ -94,14 +112,20 @@ def substitute(
         codes: Code of each chosen row, ``[V]`` int64.
         aim: Weight of the way to the code in the direction d.
         spread: Weight of the noise in it.
+
+    Raises:
+        ValueError: The tensors do not fit together, or one has gaps.
+        TypeError: A type differs.
     """
+    _check(x, rows, codebook, codes)
     out = x.new_empty(len(rows), x.shape[1])
     tile = _tile(x.shape[1])
     if len(rows):
         with torch.cuda.device_of(x):
             substitute_kernel[(triton.cdiv(len(rows), tile["ROWS"]),)](
-                seed, float(aim), float(spread), x, rows, codebook, codes, out, len(rows), **tile, **COMPILE
-            )
+                seed, float(aim), float(spread), x, rows, codebook, codes, out, len(rows), len(x), len(codebook),
+                **tile, **COMPILE,
+            )  # fmt: skip
     return out
 
 
@@ -111,12 +135,20 @@ def substitute_backward(
     """Gradients of ``x [N, D]`` and ``codebook [K, D]`` from that of the result, ``grad [V, D]``.
 
     ``out [V, D]`` is the result of :func:`substitute`; the ``rows [V]`` must all be different here.
+
+    Raises:
+        ValueError: As of :func:`substitute`.
+        TypeError: A type differs.
     """
+    _check(x, rows, codebook, codes)
+    for name, table in (("grad", grad), ("out", out)):
+        check_tensor(name, table, (len(rows), x.shape[1]), x.device)
     grad_x, radials = torch.zeros_like(x), torch.empty_like(out)
     tile = _tile(x.shape[1])
     if len(rows):
         with torch.cuda.device_of(x):
             radial_kernel[(triton.cdiv(len(rows), tile["ROWS"]),)](
-                grad, x, rows, codebook, codes, out, grad_x, radials, len(rows), **tile, **COMPILE
-            )
+                grad, x, rows, codebook, codes, out, grad_x, radials, len(rows), len(x), len(codebook), **tile,
+                **COMPILE,
+            )  # fmt: skip
     return grad_x, sum_rows(radials, codes, len(codebook), x.dtype)

@@ -8,6 +8,7 @@ import triton.language as tl
 from torch import Tensor
 
 from nsvq_lightning.rendering.cuda.records import COMPILE
+from nsvq_lightning.rendering.cuda.tensors import check_tensor
 
 __all__ = ["sorted_by_code", "sum_rows"]
 
@@ -50,7 +51,13 @@ def sum_rows(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype) 
         codes: Codes ``[N]`` int64 in [0, K).
         num_codes: K.
         dtype: Dtype of the sums, in which they are taken.
+
+    Raises:
+        ValueError: The values are not ``[N, D]`` or have gaps, or there is not one code a row.
+        TypeError: A type differs.
     """
+    check_tensor("values", values, (len(values), values.shape[-1]), values.device, values.dtype)
+    check_tensor("codes", codes, (len(values),), values.device, torch.int64)
     order, offsets = sorted_by_code(codes, num_codes)
     dim = values.shape[1]
     width = min(WIDTH, triton.next_power_of_2(dim))

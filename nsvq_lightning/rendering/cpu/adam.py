@@ -14,7 +14,7 @@ import numpy as np
 from numba import prange
 from torch import Tensor
 
-from nsvq_lightning.rendering.cpu.arrays import Array
+from nsvq_lightning.rendering.cpu.arrays import Array, flat_checked
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
 from nsvq_lightning.rendering.cpu.lanes import any_lane, fma, get, load, prefetch, put, select, splat, store, vsqrt
 from nsvq_lightning.rendering.cpu.records import F
@@ -168,10 +168,16 @@ def adam_update(
         columns: Only so many leading numbers of each row; the caller knows that gradient and moments of the others
             are 0, which Adam leaves as they are.
         rows_with_gradient: Leave rows whose gradient is 0 as they are, moments included.
+
+    Raises:
+        ValueError: The tensors differ in shape, or one has gaps.
+        TypeError: One is not float32.
     """
     packed = _factors(step, lr, betas, eps)
-    tables = [tensor.detach().numpy().reshape(-1) for tensor in (weights, gradients, first, second)]
-    threads, rows, stride = thread_count(), weights.shape[0], math.prod(weights.shape[1:])
+    given = {"weights": weights, "gradients": gradients, "first": first, "second": second}
+    shape = tuple(weights.shape)
+    tables = [flat_checked(name, tensor, shape) for name, tensor in given.items()]
+    threads, rows, stride = thread_count(), shape[0], math.prod(shape[1:])
     if rows_with_gradient:
         return partial(_update_rows, threads, rows, stride, *tables, packed)
     if columns is not None and -(-columns // WIDTH) * WIDTH <= stride:

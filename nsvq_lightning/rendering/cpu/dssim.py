@@ -15,9 +15,22 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from nsvq_lightning.losses import SSIM_C1, SSIM_C2, SSIM_RADIUS, ssim_window
+from nsvq_lightning.losses import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
+from nsvq_lightning.rendering.cpu.arrays import FLOAT32, UINT8, flat_checked
 from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
-from nsvq_lightning.rendering.cpu.lanes import fma, fnma, get, lane_sum, load, put, select, splat, store, vfabs
+from nsvq_lightning.rendering.cpu.lanes import (
+    WIDTH,
+    fma,
+    fnma,
+    get,
+    lane_sum,
+    load,
+    put,
+    select,
+    splat,
+    store,
+    vfabs,
+)
 from nsvq_lightning.rendering.cpu.records import F
 from nsvq_lightning.rendering.cpu.workspace import Workspace, recycled
 
@@ -231,9 +244,18 @@ def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float) -> tuple[float,
         image: Contiguous float32 ``[H, W, 3]`` on the CPU.
         target: Contiguous ``[H, W, 3]``, float32 in [0, 1] or uint8.
         dssim_weight: Share of 1 - SSIM.
+
+    Raises:
+        ValueError: The shapes differ or are not ``[H, W, 3]``, W is below 6, or a picture has gaps.
+        TypeError: A type differs.
     """
+    check_pair(image, target)
     height, width = image.shape[:2]
     length = 3 * width
+    if length < WIDTH:
+        raise ValueError(f"rows of the image must fill a vector, which takes a width of at least 6, got {width}")
+    kind = UINT8 if target.dtype == torch.uint8 else FLOAT32
+    pixels = flat_checked("image", image, tuple(image.shape)), flat_checked("target", target, tuple(target.shape), kind)
     pitch = (length + 2 * PAD + 15) // 16 * 16
     threads = max(1, min(thread_count(), height // RING))
     gradient = recycled(tuple(image.shape))
@@ -246,8 +268,8 @@ def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float) -> tuple[float,
     count = length * height
     white = F(255 if target.dtype == torch.uint8 else 1)
     sweep_image(
-        threads, image.numpy().reshape(-1), target.numpy().reshape(-1), white, gradient.numpy().reshape(-1), height,
-        length, pitch, F((1 - dssim_weight) / count), F(dssim_weight / count), *rows.values(), LANE_NUMBERS, sums,
+        threads, *pixels, white, gradient.numpy().reshape(-1), height, length, pitch,
+        F((1 - dssim_weight) / count), F(dssim_weight / count), *rows.values(), LANE_NUMBERS, sums,
     )  # fmt: skip
     similarity, difference = sums[0::2].sum() / count, sums[1::2].sum() / count
     work.give_back()

@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import FRUSTUM_MARGIN
-from nsvq_lightning.rendering.cpu.arrays import Array, flat
+from nsvq_lightning.rendering.cpu.arrays import Array, flat, flat_checked
 from nsvq_lightning.rendering.cpu.binning import DIGITS, count_tiles, fill_tiles, sort_by_depth
 from nsvq_lightning.rendering.cpu.blend import (
     BACKWARD_SCRATCH,
@@ -24,18 +24,24 @@ from nsvq_lightning.rendering.cpu.blend import (
 )
 from nsvq_lightning.rendering.cpu.jit import thread_count
 from nsvq_lightning.rendering.cpu.projection import find_visible, finish_records, project_backward, project_splats
-from nsvq_lightning.rendering.cpu.records import CAMERA, GROUP_TILES, RECORD, group_grid
+from nsvq_lightning.rendering.cpu.records import CAMERA, GROUP_TILES, RECORD, TILE, group_grid
 from nsvq_lightning.rendering.cpu.workspace import Workspace, recycled
 from nsvq_lightning.skips import is_on
-from nsvq_lightning.splats import SplatTensors, sh_degree_of
+from nsvq_lightning.splats import ATTRIBUTES, SplatTensors, sh_degree_of
 
 __all__ = ["render_cpu", "visible_cpu"]
 
 PROJECTION_SCRATCH = 2048 + 64
 MAX_ENTRIES = 2**31 - 1
+MAX_SIDE = TILE * (2**15 - 1)
+"""Pixels along the side of an image: a record has 16 bits for the number of a tile, one of them its sign."""
 
 
 def _pack_camera(camera: Camera) -> Array:
+    if max(camera.width, camera.height) > MAX_SIDE:
+        raise ValueError(
+            f"an image may have {MAX_SIDE} pixels along a side, got {camera.width}x{camera.height}; render it in parts"
+        )
     fx, fy, cx, cy = camera.intrinsics
     view = camera.viewmat.detach().cpu().double().numpy()
     rotation, translation = view[:3, :3], view[:3, 3]
@@ -47,6 +53,13 @@ def _pack_camera(camera: Camera) -> Array:
     return np.array(packed, np.float32).reshape(CAMERA)
 
 
+def _geometry(splats: SplatTensors) -> tuple[Array, ...]:
+    """Means, rotations, scales and opacities, flat."""
+    n = splats.means.shape[:1]
+    shapes = {"means": (*n, 3), "quats": (*n, 4), "scales": (*n, 3), "opacities": (*n,)}
+    return tuple(flat_checked(name, getattr(splats, name).contiguous(), shape) for name, shape in shapes.items())
+
+
 class _Frame:
     """One view of the splats on its way through the stages; holds its workspace as long as it lives."""
 
@@ -56,7 +69,7 @@ class _Frame:
         self.group_columns, group_rows = group_grid(camera.width, camera.height)
         self.tiles = self.group_columns * group_rows * GROUP_TILES
         self.n = splats.means.shape[0]
-        self.geometry = tuple(flat(t) for t in (splats.means, splats.quats, splats.scales, splats.opacities))
+        self.geometry = _geometry(splats)
         self.threads = thread_count()
         self.work = Workspace.borrow()
         self.records = self.work.array("records", RECORD * self.n)
@@ -121,6 +134,22 @@ class _Frame:
 _GRID = pixel_grid()
 
 
+def _colors(n: int, sh0: Tensor, shN: Tensor) -> tuple[Array, Array]:
+    """Constant and higher coefficients, flat."""
+    shape = (n, shN.shape[1], 3)
+    return flat_checked("sh0", sh0.contiguous(), (n, 1, 3)), flat_checked("shN", shN.contiguous(), shape)
+
+
+def _check_kept(attributes: tuple[Tensor, ...], shapes: tuple[tuple[int, ...], ...]) -> None:
+    """Refuse attributes whose data were exchanged since the forward pass, which autograd does not see."""
+    for name, tensor, shape in zip(ATTRIBUTES, attributes, shapes, strict=True):
+        if tensor.shape != shape:
+            raise ValueError(
+                f"{name} had shape {list(shape)} when it was rendered and {list(tensor.shape)} in the backward pass; "
+                "change the rows of splats after it"
+            )
+
+
 class _Project(torch.autograd.Function):
     """Raw attributes to projected centres; the records travel in the frame, the token ties the graph together."""
 
@@ -131,9 +160,9 @@ class _Project(torch.autograd.Function):
         radii = torch.zeros(frame.n, dtype=torch.int32)
         # Bands above the active degree count as zero, whether they are left out or evaluated.
         degrees = degree, degree if is_on("sh_bands") else sh_degree_of(shN)
-        ctx.frame, ctx.degrees, ctx.stride = frame, degrees, 3 * shN.shape[1]
+        ctx.frame, ctx.degrees, ctx.shapes = frame, degrees, tuple(tuple(tensor.shape) for tensor in attributes)
         ctx.save_for_backward(*attributes)
-        frame.finish(flat(sh0), flat(shN), ctx.stride, degrees, flat(means2d), flat(radii))
+        frame.finish(*_colors(frame.n, sh0, shN), 3 * shN.shape[1], degrees, flat(means2d), flat(radii))
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
         return means2d, means.new_zeros(()), radii
@@ -148,9 +177,10 @@ class _Project(torch.autograd.Function):
             frame.sums.fill(0)
         g_means2d = torch.zeros(frame.n, 2) if g_means2d is None else g_means2d
         *_, sh0, shN = ctx.saved_tensors
-        gradients = [recycled(tuple(tensor.shape)) for tensor in ctx.saved_tensors]
+        _check_kept(ctx.saved_tensors, ctx.shapes)
+        gradients = [recycled(shape) for shape in ctx.shapes]
         project_backward(
-            frame.threads, frame.camera, *frame.geometry, flat(sh0), flat(shN), ctx.stride, *ctx.degrees,
+            frame.threads, frame.camera, *frame.geometry, *_colors(frame.n, sh0, shN), 3 * shN.shape[1], *ctx.degrees,
             frame.ids, frame.count, frame.records, frame.integers, frame.sums, flat(g_means2d),
             *(flat(gradient) for gradient in gradients), frame.scratch,
         )  # fmt: skip
@@ -170,9 +200,10 @@ class _Blend(torch.autograd.Function):
         work = frame.work
         frame.touched = work.array("touched", frame.entries.size + BATCH, np.uint16)
         frame.ends = work.array("ends", frame.tiles, np.int64)
+        behind = flat_checked("background", background.contiguous(), (3,))
         blend(
             frame.threads, frame.records, frame.entries, frame.offsets, frame.group_columns, frame.width, frame.height,
-            flat(background), _GRID, frame.touched, frame.ends, flat(image), flat(transmittance), flat(depth),
+            behind, _GRID, frame.touched, frame.ends, flat(image), flat(transmittance), flat(depth),
             work.rows("blend", frame.threads, FORWARD_SCRATCH), is_on("blocks"), is_on("saturated"),
             np.zeros(1, np.int64),
         )  # fmt: skip
@@ -218,7 +249,13 @@ def render_cpu(
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
 
     See :func:`nsvq_lightning.render` for the meaning of arguments and results.
+
+    Raises:
+        ValueError: The attributes do not fit together, ``sh_degree`` is out of range, or the image is too large.
+        TypeError: An attribute is not float32.
     """
+    if not 0 <= sh_degree <= sh_degree_of(splats.shN):
+        raise ValueError(f"sh_degree must be between 0 and that of shN {list(splats.shN.shape)}, got {sh_degree}")
     attributes = splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN
     frame = _Frame(splats, camera)
     means2d, token, radii = _Project.apply(frame, sh_degree, *attributes)
@@ -227,8 +264,13 @@ def render_cpu(
 
 
 def visible_cpu(splats: SplatTensors, camera: Camera) -> Tensor:
-    """Rows ``[V]`` int64, ascending, of the splats that can change the image."""
-    geometry = tuple(flat(t) for t in (splats.means, splats.quats, splats.scales, splats.opacities))
+    """Rows ``[V]`` int64, ascending, of the splats that can change the image.
+
+    Raises:
+        ValueError: The attributes do not fit together, or the image is too large.
+        TypeError: An attribute is not float32.
+    """
+    geometry = _geometry(splats)
     threads = thread_count()
     found, runs = np.empty(splats.means.shape[0], np.int64), np.empty((threads, 2), np.int64)
     scratch = np.empty((threads, PROJECTION_SCRATCH), np.float32)

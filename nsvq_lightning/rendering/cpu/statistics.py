@@ -6,6 +6,7 @@ import numpy as np
 from numba import prange
 from torch import Tensor
 
+from nsvq_lightning.rendering.cpu.arrays import INT32, flat_checked
 from nsvq_lightning.rendering.cpu.jit import kernel, thread_count
 from nsvq_lightning.rendering.cpu.lanes import get, put
 from nsvq_lightning.rendering.cpu.records import F
@@ -33,7 +34,15 @@ def add_view(sums: Tensor, views: Tensor, gradients: Tensor, radii: Tensor, fact
         gradients: Gradient by the projected centres ``[N, 2]`` float32, per pixel.
         radii: Radius on the screen ``[N]`` int32, 0 for splats that were not seen.
         factors: What the two components count times.
+
+    Raises:
+        ValueError: The tensors are not of the same splats, or one that is read or written in place has gaps.
+        TypeError: A type differs.
     """
-    tensors = (gradients.contiguous().view(-1), radii), (sums, views)
-    inputs, outputs = ([tensor.numpy() for tensor in group] for group in tensors)
+    rows = tuple(radii.shape[:1])
+    inputs = (
+        flat_checked("gradients", gradients.contiguous(), (*rows, 2)),
+        flat_checked("radii", radii, rows, INT32),
+    )
+    outputs = flat_checked("sums", sums, rows), flat_checked("views", views, rows)
     _add(thread_count(), *inputs, F(factors[0]), F(factors[1]), *outputs)

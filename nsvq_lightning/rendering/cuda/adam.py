@@ -15,6 +15,7 @@ import triton.language as tl
 from torch import Tensor
 
 from nsvq_lightning.rendering.cuda.records import COMPILE
+from nsvq_lightning.rendering.cuda.tensors import check_tensor
 
 __all__ = ["adam_update"]
 
@@ -92,8 +93,15 @@ def adam_update(
         columns: Only so many leading numbers of each row; the caller knows that gradient and moments of the others
             are 0, which Adam leaves as they are.
         rows_with_gradient: Leave rows whose gradient is 0 as they are, moments included.
+
+    Raises:
+        ValueError: The tensors differ in shape or device, or one has gaps.
+        TypeError: A type differs.
     """
-    tables = [tensor.detach() for tensor in (weights, gradients, first, second)]
+    given = {"weights": weights, "gradients": gradients, "first": first, "second": second}
+    for name, tensor in given.items():
+        check_tensor(name, tensor, weights.shape, weights.device)
+    tables = [tensor.detach() for tensor in given.values()]
     factors = _factors(step, lr, betas, eps)
     rows, stride = weights.shape[0], math.prod(weights.shape[1:])
 

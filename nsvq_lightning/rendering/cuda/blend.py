@@ -48,6 +48,7 @@ from nsvq_lightning.rendering.cuda.records import (
     X,
     Y,
 )
+from nsvq_lightning.rendering.cuda.tensors import check_tensor
 
 __all__ = ["blend", "blend_backward", "tile_grid"]
 
@@ -206,6 +207,14 @@ def tile_grid(width: int, height: int) -> tuple[int, int]:
     return triton.cdiv(width, TILE.value), triton.cdiv(height, TILE.value)
 
 
+def _check_lists(records: Tensor, tiles: Tiles, count: int) -> None:
+    """Records, and the lists of ``count`` tiles."""
+    visible, pairs, device = len(records), len(tiles.ranks), records.device
+    check_tensor("records", records, (visible, RECORD.value), device)
+    for name, length in (("offsets", count + 1), ("ranks", pairs), ("slots", pairs), ("ends", visible)):
+        check_tensor(f"tiles.{name}", getattr(tiles, name), (length,), device, torch.int32)
+
+
 def blend(lens: Lens, records: Tensor, tiles: Tiles, background: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, transmittance ``[H, W]``, depth ``[H, W]``, and how far each list was gone through.
 
@@ -214,8 +223,14 @@ def blend(lens: Lens, records: Tensor, tiles: Tiles, background: Tensor) -> tupl
         records: Splats front to back ``[V, RECORD]``.
         tiles: Their lists by tile.
         background: RGB ``[3]``.
+
+    Raises:
+        ValueError: The tensors do not fit together.
+        TypeError: A type differs.
     """
     columns, rows = tile_grid(lens.width, lens.height)
+    _check_lists(records, tiles, columns * rows)
+    check_tensor("background", background, (3,), records.device)
     image = records.new_empty(lens.height, lens.width, 3)
     transmittance, depth = (records.new_empty(lens.height, lens.width) for _ in range(2))
     ends = torch.empty(columns * rows, dtype=torch.int32, device=records.device)
@@ -247,8 +262,21 @@ def blend_backward(
         ends: What :func:`blend` returned, as are ``outputs``: image, transmittance and depth.
         outputs: See ``ends``.
         gradients: Of image, alpha and depth, contiguous; None where nothing depends on one.
+
+    Raises:
+        ValueError: The tensors do not fit together.
+        TypeError: A type differs.
     """
     columns, rows = tile_grid(lens.width, lens.height)
+    _check_lists(records, tiles, columns * rows)
+    check_tensor("ids", ids, (len(records),), records.device, torch.int64)
+    check_tensor("ends", ends, (columns * rows,), records.device, torch.int32)
+    size = lens.height, lens.width
+    for name, value, gradient in zip(("image", "alpha", "depth"), outputs, gradients, strict=True):
+        shape = (*size, 3) if name == "image" else size
+        check_tensor(name, value, shape, records.device)
+        if gradient is not None:
+            check_tensor(f"gradient of {name}", gradient, shape, records.device)
     image, transmittance, depth = outputs
     g_image, g_alpha, g_depth = gradients
     totals, g_means2d = torch.zeros_like(records), records.new_zeros(n, 2)

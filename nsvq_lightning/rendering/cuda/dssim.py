@@ -17,8 +17,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nsvq_lightning.losses import SSIM_C1, SSIM_C2, SSIM_RADIUS, ssim_window
+from nsvq_lightning.losses import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
 from nsvq_lightning.rendering.cuda.records import COMPILE
+from nsvq_lightning.rendering.cuda.tensors import check_tensor
 
 __all__ = ["Derivatives", "l1_dssim", "l1_dssim_backward"]
 
@@ -217,6 +218,13 @@ def _grid(image: Tensor) -> tuple[int, int]:
     return triton.cdiv(image.shape[0], ROWS), triton.cdiv(3 * image.shape[1], COLUMNS)
 
 
+def _check_pictures(image: Tensor, target: Tensor) -> None:
+    check_pair(image, target)
+    check_tensor("image", image, image.shape, image.device)
+    kind = torch.uint8 if target.dtype == torch.uint8 else torch.float32
+    check_tensor("target", target, image.shape, image.device, kind)
+
+
 def l1_dssim(
     image: Tensor, target: Tensor, dssim_weight: float, *, derived: bool = True
 ) -> tuple[Tensor, Derivatives | None]:
@@ -227,7 +235,12 @@ def l1_dssim(
         target: Contiguous ``[H, W, 3]`` there, float32 in [0, 1] or uint8.
         dssim_weight: Share of 1 - SSIM.
         derived: Whether :func:`l1_dssim_backward` will follow.
+
+    Raises:
+        ValueError: The pictures differ in shape or device or are not ``[H, W, 3]``, or one has gaps.
+        TypeError: A type differs.
     """
+    _check_pictures(image, target)
     height, width = image.shape[:2]
     length, grid = 3 * width, _grid(image)
     programs = grid[0] * grid[1]
@@ -250,7 +263,14 @@ def l1_dssim_backward(image: Tensor, target: Tensor, derivatives: Derivatives, s
         target: As there.
         derivatives: What it returned.
         scale: float32 scalar on the device.
+
+    Raises:
+        ValueError: As of :func:`l1_dssim`, or the derivatives are those of another picture.
+        TypeError: A type differs.
     """
+    _check_pictures(image, target)
+    check_tensor("derivatives", derivatives.planes, (DERIVATIVES, *image.shape), image.device)
+    check_tensor("scale", scale, (), image.device)
     height, width = image.shape[:2]
     length, grid, count = 3 * width, _grid(image), image.numel()
     weight = derivatives.dssim_weight

@@ -39,6 +39,8 @@ from nsvq_lightning.rendering.cuda.records import (
     X,
     Y,
 )
+from nsvq_lightning.rendering.cuda.tensors import check_tensor
+from nsvq_lightning.splats import ATTRIBUTES, sh_degree_of
 
 __all__ = ["Lens", "Projected", "project", "project_backward", "project_radii"]
 
@@ -398,10 +400,25 @@ class Projected(NamedTuple):
     boxes: Tensor
 
 
+def _check_attributes(lens: Lens, attributes: tuple[Tensor, ...]) -> None:
+    n, device, coefficients = len(attributes[0]), attributes[0].device, attributes[-1].shape[1]
+    check_tensor("lens.view", lens.view, (15,), device)
+    shapes = (n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, coefficients, 3)
+    for name, attribute, shape in zip(ATTRIBUTES, attributes, shapes, strict=True):
+        check_tensor(name, attribute, shape, device)
+
+
+def _check_degree(degree: int, attributes: tuple[Tensor, ...]) -> None:
+    stored = sh_degree_of(attributes[-1])
+    if not 0 <= degree <= stored:
+        raise ValueError(f"the degree must be between 0 and the stored one, {stored}, got {degree}")
+
+
 def _launch_projection(
     lens: Lens, attributes: tuple[Tensor, ...], degree: int, records: Tensor, boxes: Tensor, means2d: Tensor
 ) -> Tensor:
     n, shN = attributes[0].shape[0], attributes[-1]
+    _check_attributes(lens, attributes)
     radii = torch.zeros(n, dtype=torch.int32, device=shN.device)
     if n:
         project_kernel[(triton.cdiv(n, BLOCK),)](
@@ -412,7 +429,12 @@ def _launch_projection(
 
 
 def project_radii(lens: Lens, attributes: tuple[Tensor, ...]) -> Tensor:
-    """Radii ``[N]`` int32 of all splats, 0 where not in view; the colours in ``attributes`` are not read."""
+    """Radii ``[N]`` int32 of all splats, 0 where not in view; the colours in ``attributes`` are not read.
+
+    Raises:
+        ValueError: The tensors do not fit together.
+        TypeError: A type differs.
+    """
     unused = attributes[0]
     return _launch_projection(lens, attributes, RADIUS_ONLY, unused, unused, unused)
 
@@ -424,7 +446,12 @@ def project(lens: Lens, attributes: tuple[Tensor, ...], degree: int) -> Projecte
         lens: Where to look from.
         attributes: The six raw attributes, contiguous float32, in the order of :class:`~nsvq_lightning.RawSplats`.
         degree: Highest degree of the spherical harmonics that is evaluated.
+
+    Raises:
+        ValueError: The tensors do not fit together, or the degree is above the stored one.
+        TypeError: A type differs.
     """
+    _check_degree(degree, attributes)
     means = attributes[0]
     n = means.shape[0]
     records = means.new_empty(n, RECORD.value)
@@ -455,7 +482,18 @@ def project_backward(
         records: Their records ``[V, RECORD]``.
         totals: Their summed moments ``[V, RECORD]``.
         g_means2d: Gradient of the projected centres ``[N, 2]``.
+
+    Raises:
+        ValueError: The tensors do not fit together, or the degree is above the stored one.
+        TypeError: A type differs.
     """
+    _check_degree(degree, attributes)
+    _check_attributes(lens, attributes)
+    device = attributes[0].device
+    check_tensor("ids", ids, (len(ids),), device, torch.int64)
+    check_tensor("records", records, (len(ids), RECORD.value), device)
+    check_tensor("totals", totals, (len(ids), RECORD.value), device)
+    check_tensor("g_means2d", g_means2d, (len(attributes[0]), 2), device)
     gradients = [torch.zeros_like(attribute) for attribute in attributes]
     means, quats, scales, logits, _, shN = attributes
     count = ids.shape[0]

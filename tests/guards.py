@@ -1,0 +1,116 @@
+"""Guard words: every array that a kernel is called with lies between words that it must leave alone.
+
+Compiled code looks at no bounds, so a write past the end of an array changes whatever lies there, and shows iterations
+later or never. With :func:`guarded` a kernel works on copies of its arrays, each in the middle of a block of its own,
+and the words around them are looked at after every call: whoever allocated the arrays (a workspace, ``recycled``, an
+entry point), and however much longer they are than what is passed on. What a kernel reads past an end are guard words,
+too, not the neighbour that happens to lie there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba.core.registry import CPUDispatcher
+from numpy.lib.array_utils import byte_bounds
+
+__all__ = ["GuardError", "guarded"]
+
+GUARD = 4096
+"""Bytes before and after each array."""
+WORD = 0xA5
+
+
+class GuardError(AssertionError):
+    """A kernel has written beside its arrays."""
+
+
+class _Block(NamedTuple):
+    """Memory from ``low`` to ``high``, copied into ``data`` between guard words."""
+
+    low: int
+    high: int
+    data: np.ndarray[Any, np.dtype[np.uint8]]
+
+    @property
+    def is_intact(self) -> bool:
+        return bool((self.data[:GUARD] == WORD).all() and (self.data[GUARD + self.high - self.low :] == WORD).all())
+
+
+@contextmanager
+def guarded() -> Iterator[None]:
+    """Check guard words after every call of a kernel from Python, in the body of a ``with`` statement.
+
+    Raises:
+        GuardError: A kernel has written beside its arrays; it names kernel and argument.
+    """
+    before = CPUDispatcher.__call__
+    CPUDispatcher.__call__ = lambda kernel, *arguments: _call(before, kernel, arguments)
+    try:
+        yield
+    finally:
+        CPUDispatcher.__call__ = before
+
+
+def _call(call: Callable[..., Any], kernel: Any, arguments: tuple[Any, ...]) -> Any:
+    arrays = list(_arrays(arguments))
+    blocks = _blocks(arrays)
+    copies = {id(array): _copy(array, blocks) for array in arrays}
+    result = call(kernel, *_replaced(arguments, copies))
+    for number, array in enumerate(arrays):
+        if not _block_of(array, blocks).is_intact:
+            raise GuardError(f"{kernel.py_func.__module__}.{kernel.__name__} has written beside array {number}")
+        if array.flags.writeable:
+            np.copyto(array, copies[id(array)])
+    return result
+
+
+def _arrays(value: Any) -> Iterator[Any]:
+    """All arrays in arguments, which may be in tuples."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif isinstance(value, tuple):
+        for part in value:
+            yield from _arrays(part)
+
+
+def _replaced(value: Any, copies: dict[int, Any]) -> Any:
+    if isinstance(value, np.ndarray):
+        return copies[id(value)]
+    if isinstance(value, tuple):
+        parts = (_replaced(part, copies) for part in value)
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    return value
+
+
+def _blocks(arrays: list[Any]) -> list[_Block]:
+    """A block for each array; one for those that share memory, such as records as floats and as integers."""
+    spans: list[list[int]] = []
+    for low, high in sorted(byte_bounds(array) for array in arrays if array.size):
+        if spans and low < spans[-1][1]:
+            spans[-1][1] = max(spans[-1][1], high)
+        else:
+            spans.append([low, high])
+    blocks = [_Block(low, high, np.full(high - low + 2 * GUARD, WORD, np.uint8)) for low, high in spans]
+    return [*blocks, _Block(0, 0, np.full(2 * GUARD, WORD, np.uint8))]
+
+
+def _block_of(array: Any, blocks: list[_Block]) -> _Block:
+    """The block of an array; that of no bytes for an empty one."""
+    if array.size == 0:
+        return blocks[-1]
+    low, _ = byte_bounds(array)
+    return next(block for block in blocks if block.low <= low < block.high)
+
+
+def _copy(array: Any, blocks: list[_Block]) -> Any:
+    """The array in its block, as the compiler sees it: with the same strides, and read-only if it is."""
+    block = _block_of(array, blocks)
+    place = GUARD + (array.__array_interface__["data"][0] - block.low if array.size else 0)
+    copy = np.ndarray(array.shape, array.dtype, block.data.data, place, array.strides)
+    np.copyto(copy, array)
+    copy.flags.writeable = array.flags.writeable
+    return copy
