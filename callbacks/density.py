@@ -12,7 +12,15 @@ from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 
 from nsvq_lightning.edit import append_rows, keep_rows, replace_attribute, reset_moments
-from nsvq_lightning.host import SplatHost, as_host, next_iteration, raw_optimizer, sum_over_processes
+from nsvq_lightning.host import (
+    SplatHost,
+    as_host,
+    next_iteration,
+    raw_optimizer,
+    sum_over_processes,
+    train_contributions,
+)
+from nsvq_lightning.importance import most_contributing
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.replicas import check_replicas
@@ -52,8 +60,8 @@ class DensityControl(LatchedCallback):
 
     Args:
         rules: All numbers.
-        max_splats: Never grow beyond this many; those with the largest statistic go first. None for no limit, as in the
-            paper.
+        max_splats: Never more than this many. Where the scene starts with more, those that contribute most to the train
+            views stay; while it grows, those with the largest statistic go first. None for no limit, as in the paper.
         finite_every: Iterations between two searches for non-finite splats; a step whose loss is not finite always
             causes one.
 
@@ -92,6 +100,25 @@ class DensityControl(LatchedCallback):
                 "clone it crashes or silently stops averaging. Train with --trainer.strategy=view_parallel, or on one "
                 "device (--trainer.devices=1)"
             )
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Remove splats where there are more than ``max_splats`` already.
+
+        Raises:
+            ValueError: There are, and the trainer has no data module whose views could tell which ones matter.
+        """
+        super().on_train_start(trainer, pl_module)
+        host = as_host(pl_module)
+        count = len(host.splats)
+        if self.max_splats is None or count <= self.max_splats:
+            return
+        if host.phase > Phase.PRUNE:
+            log.warning("max_splats=%d comes too late for %d splats with codebooks; all stay", self.max_splats, count)
+            return
+        kept = most_contributing(train_contributions(trainer, host), self.max_splats)
+        keep_rows(host.splats, raw_optimizer(trainer), kept)
+        check_replicas(trainer, "the limit of splats")
+        log.info("kept %d of %d splats, those that contribute most to the train views", self.max_splats, count)
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         """Ask for screen-space gradients while they are needed."""

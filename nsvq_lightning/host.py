@@ -51,8 +51,8 @@ class SplatHost(Protocol):
       the attribute, and for each codebook, named ``codebook_<attribute>``: :func:`nsvq_lightning.optim.param_groups`
       makes them;
     * a ``training_step`` that returns a dictionary with ``loss`` and, for density control, the ``render`` of the
-      splats, whose ``means2d`` retains its gradient while ``wants_screen_gradients`` is set; None where the step is
-      not to update anything;
+      splats, whose ``means2d`` retains its gradient while ``wants_screen_gradients`` is set, and ``edits``, the
+      ``splats.edits`` when they were rendered; None where the step is not to update anything;
     * for reports, test and validation steps that return a dictionary with ``image``, ``psnr`` and ``ssim`` of a view.
 
     Callbacks check members and groups before the first iteration (:func:`splat_host`, :func:`check_optimizer`).

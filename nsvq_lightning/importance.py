@@ -12,7 +12,7 @@ from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.sh import C0
 from nsvq_lightning.splats import RawSplats, SplatTensors
 
-__all__ = ["contributions", "least_contributing", "row_weights"]
+__all__ = ["contributions", "least_contributing", "most_contributing", "row_weights"]
 
 
 def contributions(
@@ -52,6 +52,18 @@ def least_contributing(contribution: Tensor, share: float) -> Tensor:
     ascending, order = contribution.double().sort(stable=True)
     mask = torch.empty_like(order, dtype=torch.bool)
     mask[order] = ascending.cumsum(0) <= share * ascending.sum()
+    return mask
+
+
+def most_contributing(contribution: Tensor, count: int) -> Tensor:
+    """Mask ``[N]`` of the ``count`` splats that contribute most; of equals the first.
+
+    Args:
+        contribution: Contribution ``[N]``.
+        count: How many, at most N.
+    """
+    mask = torch.zeros_like(contribution, dtype=torch.bool)
+    mask[contribution.argsort(descending=True, stable=True)[:count]] = True
     return mask
 
 

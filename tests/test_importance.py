@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nsvq_lightning.importance import contributions, least_contributing, row_weights
+from nsvq_lightning.importance import contributions, least_contributing, most_contributing, row_weights
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, render
 from nsvq_lightning.rendering.sh import C0
@@ -60,3 +60,10 @@ def test_the_least_contributing_go() -> None:
 def test_weights_are_never_zero() -> None:
     torch.testing.assert_close(row_weights(torch.tensor([0.0, 200.0])), torch.tensor([1.0, 201.0]))
     assert (row_weights(torch.zeros(3)) > 0).all()
+
+
+def test_the_most_contributing_are_kept_and_of_equals_the_first() -> None:
+    contribution = torch.tensor([0.0, 3.0, 1.0, 3.0, 1.0, 2.0])
+    assert most_contributing(contribution, 2).nonzero()[:, 0].tolist() == [1, 3]
+    assert most_contributing(contribution, 4).nonzero()[:, 0].tolist() == [1, 2, 3, 5]
+    assert most_contributing(contribution, 6).all()

@@ -1,0 +1,56 @@
+"""``max_splats`` is a limit: of the scene that training starts with, and of what grows from it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from conftest import Recipe, RunFactory
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from nsvq_lightning.callbacks import DensityControl, DensityRules
+from nsvq_lightning.host import as_host, train_contributions
+from nsvq_lightning.module import SplatModule
+
+
+class Counts(Callback):
+    """The number of splats in each iteration, and what the first ones contribute."""
+
+    def __init__(self) -> None:
+        self.seen: list[int] = []
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        self.seen.append(len(as_host(pl_module).splats))
+
+
+def limited(most: int | None) -> DensityControl:
+    return DensityControl(DensityRules(grad_threshold=5e-6), max_splats=most)
+
+
+@pytest.mark.parametrize("most", [100, 400])
+def test_no_iteration_has_more(run: RunFactory, recipe: Recipe, most: int) -> None:
+    counts = Counts()
+    _, module = run([*recipe(density=limited(most)).values(), counts])
+    assert counts.seen[0] == most  # the scene has 500 points
+    assert max(counts.seen) == most
+    assert len(module.splats) <= most
+
+
+def test_what_stays_is_what_the_photos_see(run: RunFactory, recipe: Recipe) -> None:
+    trainer, everything = run(recipe(density=limited(None)).values(), max_steps=1, module={"rates": {"means": 1e-12}})
+    contribution = train_contributions(trainer, everything)
+    expected = everything.splats.means[contribution.argsort(descending=True)[:50]]
+    _, few = run(recipe(density=limited(50)).values(), max_steps=1, module={"rates": {"means": 1e-12}})
+    same = (few.splats.means[:, None] - expected[None]).abs().amax(2).amin(1) < 1e-4
+    assert same.sum() > 45  # one step of the other attributes has moved the order a little
+
+
+def test_the_limit_comes_too_late_for_codebooks(
+    run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
+) -> None:
+    trainer, module = run(recipe().values())
+    assert isinstance(module, SplatModule)
+    count = len(module.splats)
+    limited(20).on_train_start(trainer, module)
+    assert len(module.splats) == count
+    assert f"max_splats=20 comes too late for {count} splats" in caplog.text
