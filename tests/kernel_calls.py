@@ -262,6 +262,11 @@ NUMBA: dict[str, list[Case]] = {
         Case(lambda: {"values": _codes().reshape(20, 2)}, rows=("values",), columns=("values",))
     ],
     f"{_IO}.entropy.decode_integers": [Case(_stored_integers)],
+    f"{_IO}.palette.find_palette": [
+        Case(
+            lambda: {"rows": _normal(60, 5), "weight": np.ones(60), "count": 7}, columns=("rows",), types=("weight",)
+        )
+    ],
     f"{_IO}.morton.nearest_before": [Case(lambda: {"cells": _codes(60).reshape(20, 3)}, rows=("cells",))],
 }  # fmt: skip
 

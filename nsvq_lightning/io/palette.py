@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nsvq_lightning.rendering.cpu.arrays import check_array, check_table
 from nsvq_lightning.rendering.cpu.jit import kernel
 
 __all__ = ["find_palette", "in_order_of_use"]
@@ -34,8 +35,14 @@ def find_palette(
 
     Returns:
         The mean of each cell ``[K, D]`` with K at most ``count``, and the cell of each row ``[N]``.
+
+    Raises:
+        TypeError: ``rows`` are not float32.
+        ValueError: They have another shape, or gaps, or there is another number of weights.
     """
+    check_table("rows", rows)
     wide = weight.astype(np.float64)
+    check_array("weight", wide, rows.shape[:1], wide.dtype)
     labels = _labels(rows, wide, count)
     mass = np.bincount(labels, wide)
     sums = (np.bincount(labels, wide * column) for column in rows.T)

@@ -13,6 +13,7 @@ from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 
 from nsvq_lightning.callbacks import DensityControl, DensityRules
 from nsvq_lightning.edit import append_rows, keep_rows
+from nsvq_lightning.module import SplatModule
 from nsvq_lightning.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.rendering.rasterize import Render
@@ -234,7 +235,7 @@ def test_resuming_right_after_an_edit_does_not_repeat_it() -> None:
 
 
 def test_ddp_is_refused_with_the_reason() -> None:
-    control, host = DensityControl(), SimpleNamespace()
+    control, host = DensityControl(), SplatModule(codebooks=None)
     with pytest.raises(ValueError, match=r"silently stops averaging.*strategy=view_parallel"):
         control.setup(SimpleNamespace(strategy=DDPStrategy()), host, "fit")  # type: ignore[arg-type]
     control.setup(SimpleNamespace(strategy=SingleDeviceStrategy()), host, "fit")  # type: ignore[arg-type]
