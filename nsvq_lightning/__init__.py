@@ -6,24 +6,14 @@ The public names are loaded on first use, so that light commands such as ``nsvq 
 from __future__ import annotations
 
 import importlib
-import os
 from typing import TYPE_CHECKING, Any
 
+from nsvq_lightning.environment import set_defaults
 from nsvq_lightning.top_level import find_callbacks
 
 __version__ = "0.1.0"
 
-_ENVIRONMENT = {
-    # Waiting OpenMP threads otherwise spin: as soon as anything else runs on the machine, the threads that have work
-    # wait for those that only spin, and a step takes several times as long.
-    "OMP_WAIT_POLICY": "passive",
-    # Large tensors in large pages: a step of 100k splats takes 3 % less time, one of 500k splats 4 %.
-    "THP_MEM_ALLOC_ENABLE": "1",
-}
-"""What torch and OpenMP read when they are loaded, so import this package before torch; what the user has set stays."""
-
-for _name, _value in _ENVIRONMENT.items():
-    os.environ.setdefault(_name, _value)
+set_defaults()  # before anything imports torch
 
 _HOME = {
     "Camera": "nsvq_lightning.rendering.camera",

@@ -35,6 +35,10 @@ NOT_ACTIONABLE = (
 """Parts of warnings of Lightning and torch that a user of this command can do nothing about."""
 
 
+NOT_OURS = ("Tip:", "TPU available", "HPU available", "litlogger", "litmodels", "`Trainer.fit` stopped")
+"""Parts of what Lightning says that advertise, or say what the bar has said already, in the middle of its line."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``nsvq ARGUMENTS``.
 
@@ -134,7 +138,7 @@ def _quiet_lightning() -> None:
 
     def keep(record: logging.LogRecord) -> bool:
         text = record.getMessage()
-        return not any(part in text for part in ("Tip:", "TPU available", "HPU available", "litlogger", "litmodels"))
+        return not any(part in text for part in NOT_OURS)
 
     for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
         logging.getLogger(name).addFilter(keep)

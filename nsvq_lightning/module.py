@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
@@ -14,6 +15,7 @@ from torchmetrics import Metric
 from nsvq_lightning.branch import branch_checkpoint, can_branch, check_continuation
 from nsvq_lightning.data.scene import ONE_PLACE, View
 from nsvq_lightning.edit import finite_splats
+from nsvq_lightning.environment import threads_spin
 from nsvq_lightning.host import log_interval
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.precision import Storage
@@ -149,12 +151,18 @@ class SplatModule(SplatModel):
         check_continuation(checkpoint, self)
 
     def on_fit_start(self) -> None:
-        """Say so where the splats are trained on a GPU."""
+        """Say what the user should know of this device."""
         if self.device.type == "cuda":
             log.warning(
                 "training on %s with kernels that are tested under Triton's interpreter, but have never run on a GPU: "
                 "--trainer.accelerator=cpu trains without them, and docs/backends.md says more",
                 torch.cuda.get_device_name(self.device),
+            )
+
+        elif threads_spin() and torch.get_num_threads() > 1 and hasattr(os, "getloadavg") and os.getloadavg()[0] > 1.0:
+            log.warning(
+                "other processes need the cores, too, and waiting threads will hold them: a run may take twice as long. "
+                "Import nsvq_lightning before torch, or set OMP_WAIT_POLICY=passive"
             )
 
     def on_train_start(self) -> None:
