@@ -9,7 +9,7 @@ from typing import Any
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.pictures import file_stem, write_png
-from nsvq_lightning.run_folder import run_folder
+from nsvq_lightning.run_folder import is_trial, run_folder
 
 __all__ = ["RenderWriter"]
 
@@ -39,7 +39,8 @@ class RenderWriter(Callback):
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Make the folder, while all processes are together: some have fewer views than others."""
         self._target = run_folder(trainer) / "predictions" if self.folder is None else Path(self.folder)
-        self._target.mkdir(parents=True, exist_ok=True)
+        if not is_trial(trainer):
+            self._target.mkdir(parents=True, exist_ok=True)
 
     def on_predict_batch_end(
         self,
@@ -51,8 +52,11 @@ class RenderWriter(Callback):
         dataloader_idx: int = 0,
     ) -> None:
         """Write one picture."""
+        if is_trial(trainer):
+            return
         write_png(self._target / f"{file_stem(outputs['name'])}.png", outputs["image"])
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Say where the pictures are."""
-        log.info("rendered views are in %s", self._target)
+        if not is_trial(trainer):
+            log.info("rendered views are in %s", self._target)

@@ -149,7 +149,10 @@ class MetricReport(WritingCallback):
     # In test
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write the file, read it back, and let the module test what was read."""
+        """Write the file, read it back, and let the module test what was read; a trial tests what is in memory."""
+        self._scene, self._scores = None, []
+        if is_trial(trainer):
+            return
         host = as_host(pl_module)
         # Here all processes are together; some have fewer views than others.
         self._folder = run_folder(trainer)
@@ -163,7 +166,6 @@ class MetricReport(WritingCallback):
         # Detached tensors, not the module: as a submodule it would enter checkpoints.
         decoded = self._scene.decode().to(host.device).raw()
         host.evaluation_splats = RawSplats(*(tensor.detach() for tensor in decoded))
-        self._scores = []
         self._lpips, self._lpips_reason = build_lpips() if self.lpips else (None, "switched off")
         if self._lpips is not None:
             self._lpips.to(host.device)
@@ -178,6 +180,8 @@ class MetricReport(WritingCallback):
         dataloader_idx: int = 0,
     ) -> None:
         """Keep the scores of one view and write its picture."""
+        if self._scene is None:
+            return
         image, photo = outputs["image"], eight_bit(batch.image)
         score = ViewScore(batch.name, float(outputs["psnr"]), float(outputs["ssim"]))
         self._scores.append(replace(score, lpips=self._lpips_of(image, photo)))
@@ -193,11 +197,11 @@ class MetricReport(WritingCallback):
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write the numbers."""
+        if self._scene is None:
+            return
         host = as_host(pl_module)
         scores = _gathered(trainer, self._scores)
-        if self._scene is None or not scores:
-            return
-        if trainer.is_global_zero:
+        if trainer.is_global_zero and scores:
             folder = self._folder
             lpips = (None, self._lpips_reason) if self._lpips is None else (_mean(scores, "lpips"), None)
             metrics = summarize(folder / "scene.nsvq", self._scene, scores, lpips, host, self._paper_level)

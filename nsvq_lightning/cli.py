@@ -34,7 +34,6 @@ NOT_ACTIONABLE = (
 )
 """Parts of warnings of Lightning and torch that a user of this command can do nothing about."""
 
-
 NOT_OURS = ("Tip:", "TPU available", "HPU available", "litlogger", "litmodels", "`Trainer.fit` stopped")
 """Parts of what Lightning says that advertise, or say what the bar has said already, in the middle of its line."""
 
@@ -78,7 +77,8 @@ def _run_lightning(arguments: list[str]) -> int:
     from nsvq_lightning.lightning_cli import SplatCLI
 
     _quiet_lightning()
-    sys.path.append(os.getcwd())  # as `python -m` does, but last: quantizers and callbacks of one's own
+    if os.getcwd() not in sys.path:  # last, unlike `python -m`: for quantizers and callbacks of one's own
+        sys.path.append(os.getcwd())
     configs = _config_values(arguments)
     try:
         for config in configs:

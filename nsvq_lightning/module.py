@@ -161,8 +161,8 @@ class SplatModule(SplatModel):
 
         elif threads_spin() and torch.get_num_threads() > 1 and hasattr(os, "getloadavg") and os.getloadavg()[0] > 1.0:
             log.warning(
-                "other processes need the cores, too, and waiting threads will hold them: a run may take twice as long. "
-                "Import nsvq_lightning before torch, or set OMP_WAIT_POLICY=passive"
+                "other processes need the cores, too, and waiting threads hold them: a run may take twice as long; "
+                "import nsvq_lightning before torch, or set OMP_WAIT_POLICY=passive"
             )
 
     def on_train_start(self) -> None:

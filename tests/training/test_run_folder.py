@@ -11,8 +11,9 @@ from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import CSVLogger, Logger
 
 from nsvq_lightning.benchmark.fitting import quiet_trainer
-from nsvq_lightning.callbacks import ExportScene, MetricReport, PhaseSchedule, RunCheckpoint
+from nsvq_lightning.callbacks import ExportScene, MetricReport, PhaseSchedule, RenderWriter, RunCheckpoint
 from nsvq_lightning.cli import main
+from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.run_folder import claim_version, run_folder
 
 
@@ -79,8 +80,13 @@ def test_what_callbacks_were_told_to_write_elsewhere_is_not_overwritten_either(r
     assert contents(tmp_path / "kept") == before
 
 
-def test_a_trial_leaves_no_folder(run: RunFactory, tmp_path: Path) -> None:
-    run(callbacks(), default_root_dir=tmp_path / "runs", fast_dev_run=True)
+def test_a_trial_leaves_no_folder(run: RunFactory, tmp_path: Path, demo_scene: Path) -> None:
+    everything = [*callbacks(), RenderWriter()]
+    trainer, module = run(everything, default_root_dir=tmp_path / "runs", fast_dev_run=True)
+    data = ColmapDataModule(str(demo_scene), factor=2)
+    (scores,) = trainer.test(module, datamodule=data, verbose=False)
+    assert scores["test/psnr"] > 5
+    trainer.predict(module, datamodule=data)
     assert not (tmp_path / "runs").exists()
 
 
