@@ -12,8 +12,10 @@ import torch
 from nsvq_lightning.callbacks import CodebookReplacement, OpacityRegularization, PhaseSchedule, ShDegreeSchedule
 from nsvq_lightning.callbacks.codebooks import perplexity
 from nsvq_lightning.callbacks.latch import StepLatch
+from nsvq_lightning.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.schedule import Phase, Schedule
+from nsvq_lightning.splats import Splats
 
 
 def host(**values: Any) -> Any:
@@ -134,6 +136,7 @@ def test_usage_of_several_processes_is_saved_and_resumed_once(rank: int) -> None
         world_size=2,
         is_global_zero=rank == 0,
         strategy=SimpleNamespace(reduce=lambda tensor, reduce_op: tensor.mul_(2)),
+        optimizers=[build_adam(param_groups(Splats(), {"scales": quantizer}, LearningRates(), 1.0))],
     )
     quantizer.usage.copy_(torch.tensor([3, 0, 1, 0]))
     quantizer.window.fill_(5)
