@@ -99,12 +99,12 @@ class MetricReport(WritingCallback):
         folder = run_folder(trainer)
         if trainer.is_global_zero and host.history and not is_trial(trainer):
             with host.stopwatch.paused(host.device):
+                write_curve_csv(folder / "curve.csv", host.history)
                 write_curve(folder / "curve.png", host.history, host.schedule)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Evaluate the end of a run that was stopped after its last iteration: continued, it trains no more."""
-        history = as_host(pl_module).history
-        if trainer.global_step and (not history or history[-1]["iteration"] < trainer.global_step):
+        """Make up for what a run that was stopped after its last iteration has missed: continued, it trains no more."""
+        if trainer.global_step and not (run_folder(trainer) / "curve.png").exists():
             self.on_train_end(trainer, pl_module)
 
     def _evaluate_once(self, trainer: Trainer, module: LightningModule, iteration: int) -> None:

@@ -246,17 +246,19 @@ def test_a_signal_in_the_last_evaluation_waits_for_the_last_checkpoint(
     assert_same(read(path), read(last))
 
 
+@pytest.mark.parametrize("hook", ["on_train_epoch_end", "on_train_end"])
 def test_a_run_that_broke_in_its_last_evaluation_makes_up_for_it(
-    run: RunFactory, recipe: Recipe, whole: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+    run: RunFactory, recipe: Recipe, whole: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch, hook: str
 ) -> None:
-    runner = Runner(run, recipe, "defaults")
+    runner, start = Runner(run, recipe, "defaults"), shortly_before(whole("defaults"), 60)
     with monkeypatch.context() as patch:
-        patch.setattr(MetricReport, "on_train_end", lambda *_: fail())
-        path = runner.stopped(Broken, Callback(), start=shortly_before(whole("defaults"), 60))
+        patch.setattr(MetricReport, hook, lambda *_: fail())
+        path = runner.stopped(Broken, Callback(), start=start)
     assert iteration_of(path) == 60
     folder = runner.continued(path)
     assert (folder / "scene.nsvq").read_bytes() == (whole("defaults") / "scene.nsvq").read_bytes()
     assert [line.split(",")[0] for line in (folder / "curve.csv").read_text().splitlines()[1:]][-1] == "60"
+    assert (folder / "curve.png").exists()
 
 
 def test_a_checkpoint_that_cannot_be_written_hides_no_error_and_harms_no_other(
