@@ -30,9 +30,16 @@ def ctrl_c() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+WHOLE_RUNS = {"benchmark", "sweep", "training"}
+"""Folders whose tests train: ``training/test_guarded_run.py`` does so for all of them between guard words."""
+
+
 @pytest.fixture(autouse=True)
-def guard_words() -> Iterator[None]:
-    """In every test kernels work between guard words; where they are timed, they are not."""
+def guard_words(request: pytest.FixtureRequest) -> Iterator[None]:
+    """In every test of kernels and what calls them, kernels work between guard words."""
+    if request.path.parent.name in WHOLE_RUNS:
+        yield
+        return
     with guarded():
         yield
 
