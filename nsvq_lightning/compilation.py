@@ -44,7 +44,7 @@ class _Clock(event.Listener):  # type: ignore[misc]  # Numba has no types
         self._since = time.perf_counter()
         if not self._announced:
             self._announced = True
-            log.info("compiling kernels, once on this machine: up to two minutes in all, as they are needed")
+            log.info("compiling kernels, once on this machine: one to three minutes in all, as they are needed")
         for watcher in self.watchers:
             watcher(True)
 
