@@ -158,7 +158,6 @@ class SplatModule(SplatModel):
                 "--trainer.accelerator=cpu trains without them, and docs/backends.md says more",
                 torch.cuda.get_device_name(self.device),
             )
-
         elif threads_spin() and torch.get_num_threads() > 1 and hasattr(os, "getloadavg") and os.getloadavg()[0] > 1.0:
             log.warning(
                 "other processes need the cores, too, and waiting threads hold them: a run may take twice as long; "
