@@ -10,7 +10,7 @@ import torch
 
 from nsvq_lightning.benchmark.machine import describe_machine
 from nsvq_lightning.doctor.finding import Finding, good, note
-from nsvq_lightning.rendering.cpu import lanes  # this way this file is not taken for one with kernels
+from nsvq_lightning.rendering.cpu import lanes
 from nsvq_lightning.rendering.rasterize import fast_backends
 
 __all__ = ["check_backends", "check_extras", "usable_backends"]

@@ -15,7 +15,7 @@ import torch
 from nsvq_lightning.benchmark.machine import describe_machine
 from nsvq_lightning.benchmark.settings import usable_cores
 from nsvq_lightning.doctor.finding import Finding, good, note, problem
-from nsvq_lightning.rendering.cpu import jit  # this way this file is not taken for one with kernels
+from nsvq_lightning.rendering.cpu.jit import thread_count
 
 __all__ = [
     "available_memory",
@@ -72,7 +72,7 @@ def check_opencv() -> Iterator[Finding]:
 
 def check_threads() -> Iterator[Finding]:
     """Whether the kernels use all cores, and do not wait for each other by spinning."""
-    cores, used = usable_cores(), jit.thread_count()
+    cores, used = usable_cores(), thread_count()
     torchs, numbas = torch.get_num_threads(), int(numba.config.NUMBA_NUM_THREADS)
     values = {"cores": cores, "torch": torchs, "numba": numbas, "used": used}
     counts = f"{used} used of {cores} cores (torch {torchs}, numba {numbas})"

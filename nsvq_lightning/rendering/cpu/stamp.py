@@ -1,0 +1,192 @@
+"""Whether a stored kernel is still the one that its source says.
+
+Numba keeps a compiled kernel until the file with its source changes. That is too late, since a kernel contains the code
+of its helpers and the constants of other modules, and too early, since a comment changes nothing. The digest covers
+what a kernel is compiled from: its code, and whatever that names, through any number of modules.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import inspect
+import sys
+from collections.abc import Iterable
+from types import BuiltinFunctionType, CodeType, FunctionType, MethodDescriptorType, ModuleType
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.dispatcher import Dispatcher
+from numba.extending import lower_builtin
+
+__all__ = ["KernelStore", "digest"]
+
+LIBRARIES = frozenset({"llvmlite", "numba", "numpy", "torch", *sys.stdlib_module_names})
+"""Not looked into: what a kernel depends on there is Numba's version, which its own stamp has."""
+
+
+class _Layout(CompileResultCacheImpl):
+    """Names files after the kernel alone; Numba's own names move with its line number."""
+
+    def get_filename_base(self, fullname: str, abiflags: str) -> str:
+        kept = fullname.replace("<", "").replace(">", "")
+        return f"{kept}.py{sys.version_info[0]}{sys.version_info[1]}{abiflags}"
+
+
+class KernelStore(FunctionCache):
+    """Numba's store of one kernel on the disk, stale when :func:`digest` says so."""
+
+    _impl_class = _Layout
+
+    def _load_overload(self, sig: Any, target_context: Any) -> Any:
+        # Not earlier: a kernel may name helpers that its module defines after it.
+        self._cache_file._source_stamp = digest(_Template(self._py_func))
+        return super()._load_overload(sig, target_context)
+
+    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
+        # Kernels that a function makes differ in what they close over, and share a file.
+        return sig, codegen.magic_tuple(), digest(_cells(self._py_func))
+
+
+class _Template:
+    """A function without the values that it closes over."""
+
+    def __init__(self, function: FunctionType) -> None:
+        self.function = function
+
+
+def digest(thing: Any) -> str:
+    """SHA-256 of what a kernel, a helper or a value that they name consists of: code, constants and options.
+
+    Not of what does not enter the compiled code: names of arguments, line numbers, comments, docstrings, annotations.
+
+    Raises:
+        TypeError: The thing, or one that it leads to, is of a kind that no kernel can name.
+    """
+    found = hashlib.sha256()
+    _Walk(found).add(thing)
+    return found.hexdigest()
+
+
+class _Walk:
+    """Feeds a digest with everything that a thing leads to, each once."""
+
+    def __init__(self, found: Any) -> None:
+        self._found = found
+        self._seen: dict[int, int] = {}
+        self._kept: list[Any] = []  # so that no number in the former is given to another thing
+
+    def add(self, thing: Any) -> None:
+        if isinstance(thing, type(None) | type(...) | bool | int | float | complex | str | bytes):
+            self._say(type(thing).__name__, repr(thing))
+            return
+        if isinstance(thing, tuple | list):
+            self._say(type(thing).__name__, len(thing))
+            self._each(thing)
+            return
+        if id(thing) in self._seen:
+            self._say("again", self._seen[id(thing)])
+            return
+        self._seen[id(thing)] = len(self._seen)
+        self._kept.append(thing)
+        self._open(thing)
+
+    def _open(self, thing: Any) -> None:
+        if isinstance(thing, set | frozenset):
+            self._say("set", *sorted(map(digest, thing)))
+        elif isinstance(thing, dict):
+            self._say("dict", len(thing))
+            self._each(thing.items())
+        elif isinstance(thing, np.ndarray | np.generic):
+            self._say("array", thing.dtype, thing.shape)
+            self._found.update(thing.tobytes())
+        elif isinstance(thing, Dispatcher):
+            self._say("kernel")
+            self._each((thing.targetoptions, thing.py_func))
+        elif isinstance(thing, _Template):
+            self._function(thing.function)
+        elif isinstance(thing, types.Type | ir.Type | ir.Value | np.dtype):
+            self._say(type(thing).__name__, thing)
+        elif isinstance(thing, ModuleType) or _is_foreign(thing):
+            # What is used of a module of our own is added where the code that names it is.
+            self._say(getattr(thing, "__module__", ""), getattr(thing, "__qualname__", getattr(thing, "__name__", "")))
+        elif isinstance(thing, FunctionType):
+            self._function(thing)
+            self._each(_cells(thing))
+        elif isinstance(thing, CodeType):
+            self._code(thing, None)
+        elif isinstance(thing, type):
+            self._say("class", thing.__qualname__)
+            self._each(thing.__bases__)
+            self._each(item for item in vars(thing).items() if not item[0].startswith("__"))
+        elif hasattr(thing, "_defn"):  # an intrinsic
+            self.add(thing._defn)
+        elif isinstance(thing, property | staticmethod | classmethod | functools.partial):
+            self._each(getattr(thing, part, None) for part in ("fget", "__func__", "func", "args", "keywords"))
+        else:
+            raise TypeError(f"a kernel names {thing!r}; of a {type(thing).__name__} it cannot be told when it changes")
+
+    def _function(self, function: FunctionType) -> None:
+        self._say("function", function.__qualname__)
+        self._each((function.__defaults__, function.__kwdefaults__))
+        self._code(function.__code__, function.__doc__)
+        names = _names(function.__code__)
+        for name in sorted(names & function.__globals__.keys()):
+            value = function.__globals__[name]
+            self.add(name)
+            self.add(value)
+            if isinstance(value, ModuleType) and not _is_library(value.__name__):
+                self._each(vars(value)[part] for part in sorted(names & vars(value).keys()))
+        if any(value is lower_builtin for value in function.__globals__.values()):
+            # It says what operators mean, and no code that uses them names it.
+            self._say("operators", _source(function.__module__))
+
+    def _code(self, code: CodeType, doc: str | None) -> None:
+        constants = code.co_consts
+        if doc is not None and constants and constants[0] == doc:
+            constants = constants[1:]
+        self._say("code", code.co_code.hex(), code.co_names, code.co_argcount, code.co_flags & 0xFF)
+        self._each(constants)
+
+    def _each(self, things: Iterable[Any]) -> None:
+        for thing in things:
+            self.add(thing)
+
+    def _say(self, *words: Any) -> None:
+        self._found.update("\0".join(map(str, words)).encode() + b"\n")
+
+
+def _cells(function: FunctionType) -> tuple[Any, ...]:
+    return tuple(cell.cell_contents for cell in function.__closure__ or ())
+
+
+def _names(code: CodeType) -> set[str]:
+    """All names in a function's code and in those that it holds."""
+    held = (_names(constant) for constant in code.co_consts if isinstance(constant, CodeType))
+    return set(code.co_names).union(*held)
+
+
+def _is_library(module: str) -> bool:
+    return module.partition(".")[0] in LIBRARIES
+
+
+def _is_foreign(thing: Any) -> bool:
+    """Whether a thing is a library's, or Python's own."""
+    module = getattr(thing, "__module__", None)
+    if isinstance(thing, BuiltinFunctionType | MethodDescriptorType | np.ufunc):
+        return True
+    return isinstance(module, str) and isinstance(thing, type | FunctionType) and _is_library(module)
+
+
+@functools.cache
+def _source(module: str) -> str:
+    """Digest of a module's statements, without comments and docstrings."""
+    tree = ast.parse(inspect.getsource(sys.modules[module]))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
+            del node.body[0]
+    return digest(ast.dump(tree))
