@@ -1,7 +1,7 @@
 """Lightning callbacks: everything of a run that happens at certain steps.
 
 Each takes its decisions from the module's schedule and the trainer's step alone, through
-:class:`nsvq_lightning.host.SplatHost`; none knows another. The order of their list matters in two places only:
+:class:`nsvq_lightning.training.host.SplatHost`; none knows another. The order of their list matters in two places only:
 :class:`DensityControl` belongs before :class:`CanonicalCovariance`, which may come after the same iteration, and
 :class:`ContributionPruning` before :class:`MetricReport`, whose figures are then those of the splats that are left.
 """

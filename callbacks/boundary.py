@@ -10,9 +10,9 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loops.loop import _Loop
 from torch import Tensor
 
-from nsvq_lightning.host import SplatHost, as_host, raw_optimizer
-from nsvq_lightning.schedule import Phase
-from nsvq_lightning.state import RunState
+from nsvq_lightning.training.host import SplatHost, as_host, raw_optimizer
+from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.training.state import RunState
 
 __all__ = ["StepBoundary"]
 

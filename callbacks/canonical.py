@@ -9,13 +9,13 @@ from typing import Any, Literal, get_args
 import torch
 from lightning.pytorch import LightningModule, Trainer
 
-from nsvq_lightning.canonical import Form, canonical
-from nsvq_lightning.covariance_error import form_errors
-from nsvq_lightning.edit import change_coordinates, finite_rows, raise_scales
-from nsvq_lightning.host import SplatHost, as_host, raw_optimizer, train_cameras
-from nsvq_lightning.pixel_size import scale_floor
+from nsvq_lightning.compression.covariance_error import form_errors
+from nsvq_lightning.compression.pixel_size import scale_floor
 from nsvq_lightning.random import derive_seed
-from nsvq_lightning.schedule import Phase
+from nsvq_lightning.splats.forms import Form, canonical
+from nsvq_lightning.training.edit import change_coordinates, finite_rows, raise_scales
+from nsvq_lightning.training.host import SplatHost, as_host, raw_optimizer, train_cameras
+from nsvq_lightning.training.schedule import Phase
 
 from .latch import LatchedCallback
 
@@ -29,12 +29,12 @@ Mode = Literal["none", "sign", "full", "auto"]
 class CanonicalCovariance(LatchedCallback):
     """After the last iteration before the quantize phase, brings together covariances that look the same.
 
-    ``mode`` gives each one scale and rotation out of the 48 that mean the same (:mod:`nsvq_lightning.canonical`), so
+    ``mode`` gives each one scale and rotation out of the 48 that mean the same (:mod:`nsvq_lightning.splats.forms`), so
     that k-means finds them together; nothing that is rendered changes. Rows are not kept so afterwards: they move
     continuously and take their codes along, while a row that jumped to another representative would lose its code.
 
     ``floor`` raises scales that are too small to show to one value, there and throughout the quantize phase, so that
-    codes are not spent on telling them apart (:func:`nsvq_lightning.pixel_size.scale_floor`).
+    codes are not spent on telling them apart (:func:`nsvq_lightning.compression.pixel_size.scale_floor`).
 
     With 4k codes on 187 k splats, right after k-means for scales and rotations, test PSNR was 30.47 dB with ``none``,
     30.61 dB with ``sign`` and 31.17 dB with ``full``, of 31.64 dB unquantized; ``auto`` took the last.

@@ -10,10 +10,10 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from torch.optim import Optimizer
 
-from nsvq_lightning.host import as_host
 from nsvq_lightning.io.atomic import atomic_path
-from nsvq_lightning.run_folder import is_trial, run_folder
-from nsvq_lightning.schedule import Schedule
+from nsvq_lightning.training.host import as_host
+from nsvq_lightning.training.run_folder import is_trial, run_folder
+from nsvq_lightning.training.schedule import Schedule
 
 from .boundary import StepBoundary
 from .hosted import WritingCallback

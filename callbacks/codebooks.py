@@ -10,8 +10,12 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor, nn
 
-from nsvq_lightning.edit import reset_moments
-from nsvq_lightning.host import (
+from nsvq_lightning.compression.importance import row_weights
+from nsvq_lightning.quantize.attributes import QUANTIZED
+from nsvq_lightning.quantize.base import Quantizer
+from nsvq_lightning.random import generator
+from nsvq_lightning.training.edit import reset_moments
+from nsvq_lightning.training.host import (
     SplatHost,
     as_host,
     next_iteration,
@@ -19,13 +23,9 @@ from nsvq_lightning.host import (
     sum_over_processes,
     train_contributions,
 )
-from nsvq_lightning.importance import row_weights
-from nsvq_lightning.optim import codebook_group
-from nsvq_lightning.quantize.attributes import QUANTIZED
-from nsvq_lightning.quantize.base import Quantizer
-from nsvq_lightning.random import generator
-from nsvq_lightning.replicas import check_replicas, follow_first
-from nsvq_lightning.schedule import Phase
+from nsvq_lightning.training.optim import codebook_group
+from nsvq_lightning.training.replicas import check_replicas, follow_first
+from nsvq_lightning.training.schedule import Phase
 
 from .finite_search import keep_finite_splats
 from .latch import LatchedCallback

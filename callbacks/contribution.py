@@ -7,10 +7,10 @@ from typing import Any
 
 from lightning.pytorch import LightningModule, Trainer
 
-from nsvq_lightning.edit import keep_rows
-from nsvq_lightning.host import SplatHost, as_host, next_iteration, raw_optimizer, train_contributions
-from nsvq_lightning.importance import least_contributing
-from nsvq_lightning.schedule import Phase
+from nsvq_lightning.compression.importance import least_contributing
+from nsvq_lightning.training.edit import keep_rows
+from nsvq_lightning.training.host import SplatHost, as_host, next_iteration, raw_optimizer, train_contributions
+from nsvq_lightning.training.schedule import Phase
 
 from .latch import LatchedCallback
 
@@ -22,8 +22,9 @@ log = logging.getLogger(__name__)
 class ContributionPruning(LatchedCallback):
     """Once before the quantize phase, removes the splats that contribute least to the train views.
 
-    A splat contributes its blending weight, summed over all pixels (:func:`nsvq_lightning.importance.contributions`):
-    unlike opacity this also finds splats that are hidden behind others, or small. The paper prunes by opacity alone.
+    A splat contributes its blending weight, summed over all pixels
+    (:func:`nsvq_lightning.compression.importance.contributions`): unlike opacity this also finds splats that are hidden
+    behind others, or small. The paper prunes by opacity alone.
 
     Of 187 k splats at iteration 18 000, before any further training: share 0.001 took 11 % of them and 0.03 dB of test
     PSNR, 0.003 18 % and 0.11 dB, 0.01 30 % and 0.38 dB.

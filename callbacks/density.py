@@ -11,8 +11,12 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 
-from nsvq_lightning.edit import append_rows, keep_rows, replace_attribute, reset_moments
-from nsvq_lightning.host import (
+from nsvq_lightning.compression.importance import most_contributing
+from nsvq_lightning.random import generator
+from nsvq_lightning.rendering.rasterize import Render
+from nsvq_lightning.splats.splats import RawSplats
+from nsvq_lightning.training.edit import append_rows, keep_rows, replace_attribute, reset_moments
+from nsvq_lightning.training.host import (
     SplatHost,
     as_host,
     next_iteration,
@@ -20,12 +24,8 @@ from nsvq_lightning.host import (
     sum_over_processes,
     train_contributions,
 )
-from nsvq_lightning.importance import most_contributing
-from nsvq_lightning.random import generator
-from nsvq_lightning.rendering.rasterize import Render
-from nsvq_lightning.replicas import check_replicas
-from nsvq_lightning.schedule import Phase
-from nsvq_lightning.splats import RawSplats
+from nsvq_lightning.training.replicas import check_replicas
+from nsvq_lightning.training.schedule import Phase
 
 from .density_rules import (
     DensityRules,

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nsvq_lightning.rendering.kernels import kernels_for
+from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.rendering.reference import rotation_matrices
-from nsvq_lightning.splats import RawSplats
+from nsvq_lightning.splats.splats import RawSplats
 
 __all__ = [
     "DensityRules",
@@ -29,7 +29,8 @@ __all__ = [
 class DensityRules:
     """Numbers of adaptive density control (Kerbl et al. 2023, section 5) and of the prune phase (paper, section 3.4).
 
-    Iterations are those of the reference run of 45 000; :class:`~nsvq_lightning.schedule.Schedule` scales them.
+    Iterations are those of the reference run of 45 000; :class:`~nsvq_lightning.training.schedule.Schedule` scales
+    them.
 
     Attributes:
         start: First iteration that clones and splits.

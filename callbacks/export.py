@@ -8,9 +8,9 @@ from pathlib import Path
 
 from lightning.pytorch import LightningModule, Trainer
 
-from nsvq_lightning.compress import DEFAULT_EXPORT, EXPORT_FORMATS, export_scene
-from nsvq_lightning.host import as_host
-from nsvq_lightning.run_folder import is_trial, run_folder
+from nsvq_lightning.compression.stored import DEFAULT_EXPORT, EXPORT_FORMATS, export_scene
+from nsvq_lightning.training.host import as_host
+from nsvq_lightning.training.run_folder import is_trial, run_folder
 
 from .hosted import WritingCallback
 

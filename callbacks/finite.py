@@ -8,12 +8,12 @@ from typing import Any
 import torch
 from lightning.pytorch import LightningModule, Trainer
 
-from nsvq_lightning.edit import reset_moments
-from nsvq_lightning.host import SplatHost, as_host, raw_optimizer
-from nsvq_lightning.optim import codebook_group
 from nsvq_lightning.quantize.base import is_mendable
 from nsvq_lightning.random import generator
-from nsvq_lightning.schedule import Phase
+from nsvq_lightning.training.edit import reset_moments
+from nsvq_lightning.training.host import SplatHost, as_host, raw_optimizer
+from nsvq_lightning.training.optim import codebook_group
+from nsvq_lightning.training.schedule import Phase
 
 from .finite_search import FiniteSearch
 from .latch import LatchedCallback

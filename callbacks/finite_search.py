@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from lightning.pytorch import Trainer
 
-from nsvq_lightning.edit import drop_non_finite
-from nsvq_lightning.host import SplatHost, raw_optimizer
+from nsvq_lightning.training.edit import drop_non_finite
+from nsvq_lightning.training.host import SplatHost, raw_optimizer
 
 __all__ = ["FiniteSearch", "keep_finite_splats"]
 
@@ -14,8 +14,8 @@ class FiniteSearch:
     """Says after which iterations to search for NaN and infinite numbers: every so many, and when nothing was updated.
 
     A step with a loss that is not finite leaves no parameter a gradient, on any process
-    (:class:`nsvq_lightning.SplatModule`, :class:`nsvq_lightning.strategies.ViewParallelStrategy`). So all processes get
-    the same answer without asking each other.
+    (:class:`nsvq_lightning.SplatModule`, :class:`nsvq_lightning.training.strategies.ViewParallelStrategy`). So all
+    processes get the same answer without asking each other.
 
     Args:
         every: Iterations between two searches.
@@ -41,7 +41,7 @@ def _was_updated(trainer: Trainer) -> bool:
 
 
 def keep_finite_splats(trainer: Trainer, host: SplatHost) -> None:
-    """Drop splats that are not finite, with their frozen codes (:func:`nsvq_lightning.edit.drop_non_finite`).
+    """Drop splats that are not finite, with their frozen codes (:func:`nsvq_lightning.training.edit.drop_non_finite`).
 
     The replicas of several processes are equal, so all drop the same without asking each other. Gradients are lost
     where splats are dropped: call it between an update and the next backward pass.

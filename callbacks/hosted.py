@@ -7,14 +7,14 @@ from typing import ClassVar
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from nsvq_lightning.host import check_optimizer, splat_host
-from nsvq_lightning.run_folder import is_trial, run_folder, take
+from nsvq_lightning.training.host import check_optimizer, splat_host
+from nsvq_lightning.training.run_folder import is_trial, run_folder, take
 
 __all__ = ["HostedCallback", "WritingCallback"]
 
 
 class HostedCallback(Callback):
-    """Callback of any module that follows :class:`nsvq_lightning.host.SplatHost`; every callback here is one.
+    """Callback of any module that follows :class:`nsvq_lightning.training.host.SplatHost`; every callback here is one.
 
     What the module must have is checked before anything starts, what its optimiser must have as soon as there is one.
     A subclass that has these hooks itself calls them here first.
@@ -24,7 +24,7 @@ class HostedCallback(Callback):
         """Check the module.
 
         Raises:
-            TypeError: It lacks something that :class:`~nsvq_lightning.host.SplatHost` names.
+            TypeError: It lacks something that :class:`~nsvq_lightning.training.host.SplatHost` names.
         """
         splat_host(pl_module)
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from lightning.pytorch import LightningModule, Trainer
 
-from nsvq_lightning.host import as_host, next_iteration
-from nsvq_lightning.schedule import Phase
+from nsvq_lightning.training.host import as_host, next_iteration
+from nsvq_lightning.training.schedule import Phase
 
 from .hosted import HostedCallback
 
@@ -19,7 +19,8 @@ class OpacityRegularization(HostedCallback):
     """Adds λ · Σ opacity to the loss during the prune phase, so that needless splats fade and are pruned.
 
     It is a sum over the splats (paper, section 3.4), so its strength grows with their number. A shorter run has fewer
-    iterations to fade a splat in, and a proportionally larger λ (:meth:`nsvq_lightning.schedule.Schedule.strength`).
+    iterations to fade a splat in, and a proportionally larger λ
+    (:meth:`nsvq_lightning.training.schedule.Schedule.strength`).
 
     Args:
         weight: λ of the reference run.

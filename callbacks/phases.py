@@ -7,8 +7,8 @@ from typing import Any
 
 from lightning.pytorch import LightningModule, Trainer
 
-from nsvq_lightning.host import as_host, next_iteration
-from nsvq_lightning.schedule import Phase, Schedule
+from nsvq_lightning.training.host import as_host, next_iteration
+from nsvq_lightning.training.schedule import Phase, Schedule
 
 from .hosted import HostedCallback
 
@@ -21,7 +21,7 @@ class PhaseSchedule(HostedCallback):
     """Gives the module its schedule, and writes the phase of each iteration into its buffer.
 
     The ends of the phases are iterations of a reference run, the paper's of 45 000 iterations by default; a run of any
-    other length is that run, scaled (:mod:`nsvq_lightning.schedule` says what scales how).
+    other length is that run, scaled (:mod:`nsvq_lightning.training.schedule` says what scales how).
 
     Args:
         total: Iterations of the run; None takes ``trainer.max_steps``.
@@ -35,7 +35,7 @@ class PhaseSchedule(HostedCallback):
         min_finetune: Lower limit of the length of the fine-tune phase, up to half of what follows the prune phase.
 
     Raises:
-        ValueError: See :class:`~nsvq_lightning.schedule.Schedule`.
+        ValueError: See :class:`~nsvq_lightning.training.schedule.Schedule`.
     """
 
     def __init__(

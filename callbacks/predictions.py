@@ -8,8 +8,8 @@ from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from nsvq_lightning.pictures import file_stem, write_png
-from nsvq_lightning.run_folder import is_trial, run_folder
+from nsvq_lightning.report.pictures import file_stem, write_png
+from nsvq_lightning.training.run_folder import is_trial, run_folder
 
 __all__ = ["RenderWriter"]
 

@@ -12,19 +12,19 @@ from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor
 from torchmetrics import Metric
 
-from nsvq_lightning.compress import export_scene
+from nsvq_lightning.compression.stored import export_scene
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.evaluation import ViewScore, evaluate
-from nsvq_lightning.host import SplatHost, as_host, next_iteration
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.container import read_nsvq
-from nsvq_lightning.metrics import build_lpips, eight_bit
-from nsvq_lightning.picture_logs import log_pictures
-from nsvq_lightning.pictures import comparison, file_stem, write_png
+from nsvq_lightning.io.nsvq.file import read_nsvq
+from nsvq_lightning.quality.metrics import build_lpips, eight_bit
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.report_files import paper_level, summarize, write_curve, write_curve_csv, write_metrics, write_views
-from nsvq_lightning.run_folder import is_trial, run_folder
-from nsvq_lightning.splats import RawSplats
+from nsvq_lightning.report.evaluation import ViewScore, evaluate
+from nsvq_lightning.report.files import paper_level, summarize, write_curve, write_curve_csv, write_metrics, write_views
+from nsvq_lightning.report.picture_logs import log_pictures
+from nsvq_lightning.report.pictures import comparison, file_stem, write_png
+from nsvq_lightning.splats.splats import RawSplats
+from nsvq_lightning.training.host import SplatHost, as_host, next_iteration
+from nsvq_lightning.training.run_folder import is_trial, run_folder
 
 from .hosted import WritingCallback
 from .watchers import tell_watchers

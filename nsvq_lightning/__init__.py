@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from nsvq_lightning.environment import set_defaults
+from nsvq_lightning.compute.environment import set_defaults
 from nsvq_lightning.top_level import find_callbacks
 
 __version__ = "0.1.0"
@@ -19,8 +19,8 @@ _HOME = {
     "Camera": "nsvq_lightning.rendering.camera",
     "ColmapDataModule": "nsvq_lightning.data.datamodule",
     "Render": "nsvq_lightning.rendering.rasterize",
-    "SplatModule": "nsvq_lightning.module",
-    "Splats": "nsvq_lightning.splats",
+    "SplatModule": "nsvq_lightning.training.module",
+    "Splats": "nsvq_lightning.splats.splats",
     "load": "nsvq_lightning.io.formats",
     "render": "nsvq_lightning.rendering.rasterize",
     "save": "nsvq_lightning.io.formats",
@@ -29,10 +29,10 @@ _HOME = {
 if TYPE_CHECKING:
     from nsvq_lightning.data.datamodule import ColmapDataModule
     from nsvq_lightning.io.formats import load, save
-    from nsvq_lightning.module import SplatModule
     from nsvq_lightning.rendering.camera import Camera
     from nsvq_lightning.rendering.rasterize import Render, render
-    from nsvq_lightning.splats import Splats
+    from nsvq_lightning.splats.splats import Splats
+    from nsvq_lightning.training.module import SplatModule
 
 __all__ = ["Camera", "ColmapDataModule", "Render", "SplatModule", "Splats", "load", "render", "save"]
 

@@ -185,7 +185,7 @@ def _read_ply(path: Path) -> object:
 
 
 def _build_nsvq(folder: Path) -> list[Path]:
-    from nsvq_lightning.io.container import write_nsvq
+    from nsvq_lightning.io.nsvq.file import write_nsvq
 
     files = [folder / "compact.nsvq", folder / "paper.nsvq"]
     for path in files:
@@ -194,7 +194,7 @@ def _build_nsvq(folder: Path) -> list[Path]:
 
 
 def _read_nsvq(path: Path) -> object:
-    from nsvq_lightning.io.container import read_nsvq
+    from nsvq_lightning.io.nsvq.file import read_nsvq
 
     return read_nsvq(path).arrays()
 
@@ -292,7 +292,7 @@ def _read_colmap(path: Path) -> object:
 def _build_checkpoint(folder: Path) -> list[Path]:
     import torch
 
-    from nsvq_lightning.module import SplatModule
+    from nsvq_lightning.training.module import SplatModule
 
     path = folder / "small.ckpt"
     version = {"pytorch-lightning_version": "2.6.6"}
@@ -301,13 +301,13 @@ def _build_checkpoint(folder: Path) -> list[Path]:
 
 
 def _read_checkpoint(path: Path) -> object:
-    from nsvq_lightning.checkpoint_file import read_checkpoint
+    from nsvq_lightning.training.checkpoints import read_checkpoint
 
     return read_checkpoint(path)
 
 
 def _build_config(folder: Path) -> list[Path]:
-    from nsvq_lightning.cli import find_config
+    from nsvq_lightning.commands.main import find_config
 
     files = []
     for name in ("nsvq_4k", "better_4k", "demo"):
@@ -319,7 +319,7 @@ def _build_config(folder: Path) -> list[Path]:
 @cache
 def _parser() -> Callable[[list[str]], object]:
     """The parser of the command line, built once: it takes longer than reading a config."""
-    from nsvq_lightning.lightning_cli import SplatCLI
+    from nsvq_lightning.commands.fit import SplatCLI
 
     class Cli(SplatCLI):
         def parse_arguments(self, parser: object, args: object) -> None:
@@ -334,7 +334,7 @@ def _parser() -> Callable[[list[str]], object]:
 
 def _read_config(path: Path) -> object:
     """Parse it as ``nsvq fit`` would; what is wrong ends the command with status 2 and a message."""
-    from nsvq_lightning.cli import check_config
+    from nsvq_lightning.commands.main import check_config
 
     check_config(str(path))
     status: object = 0

@@ -21,9 +21,9 @@ from guards import guarded
 from numba import prange
 from torch import Tensor
 
+from nsvq_lightning.compute.jit import kernel
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.cpu.jit import kernel
-from nsvq_lightning.splats import RawSplats
+from nsvq_lightning.splats.splats import RawSplats
 
 __all__ = ["NUMBA", "SCALAR", "TRITON", "Case"]
 
@@ -133,7 +133,7 @@ def _paths() -> dict[str, Any]:
 
 
 def _stored_paths() -> dict[str, Any]:
-    from nsvq_lightning.io.entropy import encode_paths
+    from nsvq_lightning.io.nsvq.entropy import encode_paths
 
     arguments = _paths()
     paths = arguments.pop("paths")
@@ -147,13 +147,13 @@ def _keys() -> dict[str, Any]:
 
 
 def _stored_keys() -> dict[str, Any]:
-    from nsvq_lightning.io.entropy import encode_keys
+    from nsvq_lightning.io.nsvq.entropy import encode_keys
 
     return {"data": encode_keys(**_keys()), "depths": _keys()["depths"]}
 
 
 def _stored_integers() -> dict[str, Any]:
-    from nsvq_lightning.io.entropy import encode_integers
+    from nsvq_lightning.io.nsvq.entropy import encode_integers
 
     return {"data": encode_integers(_codes(40).reshape(20, 2)), "rows": 20, "columns": 2}
 
@@ -338,7 +338,7 @@ def _projection_backward() -> dict[str, Any]:
 
 @cache
 def _derivatives() -> Any:
-    from nsvq_lightning.rendering.cuda.dssim import l1_dssim
+    from nsvq_lightning.quality.ssim_cuda import l1_dssim
 
     return l1_dssim(**_pictures())[1]
 

@@ -11,8 +11,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from nsvq_lightning.canonical import Form, canonical
 from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.splats.forms import Form, canonical
 
 sys.path.insert(0, str(Path(__file__).parent / "rendering"))
 from scenes import front_camera, random_splats

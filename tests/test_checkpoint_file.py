@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from nsvq_lightning.checkpoint_file import PlainCheckpointIO, read_checkpoint
 from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.training.checkpoints import PlainCheckpointIO, read_checkpoint
 
 SCENE = {"splats.means": torch.arange(300.0).view(100, 3), "state._phase": torch.tensor(0)}
 

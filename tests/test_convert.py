@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nsvq_lightning.commands import COMMANDS
-from nsvq_lightning.compress import export_scene
-from nsvq_lightning.convert_command import main
+from nsvq_lightning.commands.convert import main
+from nsvq_lightning.commands.registry import COMMANDS
+from nsvq_lightning.compression.stored import export_scene
 from nsvq_lightning.io import FORMATS, read_scene, save
-from nsvq_lightning.io.precision import LEVELS, Storage
+from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.spz_frame import read_spz_header
 
 sys.path.insert(0, str(Path(__file__).parent / "io"))

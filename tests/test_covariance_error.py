@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from nsvq_lightning.covariance_error import covariance_error, covariances, form_errors
+from nsvq_lightning.compression.covariance_error import covariance_error, covariances, form_errors
 
 
 def shuffled_axes(count: int) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from nsvq_lightning.edit import (
+from nsvq_lightning.splats.splats import ATTRIBUTES, Splats
+from nsvq_lightning.training.edit import (
     append_rows,
     change_coordinates,
     drop_non_finite,
@@ -16,8 +17,7 @@ from nsvq_lightning.edit import (
     replace_attribute,
     reset_moments,
 )
-from nsvq_lightning.optim import LearningRates, build_adam, param_groups
-from nsvq_lightning.splats import ATTRIBUTES, Splats
+from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 
 
 def make(n: int, seed: int = 0) -> Splats:

@@ -14,16 +14,19 @@ import pytest
 import torch
 
 import nsvq_lightning
-from nsvq_lightning.cli import main
-from nsvq_lightning.commands import COMMANDS
-from nsvq_lightning.lightning_cli import DEFAULT_CALLBACKS
-from nsvq_lightning.option_help import first_sentence
-from nsvq_lightning.trainer import SplatTrainer
+from nsvq_lightning.commands.fit import DEFAULT_CALLBACKS
+from nsvq_lightning.commands.main import main
+from nsvq_lightning.commands.option_help import first_sentence
+from nsvq_lightning.commands.registry import COMMANDS
+from nsvq_lightning.training.trainer import SplatTrainer
 
 
 @pytest.mark.parametrize(("argument", "said"), [("--version", nsvq_lightning.__version__), ("--help", "benchmark")])
 def test_version_and_overview_come_without_torch(argument: str, said: str) -> None:
-    code = "import sys; from nsvq_lightning.cli import main; s = main(sys.argv[1:]); exit(s or 'torch' in sys.modules)"
+    code = (
+        "import sys; from nsvq_lightning.commands.main import main; status = main(sys.argv[1:]); "
+        "exit(status or 'torch' in sys.modules)"
+    )
     done = subprocess.run([sys.executable, "-c", code, argument], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert said in done.stdout
@@ -140,7 +143,9 @@ def test_the_environment_is_set_by_the_import_unless_the_user_has() -> None:
     [("torch", {}, True), ("json", {}, False), ("torch", {"OMP_WAIT_POLICY": "passive"}, False)],
 )
 def test_who_imports_torch_first_is_known(first: str, given: dict[str, str], spin: bool) -> None:
-    code = f"import {first}, nsvq_lightning; from nsvq_lightning.environment import threads_spin; print(threads_spin())"
+    code = (
+        f"import {first}, nsvq_lightning; from nsvq_lightning.compute import environment as e; print(e.threads_spin())"
+    )
     environment = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"} | given
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert done.stdout == f"{spin}\n"

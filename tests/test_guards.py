@@ -10,8 +10,8 @@ import pytest
 from guards import GuardError, guarded
 from numba import njit, typeof
 
-from nsvq_lightning.rendering.cpu.lanes import put
-from nsvq_lightning.rendering.cpu.workspace import Workspace, recycled
+from nsvq_lightning.compute.lanes import put
+from nsvq_lightning.compute.workspace import Workspace, recycled
 
 
 @njit

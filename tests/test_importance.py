@@ -8,11 +8,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nsvq_lightning.importance import contributions, least_contributing, most_contributing, row_weights
+from nsvq_lightning.compression.importance import contributions, least_contributing, most_contributing, row_weights
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, render
 from nsvq_lightning.rendering.sh import C0
-from nsvq_lightning.splats import RawSplats, SplatTensors
+from nsvq_lightning.splats.splats import RawSplats, SplatTensors
 
 sys.path.insert(0, str(Path(__file__).parent / "rendering"))
 from scenes import front_camera, random_splats

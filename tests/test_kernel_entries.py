@@ -28,7 +28,7 @@ def test_every_function_that_calls_a_kernel_has_a_case(compiler: str) -> None:
 def test_a_new_entry_point_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The search itself: public, private and compiled functions of a module that is new in the package."""
     source = """
-from nsvq_lightning.rendering.cpu.jit import kernel
+from nsvq_lightning.compute.jit import kernel
 
 @kernel
 def compiled(array):

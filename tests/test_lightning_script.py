@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from nsvq_lightning import lightning_script
+from nsvq_lightning.commands.registry import lightning_script
 
 Install = Callable[[str, str], None]
 
@@ -21,9 +21,9 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         seen.append(list(argv or []))
         return 3
 
-    front_end = types.ModuleType("nsvq_lightning.cli")
+    front_end = types.ModuleType("nsvq_lightning.commands.main")
     front_end.__dict__["main"] = main
-    monkeypatch.setitem(sys.modules, "nsvq_lightning.cli", front_end)
+    monkeypatch.setitem(sys.modules, "nsvq_lightning.commands.main", front_end)
     return seen
 
 
@@ -49,8 +49,8 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
 
 
 def test_the_words_are_those_of_the_front_end() -> None:
-    from nsvq_lightning.commands import COMMANDS
-    from nsvq_lightning.lightning_cli import SplatCLI
+    from nsvq_lightning.commands.fit import SplatCLI
+    from nsvq_lightning.commands.registry import COMMANDS
 
     assert {name for name, command in COMMANDS.items() if command.module is None} == set(SplatCLI.subcommands())
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from nsvq_lightning.losses import photometric_loss, ssim
+from nsvq_lightning.quality.loss import photometric_loss, ssim
 
 
 def pair(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:

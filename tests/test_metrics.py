@@ -10,7 +10,7 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
-from nsvq_lightning.metrics import PSNR, SSIM, build_lpips, eight_bit, image_metrics
+from nsvq_lightning.quality.metrics import PSNR, SSIM, build_lpips, eight_bit, image_metrics
 
 
 def picture(seed: int, height: int = 40, width: int = 52) -> Tensor:

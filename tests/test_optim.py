@@ -8,7 +8,10 @@ import pytest
 import torch
 from torch import nn
 
-from nsvq_lightning.optim import (
+from nsvq_lightning.compute.rows import take_rows
+from nsvq_lightning.skips import switched
+from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.training.optim import (
     LearningRates,
     SplatAdam,
     apply_rates,
@@ -19,9 +22,6 @@ from nsvq_lightning.optim import (
     set_columns,
     set_lr,
 )
-from nsvq_lightning.skips import switched
-from nsvq_lightning.splats import Splats
-from nsvq_lightning.subset import take_rows
 
 
 class Codebook(nn.Module):

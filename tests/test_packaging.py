@@ -139,7 +139,7 @@ def test_checkout_runs_without_links(without_links: Path) -> None:
     lines = [
         "import importlib.util, os, pickle",
         "from nsvq_lightning.callbacks.density import DensityControl",
-        "from nsvq_lightning.cli import find_config",
+        "from nsvq_lightning.commands.main import find_config",
         "assert pickle.loads(pickle.dumps(DensityControl)) is DensityControl",
         "assert DensityControl.__module__ == 'nsvq_lightning.callbacks.density'",
         "assert os.path.samefile(find_config('demo'), 'configs/demo.yaml')",
@@ -158,7 +158,10 @@ def test_callbacks_configs_and_type_marker_are_found_in_the_package() -> None:
 
 def test_scripts_point_to_modules_of_the_package() -> None:
     scripts = _project()["project"]["scripts"]
-    assert scripts == {"nsvq": "nsvq_lightning.cli:main", "lightning": "nsvq_lightning.lightning_script:main"}
+    assert scripts == {
+        "nsvq": "nsvq_lightning.commands.main:main",
+        "lightning": "nsvq_lightning.commands.lightning_script:main",
+    }
     for target in scripts.values():
         assert importlib.util.find_spec(target.split(":")[0]) is not None
 

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from nsvq_lightning.pixel_size import pixel_sizes, scale_floor
+from nsvq_lightning.compression.pixel_size import pixel_sizes, scale_floor
 from nsvq_lightning.rendering.camera import Camera
 
 

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from nsvq_lightning.cli import main
+from nsvq_lightning.commands.main import main
+from nsvq_lightning.compression.ladder import LADDER, PLAINS, Compressor, finest_within, smallest_within
+from nsvq_lightning.compression.pictures import cameras_around, middle_of
 from nsvq_lightning.io import CompressedScene, read_header, read_nsvq, write_ply
-from nsvq_lightning.io.arrays import SplatArrays
 from nsvq_lightning.io.formats import load, save
-from nsvq_lightning.io.precision import Precision, Storage
-from nsvq_lightning.posthoc import LADDER, PLAINS, Compressor, finest_within, smallest_within
+from nsvq_lightning.io.nsvq.precision import Precision, Storage
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.viewpoints import cameras_around, middle_of
+from nsvq_lightning.splats.arrays import SplatArrays
 
 
 def arrays(count: int = 1500, degree: int = 1) -> SplatArrays:
@@ -207,8 +207,10 @@ def test_photos_keep_to_the_aim(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # One rung: a looser aim must not bring larger codebooks.
-    monkeypatch.setattr("nsvq_lightning.posthoc.PLAINS", ())
-    monkeypatch.setattr("nsvq_lightning.posthoc.LADDER", tuple(rung for rung in LADDER if rung.name == "0.5k"))
+    monkeypatch.setattr("nsvq_lightning.compression.ladder.PLAINS", ())
+    monkeypatch.setattr(
+        "nsvq_lightning.compression.ladder.LADDER", tuple(rung for rung in LADDER if rung.name == "0.5k")
+    )
     source, output = tmp_path / "scene.ply", tmp_path / "out.nsvq"
     write_ply(source, arrays(400, degree=0))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from nsvq_lightning.schedule import Phase, Schedule
+from nsvq_lightning.training.schedule import Phase, Schedule
 
 
 def test_the_papers_run_has_the_papers_phases() -> None:

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from nsvq_lightning.benchmark.extremes import BROKEN, BROKEN_ROWS
-from nsvq_lightning.benchmark.settings import Settings
-from nsvq_lightning.benchmark.suites import quantize, stability
-from nsvq_lightning.benchmark.suites.render import Method, trace
-from nsvq_lightning.edit import LARGEST_LOG_SCALE, drop_non_finite
-from nsvq_lightning.optim import LearningRates, build_adam, param_groups
+from nsvq_lightning.commands.benchmark.extremes import BROKEN, BROKEN_ROWS
+from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.suites import quantize, stability
+from nsvq_lightning.commands.benchmark.suites.render import Method, trace
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats import ATTRIBUTES, RawSplats, Splats
+from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats, Splats
+from nsvq_lightning.training.edit import LARGEST_LOG_SCALE, drop_non_finite
+from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 
 SCENES = {scene.name: scene for scene in stability.cases(Settings((1,), quick=True))}
 BACKENDS = ("cpu", "reference")

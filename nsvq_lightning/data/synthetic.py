@@ -15,8 +15,8 @@ from nsvq_lightning.data.colmap import import_pycolmap
 from nsvq_lightning.data.demo_room import demo_poses, demo_room, to_srgb
 from nsvq_lightning.data.raytrace import Room
 from nsvq_lightning.data.surfaces import Array
-from nsvq_lightning.pictures import write_pixels
 from nsvq_lightning.random import generator
+from nsvq_lightning.report.pictures import write_pixels
 
 __all__ = ["render_view", "write_synthetic_scene"]
 

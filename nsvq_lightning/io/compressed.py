@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.arrays import SplatArrays, check_floats, finite_rows
 from nsvq_lightning.io.ply import plain_ply_bytes
-from nsvq_lightning.sh_degree import sh_coefficients
+from nsvq_lightning.splats.arrays import SplatArrays, check_floats, finite_rows
+from nsvq_lightning.splats.sh_degree import sh_coefficients
 
 if TYPE_CHECKING:
-    from nsvq_lightning.splats import Splats
+    from nsvq_lightning.splats.splats import Splats
 
 _T = TypeVar("_T", bound=np.generic)
 
@@ -136,7 +136,7 @@ class CompressedScene:
         )
 
     def finite(self) -> CompressedScene:
-        """The splats without NaN or infinite values, see :func:`~nsvq_lightning.io.arrays.finite_rows`."""
+        """The splats without NaN or infinite values, see :func:`~nsvq_lightning.splats.arrays.finite_rows`."""
         bad = {name: np.where(np.isfinite(rows).all(1), 0, np.nan) for name, rows in self.codebooks.items()}
         flags = {name: flags.astype(np.float32)[self.codes[name]] for name, flags in bad.items()}
         keep = finite_rows({"means": self.means, "opacities": self.opacities, **self.raw, **flags})
@@ -172,7 +172,7 @@ class CompressedScene:
         """Bytes of the file: the one it was read from, else the one that level ``paper`` would give."""
         if self.stored_bytes is not None:
             return self.stored_bytes
-        from nsvq_lightning.io.paper import paper_header
+        from nsvq_lightning.io.nsvq.paper import paper_header
 
         return paper_header(self).file_bytes
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.formats import FORMATS
-from nsvq_lightning.io.frame import MAGIC, read_header
+from nsvq_lightning.io.nsvq.frame import MAGIC, read_header
 from nsvq_lightning.io.ply import plain_ply_bytes, read_ply_size
 from nsvq_lightning.io.ply_header import PLY_MAGIC, attribute_of
 from nsvq_lightning.io.sog import read_sog_header

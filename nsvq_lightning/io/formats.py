@@ -9,17 +9,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nsvq_lightning.io.arrays import SplatArrays
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.container import read_nsvq, write_nsvq
+from nsvq_lightning.io.nsvq.file import read_nsvq, write_nsvq
+from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, Precision
 from nsvq_lightning.io.ply import read_ply, write_ply
-from nsvq_lightning.io.precision import DEFAULT_LEVEL, Precision
 from nsvq_lightning.io.sog import in_sog_order, read_sog, write_sog
 from nsvq_lightning.io.splat import read_splat, write_splat
 from nsvq_lightning.io.spz import in_spz_order, read_spz, write_spz
+from nsvq_lightning.splats.arrays import SplatArrays
 
 if TYPE_CHECKING:
-    from nsvq_lightning.splats import Splats, SplatTensors
+    from nsvq_lightning.splats.splats import Splats, SplatTensors
 
 __all__ = ["FORMATS", "Format", "load", "read_scene", "save"]
 

@@ -8,8 +8,8 @@ import numpy as np
 from numba import prange, uint64
 from numpy.typing import NDArray
 
-from nsvq_lightning.rendering.cpu.arrays import INT64, check_array
-from nsvq_lightning.rendering.cpu.jit import kernel, thread_count
+from nsvq_lightning.compute.jit import kernel, thread_count
+from nsvq_lightning.compute.memory import INT64, check_array
 
 __all__ = ["AXIS_BITS", "Grid", "morton_keys", "nearest_before", "unmorton"]
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.rendering.cpu.arrays import check_array, check_table
-from nsvq_lightning.rendering.cpu.jit import kernel
+from nsvq_lightning.compute.jit import kernel
+from nsvq_lightning.compute.memory import check_array, check_table
 
 __all__ = ["find_palette", "in_order_of_use"]
 

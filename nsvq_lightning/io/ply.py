@@ -10,12 +10,12 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.arrays import SplatArrays
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.opacity import finite_logits
 from nsvq_lightning.io.ply_header import PlyHeader, read_ply_header
-from nsvq_lightning.sh_degree import sh_coefficients
+from nsvq_lightning.splats.arrays import SplatArrays
+from nsvq_lightning.splats.sh_degree import sh_coefficients
 
 __all__ = ["plain_ply_bytes", "read_ply", "read_ply_size", "write_ply"]
 

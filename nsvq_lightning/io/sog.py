@@ -29,12 +29,12 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
-from nsvq_lightning.io.levels import best_levels, nearest_level
+from nsvq_lightning.io.lloyd import best_levels, nearest_level
 from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
-from nsvq_lightning.io.rotation import from_smallest_three, smallest_three, unit
 from nsvq_lightning.io.sog_archive import META, SogArchive, picture_shape, write_archive
 from nsvq_lightning.io.splat_order import spatial_order
-from nsvq_lightning.sh_degree import sh_coefficients
+from nsvq_lightning.splats.rotations import from_smallest_three, smallest_three, unit
+from nsvq_lightning.splats.sh_degree import sh_coefficients
 
 __all__ = ["PALETTE_LIMIT", "in_sog_order", "read_sog", "read_sog_header", "write_sog"]
 

@@ -31,14 +31,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.arrays import SplatArrays
 from nsvq_lightning.io.clamping import Clamped
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
-from nsvq_lightning.io.rotation import from_smallest_three, smallest_three, unit
 from nsvq_lightning.io.splat_order import spatial_order
 from nsvq_lightning.io.spz_frame import MOST_FRACTION, SPZ_VERSIONS, SpzHeader, read_frame, write_frame
-from nsvq_lightning.sh_degree import sh_coefficients
+from nsvq_lightning.splats.arrays import SplatArrays
+from nsvq_lightning.splats.rotations import from_smallest_three, smallest_three, unit
+from nsvq_lightning.splats.sh_degree import sh_coefficients
 
 __all__ = ["DEFAULT_VERSION", "in_spz_order", "read_spz", "write_spz"]
 

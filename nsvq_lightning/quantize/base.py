@@ -39,7 +39,7 @@ class Quantizer(Protocol):
         One that leaves training alone returns the rows themselves, -1 as their codes, and counts nothing.
 
         ``rows [V]`` int64, ascending and all different, says which; without it all rows are quantized. Gathering them
-        (:func:`nsvq_lightning.subset.take_rows`) is left to the quantizer, which may do it on the way.
+        (:func:`nsvq_lightning.compute.rows.take_rows`) is left to the quantizer, which may do it on the way.
         """
 
     def encode(self, x: Tensor) -> Tensor:

@@ -20,11 +20,8 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from nsvq_lightning.quantize.boxes import NO_CODE, Boxes, check_boxes
-from nsvq_lightning.quantize.kernels import lane_min
-from nsvq_lightning.rendering.cpu.arrays import FLOAT32, FLOAT64, INT32, INT64, check_array, check_table, outside
-from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
-from nsvq_lightning.rendering.cpu.lanes import (
+from nsvq_lightning.compute.jit import inline, kernel, thread_count
+from nsvq_lightning.compute.lanes import (
     fma,
     get,
     load,
@@ -37,7 +34,10 @@ from nsvq_lightning.rendering.cpu.lanes import (
     vmax,
     vmin,
 )
-from nsvq_lightning.rendering.cpu.rows import count_outside
+from nsvq_lightning.compute.memory import FLOAT32, FLOAT64, INT32, INT64, check_array, check_table, outside
+from nsvq_lightning.compute.rows_cpu import count_outside
+from nsvq_lightning.compute.vectors import lane_min
+from nsvq_lightning.quantize.boxes import NO_CODE, Boxes, check_boxes
 
 __all__ = ["MAX_DIM", "ROUNDING", "UNKNOWN", "BoxMemory", "box_search", "empty_memory"]
 

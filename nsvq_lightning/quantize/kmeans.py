@@ -9,10 +9,10 @@ import torch
 from numba import prange
 from torch import Tensor
 
+from nsvq_lightning.compute.jit import kernel, thread_count
 from nsvq_lightning.quantize.far_rows import spread_rows
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.quantize.sums import sum_by_code
-from nsvq_lightning.rendering.cpu.jit import kernel, thread_count
 
 __all__ = ["distinct_rows", "kmeans"]
 

@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.quantize.box_search import MAX_DIM, box_search
 from nsvq_lightning.quantize.boxes import build_boxes
 from nsvq_lightning.quantize.scores import centre_codes, score_search
-from nsvq_lightning.rendering.kernels import kernels_for
 
 __all__ = ["check_rows", "nearest", "nearest_reference"]
 

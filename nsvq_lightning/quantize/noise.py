@@ -11,8 +11,8 @@ import torch
 from numba import prange
 from numpy.typing import NDArray
 
-from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
-from nsvq_lightning.rendering.cpu.lanes import fma, load, log2, splat, store, vsqrt
+from nsvq_lightning.compute.jit import inline, kernel, thread_count
+from nsvq_lightning.compute.lanes import fma, load, log2, splat, store, vsqrt
 
 __all__ = ["COS", "MULTIPLIERS", "SIN", "draw_seed", "fill_normal", "normal_vectors"]
 

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from nsvq_lightning.compute.devices import kernels_for
+from nsvq_lightning.compute.rows import put_rows
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize.noise import draw_seed
 from nsvq_lightning.quantize.substitution import substitute, substitute_backward
 from nsvq_lightning.quantize.sums import sum_by_code
-from nsvq_lightning.rendering.kernels import kernels_for
-from nsvq_lightning.subset import put_rows
 
 __all__ = ["NSVQ", "noise_substitution"]
 

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
-from nsvq_lightning.subset import take_rows
 
 __all__ = ["PostHoc"]
 

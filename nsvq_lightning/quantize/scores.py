@@ -17,10 +17,10 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from nsvq_lightning.quantize.kernels import aligned_empty, lane_min
-from nsvq_lightning.rendering.cpu.arrays import FLOAT32, check_array, check_table
-from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
-from nsvq_lightning.rendering.cpu.lanes import fma, fnma, get, load, lowest_bit, mask_bits, put, splat, store, vmin
+from nsvq_lightning.compute.jit import inline, kernel, thread_count
+from nsvq_lightning.compute.lanes import fma, fnma, get, load, lowest_bit, mask_bits, put, splat, store, vmin
+from nsvq_lightning.compute.memory import FLOAT32, check_array, check_table
+from nsvq_lightning.compute.vectors import aligned_empty, lane_min
 
 __all__ = ["LIST", "CentredCodes", "centre_codes", "score_search", "true_distance"]
 

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from nsvq_lightning.compute.rows import put_rows
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.sums import sum_by_code
 from nsvq_lightning.random import generator as seeded
-from nsvq_lightning.subset import put_rows
 
 __all__ = ["StraightThrough", "TrainedStraightThrough"]
 

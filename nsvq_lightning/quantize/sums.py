@@ -11,9 +11,9 @@ from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nsvq_lightning.rendering.cpu.arrays import INT64, flat_checked, outside
-from nsvq_lightning.rendering.cpu.jit import kernel, thread_count
-from nsvq_lightning.rendering.kernels import kernels_for
+from nsvq_lightning.compute.devices import kernels_for
+from nsvq_lightning.compute.jit import kernel, thread_count
+from nsvq_lightning.compute.memory import INT64, flat_checked, outside
 
 __all__ = ["count_hits", "lookup", "sum_by_code"]
 

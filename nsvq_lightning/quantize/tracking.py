@@ -20,14 +20,8 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, BoxMemory, box_search, empty_memory
-from nsvq_lightning.quantize.boxes import build_boxes
-from nsvq_lightning.quantize.kernels import lane_min
-from nsvq_lightning.quantize.nearest import check_rows, nearest
-from nsvq_lightning.quantize.scores import LIST, centre_codes, score_search, true_distance
-from nsvq_lightning.rendering.cpu.arrays import INT64, check_array
-from nsvq_lightning.rendering.cpu.jit import inline, kernel, thread_count
-from nsvq_lightning.rendering.cpu.lanes import (
+from nsvq_lightning.compute.jit import inline, kernel, thread_count
+from nsvq_lightning.compute.lanes import (
     fma,
     get,
     lane_sum,
@@ -39,6 +33,12 @@ from nsvq_lightning.rendering.cpu.lanes import (
     splat,
     store,
 )
+from nsvq_lightning.compute.memory import INT64, check_array
+from nsvq_lightning.compute.vectors import lane_min
+from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, BoxMemory, box_search, empty_memory
+from nsvq_lightning.quantize.boxes import build_boxes
+from nsvq_lightning.quantize.nearest import check_rows, nearest
+from nsvq_lightning.quantize.scores import LIST, centre_codes, score_search, true_distance
 
 __all__ = ["NearestTracker"]
 

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from nsvq_lightning.compute import support as cuda_support
+from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.cuda import support as cuda_support
 from nsvq_lightning.rendering.gsplat import support as gsplat_support
-from nsvq_lightning.rendering.kernels import kernels_for
 from nsvq_lightning.rendering.reference import render_reference, visible_rows
-from nsvq_lightning.splats import ATTRIBUTES, SplatTensors, check_shapes, sh_degree_of
+from nsvq_lightning.splats.splats import ATTRIBUTES, SplatTensors, check_shapes, sh_degree_of
 
 __all__ = ["BACKENDS", "Render", "fast_backends", "render", "resolve_backend", "visible"]
 
@@ -60,7 +60,7 @@ def render(
     """Render splats as a camera sees them (3D Gaussian Splatting, eq. 3), differentiable in all six raw attributes.
 
     Args:
-        splats: Raw attributes, see :class:`nsvq_lightning.splats.SplatTensors` for shapes and spaces.
+        splats: Raw attributes, see :class:`nsvq_lightning.splats.splats.SplatTensors` for shapes and spaces.
         camera: Where to look from; COLMAP axes.
         sh_degree: Highest degree of the spherical harmonics that is evaluated; all stored ones by default.
         background: RGB ``[3]`` behind the splats; black by default.

@@ -25,7 +25,7 @@ from nsvq_lightning.rendering.constants import (
     TRANSMITTANCE_MIN,
 )
 from nsvq_lightning.rendering.sh import sh_colors
-from nsvq_lightning.splats import RawSplats, SplatTensors
+from nsvq_lightning.splats.splats import RawSplats, SplatTensors
 
 __all__ = ["Projection", "project", "render_reference", "rotation_matrices", "visible_rows"]
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from nsvq_lightning import cli as front_end
-from nsvq_lightning.benchmark import cli, timing
-from nsvq_lightning.benchmark.registry import SUITES
-from nsvq_lightning.benchmark.report import fill_in
-from nsvq_lightning.benchmark.suites import loss
-from nsvq_lightning.commands import COMMANDS
+from nsvq_lightning.commands.benchmark import cli, timing
+from nsvq_lightning.commands.benchmark.registry import SUITES
+from nsvq_lightning.commands.benchmark.report import fill_in
+from nsvq_lightning.commands.benchmark.suites import loss
+from nsvq_lightning.commands.registry import COMMANDS
+from nsvq_lightning.commands.registry import main as front_end
 from nsvq_lightning.skips import SKIPS
 
 SMALL = ["loss", "--quick", "--repeats", "1", "--threads", "1"]
@@ -114,7 +114,7 @@ def test_both_scripts_know_the_word() -> None:
 
 def test_help_does_not_load_torch() -> None:
     code = (
-        "import sys\nfrom nsvq_lightning.cli import main\n"
+        "import sys\nfrom nsvq_lightning.commands.main import main\n"
         "try:\n    main(['benchmark', '--help'])\n"
         "finally:\n    assert not {'torch', 'numba', 'lightning'} & set(sys.modules)\n"
     )

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from nsvq_lightning.benchmark.fitting import Step, StepClock, fit, one_phase, quiet, training_callbacks
+from nsvq_lightning.commands.benchmark.fitting import Step, StepClock, fit, one_phase, quiet, training_callbacks
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.module import SplatModule
-from nsvq_lightning.schedule import Phase
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.schedule import Phase
 
 PAUSE = 0.1
 CODES = {"scales": 24, "quats": 24, "sh0": 16, "shN": 16}

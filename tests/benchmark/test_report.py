@@ -8,12 +8,12 @@ from typing import Any
 import cv2
 import pytest
 
-from nsvq_lightning.benchmark.machine import describe_machine
-from nsvq_lightning.benchmark.plot import draw_suite
-from nsvq_lightning.benchmark.registry import Suite
-from nsvq_lightning.benchmark.report import as_json, as_markdown, fill_in, number, suite_tables
-from nsvq_lightning.benchmark.row import Row, Timing
-from nsvq_lightning.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.machine import describe_machine
+from nsvq_lightning.commands.benchmark.plot import draw_suite
+from nsvq_lightning.commands.benchmark.registry import Suite
+from nsvq_lightning.commands.benchmark.report import as_json, as_markdown, fill_in, number, suite_tables
+from nsvq_lightning.commands.benchmark.row import Row, Timing
+from nsvq_lightning.commands.benchmark.settings import Settings
 
 MACHINE: dict[str, Any] = {
     "cpu": "Abacus 1",

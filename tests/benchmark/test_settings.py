@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from nsvq_lightning.benchmark.settings import Settings, usable_cores
+from nsvq_lightning.commands.benchmark.settings import Settings, usable_cores
 
 
 def test_full_and_quick_runs_have_their_own_defaults() -> None:

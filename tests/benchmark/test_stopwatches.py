@@ -7,9 +7,9 @@ import pytest
 import torch
 
 import nsvq_lightning
-from nsvq_lightning.benchmark import stopwatches
-from nsvq_lightning.benchmark.stopwatches import Own, Recorder, RecordingProfiler, timed_functions
-from nsvq_lightning.benchmark.workloads import synthetic_workload
+from nsvq_lightning.commands.benchmark import stopwatches
+from nsvq_lightning.commands.benchmark.stopwatches import Own, Recorder, RecordingProfiler, timed_functions
+from nsvq_lightning.commands.benchmark.workloads import synthetic_workload
 from nsvq_lightning.rendering import rasterize
 from nsvq_lightning.rendering.cpu import blend, rasterizer
 
@@ -77,7 +77,7 @@ def test_other_threads_are_not_in_the_time(wait: Callable[[float], None]) -> Non
 
 def test_kernels_functions_and_methods_are_timed_and_put_back() -> None:
     workload = synthetic_workload("A20k").crop(32, 32)
-    leaves = nsvq_lightning.splats.RawSplats(*(tensor.clone().requires_grad_() for tensor in workload.splats))
+    leaves = nsvq_lightning.splats.splats.RawSplats(*(tensor.clone().requires_grad_() for tensor in workload.splats))
 
     def image_and_gradient() -> tuple[torch.Tensor, torch.Tensor]:
         image = rasterize.render(leaves, workload.camera).image

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from nsvq_lightning import save
-from nsvq_lightning.benchmark import suites, timing
-from nsvq_lightning.benchmark.errors import relative_l2, worst_first
-from nsvq_lightning.benchmark.registry import SUITES, Unavailable, load_suite, suite_names
-from nsvq_lightning.benchmark.row import Row
-from nsvq_lightning.benchmark.settings import Settings
-from nsvq_lightning.benchmark.stopwatches import Own
-from nsvq_lightning.benchmark.suites import (
+from nsvq_lightning.commands.benchmark import suites, timing
+from nsvq_lightning.commands.benchmark.errors import relative_l2, worst_first
+from nsvq_lightning.commands.benchmark.registry import SUITES, Unavailable, load_suite, suite_names
+from nsvq_lightning.commands.benchmark.row import Row
+from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.stopwatches import Own
+from nsvq_lightning.commands.benchmark.suites import (
     codec,
     gpu,
     kmeans,
@@ -28,10 +28,10 @@ from nsvq_lightning.benchmark.suites import (
     render,
     train,
 )
-from nsvq_lightning.benchmark.workloads import synthetic_workload
-from nsvq_lightning.io.arrays import SplatArrays
-from nsvq_lightning.schedule import Phase
-from nsvq_lightning.splats import RawSplats
+from nsvq_lightning.commands.benchmark.workloads import synthetic_workload
+from nsvq_lightning.splats.arrays import SplatArrays
+from nsvq_lightning.splats.splats import RawSplats
+from nsvq_lightning.training.schedule import Phase
 
 TINY = Settings((1,), quick=True, repeats=2, seconds=0.01, workloads=("A20k",), steps=8)
 BY_STEP = ("train", "profile", "gpu")
@@ -262,8 +262,8 @@ def test_names_are_put_into_the_first_part_that_fits() -> None:
         "nsvq_lightning.rendering.cpu.blend.blend": Own(0.5, 1),
         "nsvq_lightning.rendering.cpu.blend.blend_backward": Own(0.25, 1),
         "nsvq_lightning.rendering.cpu.blend.total_slots": Own(0.125, 1),
-        "nsvq_lightning.rendering.cpu.arrays.flat": Own(0.0001, 28),
-        "nsvq_lightning.rendering.cpu.dssim.sweep_image": Own(0.003, 1),
+        "nsvq_lightning.compute.memory.flat": Own(0.0001, 28),
+        "nsvq_lightning.quality.ssim_cpu.sweep_image": Own(0.003, 1),
         "[LightningModule]SplatModule.optimizer_step": Own(0.005, 1),
         "run_training_batch": Own(0.1, 1),
     }

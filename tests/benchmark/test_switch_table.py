@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from nsvq_lightning.benchmark.row import Row, Timing
-from nsvq_lightning.benchmark.settings import Settings
-from nsvq_lightning.benchmark.switch_table import fill_switches, scene_name, shares_saved
+from nsvq_lightning.commands.benchmark.row import Row, Timing
+from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.switch_table import fill_switches, scene_name, shares_saved
 
 EMPTY = "before\n<!-- switches -->\n<!-- end -->\nafter\n"
 DOCUMENTATION = Path(__file__).resolve().parents[2] / "docs" / "skips.md"

@@ -6,10 +6,10 @@ import time
 import pytest
 import torch
 
-from nsvq_lightning.benchmark import timing
-from nsvq_lightning.benchmark.row import Timing
-from nsvq_lightning.benchmark.settings import Settings
-from nsvq_lightning.benchmark.timing import Case, measure
+from nsvq_lightning.commands.benchmark import timing
+from nsvq_lightning.commands.benchmark.row import Timing
+from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.timing import Case, measure
 
 
 @pytest.fixture(autouse=True)

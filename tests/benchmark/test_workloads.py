@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from nsvq_lightning import save
-from nsvq_lightning.benchmark.settings import Settings
-from nsvq_lightning.benchmark.sizes import STANDARD
-from nsvq_lightning.benchmark.views import FADING, write_views
-from nsvq_lightning.benchmark.workloads import scene_workload, single_workload, synthetic_workload, workloads
+from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.sizes import STANDARD
+from nsvq_lightning.commands.benchmark.views import FADING, write_views
+from nsvq_lightning.commands.benchmark.workloads import scene_workload, single_workload, synthetic_workload, workloads
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats import RawSplats, Splats
+from nsvq_lightning.splats.splats import RawSplats, Splats
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_scene_file_is_seen_whole_and_without_broken_splats(tmp_path: Path, monk
     assert [workload.name for workload in workloads(Settings((1,), scene=path))] == ["scene.ply"]
     # Our own writer drops such rows; files of others have them.
     source.opacities[3] = torch.nan
-    monkeypatch.setattr("nsvq_lightning.benchmark.workloads.load", lambda _: Splats.from_tensors(*source))
+    monkeypatch.setattr("nsvq_lightning.commands.benchmark.workloads.load", lambda _: Splats.from_tensors(*source))
     assert len(scene_workload(path).splats.means) == 499
 
 

@@ -12,10 +12,10 @@ import torch
 from nsvq_lightning.callbacks import CodebookReplacement, OpacityRegularization, PhaseSchedule, ShDegreeSchedule
 from nsvq_lightning.callbacks.codebooks import perplexity
 from nsvq_lightning.callbacks.latch import StepLatch
-from nsvq_lightning.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.quantize import NSVQ
-from nsvq_lightning.schedule import Phase, Schedule
-from nsvq_lightning.splats import Splats
+from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
+from nsvq_lightning.training.schedule import Phase, Schedule
 
 
 def host(**values: Any) -> Any:

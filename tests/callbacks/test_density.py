@@ -12,14 +12,14 @@ import torch
 from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 
 from nsvq_lightning.callbacks import DensityControl, DensityRules
-from nsvq_lightning.edit import append_rows, keep_rows
-from nsvq_lightning.module import SplatModule
-from nsvq_lightning.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.rendering.rasterize import Render
-from nsvq_lightning.schedule import Schedule
-from nsvq_lightning.splats import Splats
-from nsvq_lightning.strategies import ViewParallelStrategy
+from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.training.edit import append_rows, keep_rows
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
+from nsvq_lightning.training.schedule import Schedule
+from nsvq_lightning.training.strategies import ViewParallelStrategy
 
 EXTENT = 2.0
 SMALL, LARGE = 0.01, 0.05  # below and above 0.01 · extent

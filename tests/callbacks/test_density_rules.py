@@ -21,7 +21,7 @@ from nsvq_lightning.callbacks.density_rules import (
     split_mask,
 )
 from nsvq_lightning.random import generator
-from nsvq_lightning.splats import RawSplats
+from nsvq_lightning.splats.splats import RawSplats
 
 RULES = DensityRules()
 

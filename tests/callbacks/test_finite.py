@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.callbacks import FiniteCodes
-from nsvq_lightning.optim import codebook_group
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
-from nsvq_lightning.schedule import Schedule
+from nsvq_lightning.training.optim import codebook_group
+from nsvq_lightning.training.schedule import Schedule
 
 ROWS = torch.randn(50, 3, generator=generator(0))
 QUANTIZE, FINETUNE = 30_000, 44_000

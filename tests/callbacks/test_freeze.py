@@ -12,11 +12,11 @@ import torch
 
 from nsvq_lightning.callbacks import FreezeCodes
 from nsvq_lightning.callbacks.finite_search import keep_finite_splats
-from nsvq_lightning.edit import append_rows, keep_rows
-from nsvq_lightning.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.quantize import NSVQ
-from nsvq_lightning.schedule import Phase, Schedule
-from nsvq_lightning.splats import Splats
+from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.training.edit import append_rows, keep_rows
+from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
+from nsvq_lightning.training.schedule import Phase, Schedule
 
 FIRST = 43_001
 

@@ -9,10 +9,10 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning import callbacks
-from nsvq_lightning.module import SplatModule
-from nsvq_lightning.optim import LearningRates, param_groups
-from nsvq_lightning.progress import SplatProgressBar
-from nsvq_lightning.splats import Splats
+from nsvq_lightning.callbacks.progress import SplatProgressBar
+from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.optim import LearningRates, param_groups
 
 HOSTED = [
     kind

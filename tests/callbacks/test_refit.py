@@ -12,7 +12,7 @@ from torch import Tensor
 from nsvq_lightning.callbacks import CodebookRefit
 from nsvq_lightning.quantize import NSVQ, StraightThrough
 from nsvq_lightning.random import generator
-from nsvq_lightning.schedule import Schedule
+from nsvq_lightning.training.schedule import Schedule
 
 ROWS = torch.randn(50, 3, generator=generator(0))
 

@@ -12,7 +12,7 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor, nn
 
-from nsvq_lightning.benchmark.fitting import quiet_trainer
+from nsvq_lightning.commands.benchmark.fitting import quiet_trainer
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
 from nsvq_lightning.data.sampler import ViewSampler
 from nsvq_lightning.data.scene import SceneError, View

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from llvmlite import binding
 
-from nsvq_lightning.doctor import machine
-from nsvq_lightning.doctor.backends import check_backends
-from nsvq_lightning.doctor.cli import main
+from nsvq_lightning.commands.doctor import machine
+from nsvq_lightning.commands.doctor.backends import check_backends
+from nsvq_lightning.commands.doctor.cli import main
 
 
 def test_json_has_every_finding_and_the_verdict(capsys: pytest.CaptureFixture[str]) -> None:
@@ -41,7 +41,7 @@ def test_a_bad_folder_gives_status_1(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 def test_help_answers_before_torch_is_imported() -> None:
-    code = "import sys; from nsvq_lightning.cli import main\ntry: main(['doctor', '--help'])\n"
+    code = "import sys; from nsvq_lightning.commands.main import main\ntry: main(['doctor', '--help'])\n"
     code += "finally: assert 'torch' not in sys.modules"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from nsvq_lightning.doctor.finding import Finding, good, report
+from nsvq_lightning.commands.doctor.finding import Finding, good, report
 
 
 def test_a_check_that_breaks_is_a_problem_and_keeps_what_it_said_before() -> None:

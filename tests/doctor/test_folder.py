@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
+from nsvq_lightning.commands.doctor import folder as folder_checks
+from nsvq_lightning.commands.doctor.finding import Finding, good
+from nsvq_lightning.commands.doctor.folder import check_folder
+from nsvq_lightning.commands.doctor.model_checks import check_overlap, corner_shift, shared_points
+from nsvq_lightning.commands.doctor.photo_checks import read_photos
 from nsvq_lightning.data.colmap import import_pycolmap, read_model
 from nsvq_lightning.data.scene import load_scene
-from nsvq_lightning.doctor import folder as folder_checks
-from nsvq_lightning.doctor.finding import Finding, good
-from nsvq_lightning.doctor.folder import check_folder
-from nsvq_lightning.doctor.model_checks import check_overlap, corner_shift, shared_points
-from nsvq_lightning.doctor.photo_checks import read_photos
 
 SceneFactory = Callable[..., Path]
 
@@ -43,7 +43,7 @@ def test_a_sound_scene_has_no_problem(scene: Path) -> None:
 
 
 def test_the_estimate_of_a_run_is_measured(demo_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from nsvq_lightning.doctor import budget
+    from nsvq_lightning.commands.doctor import budget
 
     monkeypatch.setattr(budget, "SPLATS", 2000)
     scene = load_scene(demo_scene)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nsvq_lightning.doctor import self_test
+from nsvq_lightning.commands.doctor import self_test
 from nsvq_lightning.rendering.rasterize import Render, render
 
 

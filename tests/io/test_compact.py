@@ -13,11 +13,11 @@ import torch
 from numpy.typing import NDArray
 
 from nsvq_lightning.io import CompressedScene, FormatError, read_header, read_nsvq, write_nsvq
-from nsvq_lightning.io.arrays import SplatArrays
 from nsvq_lightning.io.compressed import attribute_dims
-from nsvq_lightning.io.container import encode
 from nsvq_lightning.io.formats import save
-from nsvq_lightning.io.precision import OPACITY_ERRORS, Precision
+from nsvq_lightning.io.nsvq.file import encode
+from nsvq_lightning.io.nsvq.precision import OPACITY_ERRORS, Precision
+from nsvq_lightning.splats.arrays import SplatArrays
 
 SIZES = {"quats": 64, "scales": 100, "sh0": 33, "shN": 16}
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.entropy import (
+from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.nsvq.entropy import (
     decode_integers,
     decode_keys,
     decode_paths,
@@ -14,7 +15,6 @@ from nsvq_lightning.io.entropy import (
     encode_keys,
     encode_paths,
 )
-from nsvq_lightning.io.errors import FormatError
 
 
 def before(count: int) -> NDArray[np.int32]:

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nsvq_lightning import cli
-from nsvq_lightning.info import main
+from nsvq_lightning.commands.info import main
+from nsvq_lightning.commands.registry import main as cli
 from nsvq_lightning.io import CompressedScene, SplatArrays, write_nsvq, write_ply
 
 
@@ -88,7 +88,7 @@ def test_bad_files_are_one_line_and_status_1(
 
 def test_it_starts_without_torch_in_under_a_second(tmp_path: Path) -> None:
     write_nsvq(tmp_path / "x.nsvq", _scene(1000))
-    code = "import sys; from nsvq_lightning.info import main; status = main(sys.argv[1:]); "
+    code = "import sys; from nsvq_lightning.commands.info import main; status = main(sys.argv[1:]); "
     code += "assert 'torch' not in sys.modules; sys.exit(status)"
     times = []
     for _ in range(3):

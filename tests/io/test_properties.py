@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from nsvq_lightning.io import CompressedScene, read_nsvq, write_nsvq
 from nsvq_lightning.io.compressed import attribute_dims
 from nsvq_lightning.io.formats import FORMATS, read_scene
-from nsvq_lightning.io.precision import Precision
+from nsvq_lightning.io.nsvq.precision import Precision
 
 CASES = int(os.environ.get("NSVQ_FUZZ_CASES", "40"))
 """Scenes for each property; more in a run by hand."""

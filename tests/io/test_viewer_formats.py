@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 import torch
 
-from nsvq_lightning.info import main as info
+from nsvq_lightning.commands.info import main as info
+from nsvq_lightning.compression.picture_error import decibels, picture_error, pictures
+from nsvq_lightning.compression.pictures import cameras_around
 from nsvq_lightning.io import CompressedScene, FormatError, SplatArrays, load, read_scene, save
 from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.sog import write_sog
 from nsvq_lightning.io.spz_frame import read_spz_header
-from nsvq_lightning.picture_error import decibels, picture_error, pictures
-from nsvq_lightning.viewpoints import cameras_around
 
 sys.path.insert(0, str(Path(__file__).parent))
 from viewer_scenes import angles, coded_scene, nearest_in, needs_zstd, plain_scene, sigmoid

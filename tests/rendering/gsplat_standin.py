@@ -16,7 +16,7 @@ from torch import Tensor
 from nsvq_lightning.rendering import constants, reference
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.sh import sh_basis
-from nsvq_lightning.splats import RawSplats
+from nsvq_lightning.splats.splats import RawSplats
 
 ALPHA_MAX = 0.999
 UNWRITTEN = float("nan")

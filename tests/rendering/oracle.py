@@ -6,7 +6,7 @@ import torch
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, render
-from nsvq_lightning.splats import ATTRIBUTES, RawSplats
+from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats
 
 Gradients = dict[str, torch.Tensor]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.splats import RawSplats
+from nsvq_lightning.splats.splats import RawSplats
 
 
 def random_splats(n: int, seed: int = 0, sh_degree: int = 3, log_scale: float = -2.5) -> RawSplats:

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from nsvq_lightning.cli import main
+from nsvq_lightning.commands.main import main
 from nsvq_lightning.rendering.gsplat import support
 from nsvq_lightning.rendering.rasterize import BACKENDS, fast_backends, render, resolve_backend, visible
-from nsvq_lightning.splats import RawSplats
+from nsvq_lightning.splats.splats import RawSplats
 
 sys.path.insert(0, str(Path(__file__).parent))
 import gsplat_standin

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 import pytest
 
-from nsvq_lightning.rendering.cpu import lanes
+from nsvq_lightning.compute import lanes
 
 Array = np.ndarray[Any, np.dtype[Any]]
 

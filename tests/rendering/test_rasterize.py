@@ -11,11 +11,13 @@ import numba
 import pytest
 import torch
 
+from nsvq_lightning.compute import jit
+from nsvq_lightning.quality import ssim_cpu as dssim
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.cpu import dssim, jit, projection, rasterizer
+from nsvq_lightning.rendering.cpu import projection, rasterizer
 from nsvq_lightning.rendering.rasterize import _warn_of_plain_torch, render, resolve_backend, visible
 from nsvq_lightning.skips import switched
-from nsvq_lightning.splats import RawSplats, Splats
+from nsvq_lightning.splats.splats import RawSplats, Splats
 
 sys.path.insert(0, str(Path(__file__).parent))
 import oracle

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nsvq_lightning.rendering.cpu import lanes
-from nsvq_lightning.rendering.cpu.stamp import digest
+from nsvq_lightning.compute import lanes
+from nsvq_lightning.compute.stamp import digest
 
 CONSTANTS = "SCALE = 2.0  # of the sum\n"
 HELPERS = '''
 import stamped_constants
-from nsvq_lightning.rendering.cpu.jit import inline
+from nsvq_lightning.compute.jit import inline
 
 
 @inline
@@ -26,7 +26,7 @@ def scaled(x, shift=1.0):
 '''
 KERNELS = '''
 from stamped_helpers import scaled
-from nsvq_lightning.rendering.cpu.jit import kernel
+from nsvq_lightning.compute.jit import kernel
 
 
 def total(table):
@@ -129,7 +129,7 @@ def test_meaning_of_operators_counts_for_all_that_names_their_module(monkeypatch
 
     before = digest(kernel)
     assert digest(kernel) == before
-    monkeypatch.setattr("nsvq_lightning.rendering.cpu.stamp._source", lambda module: f"another {module}")
+    monkeypatch.setattr("nsvq_lightning.compute.stamp._source", lambda module: f"another {module}")
     assert digest(kernel) != before
 
 

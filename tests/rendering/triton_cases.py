@@ -22,7 +22,7 @@ from nsvq_lightning.rendering.cuda.binning import list_tiles
 from nsvq_lightning.rendering.cuda.blend import blend, tile_grid
 from nsvq_lightning.rendering.cuda.projection import Lens, project
 from nsvq_lightning.rendering.rasterize import render, resolve_backend, visible
-from nsvq_lightning.splats import RawSplats
+from nsvq_lightning.splats.splats import RawSplats
 
 sys.path.insert(0, str(Path(__file__).parent))
 import oracle

@@ -10,10 +10,11 @@ import math
 import pytest
 import torch
 
-from nsvq_lightning import losses, optim
-from nsvq_lightning.losses import photometric_loss, ssim
-from nsvq_lightning.rendering.cpu.adam import adam_update as adam_update_cpu
-from nsvq_lightning.rendering.cuda.adam import adam_update
+from nsvq_lightning.quality import loss as losses
+from nsvq_lightning.quality.loss import photometric_loss, ssim
+from nsvq_lightning.training import optim
+from nsvq_lightning.training.adam_cpu import adam_update as adam_update_cpu
+from nsvq_lightning.training.adam_cuda import adam_update
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 

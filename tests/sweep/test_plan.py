@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from nsvq_lightning.sweep.plan import Request, Run, plan
+from nsvq_lightning.commands.sweep.plan import Request, Run, plan
 
 
 @pytest.fixture

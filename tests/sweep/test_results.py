@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import pytest
 
-from nsvq_lightning.sweep.plot import draw_sweep
-from nsvq_lightning.sweep.results import Row, as_markdown, grouped, series_of
+from nsvq_lightning.commands.sweep.plot import draw_sweep
+from nsvq_lightning.commands.sweep.results import Row, as_markdown, grouped, series_of
 
 
 def row(seed: int = 0, psnr: float | None = 30.0, **other: object) -> Row:

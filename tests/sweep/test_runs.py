@@ -16,12 +16,12 @@ from typing import Any
 
 import pytest
 
-from nsvq_lightning.cli import main
-from nsvq_lightning.sweep.cli import main as sweep_main
-from nsvq_lightning.sweep.plan import Request, Run, plan
-from nsvq_lightning.sweep.results import Row
-from nsvq_lightning.sweep.runs import Sweep
-from nsvq_lightning.sweep.training import Training, TrainingError, run_subprocess
+from nsvq_lightning.commands.main import main
+from nsvq_lightning.commands.sweep.cli import main as sweep_main
+from nsvq_lightning.commands.sweep.plan import Request, Run, plan
+from nsvq_lightning.commands.sweep.results import Row
+from nsvq_lightning.commands.sweep.runs import Sweep
+from nsvq_lightning.commands.sweep.training import Training, TrainingError, run_subprocess
 
 OPTIONS = (
     "--data.factor=2",

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from nsvq_lightning.sweep import settings as module
-from nsvq_lightning.sweep.settings import Settings, digest, resolve, trunk_of
+from nsvq_lightning.commands.sweep import settings as module
+from nsvq_lightning.commands.sweep.settings import Settings, digest, resolve, trunk_of
 
 SCENE = ["--data.root=scene", "--trainer.max_steps=60"]
 

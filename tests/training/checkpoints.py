@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.callbacks import RunCheckpoint
-from nsvq_lightning.schedule import Schedule
+from nsvq_lightning.training.schedule import Schedule
 
 
 class CheckpointAt(RunCheckpoint):

@@ -11,7 +11,6 @@ import pytest
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 
-from nsvq_lightning.benchmark.fitting import quiet_trainer
 from nsvq_lightning.callbacks import (
     CodebookInit,
     CodebookReplacement,
@@ -25,8 +24,9 @@ from nsvq_lightning.callbacks import (
     PhaseSchedule,
     ShDegreeSchedule,
 )
+from nsvq_lightning.commands.benchmark.fitting import quiet_trainer
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.module import SplatModule
+from nsvq_lightning.training.module import SplatModule
 
 sys.path.insert(0, str(Path(__file__).parent))  # test modules share what stands in modules beside them
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from nsvq_lightning.host import as_host
+from nsvq_lightning.training.host import as_host
 
 
 class ReplicaWitness(Callback):

@@ -22,14 +22,14 @@ from nsvq_lightning.callbacks import (
     PhaseSchedule,
     RunCheckpoint,
 )
-from nsvq_lightning.cli import main
-from nsvq_lightning.covariance_error import covariances
+from nsvq_lightning.commands.main import main
+from nsvq_lightning.compression.covariance_error import covariances
+from nsvq_lightning.compression.pixel_size import scale_floor
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.module import SplatModule
-from nsvq_lightning.pixel_size import scale_floor
 from nsvq_lightning.quantize import NSVQ
-from nsvq_lightning.run_folder import run_folder
-from nsvq_lightning.schedule import Phase
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.run_folder import run_folder
+from nsvq_lightning.training.schedule import Phase
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 Recipe = Callable[..., dict[str, Callback]]

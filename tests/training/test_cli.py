@@ -13,13 +13,13 @@ import pytest
 import torch
 import yaml
 
-from nsvq_lightning import cli
-from nsvq_lightning.cli import _without_folder, check_config, find_config, main, resolve_configs
-from nsvq_lightning.io.container import read_nsvq
+from nsvq_lightning.commands.main import _without_folder, check_config, find_config, main, resolve_configs
+from nsvq_lightning.commands.registry import main as cli
 from nsvq_lightning.io.formats import load
-from nsvq_lightning.module import SplatModule
-from nsvq_lightning.schedule import Phase
+from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.skips import is_on
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.schedule import Phase
 
 CODES = ["--model.codebooks.scales=16", "--model.codebooks.sh0=8"]
 
@@ -88,7 +88,7 @@ def test_checkpoints_of_the_command_line_are_plain_data_and_load(finished: Path)
     path = finished / "checkpoints" / "last.ckpt"
     stored = torch.load(path, weights_only=True)
     assert stored["hyper_parameters"]["quantizer"]["class_path"].endswith("NSVQ")
-    from nsvq_lightning.module import SplatModule
+    from nsvq_lightning.training.module import SplatModule
 
     module = SplatModule.load_from_checkpoint(path, weights_only=True)
     assert set(module.quantizers) == {"scales", "sh0"}
@@ -441,7 +441,7 @@ def test_errors_are_one_line_and_name_the_option(capsys: pytest.CaptureFixture[s
 
 def test_info_starts_without_torch(finished: Path) -> None:
     code = (
-        "import sys; from nsvq_lightning.cli import main; status = main(sys.argv[1:]); "
+        "import sys; from nsvq_lightning.commands.main import main; status = main(sys.argv[1:]); "
         "assert 'torch' not in sys.modules, 'torch was imported'; sys.exit(status)"
     )
     done = subprocess.run(

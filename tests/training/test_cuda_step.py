@@ -16,16 +16,16 @@ from typing import Any
 import pytest
 import torch
 
-from nsvq_lightning.losses import photometric_loss, ssim
-from nsvq_lightning.optim import SplatAdam, build_adam, set_columns
+from nsvq_lightning.compute.devices import kernels_for
+from nsvq_lightning.compute.rows import take_rows
+from nsvq_lightning.quality.loss import photometric_loss, ssim
 from nsvq_lightning.quantize.diveq import DiVeQ
 from nsvq_lightning.quantize.nsvq import NSVQ
 from nsvq_lightning.quantize.straight_through import StraightThrough, TrainedStraightThrough
 from nsvq_lightning.quantize.sums import lookup, sum_by_code
 from nsvq_lightning.random import generator
-from nsvq_lightning.rendering.kernels import kernels_for
 from nsvq_lightning.skips import switched
-from nsvq_lightning.subset import take_rows
+from nsvq_lightning.training.optim import SplatAdam, build_adam, set_columns
 
 USERS = ("losses", "optim", "subset", "quantize.nearest", "quantize.nsvq", "quantize.sums", "callbacks.density_rules")
 """The modules that choose kernels by device."""

@@ -15,10 +15,10 @@ from torch import Tensor
 from nsvq_lightning.callbacks import DensityControl, DensityRules
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.data.synthetic import write_synthetic_scene
-from nsvq_lightning.module import SplatModule
 from nsvq_lightning.random import generator
-from nsvq_lightning.schedule import Phase
-from nsvq_lightning.splats import Splats
+from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.schedule import Phase
 
 FAR = 1e5
 

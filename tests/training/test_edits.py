@@ -11,9 +11,9 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.callbacks import PhaseSchedule
-from nsvq_lightning.edit import append_rows, keep_rows
-from nsvq_lightning.host import as_host, raw_optimizer
-from nsvq_lightning.module import SplatModule
+from nsvq_lightning.training.edit import append_rows, keep_rows
+from nsvq_lightning.training.host import as_host, raw_optimizer
+from nsvq_lightning.training.module import SplatModule
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 Recipe = Callable[..., dict[str, Callback]]

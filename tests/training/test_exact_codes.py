@@ -10,12 +10,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from nsvq_lightning.benchmark.fitting import fit
 from nsvq_lightning.callbacks import CodebookInit, CodebookReplacement, PhaseSchedule
+from nsvq_lightning.commands.benchmark.fitting import fit
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.module import SplatModule
 from nsvq_lightning.quantize import CodebookQuantizer, nearest_reference
-from nsvq_lightning.splats import Splats
+from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.training.module import SplatModule
 
 WARM_UP = 30
 """Steps before the codebooks start, so that rows differ."""

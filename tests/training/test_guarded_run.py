@@ -8,8 +8,8 @@ from conftest import Recipe
 from guards import guarded
 from lightning.pytorch import Trainer
 
-from nsvq_lightning.module import SplatModule
-from nsvq_lightning.run_folder import run_folder
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.run_folder import run_folder
 
 
 def test_no_kernel_of_a_run_writes_beside_its_arrays(

@@ -30,12 +30,12 @@ from nsvq_lightning.callbacks import (
     PhaseSchedule,
     RunCheckpoint,
 )
-from nsvq_lightning.cli import main
-from nsvq_lightning.lightning_cli import continuation
-from nsvq_lightning.module import SplatModule
+from nsvq_lightning.commands.fit import continuation
+from nsvq_lightning.commands.main import main
 from nsvq_lightning.quantize import StraightThrough
-from nsvq_lightning.run_folder import run_folder
-from nsvq_lightning.schedule import Schedule
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.run_folder import run_folder
+from nsvq_lightning.training.schedule import Schedule
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 Recipe = Callable[..., dict[str, Callback]]
@@ -365,9 +365,9 @@ def test_the_command_that_continues_again_names_one_checkpoint(monkeypatch: pyte
 
 KILLED = """
 import os, signal, sys
-from nsvq_lightning.cli import main
-from nsvq_lightning.lightning_cli import continuation
-from nsvq_lightning.module import SplatModule
+from nsvq_lightning.commands.main import main
+from nsvq_lightning.commands.fit import continuation
+from nsvq_lightning.training.module import SplatModule
 step = SplatModule.training_step
 def killed(module, batch, batch_idx):
     if module.global_step + 1 == {iteration}:

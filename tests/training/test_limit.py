@@ -9,8 +9,8 @@ from conftest import Recipe, RunFactory
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.callbacks import DensityControl, DensityRules
-from nsvq_lightning.host import as_host, train_contributions
-from nsvq_lightning.module import SplatModule
+from nsvq_lightning.training.host import as_host, train_contributions
+from nsvq_lightning.training.module import SplatModule
 
 
 class Counts(Callback):

@@ -11,22 +11,22 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor, nn
 
-from nsvq_lightning.benchmark.fitting import fit
 from nsvq_lightning.callbacks import PhaseSchedule
+from nsvq_lightning.commands.benchmark.fitting import fit
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.host import SplatHost, splat_host
-from nsvq_lightning.hyperparameters import plain
 from nsvq_lightning.io.formats import save
-from nsvq_lightning.module import SplatModule
-from nsvq_lightning.optim import LearningRates
 from nsvq_lightning.quantize.nsvq import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render, visible
-from nsvq_lightning.schedule import Phase
-from nsvq_lightning.splats import ATTRIBUTES, RawSplats, Splats
-from nsvq_lightning.state import RunState, Stopwatch
+from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats, Splats
+from nsvq_lightning.training.host import SplatHost, splat_host
+from nsvq_lightning.training.hyperparameters import plain
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.optim import LearningRates
+from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.training.state import RunState, Stopwatch
 
 CODES = {"scales": 6, "quats": 5, "sh0": 4, "shN": 3}
 
@@ -76,7 +76,7 @@ def test_quantizing_renders_the_visible_splats_with_noise_of_the_right_length(
         seen.append(splats)
         return render(splats, view, **settings)
 
-    monkeypatch.setattr("nsvq_lightning.model.render", spy)
+    monkeypatch.setattr("nsvq_lightning.training.model.render", spy)
     module.phase = Phase.QUANTIZE
     module(camera())
     rows = visible(module.splats.raw(), camera())
@@ -138,7 +138,7 @@ def test_a_loss_that_is_not_finite_skips_the_update(
 ) -> None:
     view = View("a.png", 0, camera(), torch.zeros(30, 40, 3, dtype=torch.uint8))
     assert module.training_step(view, 0) is not None
-    monkeypatch.setattr("nsvq_lightning.module.photometric_loss", lambda image, *_: image.sum() * torch.nan)
+    monkeypatch.setattr("nsvq_lightning.training.module.photometric_loss", lambda image, *_: image.sum() * torch.nan)
     assert module.training_step(view, 0) is None
     assert "the loss of a.png is nan, no update" in caplog.text
 
@@ -190,7 +190,7 @@ def test_a_loaded_state_refreshes_the_mirrors() -> None:
 
 def test_a_paused_stopwatch_stands_still(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr("nsvq_lightning.state.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("nsvq_lightning.training.state.time.perf_counter", lambda: now[0])
     state = RunState()
     watch = Stopwatch(state)
     watch.lap()
@@ -235,7 +235,7 @@ def test_splats_of_a_file_that_are_not_finite_are_left_out(
 ) -> None:
     start = make_splats()
     start.quats.data[7, 2] = torch.nan
-    monkeypatch.setattr("nsvq_lightning.module.load", lambda _: start)
+    monkeypatch.setattr("nsvq_lightning.training.module.load", lambda _: start)
     data = ColmapDataModule(str(demo_scene), factor=4)
 
     def fitted() -> SplatModule:

@@ -13,9 +13,8 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.callbacks import CodebookRefit, CodebookReplacement, MetricReport, PhaseSchedule, RunCheckpoint
-from nsvq_lightning.io.container import read_nsvq
-from nsvq_lightning.io.precision import Storage
-from nsvq_lightning.module import SplatModule
+from nsvq_lightning.io.nsvq.file import read_nsvq
+from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.quantize import (
     CodebookQuantizer,
     DiVeQ,
@@ -26,8 +25,9 @@ from nsvq_lightning.quantize import (
     kmeans,
 )
 from nsvq_lightning.random import generator
-from nsvq_lightning.run_folder import run_folder
-from nsvq_lightning.schedule import Phase, Schedule
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.run_folder import run_folder
+from nsvq_lightning.training.schedule import Phase, Schedule
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 Recipe = Callable[..., dict[str, Callback]]

@@ -29,15 +29,15 @@ from nsvq_lightning.callbacks import (
     RunCheckpoint,
 )
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.io.container import read_header, read_nsvq, write_nsvq
 from nsvq_lightning.io.formats import load
-from nsvq_lightning.io.precision import Storage
-from nsvq_lightning.module import SplatModule
-from nsvq_lightning.optim import LearningRates, position_lr
+from nsvq_lightning.io.nsvq.file import read_header, read_nsvq, write_nsvq
+from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.quantize import NSVQ, PostHoc, StraightThrough
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.run_folder import run_folder
-from nsvq_lightning.schedule import Phase, Schedule
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.optim import LearningRates, position_lr
+from nsvq_lightning.training.run_folder import run_folder
+from nsvq_lightning.training.schedule import Phase, Schedule
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 Recipe = Callable[..., dict[str, Callback]]

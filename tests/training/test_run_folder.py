@@ -10,11 +10,11 @@ from conftest import RunFactory
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import CSVLogger, Logger
 
-from nsvq_lightning.benchmark.fitting import quiet_trainer
 from nsvq_lightning.callbacks import ExportScene, MetricReport, PhaseSchedule, RenderWriter, RunCheckpoint
-from nsvq_lightning.cli import main
+from nsvq_lightning.commands.benchmark.fitting import quiet_trainer
+from nsvq_lightning.commands.main import main
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.run_folder import claim_version, run_folder
+from nsvq_lightning.training.run_folder import claim_version, run_folder
 
 
 class Elsewhere(Logger):

@@ -10,9 +10,9 @@ from lightning.pytorch import Callback, Trainer
 from torch import Tensor
 
 from nsvq_lightning.io.formats import load
-from nsvq_lightning.module import SplatModule
-from nsvq_lightning.run_folder import run_folder
 from nsvq_lightning.skips import SKIPS, switched
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.run_folder import run_folder
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 Recipe = Callable[..., dict[str, Callback]]

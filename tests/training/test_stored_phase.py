@@ -7,10 +7,10 @@ import logging
 import pytest
 import torch
 
-from nsvq_lightning.module import SplatModule
 from nsvq_lightning.quantize import PostHoc
-from nsvq_lightning.schedule import Phase
-from nsvq_lightning.splats import ATTRIBUTES, Splats
+from nsvq_lightning.splats.splats import ATTRIBUTES, Splats
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.schedule import Phase
 
 
 def splats(count: int = 40) -> Splats:

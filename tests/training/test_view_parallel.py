@@ -22,8 +22,8 @@ import torch
 import torch.distributed
 from checkpoints import assert_same_end, iteration_of, read
 
-from nsvq_lightning.cli import main
-from nsvq_lightning.schedule import Phase
+from nsvq_lightning.commands.main import main
+from nsvq_lightning.training.schedule import Phase
 
 pytestmark = pytest.mark.skipif(
     not (torch.distributed.is_available() and torch.distributed.is_gloo_available()),

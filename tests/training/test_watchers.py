@@ -14,7 +14,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from nsvq_lightning.callbacks import MetricReport, RunCheckpoint
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.run_folder import run_folder
+from nsvq_lightning.training.run_folder import run_folder
 
 
 def curve(folder: Path) -> dict[int, float]:

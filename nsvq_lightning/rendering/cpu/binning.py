@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from nsvq_lightning.rendering.cpu.jit import inline, kernel
-from nsvq_lightning.rendering.cpu.lanes import get, prefetch, put
+from nsvq_lightning.compute.jit import inline, kernel
+from nsvq_lightning.compute.lanes import get, prefetch, put
 from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES
 
 DIGIT_BITS = 11

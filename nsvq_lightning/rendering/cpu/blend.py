@@ -14,9 +14,8 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from nsvq_lightning.rendering import constants
-from nsvq_lightning.rendering.cpu.jit import inline, kernel
-from nsvq_lightning.rendering.cpu.lanes import (
+from nsvq_lightning.compute.jit import inline, kernel
+from nsvq_lightning.compute.lanes import (
     any_lane,
     column_bits,
     exp2,
@@ -40,6 +39,7 @@ from nsvq_lightning.rendering.cpu.lanes import (
     vmax,
     vmin,
 )
+from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.cpu.records import (
     BLUE,
     DEPTH,

@@ -8,9 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from nsvq_lightning.rendering import constants, sh
-from nsvq_lightning.rendering.cpu.jit import inline, kernel
-from nsvq_lightning.rendering.cpu.lanes import (
+from nsvq_lightning.compute.jit import inline, kernel
+from nsvq_lightning.compute.lanes import (
     exp2_clamped,
     fma,
     fnma,
@@ -41,6 +40,7 @@ from nsvq_lightning.rendering.cpu.lanes import (
     vmin,
     vsqrt,
 )
+from nsvq_lightning.rendering import constants, sh
 from nsvq_lightning.rendering.cpu.records import (
     BLUE,
     CX,

@@ -9,9 +9,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from nsvq_lightning.compute.jit import thread_count
+from nsvq_lightning.compute.memory import Array, flat, flat_checked
+from nsvq_lightning.compute.workspace import Workspace, recycled
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import FRUSTUM_MARGIN
-from nsvq_lightning.rendering.cpu.arrays import Array, flat, flat_checked
 from nsvq_lightning.rendering.cpu.binning import DIGITS, count_tiles, fill_tiles, sort_by_depth
 from nsvq_lightning.rendering.cpu.blend import (
     BACKWARD_SCRATCH,
@@ -22,12 +24,10 @@ from nsvq_lightning.rendering.cpu.blend import (
     pixel_grid,
     total_slots,
 )
-from nsvq_lightning.rendering.cpu.jit import thread_count
 from nsvq_lightning.rendering.cpu.projection import find_visible, finish_records, project_backward, project_splats
 from nsvq_lightning.rendering.cpu.records import CAMERA, GROUP_TILES, RECORD, TILE, group_grid
-from nsvq_lightning.rendering.cpu.workspace import Workspace, recycled
 from nsvq_lightning.skips import is_on
-from nsvq_lightning.splats import ATTRIBUTES, SplatTensors, sh_degree_of
+from nsvq_lightning.splats.splats import ATTRIBUTES, SplatTensors, sh_degree_of
 
 __all__ = ["render_cpu", "visible_cpu"]
 

@@ -16,6 +16,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from nsvq_lightning.compute.tensors import check_tensor
 from nsvq_lightning.rendering.cuda.binning import Tiles
 from nsvq_lightning.rendering.cuda.projection import Lens
 from nsvq_lightning.rendering.cuda.records import (
@@ -48,7 +49,6 @@ from nsvq_lightning.rendering.cuda.records import (
     X,
     Y,
 )
-from nsvq_lightning.rendering.cuda.tensors import check_tensor
 
 __all__ = ["blend", "blend_backward", "tile_grid"]
 

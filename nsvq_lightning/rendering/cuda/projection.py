@@ -12,6 +12,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from nsvq_lightning.compute.tensors import check_tensor
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda.harmonics import color, color_backward
@@ -39,8 +40,7 @@ from nsvq_lightning.rendering.cuda.records import (
     X,
     Y,
 )
-from nsvq_lightning.rendering.cuda.tensors import check_tensor
-from nsvq_lightning.splats import ATTRIBUTES, sh_degree_of
+from nsvq_lightning.splats.splats import ATTRIBUTES, sh_degree_of
 
 __all__ = ["Lens", "Projected", "project", "project_backward", "project_radii"]
 

@@ -12,7 +12,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda.binning import Tiles, list_tiles
 from nsvq_lightning.rendering.cuda.blend import blend, blend_backward, tile_grid
 from nsvq_lightning.rendering.cuda.projection import Lens, project, project_backward, project_radii
-from nsvq_lightning.splats import SplatTensors
+from nsvq_lightning.splats.splats import SplatTensors
 
 __all__ = ["render_cuda", "visible_cuda"]
 

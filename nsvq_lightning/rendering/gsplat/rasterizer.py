@@ -29,7 +29,7 @@ from torch import Tensor
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import BLUR, NEAR
-from nsvq_lightning.splats import SplatTensors
+from nsvq_lightning.splats.splats import SplatTensors
 
 __all__ = ["render_gsplat", "visible_gsplat"]
 

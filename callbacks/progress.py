@@ -1,0 +1,157 @@
+"""The progress of a run as a whole: a bar on a terminal, plain lines in a file."""
+
+from __future__ import annotations
+
+import sys
+import time
+from contextlib import ExitStack
+from typing import Any
+
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import TQDMProgressBar
+from lightning.pytorch.callbacks.progress.tqdm_progress import Tqdm
+
+from nsvq_lightning.compute.compilation import compile_seconds, compile_watcher
+from nsvq_lightning.training.host import as_host, splat_host
+
+__all__ = ["SplatProgressBar"]
+
+LINES = 50
+"""Lines of a run where the output is no terminal."""
+
+
+class SplatProgressBar(TQDMProgressBar):
+    """One bar over the iterations of the run, also of a resumed one; where the output is no terminal, plain lines.
+
+    Behind count and time it shows the phase, the number of splats, the training PSNR of recent steps (exponential mean)
+    and the latest test PSNR. It fits 80 columns. The time that kernels are compiled for is left out of the estimate of
+    what remains.
+
+    Args:
+        refresh_rate: Iterations between two refreshes on a terminal; 0 switches the bar off.
+        smoothing: Weight of the past in the exponential mean, in [0, 1).
+
+    Raises:
+        ValueError: ``smoothing`` is out of range.
+    """
+
+    BAR_FORMAT = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} {elapsed}<{remaining}{postfix}"
+
+    def __init__(self, refresh_rate: int = 25, smoothing: float = 0.8) -> None:
+        if not 0.0 <= smoothing < 1.0:
+            raise ValueError(f"smoothing must be in [0, 1), got {smoothing}")
+        super().__init__(refresh_rate=refresh_rate)
+        self.smoothing = smoothing
+        self._psnr: float | None = None
+        self._is_plain = False
+        self._started = self._compiled_before = 0.0
+        self._watching = ExitStack()
+
+    @property
+    def total_train_batches(self) -> int | float:
+        """Micro-batches of the whole run; the epoch of an endless sampler never ends."""
+        return self.trainer.max_steps * self.trainer.accumulate_grad_batches
+
+    @property
+    def is_disabled(self) -> bool:
+        """Whether no bar is drawn."""
+        return super().is_disabled or self._is_plain
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """See what the output is; lines in a file are few."""
+        super().setup(trainer, pl_module, stage)
+        splat_host(pl_module)
+        self._psnr = None
+        self._is_plain = not _shows_bars()
+        if stage == "fit" and self._is_plain and self._refresh_rate > 0:
+            self._refresh_rate = max(self._refresh_rate, trainer.max_steps // LINES)
+
+    def on_train_start(self, trainer: Trainer, *args: Any) -> None:
+        """Start the bar where the run is."""
+        super().on_train_start(trainer, *args)
+        done = trainer.global_step * trainer.accumulate_grad_batches
+        self.train_progress_bar.reset(total=self.total_train_batches)
+        self.train_progress_bar.initial = self.train_progress_bar.n = done  # n - initial, over the time, is the speed
+        self._started, self._compiled_before = time.time(), compile_seconds()
+        self._watching.enter_context(compile_watcher(self._show_compilation))
+
+    def on_train_epoch_start(self, trainer: Trainer, *args: Any) -> None:
+        """Leave the bar as it is: there is only one epoch, and a resumed run is in the middle of it."""
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Refresh the bar, or write a line."""
+        # A resumed run starts to count batches anew; its bar does not.
+        done = trainer.global_step * trainer.accumulate_grad_batches
+        if not self._should_update(done, int(self.total_train_batches)):
+            return
+        text = self._text(trainer, pl_module)
+        if self._is_plain:
+            sys.stdout.write(f"{self._line(trainer)}: {text}\n")
+            sys.stdout.flush()
+            return
+        bar = self.train_progress_bar
+        bar.start_t = self._start_without_compilation()
+        bar.n = done
+        bar.set_postfix_str(text)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave the bar as it is; the end of the run is the end of its only epoch."""
+
+    def on_train_end(self, *args: Any) -> None:
+        """Close the bar."""
+        super().on_train_end(*args)
+        self._watching.close()
+
+    def on_exception(self, *args: Any) -> None:
+        """Close the bar, so that what went wrong starts on a line of its own."""
+        self._watching.close()
+        if self._train_progress_bar is not None:
+            self._train_progress_bar.close()
+
+    def init_train_tqdm(self) -> Tqdm:
+        """The bar, without the word epoch."""
+        bar = super().init_train_tqdm()
+        bar.set_description_str("", refresh=False)
+        return bar
+
+    def _line(self, trainer: Trainer) -> str:
+        step, total = trainer.global_step, trainer.max_steps
+        seconds = time.time() - self._start_without_compilation()
+        done = self.train_progress_bar.initial / trainer.accumulate_grad_batches
+        left = seconds * (total - step) / max(1.0, step - done)
+        passed, remaining = Tqdm.format_interval(seconds), Tqdm.format_interval(left)
+        return f"iteration {step} of {total} ({100 * step // total} %), {passed} passed, {remaining} left"
+
+    def _start_without_compilation(self) -> float:
+        return self._started + compile_seconds() - self._compiled_before
+
+    def _text(self, trainer: Trainer, module: LightningModule) -> str:
+        host = as_host(module)
+        parts = [f"{host.phase.name.lower()} {_rounded(len(host.splats))} splats"]
+        psnr = trainer.callback_metrics.get("train/psnr")
+        if psnr is not None:
+            past = float(psnr) if self._psnr is None else self._psnr
+            self._psnr = self.smoothing * past + (1.0 - self.smoothing) * float(psnr)
+            parts.append(f"{self._psnr:.1f} dB")
+        if host.history:
+            parts.append(f"test {host.history[-1]['psnr']:.2f}")
+        return " ".join(parts)
+
+    def _show_compilation(self, compiling: bool) -> None:
+        bar = self._train_progress_bar
+        if compiling and bar is not None and not bar.disable:
+            bar.set_postfix_str("compiling kernels")  # the next refresh takes it away
+
+
+def _shows_bars() -> bool:
+    """Whether the output is a terminal or a notebook, where a line can be drawn again."""
+    return sys.stdout.isatty() or "ipykernel" in sys.modules
+
+
+def _rounded(count: int) -> str:
+    """A number in at most five characters."""
+    if count < 10_000:
+        return str(count)
+    return f"{count / 1000:.0f}k" if count < 1_000_000 else f"{count / 1e6:.2f}M"

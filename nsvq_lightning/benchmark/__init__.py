@@ -1,5 +1,0 @@
-"""Run time against error: every fast part of the package measured beside its plain counterpart and a float64 oracle."""
-
-from nsvq_lightning.benchmark.cli import main
-
-__all__ = ["main"]

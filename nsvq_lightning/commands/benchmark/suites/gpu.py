@@ -1,0 +1,194 @@
+"""The back-ends of a GPU side by side, beside the limit of its memory, and a training step of each phase on it.
+
+Times are those between two events in the GPU's stream. No render can be faster than its memory gives and takes what it
+must read and write once: ``share of memory limit %`` is that time, at the speed of a plain copy, as a share of the
+measured one. What a back-end reads again, sorts or keeps for the backward pass is its own affair and not in the limit.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from statistics import median
+
+import torch
+
+from nsvq_lightning.commands.benchmark.fitting import Step, StepClock, fit, one_phase, training_callbacks
+from nsvq_lightning.commands.benchmark.registry import Unavailable
+from nsvq_lightning.commands.benchmark.row import Row, Timing
+from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.sizes import LARGE, STANDARD
+from nsvq_lightning.commands.benchmark.suites.render import (
+    BOTH,
+    FORWARD,
+    ORACLE_PAIRS,
+    Method,
+    case_of,
+    crop_for_oracle,
+    crop_note,
+    leaves_of,
+    method_errors,
+)
+from nsvq_lightning.commands.benchmark.timing import Case, finish, measure, milliseconds, sgemm, use_threads
+from nsvq_lightning.commands.benchmark.trainees import Trainee, trainee
+from nsvq_lightning.commands.benchmark.workloads import Workload, synthetic_workload, workloads
+from nsvq_lightning.data.scene import View
+from nsvq_lightning.quantize import NSVQ
+from nsvq_lightning.rendering.rasterize import fast_backends, resolve_backend, visible
+from nsvq_lightning.training.schedule import Phase
+
+__all__ = ["copy_speed", "least_bytes", "run", "run_on"]
+
+log = logging.getLogger(__name__)
+
+COMPARED = ("cuda", "gsplat")
+"""Back-ends that are missed where they are not there."""
+COPIED = 2**28
+"""Bytes of the copy that says how fast the memory is: more than any cache holds."""
+COPIES = 5
+FLOAT = 4
+"""Bytes of a number."""
+WARM_STEPS, STEPS = {True: 6, False: 60}, {True: 8, False: 60}
+"""Steps that are not counted, and those that are: searches that remember need some to have something to."""
+
+
+def run(settings: Settings) -> list[Row]:
+    """Measure on the first CUDA device.
+
+    Raises:
+        Unavailable: There is none, or no back-end for it.
+    """
+    if not torch.cuda.is_available():
+        raise Unavailable("torch finds no CUDA device (nsvq doctor says why)")
+    device = torch.device("cuda")
+    for name in COMPARED:
+        try:
+            resolve_backend(name, torch.zeros(1, device=device))
+        except ValueError as reason:
+            log.warning("gpu: left out: %s", reason)
+    return run_on(device, settings)
+
+
+def run_on(device: torch.device, settings: Settings) -> list[Row]:
+    """Measure every fast back-end that a device has.
+
+    Raises:
+        Unavailable: There is none.
+    """
+    names = fast_backends(torch.zeros(1, device=device))
+    if not names:
+        raise Unavailable(f"no fast back-end renders on {device}: pip install triton")
+    with use_threads(max(settings.threads)):
+        speed = copy_speed(device)
+        rows: list[Row] = []
+        for workload in _workloads(settings):
+            rows += _render_rows(workload.to(device), names, speed, settings)
+        return [*rows, *_step_rows(device, names, settings)]
+
+
+def _workloads(settings: Settings) -> Iterator[Workload]:
+    """What the user names; the standard scenes are followed, one at a time, by those that are too much for a CPU."""
+    yield from workloads(settings)
+    if settings.scene is None and settings.workloads == STANDARD:
+        yield from map(synthetic_workload, LARGE)
+
+
+# Renders
+
+
+def _render_rows(workload: Workload, names: Sequence[str], speed: float, settings: Settings) -> list[Row]:
+    device, methods = workload.splats.means.device, [Method(name) for name in names]
+    crop = crop_for_oracle(workload, ORACLE_PAIRS[settings.quick])
+    errors, note = method_errors(crop, methods), crop_note(crop, workload)
+    seen = len(visible(workload.splats, workload.camera, backend=names[0]))
+    keys, leaves = [(method, operation) for method in methods for operation in (FORWARD, BOTH)], leaves_of(workload)
+    cases = [case_of(workload, leaves, *key) for key in keys]
+    threads = max(settings.threads)
+    timings = measure(cases, settings, threads, device).values()
+    rows = []
+    for (method, operation), case, timing in zip(keys, cases, timings, strict=True):
+        limit = 1000 * least_bytes(workload, seen, backward=operation == BOTH) / speed
+        values = {**errors[method, operation], "share of memory limit %": 100 * limit / timing.median}
+        values.update(_peak_memory(case, device))
+        rows.append(Row("gpu", str(workload), str(method), operation, threads, timing, values, note))
+    return rows
+
+
+def least_bytes(workload: Workload, seen: int, *, backward: bool) -> int:
+    """Bytes that a render must read and write, each once.
+
+    Forward: position, rotation, scale and opacity of all splats, colours of those seen, image, alpha and depth.
+    Backward besides: all attributes of those seen, the gradient of the image, and that of every attribute.
+
+    Args:
+        workload: What is rendered.
+        seen: Splats that can change the image.
+        backward: Whether the backward pass is in it.
+    """
+    splats, camera = workload.splats, workload.camera
+    count, pixels = len(splats.means), camera.width * camera.height
+    geometry = sum(tensor[:1].numel() for tensor in splats[:4])
+    color = sum(tensor[:1].numel() for tensor in splats[4:])
+    numbers = geometry * count + color * seen + 5 * pixels
+    if backward:
+        numbers += (geometry + color) * (seen + count) + 3 * pixels
+    return FLOAT * numbers
+
+
+def copy_speed(device: torch.device) -> float:
+    """Bytes a second that the memory of a device gives and takes: each byte of a copy is read and written."""
+    source = torch.zeros(COPIED, dtype=torch.uint8, device=device)
+    target = torch.empty_like(source)
+    case = Case("copy", lambda: target.copy_(source))
+    return 1000 * 2 * COPIED / min(milliseconds(case, device) for _ in range(COPIES))
+
+
+def _peak_memory(case: Case, device: torch.device) -> dict[str, float]:
+    """Megabytes that a call needs on top of what is there; nothing on a CPU, where torch does not count."""
+    if device.type != "cuda":
+        return {}
+    finish()
+    torch.cuda.reset_peak_memory_stats(device)
+    before = torch.cuda.memory_allocated(device)
+    case.run()
+    return {"peak MB": (torch.cuda.max_memory_allocated(device) - before) / 1e6}
+
+
+# Training steps
+
+
+def _step_rows(device: torch.device, names: Sequence[str], settings: Settings) -> list[Row]:
+    with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder:
+        subject = trainee(settings, Path(folder), "C500k")
+        rows = []
+        for phase in Phase:
+            for name in names:
+                timing = _steps(subject, phase, name, device, settings.quick)
+                values = {"steps a second": 1000 / median(timing.samples)}
+                operation, threads = f"{phase.name.lower()} step", max(settings.threads)
+                note = "whole steps by the clock, Lightning included"
+                rows.append(Row("gpu", subject.name, name, operation, threads, timing, values, note))
+        return rows
+
+
+def _steps(subject: Trainee, phase: Phase, backend: str, device: torch.device, quick: bool) -> Timing:
+    """Steps of one phase with one back-end, each followed by a matrix product."""
+    steps: list[float] = []
+    products: list[float] = []
+    product = sgemm(device)
+
+    def between(_: object, __: View, step: Step) -> None:
+        if step.iteration > WARM_STEPS[quick]:
+            steps.append(step.milliseconds)
+            products.append(milliseconds(product, device))
+
+    count = WARM_STEPS[quick] + STEPS[quick]
+    module = subject.module(
+        codebooks="1k" if quick else "16k", quantizer=partial(NSVQ, kmeans_steps=1), backend=backend
+    )
+    callbacks = [*training_callbacks(phases=one_phase(phase, count)), StepClock(between)]
+    fit(module, subject.data(), callbacks, count, accelerator=device.type)
+    return Timing(tuple(steps), tuple(products))

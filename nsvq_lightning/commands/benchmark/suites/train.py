@@ -1,0 +1,263 @@
+"""Whole runs, PSNR against seconds, and one step beside the render it contains.
+
+Runs are those of ``nsvq fit``: its module, data, callbacks, loggers and trainer; what only watches a run (reports,
+checkpoints, the progress bar) is left out, and pictures are compared while the clock stands. Every run has the same
+number of steps. Settings differ in one thing from the first one; where a setting promises the same bits, the column
+``other numbers`` says whether it keeps its word: how many of the trained numbers are not those of the first row.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from nsvq_lightning.commands.benchmark.fitting import Step, StepClock, fit, one_phase, quiet, training_callbacks
+from nsvq_lightning.commands.benchmark.row import Row, Timing
+from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.switch_table import turned_round
+from nsvq_lightning.commands.benchmark.timing import Case, milliseconds, sgemm, use_threads
+from nsvq_lightning.commands.benchmark.trainees import Trainee, trainee
+from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
+from nsvq_lightning.data.scene import View
+from nsvq_lightning.io.nsvq.file import write_nsvq
+from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.report.evaluation import evaluate
+from nsvq_lightning.skips import SKIPS, switched
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.schedule import Phase
+
+__all__ = ["Setting", "Trained", "different_numbers", "run", "settings_of"]
+
+DEMO = {True: {"views": 9, "width": 96, "height": 72}, False: {}}
+"""Size of the demo scene, quick and full; the full one is that of ``configs/demo.yaml``."""
+CODEBOOKS = {True: "0.5k", False: "1k"}
+ROUNDS = {True: 1, False: 2}
+"""Runs of every setting; their order turns, their steps are counted together."""
+EVALUATIONS = 16
+"""Points on the way of a run at which its test views are compared, besides the ends of the phases."""
+PRODUCT_EVERY = {True: 8, False: 10}
+"""Steps between two matrix products."""
+WARM_STEPS, STEPS = {True: 4, False: 10}, {True: 10, False: 60}
+"""Steps that are not counted, and those that are, where a step is compared with its render."""
+FIRST_STEPS = 8
+"""Steps of a first run that is not counted, through all phases."""
+SHIPPED = "as shipped"
+
+
+class Setting(NamedTuple):
+    """One way to run: options of the module, switches that are turned round, threads."""
+
+    name: str
+    options: Mapping[str, Any]
+    switches: Mapping[str, bool]
+    threads: int
+
+
+class Trained(NamedTuple):
+    """What one run came to.
+
+    Attributes:
+        steps: All steps.
+        course: Seconds, test PSNR in dB, on the way and at the end.
+        numbers: Everything that was trained, by name.
+        file_bytes: Size of the compressed file.
+        sgemm: Matrix products in between, ms.
+    """
+
+    steps: list[Step]
+    course: list[tuple[float, float]]
+    numbers: dict[str, Tensor]
+    file_bytes: int
+    sgemm: list[float]
+
+
+def run(settings: Settings) -> list[Row]:
+    """Train with every setting, then time single steps with every number of threads."""
+    with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder:
+        return [*_run_rows(settings, Path(folder)), *_step_rows(settings, Path(folder))]
+
+
+# Whole runs
+
+
+def settings_of(settings: Settings) -> list[Setting]:
+    """What is compared: threads, the run without codebooks, and each switch that is asked for the other way round."""
+    most, codebooks = max(settings.threads), {"codebooks": CODEBOOKS[settings.quick]}
+    chosen = [Setting(SHIPPED, codebooks, {}, most)]
+    chosen += [Setting(f"{n} thread{'s' * (n > 1)}", codebooks, {}, n) for n in settings.threads if n != most]
+    if not settings.switches:
+        chosen.append(Setting("without codebooks", {"codebooks": None}, {}, most))
+    for name in settings.switches:
+        chosen.append(Setting(turned_round(name), codebooks, {name: not SKIPS[name].default}, most))
+    return chosen
+
+
+def _run_rows(settings: Settings, folder: Path) -> list[Row]:
+    chosen = settings_of(settings)
+    # Not counted: kernels are loaded, and compiled where they never were.
+    _train(chosen[0], replace(settings, steps=FIRST_STEPS), folder)
+    trained: dict[str, list[Trained]] = {setting.name: [] for setting in chosen}
+    for turn in range(ROUNDS[settings.quick]):
+        for setting in chosen[turn:] + chosen[:turn]:
+            trained[setting.name].append(_train(setting, settings, folder))
+    workload = f"{_described(_photos(settings, folder))}, {settings.steps} steps"
+    shipped = trained[SHIPPED]
+    return [_run_row(workload, setting, trained[setting.name], shipped) for setting in chosen]
+
+
+def _photos(settings: Settings, folder: Path) -> ColmapDataModule:
+    """New at every run: some switches are about how photos are loaded."""
+    if settings.scene is not None and settings.scene.is_dir():
+        return ColmapDataModule(str(settings.scene))
+    demo = DemoDataModule(str(folder / "demo"), **DEMO[settings.quick])
+    with quiet():
+        demo.prepare_data()
+    return demo
+
+
+def _described(data: ColmapDataModule) -> str:
+    with quiet():
+        scene = data.scene
+    camera = scene.cameras[0]
+    return f"{Path(data.root).resolve().name}, {len(scene.train)} photos of {camera.width}x{camera.height}"
+
+
+def _train(setting: Setting, settings: Settings, folder: Path) -> Trained:
+    steps: list[Step] = []
+    course: list[tuple[float, float]] = []
+    products: list[float] = []
+    product, every = sgemm(), max(1, settings.steps // EVALUATIONS)
+    product_every = min(PRODUCT_EVERY[settings.quick], settings.steps)
+
+    def between(module: SplatModule, _: View, step: Step) -> None:
+        steps.append(step)
+        # Between the round numbers: opacities are reset at those, and just then a picture says nothing.
+        if step.iteration in module.schedule.ends or step.iteration % every == every // 2:
+            course.append((_seconds(steps), _test_psnr(module, data)))
+        if step.iteration % product_every == 0:
+            products.append(milliseconds(product))
+
+    init_from = None if settings.init_from is None else str(settings.init_from)
+    with use_threads(setting.threads), _switches(setting):
+        data = _photos(settings, folder)
+        module = SplatModule(**setting.options, init_from=init_from)
+        fit(module, data, [*training_callbacks(), StepClock(between)], settings.steps)
+        file_bytes = write_nsvq(folder / "scene.nsvq", module.compressed())
+    numbers = {name: tensor.detach() for name, tensor in module.named_parameters()}
+    return Trained(steps, course, numbers, file_bytes, products)
+
+
+def _seconds(steps: Sequence[Step]) -> float:
+    return sum(step.milliseconds for step in steps) / 1000
+
+
+def _switches(setting: Setting) -> AbstractContextManager[None]:
+    return switched(**setting.switches) if setting.switches else nullcontext()
+
+
+def _test_psnr(module: SplatModule, data: ColmapDataModule) -> float:
+    with torch.no_grad():
+        splats = module.hard_splats(module.phase)
+        return evaluate(
+            lambda camera: module.render_splats(splats, camera).image, data.test_dataloader(), module.device
+        ).psnr
+
+
+def _run_row(workload: str, setting: Setting, runs: Sequence[Trained], shipped: Sequence[Trained]) -> Row:
+    timing, usual = _timing(runs), _timing(shipped)
+    first = runs[0]
+    by_phase: dict[Phase, list[float]] = {}
+    for step in (step for trained in runs for step in trained.steps):
+        by_phase.setdefault(step.phase, []).append(step.milliseconds)
+    values = {
+        "PSNR dB": first.course[-1][1],
+        "seconds": fmean(_seconds(trained.steps) for trained in runs),
+        "times as shipped": _relative_mean(timing) / _relative_mean(usual),
+        "steps a second": 1000 / fmean(timing.samples),
+        **{f"{phase.name.lower()} ms": median(times) for phase, times in by_phase.items()},
+        "splats": float(len(first.numbers["splats.means"])),
+        "file bytes": float(first.file_bytes),
+        "other numbers": float(different_numbers(first.numbers, shipped[0].numbers)),
+    }
+    note = "times are of whole steps, those that start a phase included; PSNR is that of the test views"
+    return Row("train", workload, setting.name, "run", setting.threads, timing, values, note, tuple(first.course))
+
+
+def _timing(runs: Sequence[Trained]) -> Timing:
+    steps = tuple(step.milliseconds for trained in runs for step in trained.steps)
+    return Timing(steps, tuple(time for trained in runs for time in trained.sgemm))
+
+
+def _relative_mean(timing: Timing) -> float:
+    """Mean step in matrix products, so that a busy hour of the machine is not taken for a slow setting."""
+    return fmean(timing.samples) / median(timing.sgemm)
+
+
+def different_numbers(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> int:
+    """Numbers of ``found`` that are not bit for bit those of ``expected``; all of a tensor of another shape."""
+    different = 0
+    for name, tensor in found.items():
+        other = expected.get(name)
+        if other is None or other.shape != tensor.shape:
+            different += tensor.numel()
+        else:
+            different += int((tensor.view(torch.int32) != other.view(torch.int32)).sum())
+    return different
+
+
+# One step beside its render
+
+
+def _step_rows(settings: Settings, folder: Path) -> list[Row]:
+    subject = trainee(settings, folder)
+    rows = []
+    for threads in settings.threads:
+        steps, renders, products = _steps_and_renders(subject, threads, settings.quick)
+        for method, times in (("render forward + backward", renders), ("training step, Lightning included", steps)):
+            values = {"times its render": median(times) / median(renders)}
+            timing = Timing(tuple(times), tuple(products))
+            rows.append(Row("train", subject.name, method, "warmup step", threads, timing, values))
+    return rows
+
+
+def _steps_and_renders(subject: Trainee, threads: int, quick: bool) -> tuple[list[float], list[float], list[float]]:
+    """Milliseconds of steps, of the renders in them by themselves, and of matrix products, taking turns."""
+    steps: list[float] = []
+    renders: list[float] = []
+    products: list[float] = []
+    product = sgemm()
+
+    def between(module: SplatModule, view: View, step: Step) -> None:
+        if step.iteration <= WARM_STEPS[quick]:
+            return
+        steps.append(step.milliseconds)
+        turns = [(_render_case(module, view), renders), (product, products)]
+        # What comes after the product finds empty caches: each in its turn.
+        for case, times in turns if step.iteration % 2 else reversed(turns):
+            times.append(milliseconds(case))
+
+    count = WARM_STEPS[quick] + STEPS[quick]
+    with use_threads(threads):
+        callbacks = [*training_callbacks(phases=one_phase(Phase.WARMUP, count)), StepClock(between)]
+        fit(subject.module(codebooks=None), subject.data(), callbacks, count)
+    return steps, renders, products
+
+
+def _render_case(module: SplatModule, view: View) -> Case:
+    """The render of a step by itself, with the splats as they are and a gradient of the size a loss gives."""
+    leaves = module.splats.raw()
+    gradient = torch.full((view.camera.height, view.camera.width, 3), 1 / view.image.numel())
+
+    def both() -> None:
+        image = render(leaves, view.camera, sh_degree=module.active_sh_degree).image
+        torch.autograd.grad(image, leaves, gradient)
+
+    return Case("render", both)

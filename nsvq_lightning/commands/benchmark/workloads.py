@@ -1,0 +1,219 @@
+"""Synthetic scenes with the statistics of captured ones, always the same for a name."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.sizes import SIZES
+from nsvq_lightning.compression.pictures import look_at, middle_of
+from nsvq_lightning.data.scene import load_scene
+from nsvq_lightning.io.formats import load
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.splats.splats import RawSplats, Splats
+
+__all__ = ["Workload", "folder_workload", "scene_workload", "single_workload", "synthetic_workload", "workloads"]
+
+Floats = NDArray[np.float64]
+
+
+SEED = 7
+BACKGROUND = (0.2, 0.3, 0.4)
+AZIMUTH, ELEVATION, DISTANCE, FIELD_OF_VIEW = 0.5, 0.35, 4.0, 60.0
+"""Where the camera stands: radians, scene units from the target, and degrees across the image."""
+
+
+@dataclass(frozen=True, eq=False)
+class Workload:
+    """A scene, a view of it, and the gradient that a loss would send back.
+
+    Attributes:
+        name: Name in the tables.
+        splats: Raw attributes, float32, detached.
+        camera: The view.
+        background: RGB ``[3]``.
+        image_gradient: Gradient of the image ``[H, W, 3]``.
+    """
+
+    name: str
+    splats: RawSplats
+    camera: Camera
+    background: Tensor
+    image_gradient: Tensor
+
+    def crop(self, width: int, height: int) -> Workload:
+        """The middle ``width`` x ``height`` pixels of the view, with the splats and the depth they have there.
+
+        The pixels are not quite the same: the projection of splats outside a margin around the view is clamped.
+
+        Raises:
+            ValueError: The view is smaller.
+        """
+        left, top = (self.camera.width - width) // 2, (self.camera.height - height) // 2
+        if left < 0 or top < 0:
+            raise ValueError(f"cannot crop {self.camera.width}x{self.camera.height} to {width}x{height}")
+        K = self.camera.K.clone()
+        K[0, 2] -= left
+        K[1, 2] -= top
+        gradient = self.image_gradient[top : top + height, left : left + width].contiguous()
+        return replace(self, camera=Camera(K, self.camera.viewmat, width, height), image_gradient=gradient)
+
+    def to(self, device: torch.device | str) -> Workload:
+        """The workload with its splats, background and gradient on a device; the camera stays where it is."""
+        splats = RawSplats(*(tensor.to(device) for tensor in self.splats))
+        background, image_gradient = self.background.to(device), self.image_gradient.to(device)
+        return replace(self, splats=splats, background=background, image_gradient=image_gradient)
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.camera.width}x{self.camera.height}"
+
+
+def workloads(settings: Settings) -> list[Workload]:
+    """The scene that the user gives, or the synthetic scenes that the settings name.
+
+    Raises:
+        ValueError: As :func:`scene_workload`.
+        SceneError: The COLMAP folder cannot be used.
+    """
+    if settings.scene is None:
+        return [synthetic_workload(name) for name in settings.workloads]
+    if settings.scene.is_dir():
+        return [folder_workload(settings.scene, settings.init_from)]
+    return [scene_workload(settings.scene)]
+
+
+def single_workload(settings: Settings, full: str) -> Workload:
+    """The scene that the user gives, or one synthetic scene: ``full``, in a quick run the smallest.
+
+    Raises:
+        ValueError: As :func:`workloads`.
+        SceneError: As :func:`workloads`.
+    """
+    if settings.scene is None:
+        return synthetic_workload(next(iter(SIZES)) if settings.quick else full)
+    return workloads(settings)[0]
+
+
+def synthetic_workload(name: str, seed: int = SEED) -> Workload:
+    """A scene of surfaces, a loose volume and a far shell; sizes, rotations, opacities and colours are random.
+
+    Args:
+        name: One of :data:`nsvq_lightning.commands.benchmark.sizes.SIZES`.
+        seed: Seed of every draw.
+
+    Raises:
+        ValueError: There is no workload of that name.
+    """
+    if name not in SIZES:
+        raise ValueError(f"unknown workload {name!r}; choose one of {', '.join(SIZES)}")
+    n, width, height, scale = SIZES[name]
+    # One stream, so the order of the draws is part of the definition.
+    rng = np.random.default_rng(seed)
+    means = _positions(n, rng)
+    scales = math.log(scale) + rng.normal(size=(n, 1)) * 0.5 + rng.normal(size=(n, 3)) * 0.5
+    quats = _directions(rng, n, 4)
+    quats *= np.exp(rng.normal(size=(n, 1)) * 0.1)  # as training leaves them: not of unit length
+    opacities = rng.normal(size=n) * 1.8 - 0.3
+    harmonics = rng.normal(size=(n, 16, 3)) * 0.08
+    harmonics[:, 0] = rng.normal(size=(n, 3)) * 0.9
+    attributes = (means, quats, scales, opacities, harmonics[:, :1], harmonics[:, 1:])
+    camera = _camera(width, height, np.zeros(3), DISTANCE)
+    return Workload(
+        name, RawSplats(*map(_tensor, attributes)), camera, torch.tensor(BACKGROUND), _image_gradient(camera, seed)
+    )
+
+
+def scene_workload(path: Path) -> Workload:
+    """A scene file seen from the side, at 800x533, from twice the distance that holds four fifths of its splats.
+
+    Splats with a number that is not finite are left out.
+
+    Raises:
+        ValueError: The file has an unknown suffix or no finite splat.
+        FormatError: It is damaged.
+    """
+    splats = _finite_splats(path)
+    centre, reach = middle_of(splats.means.numpy())
+    camera = _camera(800, 533, centre, 2 * reach)
+    return Workload(path.name, splats, camera, torch.tensor(BACKGROUND), _image_gradient(camera, SEED))
+
+
+def folder_workload(root: Path, init_from: Path | None = None) -> Workload:
+    """A COLMAP folder's first train view, of the splats in a scene file or of those that its points become.
+
+    Raises:
+        ValueError: The file has an unknown suffix or no finite splat.
+        FormatError: It is damaged.
+        SceneError: The folder cannot be used.
+    """
+    scene = load_scene(root)
+    camera = scene.cameras[scene.train[0]]
+    if init_from is not None:
+        splats = _finite_splats(init_from)
+    else:
+        raw = Splats.from_points(scene.points, scene.colors, sh_degree=3).raw()
+        splats = RawSplats(*(tensor.detach() for tensor in raw))
+    name = root.resolve().name if init_from is None else f"{root.resolve().name} {init_from.name}"
+    return Workload(name, splats, camera, torch.tensor(BACKGROUND), _image_gradient(camera, SEED))
+
+
+def _finite_splats(path: Path) -> RawSplats:
+    """The splats of a file without those that have a number that is not finite."""
+    loaded = [tensor.detach() for tensor in load(path).raw()]
+    rows = [tensor.reshape(len(tensor), tensor.shape[1:].numel()) for tensor in loaded]
+    finite = torch.isfinite(torch.cat(rows, 1)).all(1)
+    if not bool(finite.any()):
+        raise ValueError(f"{path} holds no splat with finite numbers; there is nothing to measure")
+    return RawSplats(*(tensor[finite] for tensor in loaded))
+
+
+def _tensor(values: Floats) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, np.float32))
+
+
+def _directions(rng: np.random.Generator, count: int, dim: int) -> Floats:
+    """Uniform unit vectors ``[count, dim]``."""
+    vectors = rng.normal(size=(count, dim))
+    unit: Floats = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return unit
+
+
+def _positions(count: int, rng: np.random.Generator) -> Floats:
+    """Positions ``[count, 3]``, shuffled: a sphere, the ground, a box, a loose cloud, a shell of background."""
+    parts = [int(share * count) for share in (0.25, 0.25, 0.10, 0.25)]
+    on_sphere, on_ground, on_box, in_cloud = parts
+    sphere = _directions(rng, on_sphere, 3) * 0.9 + rng.normal(size=(on_sphere, 3)) * 0.02
+    ground = [rng.uniform(-2.2, 2.2, on_ground), 0.9 + rng.normal(size=on_ground) * 0.02]
+    ground.append(rng.uniform(-2.2, 2.2, on_ground))
+    box = rng.uniform(-0.4, 0.4, (on_box, 3))
+    axis, side = rng.integers(0, 3, on_box), rng.integers(0, 2, on_box) * 2 - 1
+    box[np.arange(on_box), axis] = 0.4 * side
+    box += np.array([1.3, 0.5, -0.6])
+    cloud = rng.normal(size=(in_cloud, 3)) * 0.8
+    on_shell = count - sum(parts)
+    shell = _directions(rng, on_shell, 3) * rng.uniform(2.5, 3.2, (on_shell, 1))
+    positions = np.concatenate([sphere, np.stack(ground, 1), box, cloud, shell])
+    return positions[rng.permutation(count)]
+
+
+def _camera(width: int, height: int, target: Floats, distance: float) -> Camera:
+    """A camera that looks at ``target`` from above and aside, y down."""
+    direction = (
+        math.cos(ELEVATION) * math.sin(AZIMUTH),
+        -math.sin(ELEVATION),
+        -math.cos(ELEVATION) * math.cos(AZIMUTH),
+    )
+    return look_at(target, target + distance * np.array(direction), width, height, math.radians(FIELD_OF_VIEW))
+
+
+def _image_gradient(camera: Camera, seed: int) -> Tensor:
+    shape = camera.height, camera.width, 3
+    noise = np.random.default_rng(seed + 1).normal(size=shape)
+    return _tensor(noise / math.prod(shape))

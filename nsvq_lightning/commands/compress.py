@@ -1,0 +1,231 @@
+"""``nsvq compress``: an existing splat file made small, without photos or fine-tuned with them."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
+
+if TYPE_CHECKING:
+    from nsvq_lightning.compression.ladder import Candidate
+    from nsvq_lightning.rendering.camera import Camera
+    from nsvq_lightning.splats.arrays import SplatArrays
+
+__all__ = ["main"]
+
+log = logging.getLogger("nsvq_lightning.compress")
+
+DEFAULT_CODEBOOKS = "16k"
+
+EPILOG = """\
+The error is the root mean square difference between pictures of the scene before and after, of channels in [0, 1]:
+0.01 is 40 dB, 0.003 is 50 dB. Pictures are the train views of --data.root, or taken from around the scene.
+Photos keep to the aim: if training leads past it, OUT is the file without training, and the trained one stays beside.
+
+examples:
+  nsvq compress scene.ply scene.nsvq
+  nsvq compress scene.ply scene.nsvq --max-error 0.01
+  nsvq compress scene.ply scene.nsvq --target-bytes 2000000
+  nsvq compress scene.ply scene.nsvq --data.root photos --max-steps 3000     # codebooks trained with the photos
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Compress a file.
+
+    Args:
+        argv: Arguments after ``nsvq compress``; those of the process if None.
+
+    Returns:
+        0, or 1 after an error in the user's files or an aim that cannot be reached. Wrong arguments end the process
+        with status 2.
+    """
+    parser = _parser()
+    options = parser.parse_args(argv)
+    if options.output.suffix.lower() != ".nsvq":
+        parser.error(f"{options.output}: the compressed scene is a .nsvq file; 'nsvq convert' writes other formats")
+    if options.max_steps is not None and options.root is None:
+        parser.error("--max-steps trains with photos: give their COLMAP folder with --data.root")
+    if options.max_steps is not None and options.max_steps < 0:
+        parser.error(f"--max-steps must be at least 0, got {options.max_steps}")
+    if options.max_steps and options.codebooks == "none":
+        parser.error("--max-steps trains codebooks, and there are none with --codebooks=none")
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
+    try:
+        return _compress(options)
+    except (ValueError, OSError) as error:
+        sys.stderr.write(f"nsvq compress: {error}\n")
+        return 1
+
+
+@dataclass(frozen=True)
+class Result:
+    """A compressed file.
+
+    Attributes:
+        settings: How it was made, for the user.
+        data: Its bytes.
+        error: Root mean square difference of its pictures to those of the original, of channels in [0, 1].
+    """
+
+    settings: str
+    data: bytes
+    error: float
+
+
+def _compress(options: argparse.Namespace) -> int:
+    from nsvq_lightning.compression.ladder import Compressor
+    from nsvq_lightning.compression.picture_error import decibels
+    from nsvq_lightning.compression.pictures import measuring_cameras
+    from nsvq_lightning.io.formats import read_scene
+    from nsvq_lightning.io.nsvq.frame import with_origin
+    from nsvq_lightning.training.run_folder import claim_version
+
+    source: Path = options.input
+    scene = read_scene(source)
+    arrays = scene.finite().arrays()
+    if len(arrays) == 0:
+        raise ValueError(f"{source} holds no splat with finite numbers; there is nothing to compress")
+    cameras = measuring_cameras(options.root, arrays.means)
+    candidate = _candidate(options, arrays, cameras, scene.origin)
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    result = Result(candidate.rung.name, candidate.data, candidate.error)
+    if options.root is not None and options.max_steps != 0:
+        if not candidate.rung.codebooks:
+            log.info("nothing to train: %s has no codebooks", candidate.rung.name)
+        else:
+            folder = claim_version(options.output.parent / f"{options.output.stem}_training")
+            status = _train(options, candidate, folder)
+            if status != 0:
+                return status
+            path = folder / "scene.nsvq"
+            data = with_origin(path.read_bytes(), scene.origin)
+            # Made anew: the pictures of the original would fill the memory while training.
+            error = Compressor(arrays, cameras, candidate.storage).error(data)
+            result = _within_aim(options, result, Result(f"{result.settings}, trained with photos", data, error), path)
+    with atomic_write(options.output) as file:
+        file.write(result.data)
+    before, after = source.stat().st_size, len(result.data)
+    sys.stdout.write(
+        f"{options.output}: {len(arrays):,} splats in {after:,} bytes, {before / after:.1f} times smaller than "
+        f"{source.name}\n  {result.settings}, error {result.error:.4g} ({decibels(result.error):.2f} dB against the "
+        f"original in {len(cameras)} pictures)\n"
+    )
+    return 0
+
+
+def _within_aim(options: argparse.Namespace, untrained: Result, trained: Result, path: Path) -> Result:
+    """The trained file, read from ``path``, unless it misses the aim that the untrained one meets."""
+    if options.target_bytes is not None and len(trained.data) > options.target_bytes:
+        missed = f"has {len(trained.data):,} bytes, more than --target-bytes={options.target_bytes}"
+    elif options.max_error is not None and trained.error > options.max_error:
+        missed = f"has an error of {trained.error:.4g}, more than --max-error={options.max_error:g}"
+    else:
+        return trained
+    log.warning(
+        "the trained file %s %s: %s is the one without training; allow more for a trained one",
+        *(path, missed, options.output),
+    )
+    return replace(untrained, settings=f"{untrained.settings}, without training")
+
+
+def _candidate(
+    options: argparse.Namespace, arrays: SplatArrays, cameras: list[Camera], origin: tuple[float, float, float]
+) -> Candidate:
+    from nsvq_lightning.compression.ladder import LADDER, PLAIN, Compressor, finest_within, smallest_within
+
+    compressor = Compressor(arrays, cameras, Storage(options.level), options.seed, origin)
+    if options.max_error is not None:
+        return smallest_within(compressor, options.max_error)
+    if options.target_bytes is not None:
+        return finest_within(compressor, options.target_bytes)
+    rungs = {rung.name: rung for rung in LADDER} | {"none": PLAIN}
+    return compressor.at(rungs[options.codebooks])
+
+
+def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> int:
+    """Train the candidate's codebooks with photos: quantize and fine-tune phase only, from the splats as they are.
+
+    Returns:
+        Exit status of ``nsvq fit``, which writes a run into ``folder``.
+    """
+    from nsvq_lightning.commands.main import main as run
+    from nsvq_lightning.compression.pixel_size import INVISIBLE
+
+    steps = 3000 if options.max_steps is None else options.max_steps
+    precision = vars(candidate.storage.precision)
+    codebooks = ", ".join(f"{name}: {codes}" for name, codes in candidate.rung.codebooks.items())
+    return run(
+        [
+            "fit",
+            f"--data.root={options.root}",
+            f"--model.init_from={options.input}",
+            f"--model.sh_degree={candidate.scene.sh_degree}",
+            f"--model.codebooks={{{codebooks}}}",
+            "--model.quantizer=TrainedStraightThrough",
+            "--model.quantizer.start=spread",
+            "--model.rates.means=1.6e-6",  # a trained scene is past the decay of this rate
+            f"--model.seed={options.seed}",
+            f"--model.storage.level={candidate.storage.level}",
+            *(f"--model.storage.precision.{name}={value}" for name, value in precision.items()),
+            "--callbacks.phases.warmup_end=0",
+            "--callbacks.phases.prune_end=0",
+            "--callbacks.canonical.mode=auto",
+            f"--callbacks.canonical.floor={INVISIBLE}",
+            "--callbacks.codebook_init.weights=contribution",
+            "--callbacks.export.formats=[nsvq]",
+            f"--trainer.max_steps={steps}",
+            f"--trainer.run_folder={folder}",
+        ]
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="nsvq compress",
+        description="Make a splat file small: codebooks by k-means, entropy coding. Photos are not needed.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("input", type=Path, metavar="SCENE", help="splat file: .ply, .nsvq, .sog, .spz or .splat")
+    parser.add_argument("output", type=Path, metavar="OUT.nsvq", help="file to write")
+    aim = parser.add_mutually_exclusive_group()
+    names = ("16k", "8k", "4k", "2k", "1k", "0.5k", "128k", "64k", "32k", "none")
+    aim.add_argument(
+        "--codebooks", choices=names, default=DEFAULT_CODEBOOKS, help=f"codebook sizes; {DEFAULT_CODEBOOKS} by default"
+    )
+    aim.add_argument(
+        "--max-error", type=_positive(float), metavar="E", help="the smallest file with this error at most"
+    )
+    aim.add_argument("--target-bytes", type=_positive(int), metavar="B", help="the best file of at most so many bytes")
+    parser.add_argument("--level", choices=LEVELS, default=DEFAULT_LEVEL, help=f"{DEFAULT_LEVEL} by default")
+    parser.add_argument("--seed", type=int, default=0, help="seed of k-means")
+    parser.add_argument(
+        "--data.root",
+        dest="root",
+        type=Path,
+        metavar="FOLDER",
+        help="COLMAP folder with the photos: errors are those in its views, and its photos train the codebooks",
+    )
+    parser.add_argument(
+        "--max-steps", type=int, metavar="N", help="iterations of that training: 3000 by default; 0 only measures"
+    )
+    return parser
+
+
+def _positive(kind: type[int] | type[float]) -> type[int] | type[float]:
+    def parse(text: str) -> int | float:
+        value = kind(text)
+        if not 0 < value < float("inf"):
+            raise argparse.ArgumentTypeError(f"must be above 0, got {text}")
+        return value
+
+    return parse  # type: ignore[return-value]

@@ -1,0 +1,133 @@
+"""``nsvq convert``: a scene file in another format, for the viewer at hand."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from nsvq_lightning.io.attribute_error import attribute_errors
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.formats import FORMATS, read_scene, save
+from nsvq_lightning.io.nsvq.precision import LEVELS
+from nsvq_lightning.io.sog import PALETTE_LIMIT
+from nsvq_lightning.io.spz import DEFAULT_VERSION
+from nsvq_lightning.io.spz_frame import SPZ_VERSIONS
+
+__all__ = ["main"]
+
+_OPTIONS = {"level": ("--level", ".nsvq"), "palette": ("--palette", ".sog"), "version": ("--spz-version", ".spz")}
+"""Options of a writer: what they are called here, and its format."""
+
+EPILOG = """\
+The codebooks of a .nsvq file are used: as the palette of .sog, and to make .spz smaller. To make a .ply small, with
+codebooks found for it, use 'nsvq compress'.
+
+examples:
+  nsvq convert scene.nsvq scene.sog
+  nsvq convert scene.ply scene.sog --palette 4096
+  nsvq convert scene.ply scene.spz --measure
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Convert a file.
+
+    Args:
+        argv: Arguments after ``nsvq convert``; those of the process if None.
+
+    Returns:
+        0, or 1 after an error in the user's files. Wrong arguments end the process with status 2.
+    """
+    parser = _parser()
+    options = parser.parse_args(argv)
+    chosen = {name: getattr(options, name) for name in _OPTIONS if getattr(options, name) is not None}
+    for flag, suffix in (_OPTIONS[name] for name in chosen):
+        if options.output.suffix.lower() != suffix:
+            parser.error(f"{flag} is an option of {suffix} files, and the output is {options.output}")
+    if options.root is not None and not options.measure:
+        parser.error("--data.root says where to measure: add --measure")
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
+    try:
+        _convert(options.input, options.output, chosen)
+        if options.measure:
+            _measure(options.input, options.output, options.root)
+    except (ValueError, OSError) as error:
+        sys.stderr.write(f"nsvq convert: {error}\n")
+        return 1
+    return 0
+
+
+def _convert(source: Path, output: Path, options: dict[str, Any]) -> None:
+    scene = read_scene(source).finite()
+    output.parent.mkdir(parents=True, exist_ok=True)
+    size = save(scene, output, **options)
+    each = f", {size / len(scene):.1f} a splat" if len(scene) else ""
+    sys.stdout.write(f"{output}: {len(scene):,} splats in {size:,} bytes{each}\n{_errors(scene, output)}")
+
+
+def _errors(scene: CompressedScene, output: Path) -> str:
+    """A line that says how far the numbers of the file are from those of the scene; nothing where none are lost."""
+    in_order = FORMATS[output.suffix.lower()].in_order
+    if in_order is None:
+        return ""
+    errors = attribute_errors(read_scene(output).arrays(), in_order(scene).arrays())
+    listed = ", ".join(f"{name} {error:.2g}{'°' * (name == 'rotation')}" for name, error in errors.items())
+    return f"  root mean square errors: {listed}\n"
+
+
+def _measure(source: Path, output: Path, root: Path | None) -> None:
+    from nsvq_lightning.compression.picture_error import decibels, picture_error, pictures
+    from nsvq_lightning.compression.pictures import measuring_cameras
+
+    original = read_scene(source).finite()
+    if len(original) == 0:
+        raise ValueError(f"{source} holds no splat with finite numbers; there is nothing to measure")
+    cameras = measuring_cameras(root, original.means)
+    error = picture_error(read_scene(output).decode(), cameras, pictures(original.decode(), cameras))
+    sys.stdout.write(
+        f"  error {error:.4g} ({decibels(error):.2f} dB against {source.name} in {len(cameras)} pictures)\n"
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    readable, writable = (
+        ", ".join(suffix for suffix, entry in FORMATS.items() if getattr(entry, action) is not None)
+        for action in ("read", "write")
+    )
+    parser = argparse.ArgumentParser(
+        prog="nsvq convert",
+        description="Write a scene file in another format; the suffixes name the formats.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("input", type=Path, metavar="SCENE", help=f"file to read: {readable}")
+    parser.add_argument("output", type=Path, metavar="OUT", help=f"file to write: {writable}")
+    parser.add_argument(
+        "--palette",
+        type=int,
+        metavar="ROWS",
+        help="most rows of the .sog palette of a scene without an SH codebook; "
+        f"{PALETTE_LIMIT} by default, 4096 to 16384 make a smaller file",
+    )
+    parser.add_argument(
+        "--spz-version",
+        dest="version",
+        type=int,
+        choices=SPZ_VERSIONS,
+        help=f"version of .spz; {DEFAULT_VERSION} by default, which more viewers open",
+    )
+    parser.add_argument("--level", choices=LEVELS, help="level of .nsvq")
+    parser.add_argument("--measure", action="store_true", help="render both files and say how they differ")
+    parser.add_argument(
+        "--data.root",
+        dest="root",
+        type=Path,
+        metavar="FOLDER",
+        help="measure in the train views of a COLMAP folder instead of views from around the scene",
+    )
+    return parser

@@ -1,0 +1,153 @@
+"""Versions, threads, memory and disk of this machine."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numba
+import torch
+
+from nsvq_lightning.commands.benchmark.machine import describe_machine
+from nsvq_lightning.commands.benchmark.settings import usable_cores
+from nsvq_lightning.commands.doctor.finding import Finding, good, note, problem
+from nsvq_lightning.compute.jit import thread_count
+
+__all__ = [
+    "available_memory",
+    "check_disk",
+    "check_memory",
+    "check_opencv",
+    "check_threads",
+    "check_versions",
+    "readable_bytes",
+]
+
+PACKAGES = ("lightning", "torchmetrics", "jsonargparse", "scipy", "pycolmap")
+"""What is used beside the packages that :func:`describe_machine` names."""
+
+OPENCV = tuple(f"opencv-{part}python{screen}" for part in ("contrib-", "") for screen in ("-headless", ""))
+"""Packages that bring ``cv2``; any of them will do."""
+
+SMALL_MEMORY, SMALL_DISK = 4 << 30, 2 << 30
+"""Bytes below which a run of usual size may not fit: pictures, splats and moments; checkpoints, report and exports."""
+BUSY = 0.5
+"""Share of the cores that others may use before times are not to be trusted."""
+
+
+def check_versions() -> Iterator[Finding]:
+    """Versions of Python and of the packages that results depend on."""
+    machine = describe_machine()
+    versions = {**machine["versions"], **{name: _version(name) for name in PACKAGES}}
+    listed = ", ".join(f"{name} {number or 'missing'}" for name, number in versions.items())
+    yield good("versions", listed, **versions)
+    yield good("machine", f"{machine['system']}, {machine['cpu']}", **machine)
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def check_opencv() -> Iterator[Finding]:
+    """Whether there is an OpenCV, and only one: several overwrite each other's files."""
+    installed = [name for name in OPENCV if _version(name) is not None]
+    try:
+        import cv2
+    except ImportError as error:
+        yield problem("opencv", f"cannot be loaded ({error}): pip install {OPENCV[0]}", packages=installed)
+        return
+    if len(installed) > 1:
+        help_ = f"they overwrite each other's files: uninstall all of them, then pip install {OPENCV[0]}"
+        yield note("opencv", f"{' and '.join(installed)} are installed: {help_}", packages=installed)
+    else:
+        yield good("opencv", f"{cv2.__version__} ({', '.join(installed) or 'not from pip'})", packages=installed)
+
+
+def check_threads() -> Iterator[Finding]:
+    """Whether the kernels use all cores, and do not wait for each other by spinning."""
+    cores, used = usable_cores(), thread_count()
+    torchs, numbas = torch.get_num_threads(), int(numba.config.NUMBA_NUM_THREADS)
+    values = {"cores": cores, "torch": torchs, "numba": numbas, "used": used}
+    counts = f"{used} used of {cores} cores (torch {torchs}, numba {numbas})"
+    if used < cores and _is_apple_silicon() and not {"OMP_NUM_THREADS", "NUMBA_NUM_THREADS"} & os.environ.keys():
+        yield good("threads", f"{counts}: those that are fast; the slow ones would hold them up", **values)
+    elif used < cores:
+        yield note("threads", f"{counts}: raise or unset OMP_NUM_THREADS and NUMBA_NUM_THREADS to use all", **values)
+    elif used > cores:
+        yield note("threads", f"{counts}: more threads than cores wait for each other; lower OMP_NUM_THREADS", **values)
+    else:
+        yield good("threads", counts, **values)
+    policy = os.environ.get("OMP_WAIT_POLICY", "not set")
+    if policy.lower() == "passive":
+        yield good("waiting", "OMP_WAIT_POLICY is passive", policy=policy)
+    else:
+        help_ = "on a shared machine threads that wait by spinning slow a step down several times; set it to passive"
+        yield note("waiting", f"OMP_WAIT_POLICY is {policy}: {help_}", policy=policy)
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    if load > BUSY * cores:
+        yield note("load", f"{load:.1f} processes were running in the last minute: times will be longer", load=load)
+
+
+def _is_apple_silicon() -> bool:
+    """Whether torch leaves out the efficiency cores on its own."""
+    return (platform.system(), platform.machine()) == ("Darwin", "arm64")
+
+
+def check_memory() -> Iterator[Finding]:
+    """Memory that a run may still take."""
+    free = available_memory()
+    if free is None:
+        yield note("memory", "this system does not say how much is available")
+    elif free < SMALL_MEMORY:
+        help_ = "end other programs, or train with --data.max_width 800 --data.cache_bytes 500000000"
+        yield note("memory", f"{readable_bytes(free)} available, a usual run takes 2 to 4 GB: {help_}", available=free)
+    else:
+        yield good("memory", f"{readable_bytes(free)} available", available=free)
+
+
+def available_memory() -> int | None:
+    """Bytes that this process may still allocate: of the machine, or of its control group if that is less."""
+    limits = [_meminfo_available(), _group_available()]
+    return min((limit for limit in limits if limit is not None), default=None)
+
+
+def _meminfo_available() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")), None)
+
+
+def _group_available() -> int | None:
+    """What the container is still allowed; page cache, which is given back when needed, counts as used in it."""
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit, used = ((group / name).read_text(encoding="ascii").strip() for name in ("memory.max", "memory.current"))
+        return None if limit == "max" else max(0, int(limit) - int(used))
+    except (OSError, ValueError):
+        return None
+
+
+def check_disk(folder: Path) -> Iterator[Finding]:
+    """Room for checkpoints, report and exports where runs are written."""
+    free = shutil.disk_usage(folder).free
+    text = f"{readable_bytes(free)} free in {folder.resolve()}"
+    if free < SMALL_DISK:
+        yield note("disk", f"{text}: checkpoints of a run take about 1 GB; see --trainer.default_root_dir", free=free)
+    elif not os.access(folder, os.W_OK):
+        yield note("disk", f"{text}, which is read-only: give --trainer.default_root_dir", free=free)
+    else:
+        yield good("disk", text, free=free)
+
+
+def readable_bytes(count: float) -> str:
+    """A number of bytes for people."""
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"

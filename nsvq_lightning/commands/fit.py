@@ -1,0 +1,319 @@
+"""LightningCLI with this package's module, data, callbacks and defaults."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import sys
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from types import NoneType
+from typing import Any, NoReturn
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint, ProgressBar
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+
+import nsvq_lightning.callbacks as callbacks
+import nsvq_lightning.quantize  # noqa: F401  short class names resolve to what is imported
+from nsvq_lightning.callbacks.progress import SplatProgressBar
+from nsvq_lightning.commands.option_help import class_help, command_help, first_sentence
+from nsvq_lightning.commands.registry import COMMANDS
+from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
+from nsvq_lightning.io.atomic import write_text
+from nsvq_lightning.skips import SKIPS, switch, switched
+from nsvq_lightning.training.checkpoints import read_checkpoint
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.run_folder import is_trial, reserve, run_folder
+from nsvq_lightning.training.trainer import SplatTrainer
+
+__all__ = ["DEFAULT_CALLBACKS", "SplatCLI", "default_loggers"]
+
+DEFAULT_CALLBACKS: dict[str, type[Callback]] = {
+    "phases": callbacks.PhaseSchedule,
+    "sh_degree": callbacks.ShDegreeSchedule,
+    "density": callbacks.DensityControl,
+    "opacity": callbacks.OpacityRegularization,
+    "contribution": callbacks.ContributionPruning,
+    "canonical": callbacks.CanonicalCovariance,
+    "codebook_init": callbacks.CodebookInit,
+    "codebook_refit": callbacks.CodebookRefit,
+    "codebook_replacement": callbacks.CodebookReplacement,
+    "codebook_finite": callbacks.FiniteCodes,
+    "freeze": callbacks.FreezeCodes,
+    "report": callbacks.MetricReport,
+    "export": callbacks.ExportScene,
+    "predictions": callbacks.RenderWriter,
+    "checkpoint": callbacks.RunCheckpoint,
+    "progress": SplatProgressBar,
+}
+"""Callback of each option group ``callbacks.<name>``. Each can be configured, exchanged for another class, or null."""
+
+TRAINER_DEFAULTS: dict[str, Any] = {
+    "max_steps": 45_000,  # the paper's run; phases and everything that depends on them follow
+    "max_epochs": -1,  # the sampler is endless: steps end the run
+    "limit_val_batches": 0,  # MetricReport evaluates, outside the training time
+    "num_sanity_val_steps": 0,
+    "devices": 1,  # more are asked for, as what a step is changes with them
+    "use_distributed_sampler": False,  # the sampler knows its rank
+    "enable_model_summary": False,
+    "default_root_dir": "runs",
+}
+
+NAMED_CHECKPOINTS = frozenset({"hpc", "registry"})
+"""What Lightning takes in place of the path of a checkpoint; ``last`` and ``best`` are those of its own callback."""
+
+PARSER_TEXTS: dict[str, Any] = {
+    "prog": "nsvq",
+    **{name: {"description": command.summary} for name, command in COMMANDS.items() if command.module is None},
+}
+
+
+class QuietParser(LightningArgumentParser):
+    """Says what is wrong without the usage, which has some hundred lines, and lists options without their classes."""
+
+    def format_help(self, *args: Any) -> str:
+        """Help of a command, see :mod:`nsvq_lightning.commands.option_help`."""
+        subcommand = self.prog.rpartition(" ")[2]
+        if subcommand not in COMMANDS:
+            return super().format_help(*args)
+        data = {} if subcommand == "export" else {"data": ColmapDataModule}
+        return command_help(
+            self, subcommand, data | {f"callbacks.{key}": kind for key, kind in DEFAULT_CALLBACKS.items()}
+        )
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        """Write the message to stderr and exit with status 2."""
+        # Parsers of nested classes are made by jsonargparse and named after the script.
+        program = self.prog.replace(" [options]", "") if self.prog.startswith("nsvq") else "nsvq COMMAND"
+        if message.endswith("required: root"):
+            message += " (--data.root=path/to/scene)"
+        elif message.startswith('Parser key "data":') and Path(message.rpartition("Given value: ")[2]).is_dir():
+            message = "--data takes the name of a data module; the folder of a scene is --data.root=path/to/scene"
+        elif "subcommand: invalid choice" in message:
+            message = f"{message.partition(' (')[0]} (choose from {', '.join(COMMANDS)})"
+        sys.stderr.write(f"error: {message}\nAll options: {program} --help\n")
+        self.exit(2)
+
+
+class RunStart(SaveConfigCallback):
+    """Opens the run: its folder, the default loggers in it, and the settings in ``config.yaml``, written atomically."""
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Open it as soon as the scene has been loaded, before anything is logged."""
+        folder = run_folder(trainer)  # asks all processes
+        if self.already_saved or is_trial(trainer):
+            return
+        self.already_saved = True
+        if self.config.trainer.logger in (None, True):
+            trainer.loggers = default_loggers(folder)
+            for logger in trainer.loggers:
+                _ = logger.experiment  # type: ignore[attr-defined]  # now, as the CSV logger warns of a folder with files
+        for callback in trainer.checkpoint_callbacks:
+            if isinstance(callback, ModelCheckpoint) and callback.dirpath is None:
+                callback.dirpath = str(folder / "checkpoints")
+        if trainer.is_global_zero:
+            write_text(folder / self.config_filename, self.parser.dump(self.config, skip_none=False))
+
+
+class SplatCLI(LightningCLI):
+    """``nsvq fit | validate | test | predict | export``.
+
+    The callbacks of a run are options of their own: ``--callbacks.density.max_splats=200000`` changes one number
+    without repeating a list; ``trainer.callbacks`` takes further ones. So are the switches of
+    :mod:`nsvq_lightning.skips`: ``--skips.adam_rows=true``.
+    """
+
+    def __init__(self, args: list[str]) -> None:
+        self._arguments = args
+        for argument in args:
+            asked = re.fullmatch(r"--callbacks\.(\w+)\.help", argument)
+            if asked and asked[1] in DEFAULT_CALLBACKS:
+                sys.stdout.write(class_help(f"callbacks.{asked[1]}", DEFAULT_CALLBACKS[asked[1]]))
+                raise SystemExit(0)
+        with switched():  # they hold for this command only
+            super().__init__(
+                SplatModule,
+                ColmapDataModule,
+                trainer_class=SplatTrainer,
+                trainer_defaults=TRAINER_DEFAULTS,
+                save_config_callback=RunStart,
+                seed_everything_default=False,  # every draw has its own generator
+                parser_class=QuietParser,
+                parser_kwargs=PARSER_TEXTS,
+                subclass_mode_data=True,
+                auto_configure_optimizers=False,  # the module builds its groups
+                args=args,
+            )
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        """Lightning's subcommands and ours, each with the arguments that are no options."""
+        return {**LightningCLI.subcommands(), "export": {"model"}}
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Add the callbacks and the switches."""
+        for skip in SKIPS.values():
+            parser.add_argument(f"--skips.{skip.name}", type=bool, default=skip.default, help=skip.summary)
+        for name, kind in DEFAULT_CALLBACKS.items():
+            key = f"callbacks.{name}"
+            path = f"{kind.__module__}.{kind.__qualname__}"
+            parser.add_argument(
+                f"--{key}", type=Callback | None, default={"class_path": path}, help=first_sentence(kind.__doc__)
+            )
+            parser.callback_keys.append(key)
+
+    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
+        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        # Export reads no scene: any data module that can be built without options will do.
+        data = DemoDataModule if subcommand == "export" else ColmapDataModule
+        parser.set_defaults({"data": {"class_path": f"{data.__module__}.{data.__qualname__}"}})
+        if subcommand == "predict":
+            # RenderWriter has them on disk; a list of all pictures would only fill the memory.
+            parser.set_defaults({"return_predictions": False})
+        return parser
+
+    def before_instantiate_classes(self) -> None:
+        """Set the switches."""
+        switch(**self._get(self.config, "skips").as_dict())
+
+    def _parse_ckpt_path(self) -> None:
+        """Take the model's settings from the checkpoint, but for those on the command line; in ``fit`` none of them.
+
+        Raises:
+            FormatError: The checkpoint cannot be used; better said now than after the scene has been loaded.
+            FileNotFoundError: There is none.
+        """
+        path = self.config[self.config.subcommand].get("ckpt_path")
+        if path is not None and path.partition(":")[0] not in NAMED_CHECKPOINTS and "://" not in path:
+            read_checkpoint(path)
+        if self.config.subcommand != "fit":
+            super()._parse_ckpt_path()
+            own = [self.config.subcommand, *_options_of("model", self._arguments)]
+            self.config = self.parser.parse_args(own, namespace=self.config, defaults=False)
+
+    def _prepare_subcommand_kwargs(self, subcommand: str) -> dict[str, Any]:
+        kwargs = super()._prepare_subcommand_kwargs(subcommand)
+        if subcommand == "export":
+            kwargs.pop("datamodule", None)
+        return kwargs
+
+    def instantiate_classes(self) -> None:
+        """Make trainer, module and data.
+
+        Raises:
+            ValueError: One of them cannot be made of these settings; the message is that of the cause.
+        """
+        try:
+            super().instantiate_classes()
+        except Exception as error:
+            cause: BaseException = error
+            while cause.__cause__ is not None:  # the parser adds what it tried besides
+                cause = cause.__cause__
+            raise ValueError(" ".join(str(cause).split())) from error
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """The trainer without the callbacks that are null, or switched off with the bar or with checkpoints."""
+        parser = self._parser(self.subcommand)
+        settings = self._get(self.config_init, "trainer")
+        # Lightning refuses a callback beside the flag, and the default callbacks hold one of each kind.
+        unwanted: list[type] = [NoneType]
+        unwanted += [ProgressBar] if settings.enable_progress_bar is False else []
+        unwanted += [Checkpoint] if settings.enable_checkpointing is False else []
+        parser.callback_keys = [
+            key for key in parser.callback_keys if not isinstance(self._get(self.config_init, key), tuple(unwanted))
+        ]
+        if settings.logger in (None, True):
+            kwargs["logger"] = False  # until the run has a folder: see RunStart
+        if self.subcommand == "validate" and settings.limit_val_batches == 0:
+            kwargs["limit_val_batches"] = 1.0  # 0 is of a config that `fit` has written
+        return super().instantiate_trainer(**kwargs)
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        """Run it; say how to continue a training that was stopped by whatever it was."""
+        if subcommand != "export":
+            reserve(self.trainer, self.config[subcommand].get("ckpt_path") if subcommand == "fit" else None)
+        try:
+            super()._run_subcommand(subcommand)
+        except BaseException:
+            path = self._last_checkpoint()
+            if subcommand == "fit" and path is not None and self.trainer.is_global_zero:
+                sys.stderr.write(f"continue with: {continuation(self._arguments, path)}\n")
+            raise
+
+    def _last_checkpoint(self) -> Path | None:
+        """The checkpoint to continue from."""
+        found: list[Callback] = self.trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
+        paths = [callback.last_path for callback in found if isinstance(callback, callbacks.RunCheckpoint)]
+        return next((path for path in paths if path is not None), None)
+
+    def after_fit(self) -> None:
+        """Test the decoded file, and say what came out."""
+        if is_trial(self.trainer) or self.trainer.interrupted:
+            return
+        self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
+        self._print_summary()
+
+    def after_test(self) -> None:
+        """Say what came out."""
+        self._print_summary()
+
+    def _print_summary(self) -> None:
+        path = run_folder(self.trainer) / "metrics.json"
+        if self.trainer.is_global_zero and path.is_file():
+            sys.stdout.write(summary(path.parent, json.loads(path.read_text(encoding="utf-8"))))
+
+
+def _options_of(group: str, arguments: Sequence[str]) -> list[str]:
+    """The options of a group among arguments, each with its value."""
+    found, takes_value = [], False
+    for argument in arguments:
+        starts = argument.startswith((f"--{group}.", f"--{group}="))
+        if starts or (takes_value and not argument.startswith("--")):
+            found.append(argument)
+        takes_value = starts and "=" not in argument
+    return found
+
+
+def continuation(arguments: Sequence[str], checkpoint: Path) -> str:
+    """The command that goes on from a checkpoint with the arguments of the run that wrote it, for a shell."""
+    as_module = Path(sys.argv[0]).parts[-2:] == ("nsvq_lightning", "__main__.py")
+    program = ["python", "-m", "nsvq_lightning"] if as_module else ["nsvq"]
+    kept, skip = [], False
+    for argument in arguments:
+        if not (skip or argument.startswith("--ckpt_path=") or argument == "--ckpt_path"):
+            kept.append(argument)
+        skip = argument == "--ckpt_path"
+    return shlex.join([*program, *kept, f"--ckpt_path={checkpoint}"])
+
+
+def summary(folder: Path, metrics: dict[str, Any]) -> str:
+    """What a run achieved, in a few lines."""
+    before = metrics["before_quantization"]
+    lines = [
+        f"{folder}",
+        f"  PSNR {_number(metrics['psnr'], '.2f')} dB, SSIM {_number(metrics['ssim'], '.4f')} "
+        f"on {metrics['views']} test views, rendered from the decoded file",
+        f"  {metrics['num_splats']} splats in {metrics['file_bytes']} bytes (scene.nsvq), "
+        f"{metrics['ratio']:.1f} times smaller than the plain .ply",
+        f"  {metrics['train_seconds']:.0f} s of training",
+    ]
+    if before is not None:
+        lines.insert(2, f"  before quantization: PSNR {_number(before['psnr'], '.2f')} dB")
+    return "\n".join(lines) + "\n"
+
+
+def default_loggers(folder: Path) -> list[Logger]:
+    """A CSV logger that writes into ``folder``, and a TensorBoard logger where that is installed."""
+    place: dict[str, Any] = {"save_dir": folder.parent, "name": "", "version": folder.name}
+    loggers: list[Logger] = [CSVLogger(**place)]
+    if find_spec("tensorboard") is not None:
+        loggers.append(TensorBoardLogger(**place, default_hp_metric=False))
+    return loggers
+
+
+def _number(value: float | None, form: str) -> str:
+    return "infinite" if value is None else format(value, form)

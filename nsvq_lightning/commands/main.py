@@ -1,0 +1,205 @@
+"""The ``nsvq`` command. Kept light: ``nsvq info`` must answer before torch would be imported."""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+import signal
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
+from pathlib import Path, PurePath
+from typing import TextIO
+
+from nsvq_lightning import __version__
+from nsvq_lightning.commands.registry import COMMANDS, overview
+from nsvq_lightning.top_level import folder_of
+
+__all__ = ["check_config", "find_config", "main", "resolve_configs"]
+
+CONFIG_OPTIONS = ("--config", "-c")
+
+TRACEBACK = "NSVQ_TRACEBACK"
+"""Environment variable that makes errors show their traceback."""
+
+NOT_ACTIONABLE = (
+    "does not have many workers",  # views come from a cache in memory; workers would each hold a copy
+    "args parameter is intended",  # we pass the arguments after looking configs up
+    "dataloader.*no length",
+    "LeafSpec",
+    "Checkpoint directory .* exists and is not empty",
+    "`tensorboardX` has been removed",
+)
+"""Parts of warnings of Lightning and torch that a user of this command can do nothing about."""
+
+NOT_OURS = ("Tip:", "TPU available", "HPU available", "litlogger", "litmodels", "`Trainer.fit` stopped")
+"""Parts of what Lightning says that advertise, or say what the bar has said already, in the middle of its line."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run ``nsvq ARGUMENTS``.
+
+    Args:
+        argv: Arguments; those of the process if None.
+
+    Returns:
+        Exit status: 0, 1 after an error in the user's files or Ctrl-C, 143 after SIGTERM.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0] in ("--help", "-h", "help"):
+        sys.stdout.write(overview())
+        return 0 if arguments else 2
+    if arguments[0] == "--version":
+        sys.stdout.write(f"nsvq {__version__}\n")
+        return 0
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a pipe on Windows, say, can take only the letters of the locale
+        sys.stdout.reconfigure(errors="replace")
+    try:
+        if arguments[0] in COMMANDS and (module := COMMANDS[arguments[0]].module) is not None:
+            command: Callable[[Sequence[str]], int] = import_module(module).main
+            return command(arguments[1:])
+        return _run_lightning(resolve_configs(arguments))
+    except ModuleNotFoundError as error:
+        if error.name != "cv2":
+            raise
+        sys.stderr.write("error: there is no OpenCV (cv2): pip install opencv-contrib-python-headless, or any other\n")
+        return 1
+
+
+def _run_lightning(arguments: list[str]) -> int:
+    for message in NOT_ACTIONABLE:
+        warnings.filterwarnings("ignore", f".*{message}.*")
+    from lightning.fabric.utilities.exceptions import MisconfigurationException
+    from lightning.pytorch.utilities.exceptions import SIGTERMException
+
+    from nsvq_lightning.commands.fit import SplatCLI
+
+    _quiet_lightning()
+    if os.getcwd() not in sys.path:  # last, unlike `python -m`: for quantizers and callbacks of one's own
+        sys.path.append(os.getcwd())
+    configs = _config_values(arguments)
+    try:
+        for config in configs:
+            check_config(config)
+        SplatCLI(arguments)
+    except SIGTERMException:  # a kind of SystemExit
+        return 128 + signal.SIGTERM  # Lightning's own exit status is that of success
+    except SystemExit as end:
+        if end.code == 2 and configs:  # the parser's messages name the option, not the file it came from
+            sys.stderr.write(f"Settings came from {', '.join(configs)} and the command line\n")
+        raise
+    except Exception as error:
+        names_file = isinstance(error, FileNotFoundError) or (isinstance(error, OSError) and error.filename is not None)
+        speaks = names_file or isinstance(error, MisconfigurationException) or _is_ours(error)
+        if os.environ.get(TRACEBACK) or not speaks:
+            raise
+        sys.stderr.write(f"error: {error}\n({TRACEBACK}=1 shows where)\n")
+        return 1
+    return 0
+
+
+def _is_ours(error: BaseException) -> bool:
+    """Whether this package raised the error: its message then says what to do, and a traceback would only hide it.
+
+    Errors of other kinds than these are mistakes of ours, whose place matters.
+    """
+    if not isinstance(error, ValueError | TypeError | OSError | RuntimeError | ArithmeticError | ImportError):
+        return False
+    frame = error.__traceback__
+    while frame is not None and frame.tb_next is not None:
+        frame = frame.tb_next
+    return frame is not None and str(frame.tb_frame.f_globals.get("__name__")).startswith(f"{__package__}.")
+
+
+class BarHandler(logging.StreamHandler[TextIO]):
+    """Writes to stderr, above a progress bar where there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record."""
+        from tqdm import tqdm
+
+        try:
+            tqdm.write(self.format(record), file=self.stream)
+        except Exception:
+            self.handleError(record)
+
+
+def _quiet_lightning() -> None:
+    """Show our log messages, once; of Lightning's only those that are not advertisements."""
+    from lightning.pytorch.utilities import rank_zero_only
+
+    logging.basicConfig(format="%(message)s", handlers=[BarHandler()])
+    logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
+    for handler in logging.getLogger().handlers:
+        # Of several processes the first one speaks; what goes wrong on another is said there.
+        handler.addFilter(lambda record: record.levelno >= logging.WARNING or getattr(rank_zero_only, "rank", 0) == 0)
+
+    def keep(record: logging.LogRecord) -> bool:
+        text = record.getMessage()
+        return not any(part in text for part in NOT_OURS)
+
+    for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
+        logging.getLogger(name).addFilter(keep)
+
+
+def resolve_configs(arguments: Sequence[str]) -> list[str]:
+    """The arguments with every ``--config NAME`` that is no file replaced by the shipped one of that name."""
+    resolved = list(arguments)
+    for place, name in _configs(arguments):
+        resolved[place] = resolved[place].removesuffix(name) + find_config(name)
+    return resolved
+
+
+def _config_values(arguments: Sequence[str]) -> list[str]:
+    return [name for _, name in _configs(arguments)]
+
+
+def _configs(arguments: Sequence[str]) -> Iterator[tuple[int, str]]:
+    """Place of each argument that ends with the name of a config, and that name."""
+    expects_config = False
+    for place, argument in enumerate(arguments):
+        option, equals, value = argument.partition("=")
+        if expects_config:
+            yield place, argument
+        elif option in CONFIG_OPTIONS and equals:
+            yield place, value
+        expects_config = not expects_config and argument in CONFIG_OPTIONS
+
+
+def check_config(path: str) -> None:
+    """Refuse a file that cannot be a config at all; a name that is no file is for the parser to complain about.
+
+    Raises:
+        ValueError: It is not text, not YAML, or not a table of settings.
+    """
+    import yaml
+
+    if not Path(path).is_file():
+        return
+    try:
+        settings = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error
+    if not isinstance(settings, dict):
+        found = "nothing" if settings is None else type(settings).__name__
+        raise ValueError(f"config {path} holds {found}: give settings by name, as 'trainer: {{max_steps: 1000}}'")
+
+
+def find_config(name: str) -> str:
+    """Path of a config: a file as given, else one shipped with the package (``nsvq_4k``, ``configs/nsvq_4k.yaml``).
+
+    A name that is neither is returned as it is, for the parser to complain about.
+    """
+    if Path(name).exists():
+        return name
+    plain = _without_folder(Path(name))
+    for shipped in (folder_of("configs") / plain, folder_of("configs") / f"{plain}.yaml"):
+        if shipped.is_file():
+            return str(shipped)
+    return name
+
+
+def _without_folder(path: PurePath) -> str:
+    return path.as_posix().removeprefix("configs/")

@@ -1,0 +1,54 @@
+"""The words that may follow ``nsvq``. Light: nothing is imported here."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+__all__ = ["COMMANDS", "Command", "overview"]
+
+
+class Command(NamedTuple):
+    """A command."""
+
+    summary: str
+    module: str | None = None
+    """Where its ``main(argv)`` is; None for those that Lightning's command line runs, whose start takes seconds."""
+
+
+COMMANDS = {
+    "fit": Command("train a scene, compress it, and measure the decoded file"),
+    "test": Command("write the compressed file of a checkpoint, read it back and measure it"),
+    "validate": Command("measure the scene of a checkpoint"),
+    "predict": Command("render every view of a scene into a folder"),
+    "export": Command("write the scene of a checkpoint as a file"),
+    "info": Command("describe a scene file of any format", "nsvq_lightning.commands.info"),
+    "convert": Command("write a scene file in another format", "nsvq_lightning.commands.convert"),
+    "compress": Command("make an existing splat file small", "nsvq_lightning.commands.compress"),
+    "sweep": Command("train many runs and compare them", "nsvq_lightning.commands.sweep.cli"),
+    "doctor": Command("say whether this machine and a scene folder are fit", "nsvq_lightning.commands.doctor.cli"),
+    "benchmark": Command("measure run time against error on this machine", "nsvq_lightning.commands.benchmark.cli"),
+}
+"""All commands by name."""
+
+
+def overview() -> str:
+    """What ``nsvq --help`` prints."""
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:{width}}  {command.summary}" for name, command in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: nsvq COMMAND [options]",
+            "",
+            "Train 3D Gaussian splatting scenes and store them small.",
+            "",
+            "commands:",
+            *lines,
+            "",
+            "nsvq COMMAND --help    options of a command",
+            "nsvq --version         version of this package",
+            "",
+            "nsvq fit --config demo.yaml               train the embedded scene",
+            "nsvq fit --config nsvq_4k.yaml --data.root path/to/scene",
+            "",
+        ]
+    )

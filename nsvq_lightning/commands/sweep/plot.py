@@ -1,0 +1,97 @@
+"""The rate–distortion picture of a sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from nsvq_lightning.commands.sweep.results import Group, Row, grouped, series_of
+from nsvq_lightning.report.figures import colours_of, draw_keys, markers_of, new_figure, write_figure
+
+__all__ = ["draw_sweep"]
+
+COLUMNS = 2
+PANEL = (6.4, 4.6)
+"""Inches across and down."""
+
+LEGEND_LINE = 0.19
+
+
+def draw_sweep(path: Path, rows: Sequence[Row]) -> None:
+    """Draw PSNR over file size: a panel and a marker for each scene, a colour for each quantizer or configuration.
+
+    A point is the mean over the seeds, its whiskers the standard deviation; lines join the codebook sizes. Runs without
+    codebooks, whose files are many times as large, are dashed lines that say their size.
+
+    Args:
+        path: PNG file, replaced atomically.
+        rows: Runs; those that failed, or whose PSNR is not finite, are left out.
+
+    Raises:
+        ValueError: There is nothing to draw.
+    """
+    rows = [row for row in rows if row.psnr is not None and row.bytes is not None]
+    if not rows:
+        raise ValueError(f"cannot draw {path}: no run has a PSNR")
+    series = series_of(rows)
+    colours = colours_of(list(dict.fromkeys(map(series, rows))))
+    markers = markers_of(list(dict.fromkeys(row.scene for row in rows)))
+    across = min(COLUMNS, len(markers))
+    down = -(-len(markers) // across)
+    keys = LEGEND_LINE * max(len(colours), len(markers))
+    figure = new_figure(PANEL[0] * across, PANEL[1] * down + keys)
+    axes = figure.subplots(down, across, squeeze=False).ravel()
+    for axis in axes[len(markers) :]:
+        axis.set_axis_off()
+    for axis, (scene, marker) in zip(axes, markers.items(), strict=False):
+        curves: dict[str, list[Group]] = {}
+        for group in grouped([row for row in rows if row.scene == scene]):
+            curves.setdefault(series(group.rows[0]), []).append(group)
+        _draw_scene(axis, {name: (groups, colours[name]) for name, groups in curves.items()}, marker)
+        axis.set_title(scene, fontsize="medium")
+    draw_keys(figure, colours, markers)
+    write_figure(path, figure)
+
+
+def _draw_scene(axis: Any, curves: dict[str, tuple[list[Group], Any]], marker: str) -> None:
+    """The curves of one scene, each with its colour."""
+    are_points = not any(group.rows[0].codebooks for groups, _ in curves.values() for group in groups)
+    labelled: set[tuple[str, ...]] = set()
+    for groups, colour in curves.values():
+        points = [group for group in groups if group.rows[0].codebooks or are_points]
+        _draw_curve(axis, points, colour, marker)
+        sizes = tuple(group.rows[0].codebooks for group in points)
+        if sizes not in labelled:
+            _label_sizes(axis, points, colour)
+            labelled.add(sizes)
+        for group in groups:
+            if group not in points:
+                _draw_level(axis, group, colour)
+    axis.margins(0.08)
+    axis.grid(alpha=0.3)
+    axis.set(xlabel="size of the file, MB", ylabel="test PSNR of the decoded file, dB")
+
+
+def _draw_curve(axis: Any, groups: Sequence[Group], colour: Any, marker: str) -> None:
+    groups = sorted(groups, key=lambda group: group.mean("bytes") or 0.0)
+    x, y = [group.mean("bytes", 1e-6) for group in groups], [group.mean("psnr") for group in groups]
+    x_spread, y_spread = [group.spread("bytes", 1e-6) for group in groups], [group.spread("psnr") for group in groups]
+    style = {"color": colour, "linewidth": 1, "elinewidth": 0.8, "capsize": 2, "markersize": 5}
+    axis.errorbar(x, y, xerr=x_spread, yerr=y_spread, fmt=f"{marker}-", **style)
+
+
+def _label_sizes(axis: Any, groups: Sequence[Group], colour: Any) -> None:
+    for group in groups:
+        place = group.mean("bytes", 1e-6), group.mean("psnr")
+        text = group.rows[0].codebooks
+        axis.annotate(text, place, (4, 5), textcoords="offset points", fontsize=7, color=colour)
+
+
+def _draw_level(axis: Any, group: Group, colour: Any) -> None:
+    """A line at the PSNR of runs that would be far outside the picture, with their size."""
+    psnr = group.mean("psnr")
+    axis.axhline(psnr, color=colour, linestyle="--", linewidth=1)
+    text = f"{group.mean('bytes', 1e-6):.3g} MB"
+    place = {"xy": (0, psnr), "xycoords": ("axes fraction", "data"), "xytext": (3, 3), "textcoords": "offset points"}
+    axis.annotate(text, **place, fontsize=7, color=colour)

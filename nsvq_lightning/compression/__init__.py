@@ -1,0 +1,1 @@
+"""Fewer bytes, the same pictures."""

@@ -1,0 +1,240 @@
+"""Compress a scene that is trained already: k-means, and the smallest of several settings that is good enough."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from nsvq_lightning.compression.covariance_error import form_errors
+from nsvq_lightning.compression.importance import contributions, row_weights
+from nsvq_lightning.compression.picture_error import decibels, picture_error, pictures
+from nsvq_lightning.compression.pixel_size import scale_floor
+from nsvq_lightning.compression.stored import compress
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.nsvq.file import decode, encode
+from nsvq_lightning.io.nsvq.frame import frame, unframe
+from nsvq_lightning.io.nsvq.precision import OPACITY_ERRORS, Precision, Storage
+from nsvq_lightning.quantize import NSVQ, QUANTIZED, Quantizer, codebook_sizes
+from nsvq_lightning.quantize.scene import attribute_rows
+from nsvq_lightning.random import generator
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.splats.arrays import SplatArrays
+from nsvq_lightning.splats.forms import canonical
+from nsvq_lightning.splats.splats import RawSplats
+
+__all__ = ["LADDER", "PLAIN", "PLAINS", "Candidate", "Compressor", "Rung", "finest_within", "smallest_within"]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One setting between large and exact, and small.
+
+    Attributes:
+        name: What messages call it.
+        codebooks: Codes by attribute; empty without codebooks.
+        coarseness: Factor on the errors of :class:`~nsvq_lightning.io.nsvq.precision.Precision`.
+    """
+
+    name: str
+    codebooks: Mapping[str, int]
+    coarseness: float = 1.0
+
+
+def _sizes(codes: int) -> dict[str, int]:
+    return {name: max(1, int(codes * attribute.code_share)) for name, attribute in QUANTIZED.items()}
+
+
+PLAIN = Rung("no codebooks", {})
+PLAINS: tuple[Rung, ...] = (Rung("no codebooks, a quarter of the errors", {}, 0.25), PLAIN)
+"""Settings without codebooks. They need no k-means, and are the smaller ones where splats are few."""
+
+LADDER: tuple[Rung, ...] = (
+    *(Rung(f"{codes // 1024}k", _sizes(codes), 0.5) for codes in (1 << 17, 1 << 16, 1 << 15)),
+    *(Rung(name, codebook_sizes(name)) for name in ("16k", "8k", "4k", "2k", "1k", "0.5k")),
+    Rung("0.5k, twice the errors", codebook_sizes("0.5k"), 2.0),
+    Rung("0.25k, four times the errors", _sizes(256), 4.0),
+)
+"""Settings with codebooks, from the most exact to the smallest."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A scene compressed at one rung.
+
+    Attributes:
+        rung: The setting.
+        scene: What is stored.
+        storage: How.
+        data: The file.
+        error: Root mean square difference of its pictures to those of the original, of channels in [0, 1].
+    """
+
+    rung: Rung
+    scene: CompressedScene
+    storage: Storage
+    data: bytes
+    error: float
+
+    @property
+    def psnr(self) -> float:
+        """The error in dB."""
+        return decibels(self.error)
+
+
+class Compressor:
+    """Compresses one scene at any rung, each at most once.
+
+    Before k-means, scales too small to show are raised, scales and rotations take the canonical form that suits the
+    scene, and codes of rotations and colours are placed by how much each splat contributes to the pictures.
+
+    Args:
+        splats: The scene, finite.
+        cameras: Views that errors and contributions are measured in.
+        storage: Level and precision, which rungs make coarser or finer.
+        seed: Seed of k-means.
+        origin: World coordinates of the point (0, 0, 0) of the positions; files keep it.
+
+    Raises:
+        ValueError: There are no splats, or no camera shows any of them.
+    """
+
+    def __init__(
+        self,
+        splats: SplatArrays,
+        cameras: Sequence[Camera],
+        storage: Storage,
+        seed: int = 0,
+        origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        if len(splats) == 0 or not cameras:
+            raise ValueError(f"cannot compress {len(splats)} splats seen by {len(cameras)} cameras")
+        self._splats = RawSplats(*(tensor.detach() for tensor in splats.to_splats().raw()))
+        self._cameras, self._storage, self._seed, self._origin = cameras, storage, seed, origin
+        self._pictures = pictures(self._splats, cameras)
+        if not any(bool(picture.any()) for picture in self._pictures):
+            raise ValueError(
+                f"all {len(cameras)} pictures of the scene are black, so no error can be measured: photos "
+                "(--data.root) must be of this scene, in its coordinates"
+            )
+        self._done: dict[str, Candidate] = {}
+
+    @cached_property
+    def _weights(self) -> Tensor:
+        """Weight of each splat ``[N]`` in k-means; only codebooks need it."""
+        return row_weights(contributions(self._splats, self._cameras, render))
+
+    @cached_property
+    def _log_floor(self) -> float | None:
+        """Log-scale below which a splat's extent does not show."""
+        return scale_floor(self._splats.means, self._cameras)
+
+    def at(self, rung: Rung) -> Candidate:
+        """The scene at a rung."""
+        if rung.name not in self._done:
+            self._done[rung.name] = self._compressed(rung)
+            found = self._done[rung.name]
+            log.info("%s: %s bytes, error %.4g (%.2f dB)", rung.name, f"{len(found.data):,}", found.error, found.psnr)
+        return self._done[rung.name]
+
+    def error(self, data: bytes) -> float:
+        """Root mean square difference of the pictures of a ``.nsvq`` file to those of the scene."""
+        splats = RawSplats(*(tensor.detach() for tensor in decode(*unframe(data)).decode().raw()))
+        return picture_error(splats, self._cameras, self._pictures)
+
+    def _compressed(self, rung: Rung) -> Candidate:
+        scene = self._quantized(rung.codebooks)
+        errors = {name: rung.coarseness * value for name, value in vars(self._storage.precision).items()}
+        least, most = OPACITY_ERRORS
+        errors["opacity"] = min(max(errors["opacity"], least), most)
+        storage = replace(self._storage, precision=Precision(**errors))
+        data = b"".join(frame(*encode(scene, storage.level, storage.precision)))
+        return Candidate(rung, scene, storage, data, self.error(data))
+
+    @torch.no_grad()
+    def _quantized(self, codebooks: Mapping[str, int]) -> CompressedScene:
+        splats = self._canonical(codebooks)
+        quantizers: dict[str, Quantizer] = {}
+        for name, codes in codebooks.items():
+            rows = attribute_rows(splats, name)
+            if rows.shape[1] == 0:
+                continue
+            # Scales spread over many sizes, of which each counts; a weight would leave the small ones none.
+            scales = name == "scales"
+            quantizer = NSVQ(codes, rows.shape[1], start="spread" if scales else "sample")
+            weight = None if scales else self._weights
+            quantizer.fit(rows, weight, generator(self._seed, 0, "kmeans", name))
+            quantizers[name] = cast(Quantizer, quantizer)
+        config = {"codebooks": {name: len(q.codebook) for name, q in quantizers.items()}}
+        return replace(compress(splats, quantizers), config=config, origin=self._origin)
+
+    def _canonical(self, codebooks: Mapping[str, int]) -> RawSplats:
+        codes = {name: codebooks[name] for name in ("scales", "quats") if name in codebooks}
+        if not codes:
+            return self._splats
+        scales, quats = self._splats.scales, self._splats.quats
+        if "scales" in codes and self._log_floor is not None:
+            scales = scales.clamp(min=self._log_floor)
+        errors = form_errors(scales, quats, codes, self._seed)
+        form = min(errors, key=errors.__getitem__)
+        if form != "none":
+            scales, quats, *_ = canonical(scales, quats, form)
+        return self._splats._replace(scales=scales, quats=quats)
+
+
+def smallest_within(compressor: Compressor, error: float) -> Candidate:
+    """The smallest file whose error is at most ``error``.
+
+    Raises:
+        ValueError: Even the most exact one has a larger one.
+    """
+    last = _last(lambda rung: compressor.at(rung).error <= error)
+    candidates = [compressor.at(rung) for rung in (*PLAINS, last or LADDER[0])]
+    within = [candidate for candidate in candidates if candidate.error <= error]
+    if not within:
+        best = min(candidates, key=_error_first)
+        raise ValueError(
+            f"no setting has an error of at most {error:g}: the most exact one has {best.error:.3g} in "
+            f"{len(best.data)} bytes; allow more, or use level 'paper' without codebooks, which loses nothing"
+        )
+    return min(within, key=lambda candidate: len(candidate.data))
+
+
+def finest_within(compressor: Compressor, target: int) -> Candidate:
+    """The most exact file of at most ``target`` bytes.
+
+    Raises:
+        ValueError: Even the smallest one has more.
+    """
+    last = _last(lambda rung: len(compressor.at(rung).data) > target)
+    first = 0 if last is None else LADDER.index(last) + 1
+    candidates = [compressor.at(rung) for rung in (*PLAINS, *LADDER[first:][:1])]
+    within = [candidate for candidate in candidates if len(candidate.data) <= target]
+    if not within:
+        least = min(len(candidate.data) for candidate in (*candidates, compressor.at(LADDER[-1])))
+        raise ValueError(
+            f"the smallest file of this scene has {least} bytes, more than {target}; most of them are positions: "
+            "train with fewer splats (--callbacks.contribution.share, --callbacks.density.max_splats)"
+        )
+    return min(within, key=_error_first)
+
+
+def _error_first(candidate: Candidate) -> tuple[float, int]:
+    return candidate.error, len(candidate.data)
+
+
+def _last(holds: Callable[[Rung], bool]) -> Rung | None:
+    """The last rung of the ladder for which something holds that holds up to some rung and not after it, or None."""
+    low, high = -1, len(LADDER)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if holds(LADDER[middle]) else (low, middle)
+    return LADDER[low] if low >= 0 else None

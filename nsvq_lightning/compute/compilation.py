@@ -1,0 +1,76 @@
+"""How long kernels have been compiled for in this process, and a word when that begins.
+
+A kernel is compiled once on a machine, at its first call, and then found on the disk. That is neither training nor a
+reason to worry, so clocks leave it out and progress says what is going on.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from numba.core import event
+
+__all__ = ["compile_seconds", "compile_watcher"]
+
+log = logging.getLogger(__name__)
+
+Watcher = Callable[[bool], None]
+"""Called with True when a compilation begins, with False when it has ended."""
+
+
+class _Clock(event.Listener):
+    """Adds up Numba's compilations; one that a kernel needs of its helpers happens within its own."""
+
+    def __init__(self) -> None:
+        self.watchers: list[Watcher] = []
+        self._seconds = 0.0
+        self._depth = 0
+        self._since = 0.0
+        self._announced = False
+
+    @property
+    def seconds(self) -> float:
+        """Seconds so far, up to this moment."""
+        return self._seconds + (time.perf_counter() - self._since if self._depth else 0.0)
+
+    def on_start(self, _: Any) -> None:
+        self._depth += 1
+        if self._depth > 1:
+            return
+        self._since = time.perf_counter()
+        if not self._announced:
+            self._announced = True
+            log.info("compiling kernels, once on this machine: one to three minutes in all, as they are needed")
+        for watcher in self.watchers:
+            watcher(True)
+
+    def on_end(self, _: Any) -> None:
+        self._depth -= 1
+        if self._depth:
+            return
+        self._seconds += time.perf_counter() - self._since
+        for watcher in self.watchers:
+            watcher(False)
+
+
+_clock = _Clock()
+event.register("numba:compile", _clock)
+
+
+def compile_seconds() -> float:
+    """Seconds spent compiling CPU kernels in this process so far; those found on the disk take none."""
+    return _clock.seconds
+
+
+@contextmanager
+def compile_watcher(watcher: Watcher) -> Iterator[None]:
+    """Tell ``watcher`` within the block whenever a compilation begins or ends."""
+    _clock.watchers.append(watcher)
+    try:
+        yield
+    finally:
+        _clock.watchers.remove(watcher)

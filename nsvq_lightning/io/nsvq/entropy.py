@@ -1,0 +1,397 @@
+"""Three kinds of numbers, entropy-coded: paths down a tree, sorted keys, integers. Each to bytes and back.
+
+All three write decisions between two ways with :mod:`nsvq_lightning.io.nsvq.range_coder` and differ in the contexts:
+what a decision's chance is kept by.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from numba import uint64
+from numpy.typing import NDArray
+
+from nsvq_lightning.compute.jit import inline, kernel
+from nsvq_lightning.compute.memory import INT32, INT64, UINT64, check_array, outside
+from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.nsvq.range_coder import (
+    decode_bit,
+    decode_plain,
+    decode_start,
+    encode_bit,
+    encode_end,
+    encode_plain,
+    new_contexts,
+)
+
+__all__ = [
+    "KEY_BITS",
+    "decode_integers",
+    "decode_keys",
+    "decode_paths",
+    "encode_integers",
+    "encode_keys",
+    "encode_paths",
+]
+
+KEY_BITS = 63
+"""Bits of a key; the highest is bit 62."""
+
+_MODELLED_BITS = 16
+"""Decisions of a path that have contexts; those below are written plain."""
+
+_LONGEST_PATH = 32
+
+_RELATIONS = 9
+"""What two neighbours say about a decision: each one took another way before, takes 0 now, or takes 1 now."""
+
+_START = uint64(0xFFFFFFFFFFFFFFFF)
+_WORD_BITS = 32
+_TOO_LARGE = 1 << 62
+_KEY_MASK = uint64((1 << KEY_BITS) - 1)
+
+
+def encode_paths(paths: NDArray[np.int64], bits: int, neighbours: NDArray[np.int32]) -> bytes:
+    """Bytes of paths ``[N]`` of ``bits`` decisions each, the first one in the highest bit.
+
+    A decision's context is the node of the tree where it is taken, and the ways that two earlier paths took there.
+
+    Args:
+        paths: The paths, in [0, 2^bits).
+        bits: Length of each, 0 to 32.
+        neighbours: Two earlier rows ``[N, 2]`` that are likely to be alike, -1 where there is none.
+
+    Raises:
+        ValueError: The arrays do not fit together, one has gaps, or a number is out of its range.
+        TypeError: The numbers have other types.
+    """
+    check_array("paths", paths, (len(neighbours),), INT64)
+    _check_paths(bits, neighbours)
+    words = _room(len(paths) * bits)
+    used = _write_paths(paths, bits, neighbours, words, new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
+    return _bytes(words, used)
+
+
+def _check_paths(bits: int, neighbours: NDArray[np.int32]) -> None:
+    if not 0 <= bits <= _LONGEST_PATH:
+        raise ValueError(f"a path must have 0 to {_LONGEST_PATH} bits, got {bits}")
+    check_array("neighbours", neighbours, (len(neighbours), 2), INT32)
+    if neighbours.size and (neighbours.min() < -1 or neighbours.max() >= len(neighbours)):
+        raise ValueError(f"neighbours must be in [-1, {len(neighbours)}), got {neighbours.min()} to {neighbours.max()}")
+
+
+def decode_paths(data: bytes | memoryview, bits: int, neighbours: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Invert :func:`encode_paths` with the same ``bits`` and ``neighbours``.
+
+    Raises:
+        FormatError: There are more or fewer bytes than N paths have.
+        ValueError: As of :func:`encode_paths`.
+        TypeError: The numbers have other types.
+    """
+    _check_paths(bits, neighbours)
+    paths, words = np.empty(len(neighbours), np.int64), _words(data)
+    used = _read_paths(words, bits, neighbours, paths, new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
+    _check_used(words, used)
+    return paths
+
+
+def encode_keys(keys: NDArray[np.uint64], depths: NDArray[np.int64]) -> bytes:
+    """Bytes of ascending keys ``[N]``, of each only its ``depths [N]`` highest bits of 63; the others must be 0.
+
+    Written is the difference to the key before, in units of the key's own depth: how many bits it has by an adaptive
+    model, those after the first plain. So the order of N points, which nobody needs, costs nothing: about log2(N!) bits
+    fewer than the keys as they are.
+
+    Raises:
+        ValueError: The arrays do not fit together, one has gaps, or the numbers do not ascend or are out of range.
+        TypeError: The numbers have other types.
+    """
+    _check_depths(depths)
+    check_array("keys", keys, (len(depths),), UINT64)
+    if bool((keys[1:] < keys[:-1]).any()) or (len(keys) and keys[-1] > _KEY_MASK):
+        raise ValueError(f"keys must ascend and be below 2^{KEY_BITS}, got {keys}; sort them")
+    words = _room(int(depths.sum()) + 8 * len(keys))
+    return _bytes(words, _write_keys(keys, depths, words, new_contexts(_KEY_CONTEXTS)))
+
+
+def _check_depths(depths: NDArray[np.int64]) -> None:
+    check_array("depths", depths, (depths.size,), INT64)
+    if depths.size and (depths.min() < 0 or depths.max() > KEY_BITS):
+        raise outside("depths", depths, KEY_BITS + 1)
+
+
+def decode_keys(data: bytes | memoryview, depths: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """Invert :func:`encode_keys` with the same ``depths``.
+
+    Raises:
+        FormatError: There are more or fewer bytes than N keys have.
+        ValueError: As of :func:`encode_keys`.
+        TypeError: The depths are not int64.
+    """
+    _check_depths(depths)
+    keys, words = np.empty(len(depths), np.uint64), _words(data)
+    _check_used(words, _read_keys(words, depths, keys, new_contexts(_KEY_CONTEXTS)))
+    return keys
+
+
+def encode_integers(values: NDArray[np.int64]) -> bytes:
+    """Bytes of integers ``[N, D]`` below 2⁶² in size.
+
+    Each column is written as it is or as differences from row to row, whichever is smaller; one byte a column says so.
+    Of a number is written how many bits it has, by an adaptive model of its column, its sign, the bit after the leading
+    one by a model, and the others plain.
+
+    Raises:
+        ValueError: The values are not ``[N, D]``, have gaps, or one is too large.
+        TypeError: They are not int64.
+    """
+    check_array("values", values, values.shape, INT64)
+    if values.ndim != 2 or (values.size and max(-int(values.min()), int(values.max())) >= _TOO_LARGE):
+        raise ValueError(f"values must have shape [N, D] and be below 2^62 in size, got {list(values.shape)}")
+    steps = np.diff(values, axis=0, prepend=0)
+    by_steps = _size(steps) < _size(values)
+    chosen = np.where(by_steps, steps, values)
+    words = _room(int(_bit_lengths(chosen).sum()) + 8 * chosen.size)
+    used = _write_integers(chosen, words, new_contexts(_INTEGER_CONTEXTS * values.shape[1]))
+    return by_steps.astype(np.uint8).tobytes() + _bytes(words, used)
+
+
+def decode_integers(data: bytes | memoryview, rows: int, columns: int) -> NDArray[np.int64]:
+    """Invert :func:`encode_integers`.
+
+    Raises:
+        FormatError: There are more or fewer bytes than these integers have.
+    """
+    if len(data) < columns:
+        raise FormatError(f"damaged: {len(data)} bytes for {columns} columns of integers")
+    by_steps = np.frombuffer(data[:columns], np.uint8).astype(bool)
+    values, words = np.empty((rows, columns), np.int64), _words(data[columns:])
+    _check_used(words, _read_integers(words, values, new_contexts(_INTEGER_CONTEXTS * columns)))
+    return np.where(by_steps, np.cumsum(values, axis=0), values)
+
+
+# Words and bytes
+
+
+def _room(bits: int) -> NDArray[np.uint32]:
+    """Words that certainly hold so many modelled bits: a surprise costs 11 bits, not one."""
+    return np.zeros(11 * bits // _WORD_BITS + 4, np.uint32)
+
+
+def _bytes(words: NDArray[np.uint32], used: int) -> bytes:
+    return words[:used].astype("<u4", copy=False).tobytes()
+
+
+def _words(data: bytes | memoryview) -> NDArray[np.uint32]:
+    if len(data) % 4:
+        raise FormatError(f"damaged: an entropy-coded stream of {len(data)} bytes, which is no multiple of 4")
+    return np.frombuffer(data, "<u4").astype(np.uint32, copy=False)
+
+
+def _check_used(words: NDArray[np.uint32], used: int) -> None:
+    """The decoder looks one word ahead of the last one."""
+    if used > len(words) + 1 or used < len(words):
+        raise FormatError(f"damaged: an entropy-coded stream of {len(words)} words, of which {used - 1} were read")
+
+
+# Paths
+
+
+@inline
+def _path_of(paths, row):  # type: ignore[no-untyped-def]
+    """The path of a row, or -1 without one, which agrees with no other."""
+    return paths[row] if row >= 0 else np.int64(-1)
+
+
+@inline
+def _way(neighbour, path, left):  # type: ignore[no-untyped-def]
+    """What a neighbour's path did at a decision with ``left`` more to come: 1 or 2, or 0 if it had left ``path``."""
+    return 1 + ((neighbour >> left) & 1) if neighbour >> (left + 1) == path else 0
+
+
+@inline
+def _context(first, second, path, left, bits):  # type: ignore[no-untyped-def]
+    """The node where a decision is taken, and the ways of the two neighbours there."""
+    node = (np.int64(1) << (bits - 1 - left)) + path
+    return _RELATIONS * node + 3 * _way(first, path, left) + _way(second, path, left)
+
+
+@partial(kernel, parallel=False, allocates=False)
+def _write_paths(paths, bits, neighbours, words, contexts):  # type: ignore[no-untyped-def]
+    low, width, used = uint64(0), _START, 0
+    plain = max(0, bits - _MODELLED_BITS)
+    for i in range(len(paths)):
+        first, second = _path_of(paths, neighbours[i, 0]), _path_of(paths, neighbours[i, 1])
+        path = np.int64(0)
+        for left in range(bits - 1, plain - 1, -1):
+            bit = (paths[i] >> left) & 1
+            context = _context(first, second, path, left, bits)
+            low, width, used = encode_bit(bit, context, contexts, low, width, words, used)
+            path = 2 * path + bit
+        low, width, used = encode_plain(paths[i] & ((1 << plain) - 1), plain, low, width, words, used)
+    return encode_end(low, words, used)
+
+
+@partial(kernel, parallel=False, allocates=False)
+def _read_paths(words, bits, neighbours, paths, contexts):  # type: ignore[no-untyped-def]
+    code, width, used = decode_start(words)
+    plain = max(0, bits - _MODELLED_BITS)
+    for i in range(len(paths)):
+        first, second = _path_of(paths, neighbours[i, 0]), _path_of(paths, neighbours[i, 1])
+        path = np.int64(0)
+        for left in range(bits - 1, plain - 1, -1):
+            context = _context(first, second, path, left, bits)
+            bit, code, width, used = decode_bit(context, contexts, code, width, words, used)
+            path = 2 * path + bit
+        rest, code, width, used = decode_plain(plain, code, width, words, used)
+        paths[i] = (path << plain) + np.int64(rest)
+    return used
+
+
+# Lengths of numbers
+
+_LENGTH_BITS = 6
+"""Decisions that tell the bits of a number, 0 to 63."""
+
+
+@inline
+def _length(size):  # type: ignore[no-untyped-def]
+    """Bits of a number; 0 for 0."""
+    length = 0
+    while length < KEY_BITS and size >> uint64(length):
+        length += 1
+    return length
+
+
+@inline
+def _below(value, bits):  # type: ignore[no-untyped-def]
+    """The number without its bit ``bits - 1`` and those above."""
+    return value & ((uint64(1) << uint64(max(bits - 1, 0))) - uint64(1))
+
+
+@inline
+def _second_context(start, length):  # type: ignore[no-untyped-def]
+    """Context of the bit after the leading one."""
+    return start + (1 << _LENGTH_BITS) + length
+
+
+@inline
+def _write_length(length, start, contexts, low, width, words, used):  # type: ignore[no-untyped-def]
+    node = 1
+    for left in range(_LENGTH_BITS - 1, -1, -1):
+        bit = (length >> left) & 1
+        low, width, used = encode_bit(bit, start + node, contexts, low, width, words, used)
+        node = 2 * node + bit
+    return low, width, used
+
+
+@inline
+def _read_length(start, contexts, code, width, words, used):  # type: ignore[no-untyped-def]
+    node = 1
+    for _ in range(_LENGTH_BITS):
+        bit, code, width, used = decode_bit(start + node, contexts, code, width, words, used)
+        node = 2 * node + bit
+    return node - (1 << _LENGTH_BITS), code, width, used
+
+
+# Keys
+
+_BEFORE = 11
+"""Classes of the size of the difference before."""
+_KEY_CONTEXTS = (KEY_BITS + 1) * _BEFORE << _LENGTH_BITS
+
+
+@inline
+def _key_context(depth, before):  # type: ignore[no-untyped-def]
+    """Start of the contexts of a key of this depth, after a difference with its highest bit at ``before``."""
+    return (depth * _BEFORE + before // 6) << _LENGTH_BITS
+
+
+@partial(kernel, parallel=False, allocates=False)
+def _write_keys(keys, depths, words, contexts):  # type: ignore[no-untyped-def]
+    low, width, used = uint64(0), _START, 0
+    last, before = uint64(0), 0
+    for i in range(len(keys)):
+        shift = uint64(KEY_BITS - depths[i])
+        step = (keys[i] >> shift) - (last >> shift)
+        length = _length(step)
+        start = _key_context(depths[i], before)
+        low, width, used = _write_length(length, start, contexts, low, width, words, used)
+        low, width, used = encode_plain(_below(step, length), length - 1, low, width, words, used)
+        last, before = keys[i], (length + np.int64(shift) if length else 0)
+    return encode_end(low, words, used)
+
+
+@partial(kernel, parallel=False, allocates=False)
+def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
+    code, width, used = decode_start(words)
+    last, before = uint64(0), 0
+    for i in range(len(keys)):
+        shift = uint64(KEY_BITS - depths[i])
+        start = _key_context(depths[i], before)
+        length, code, width, used = _read_length(start, contexts, code, width, words, used)
+        # Only an altered stream has a step that is longer than its key.
+        length = min(length, depths[i])
+        rest, code, width, used = decode_plain(length - 1, code, width, words, used)
+        step = (uint64(1) << uint64(length - 1)) | rest if length else uint64(0)
+        last = (((last >> shift) + step) << shift) & _KEY_MASK
+        before = length + np.int64(shift) if length else 0
+        keys[i] = last
+    return used
+
+
+# Integers
+
+_INTEGER_CONTEXTS = 2 << _LENGTH_BITS
+"""Contexts of a column: the tree of the lengths, and the second bit by the length."""
+
+
+def _bit_lengths(values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Bits of each number's size; 0 for 0."""
+    exponents: NDArray[np.int64] = np.frexp(np.abs(values).astype(np.float64))[1].astype(np.int64)
+    return exponents
+
+
+def _size(values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """About how many bits each column takes."""
+    total: NDArray[np.int64] = _bit_lengths(values).sum(0)
+    return total
+
+
+@partial(kernel, parallel=False, allocates=False)
+def _write_integers(values, words, contexts):  # type: ignore[no-untyped-def]
+    low, width, used = uint64(0), _START, 0
+    for i in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            size = uint64(abs(values[i, j]))
+            length = _length(size)
+            start = _INTEGER_CONTEXTS * j
+            low, width, used = _write_length(length, start, contexts, low, width, words, used)
+            if length > 0:
+                low, width, used = encode_plain(values[i, j] < 0, 1, low, width, words, used)
+            if length > 1:
+                second = np.int64(size >> uint64(length - 2)) & 1
+                context = _second_context(start, length)
+                low, width, used = encode_bit(second, context, contexts, low, width, words, used)
+                low, width, used = encode_plain(_below(size, length - 1), length - 2, low, width, words, used)
+    return encode_end(low, words, used)
+
+
+@partial(kernel, parallel=False, allocates=False)
+def _read_integers(words, values, contexts):  # type: ignore[no-untyped-def]
+    code, width, used = decode_start(words)
+    for i in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            start = _INTEGER_CONTEXTS * j
+            length, code, width, used = _read_length(start, contexts, code, width, words, used)
+            sign, size = uint64(0), uint64(min(length, 1))
+            if length > 0:
+                sign, code, width, used = decode_plain(1, code, width, words, used)
+            if length > 1:
+                context = _second_context(start, length)
+                second, code, width, used = decode_bit(context, contexts, code, width, words, used)
+                rest, code, width, used = decode_plain(length - 2, code, width, words, used)
+                size = ((uint64(2) | uint64(second)) << uint64(length - 2)) | rest
+            values[i, j] = -np.int64(size) if sign else np.int64(size)
+    return used

@@ -1,0 +1,88 @@
+"""Write and read ``.nsvq`` files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+
+from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.errors import FormatError, naming_file
+from nsvq_lightning.io.nsvq.frame import frame, read_frame, read_header
+from nsvq_lightning.io.nsvq.header import Header
+from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Precision, check_level
+
+__all__ = ["DEFAULT_LEVEL", "LEVELS", "CompressedScene", "decode", "encode", "read_header", "read_nsvq", "write_nsvq"]
+
+
+def encode(
+    scene: CompressedScene, level: str = DEFAULT_LEVEL, precision: Precision | None = None
+) -> tuple[Header, dict[str, bytes]]:
+    """Header and streams of a scene; the same arguments give the same bytes.
+
+    Args:
+        scene: The scene.
+        level: One of :data:`LEVELS`.
+        precision: Largest errors of level ``compact``; level ``paper`` has none.
+
+    Raises:
+        ValueError: Unknown level, or ``config`` is not made of JSON values.
+    """
+    check_level(level)
+    # The level's module only: entropy coding waits for Numba, which level ``paper`` has no use for.
+    if level == "compact":
+        from nsvq_lightning.io.nsvq.compact import encode_compact
+
+        return encode_compact(scene, precision)
+    from nsvq_lightning.io.nsvq.paper import encode_paper
+
+    return encode_paper(scene)
+
+
+def write_nsvq(
+    path: str | os.PathLike[str],
+    scene: CompressedScene,
+    level: str = DEFAULT_LEVEL,
+    precision: Precision | None = None,
+) -> int:
+    """Write a scene to a file, replaced atomically; arguments and errors as of :func:`encode`.
+
+    Returns:
+        Bytes of the file.
+    """
+    parts = frame(*encode(scene, level, precision))
+    with atomic_write(path) as file:
+        file.writelines(parts)
+    return sum(map(len, parts))
+
+
+def read_nsvq(path: str | os.PathLike[str]) -> CompressedScene:
+    """Read a scene: of level ``paper`` exactly what was written, of ``compact`` within its precision, splats reordered.
+
+    Raises:
+        FormatError: The file is truncated, altered, of a newer version or level, or no ``.nsvq`` file.
+    """
+    header, streams = read_frame(path)
+    with naming_file(path):
+        scene = decode(header, streams)
+    return replace(scene, stored_bytes=os.path.getsize(path))
+
+
+def decode(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene:
+    """Scene from header and streams of any level.
+
+    Raises:
+        FormatError: Of a newer level, or the streams are not what the header says.
+    """
+    if header.level == "compact":
+        from nsvq_lightning.io.nsvq.compact import decode_compact
+
+        return decode_compact(header, streams)
+    if header.level == "paper":
+        from nsvq_lightning.io.nsvq.paper import decode_paper
+
+        return decode_paper(header, streams)
+    raise FormatError(
+        f"compression level {header.level!r}; this release reads {', '.join(LEVELS)}", "update nsvq-lightning"
+    )

@@ -1,0 +1,213 @@
+"""The header of a ``.nsvq`` file: what the streams after it hold, as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, TypeVar
+
+from nsvq_lightning.io.errors import FormatError
+
+__all__ = ["PREFIX_BYTES", "AttributeEntry", "Header", "StreamEntry", "tile"]
+
+PREFIX_BYTES = 32
+"""Bytes in front of the JSON, see :mod:`nsvq_lightning.io.nsvq.frame`."""
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class AttributeEntry:
+    """How one attribute of the splats is stored.
+
+    Attributes:
+        name: Attribute, for example ``quats``.
+        dim: Numbers a splat, D.
+        storage: ``raw`` (float32, one row a splat), ``codes`` (rows of a codebook), ``steps`` (integers, one row a
+            splat), ``levels`` (shares of 1), or ``grid`` (cells of a grid).
+        codes: Rows of the codebook K, or number of levels; 0 where there are none.
+        bits: Bits of one code before entropy coding; 0 without codes.
+        step: What the integers of this attribute, or of its codebook, are multiples of; 0 for float32.
+    """
+
+    name: str
+    dim: int
+    storage: str
+    codes: int = 0
+    bits: int = 0
+    step: float = 0.0
+
+
+@dataclass(frozen=True)
+class StreamEntry:
+    """One run of bytes.
+
+    Attributes:
+        name: What it holds.
+        offset: First byte, counted from the end of the header.
+        length: Bytes.
+        encoding: How to read it, for example ``float32`` or ``bits``.
+    """
+
+    name: str
+    offset: int
+    length: int
+    encoding: str
+
+
+@dataclass(frozen=True)
+class Header:
+    """All that a ``.nsvq`` file says about its streams.
+
+    Attributes:
+        level: Compression level, which fixes the attribute and stream tables.
+        splats: Number of splats N.
+        sh_degree: Degree of the spherical harmonics, 0 to 3.
+        origin: World coordinates of the point (0, 0, 0) of the stored positions, float64.
+        attributes: Attribute table.
+        streams: Stream table; the streams follow each other without gaps.
+        config: Settings of the run; JSON values.
+        metrics: Quality measured on the decoded file; None stands for NaN or infinity.
+    """
+
+    level: str
+    splats: int
+    sh_degree: int
+    origin: tuple[float, float, float]
+    attributes: tuple[AttributeEntry, ...]
+    streams: tuple[StreamEntry, ...]
+    config: dict[str, Any] = field(default_factory=dict)
+    metrics: dict[str, float | None] = field(default_factory=dict)
+
+    @property
+    def size(self) -> int:
+        """Bytes before the first stream: prefix and JSON."""
+        return PREFIX_BYTES + len(self.to_json())
+
+    @property
+    def file_bytes(self) -> int:
+        """Bytes of the whole file."""
+        return self.size + sum(stream.length for stream in self.streams)
+
+    def to_json(self) -> bytes:
+        """The JSON text as stored; equal headers give equal bytes.
+
+        Raises:
+            ValueError: ``config`` holds something that is not a JSON value (tensor, object, NaN).
+        """
+        try:
+            table = asdict(self)
+            table["metrics"] = {name: _finite_or_none(value) for name, value in self.metrics.items()}
+            text = json.dumps(table, sort_keys=True, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+            return text.encode()
+        except (TypeError, ValueError, RecursionError) as error:
+            raise ValueError(f"config and metrics must hold plain JSON values only: {error}") from None
+
+    @classmethod
+    def from_json(cls, text: bytes) -> Header:
+        """Header from its JSON text.
+
+        Raises:
+            FormatError: An entry is missing or has the wrong type.
+        """
+        try:
+            table = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise FormatError(f"damaged: the header is not JSON ({error})") from None
+        header = cls(
+            level=_entry(table, "level", str),
+            splats=_size(table, "splats"),
+            sh_degree=_size(table, "sh_degree"),
+            origin=_origin(table),
+            attributes=tuple(_attribute(entry) for entry in _items(table, "attributes", (dict,))),
+            streams=tuple(_stream(entry) for entry in _items(table, "streams", (dict,))),
+            config=_entry(table, "config", dict),
+            metrics=_metrics(table),
+        )
+        if header.sh_degree > 3:
+            raise FormatError(f"damaged: SH degree {header.sh_degree}, the highest is 3")
+        if len({stream.name for stream in header.streams}) != len(header.streams):
+            raise FormatError("damaged: two streams have the same name")
+        return header
+
+
+def tile(streams: Sequence[tuple[str, int, str]]) -> tuple[StreamEntry, ...]:
+    """Stream table of streams given as (name, length, encoding), laid back to back."""
+    entries: list[StreamEntry] = []
+    offset = 0
+    for name, length, encoding in streams:
+        entries.append(StreamEntry(name, offset, length, encoding))
+        offset += length
+    return tuple(entries)
+
+
+def _attribute(table: dict[str, Any]) -> AttributeEntry:
+    return AttributeEntry(
+        name=_entry(table, "name", str),
+        dim=_size(table, "dim"),
+        storage=_entry(table, "storage", str),
+        codes=_size(table, "codes"),
+        bits=_size(table, "bits"),
+        step=_finite(table, "step"),
+    )
+
+
+def _stream(table: dict[str, Any]) -> StreamEntry:
+    return StreamEntry(
+        name=_entry(table, "name", str),
+        offset=_size(table, "offset"),
+        length=_size(table, "length"),
+        encoding=_entry(table, "encoding", str),
+    )
+
+
+def _entry(table: object, key: str, kind: type[_T]) -> _T:
+    value = table.get(key) if isinstance(table, dict) else None
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise FormatError(f"damaged: header entry {key!r} must be of type {kind.__name__}, got {str(value)[:60]!r}")
+    return value
+
+
+def _size(table: object, key: str) -> int:
+    value = _entry(table, key, int)
+    if value < 0:
+        raise FormatError(f"damaged: header entry {key!r} must not be negative, got {value}")
+    return value
+
+
+def _items(table: object, key: str, kinds: tuple[type, ...]) -> list[Any]:
+    values = _entry(table, key, list)
+    if any(not isinstance(value, kinds) or isinstance(value, bool) for value in values):
+        raise FormatError(f"damaged: header entry {key!r} has a member of the wrong type")
+    return values
+
+
+def _finite(table: object, key: str) -> float:
+    value = table.get(key, 0.0) if isinstance(table, dict) else None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= sys.float_info.max:
+        raise FormatError(
+            f"damaged: header entry {key!r} must be a finite number, not negative, got {str(value)[:60]!r}"
+        )
+    return float(value)
+
+
+def _origin(table: object) -> tuple[float, float, float]:
+    values = _items(table, "origin", (int, float))
+    # Comparing is safe where float() of a huge integer would overflow.
+    if len(values) != 3 or not all(abs(value) <= sys.float_info.max for value in values):
+        raise FormatError("damaged: header entry 'origin' must be three finite numbers")
+    return float(values[0]), float(values[1]), float(values[2])
+
+
+def _metrics(table: object) -> dict[str, float | None]:
+    metrics = _entry(table, "metrics", dict)
+    if any(isinstance(value, bool) or not isinstance(value, int | float | None) for value in metrics.values()):
+        raise FormatError("damaged: header entry 'metrics' must hold numbers only")
+    return metrics
+
+
+def _finite_or_none(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None

@@ -1,0 +1,126 @@
+"""Level ``paper``: the storage that the paper counts.
+
+Positions and opacities are float32, the codes of all quantized attributes one bit-packed stream, codebooks float32:
+
+    16 · N + ⌈N · Σ bits / 8⌉ + Σ 4 · K · D + header bytes,
+
+with bits = ⌈log2 K⌉ (0 for a single row). An attribute that is not quantized adds 4 · N · D instead of its bits and its
+codebook. The header is the prefix of 32 bytes and the JSON;
+:attr:`nsvq_lightning.io.nsvq.header.Header.size` states it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nsvq_lightning.io.compressed import QUANTIZABLE, CompressedScene, attribute_dims
+from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.nsvq.bits import code_bits, pack_fields, packed_bytes, unpack_fields
+from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, tile
+
+__all__ = ["decode_paper", "encode_paper", "paper_header"]
+
+_FLOATS = "float32"
+_BITS = "bits"
+
+
+def paper_header(scene: CompressedScene) -> Header:
+    """Header of the scene's file; costs nothing, since it depends on counts only."""
+    attributes = (
+        AttributeEntry("means", 3, "raw"),
+        AttributeEntry("opacities", 1, "raw"),
+        *(_attribute(scene, name, dim) for name, dim in attribute_dims(scene.sh_degree).items()),
+    )
+    return Header(
+        level="paper",
+        splats=len(scene),
+        sh_degree=scene.sh_degree,
+        origin=(float(scene.origin[0]), float(scene.origin[1]), float(scene.origin[2])),
+        attributes=attributes,
+        streams=tile(_layout(len(scene), attributes)),
+        config=dict(scene.config),
+        metrics=dict(scene.metrics),
+    )
+
+
+def encode_paper(scene: CompressedScene) -> tuple[Header, dict[str, bytes]]:
+    """Header and streams of a scene."""
+    header = paper_header(scene)
+    coded = [entry for entry in header.attributes if entry.storage == "codes"]
+    streams = {"means": _float_bytes(scene.means), "opacities": _float_bytes(scene.opacities)}
+    streams |= {name: _float_bytes(values) for name, values in scene.raw.items()}
+    streams |= {f"{name}.codebook": _float_bytes(values) for name, values in scene.codebooks.items()}
+    if coded:
+        streams["codes"] = pack_fields([scene.codes[entry.name] for entry in coded], [entry.bits for entry in coded])
+    return header, streams
+
+
+def decode_paper(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene:
+    """Scene from header and streams.
+
+    Raises:
+        FormatError: The tables are not those of this level, or a code is not a row of its codebook.
+    """
+    _check_tables(header)
+    n = header.splats
+    coded = [entry for entry in header.attributes if entry.storage == "codes"]
+    packed = unpack_fields(streams["codes"], n, [entry.bits for entry in coded]) if coded else []
+    raw = [entry for entry in header.attributes if entry.storage == "raw" and entry.name in QUANTIZABLE]
+    try:
+        return CompressedScene(
+            means=_floats(streams["means"], n, 3),
+            opacities=_floats(streams["opacities"], n, 1)[:, 0],
+            codes={entry.name: codes for entry, codes in zip(coded, packed, strict=True)},
+            codebooks={
+                entry.name: _floats(streams[f"{entry.name}.codebook"], entry.codes, entry.dim) for entry in coded
+            },
+            raw={entry.name: _floats(streams[entry.name], n, entry.dim) for entry in raw},
+            sh_degree=header.sh_degree,
+            config=header.config,
+            metrics=header.metrics,
+            origin=header.origin,
+        )
+    except ValueError as error:
+        raise FormatError(f"damaged: {error}") from None
+
+
+def _attribute(scene: CompressedScene, name: str, dim: int) -> AttributeEntry:
+    if name in scene.raw:
+        return AttributeEntry(name, dim, "raw")
+    rows = len(scene.codebooks[name])
+    return AttributeEntry(name, dim, "codes", rows, code_bits(rows))
+
+
+def _layout(n: int, attributes: tuple[AttributeEntry, ...]) -> list[tuple[str, int, str]]:
+    """Name, bytes and encoding of the streams: raw attributes, codes, codebooks."""
+    coded = [entry for entry in attributes if entry.storage == "codes"]
+    return [
+        *((entry.name, 4 * n * entry.dim, _FLOATS) for entry in attributes if entry.storage == "raw"),
+        *([("codes", packed_bytes(n, [entry.bits for entry in coded]), _BITS)] if coded else []),
+        *((f"{entry.name}.codebook", 4 * entry.codes * entry.dim, _FLOATS) for entry in coded),
+    ]
+
+
+def _check_tables(header: Header) -> None:
+    """Compare with the tables this release would write, before anything is allocated by them."""
+    dims = {"means": 3, "opacities": 1, **attribute_dims(header.sh_degree)}
+    if [(entry.name, entry.dim) for entry in header.attributes] != list(dims.items()):
+        raise FormatError(f"damaged: the attribute table must list {dims}, got {header.attributes}")
+    for entry in header.attributes:
+        raw = entry.storage == "raw" and entry.codes == entry.bits == 0
+        coded = entry.name in QUANTIZABLE and entry.storage == "codes" and 1 <= entry.codes <= 1 << 32
+        if entry.step or (not raw and not (coded and entry.bits == code_bits(entry.codes))):
+            raise FormatError(f"damaged: impossible attribute {entry}")
+    if header.streams != tile(_layout(header.splats, header.attributes)):
+        raise FormatError("damaged: the stream table does not fit the attribute table and the number of splats")
+
+
+def _float_bytes(values: NDArray[np.float32]) -> bytes:
+    return values.astype("<f4", copy=False).tobytes()
+
+
+def _floats(data: memoryview, rows: int, dim: int) -> NDArray[np.float32]:
+    return np.frombuffer(data, "<f4").astype(np.float32).reshape(rows, dim)

@@ -1,0 +1,171 @@
+"""Binary arithmetic coding with adaptive probabilities, in integers only: every machine decodes the same numbers.
+
+A range coder (Martin 1979) with a window of 64 bits that moves by words of 32: the interval ``[low, low + width)`` is
+divided in proportion to the chance of a bit. A carry out of ``low`` is added to the words that are written already.
+
+The chance of a bit is kept per *context* as a 16-bit number that moves towards each bit it meets, by 1/(n + 1.6) at the
+n-th and by 1/128 at last: as exact as a count at the start, as quick as a running mean later on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import uint32, uint64
+from numpy.typing import NDArray
+
+from nsvq_lightning.compute.jit import inline
+
+__all__ = [
+    "COUNT_LIMIT",
+    "decode_bit",
+    "decode_plain",
+    "decode_start",
+    "encode_bit",
+    "encode_end",
+    "encode_plain",
+    "new_contexts",
+]
+
+COUNT_LIMIT = 126
+"""Bits after which the chance of a context moves at its slowest."""
+
+_RATES = np.rint(65536 / (np.arange(COUNT_LIMIT + 1) + 1.6)).astype(np.int64)
+_LEAST = 48
+"""No chance is below 48/65536: a surprise costs at most 11 bits."""
+
+PLAIN_BITS = 16
+"""Bits that are written at once without a model."""
+
+_FULL = uint64(0xFFFFFFFFFFFFFFFF)
+_LOW_WORD = uint64(0xFFFFFFFF)
+
+
+def new_contexts(count: int) -> NDArray[np.uint32]:
+    """States ``[count]``: the chance of the bit 1 in 65536ths times 256, plus how many bits were met."""
+    return np.full(count, 1 << 23, np.uint32)
+
+
+@inline
+def _chance(context, contexts):
+    return uint64(contexts[context] >> uint32(8))
+
+
+@inline
+def _learn(bit, context, contexts):
+    """Move the chance towards the bit. Without branches: which way they go is what is not known."""
+    n = np.int64(contexts[context] & uint32(255))
+    chance = np.int64(contexts[context] >> uint32(8))
+    target = _LEAST + np.int64(bit) * (65536 - 2 * _LEAST)
+    chance += ((target - chance) * _RATES[n]) >> 16
+    contexts[context] = uint32((chance << 8) + n + (n < COUNT_LIMIT))
+
+
+@inline
+def _carry(words, used):
+    """Add one to the number that the words make up."""
+    last = used - 1
+    while words[last] == _LOW_WORD:
+        words[last] = 0
+        last -= 1
+    words[last] += 1
+
+
+@inline
+def _shift_out(low, width, words, used):
+    """Write the upper word of an interval that has become narrow."""
+    if width <= _LOW_WORD:
+        words[used] = low >> uint64(32)
+        used += 1
+        low <<= uint64(32)
+        width <<= uint64(32)
+    return low, width, used
+
+
+@inline
+def encode_bit(bit, context, contexts, low, width, words, used):
+    """Write a bit; returns the new ``low, width, used``. Start with ``0, 2⁶⁴ − 1, 0``."""
+    part = (width >> uint64(16)) * _chance(context, contexts)
+    one = uint64(0) - uint64(bit)  # all bits set for 1, none for 0
+    before = low
+    low += part & ~one
+    width = (part & one) | ((width - part) & ~one)
+    if low < before:
+        _carry(words, used)
+    _learn(bit, context, contexts)
+    return _shift_out(low, width, words, used)
+
+
+@inline
+def encode_plain(value, bits, low, width, words, used):
+    """Write the lower ``bits`` (0 to 62) of a number, each as likely 0 as 1; returns the new ``low, width, used``."""
+    while bits > 0:
+        now = min(bits, PLAIN_BITS)
+        bits -= now
+        width >>= uint64(now)
+        before = low
+        low += width * ((uint64(value) >> uint64(bits)) & uint64((1 << now) - 1))
+        if low < before:
+            _carry(words, used)
+        low, width, used = _shift_out(low, width, words, used)
+    return low, width, used
+
+
+@inline
+def encode_end(low, words, used):
+    """Write the one word that tells the last interval apart; returns the number of words."""
+    if low > _FULL - _LOW_WORD:
+        _carry(words, used)
+        words[used] = 0
+    else:
+        words[used] = (low + _LOW_WORD) >> uint64(32)
+    return used + 1
+
+
+@inline
+def _word(words, at):
+    """A word of the stream; zeros follow its end."""
+    return uint64(words[at]) if at < len(words) else uint64(0)
+
+
+@inline
+def decode_start(words):
+    """The state ``code, width, used`` before the first bit."""
+    return (_word(words, 0) << uint64(32)) | _word(words, 1), _FULL, 2
+
+
+@inline
+def _shift_in(code, width, words, used):
+    if width <= _LOW_WORD:
+        code = (code << uint64(32)) | _word(words, used)
+        width <<= uint64(32)
+        used += 1
+    return code, width, used
+
+
+@inline
+def decode_bit(context, contexts, code, width, words, used):
+    """Read a bit; returns it and the new ``code, width, used``."""
+    part = (width >> uint64(16)) * _chance(context, contexts)
+    bit = np.int64(code < part)
+    one = uint64(0) - uint64(bit)
+    code -= part & ~one
+    width = (part & one) | ((width - part) & ~one)
+    _learn(bit, context, contexts)
+    code, width, used = _shift_in(code, width, words, used)
+    return bit, code, width, used
+
+
+@inline
+def decode_plain(bits, code, width, words, used):
+    """Read a number of ``bits`` (0 to 62) bits; returns it and the new ``code, width, used``."""
+    value = uint64(0)
+    while bits > 0:
+        now = min(bits, PLAIN_BITS)
+        bits -= now
+        width >>= uint64(now)
+        # Only an altered stream has more than fits.
+        digit = min(code // width, uint64((1 << now) - 1))
+        code -= digit * width
+        value = (value << uint64(now)) | digit
+        code, width, used = _shift_in(code, width, words, used)
+    return value, code, width, used

@@ -1,0 +1,128 @@
+"""Image quality as the published tables measure it: PSNR, SSIM, LPIPS.
+
+Rendered images are rounded to 8 bit first, as if read back from a PNG. Every metric is the mean over images of a value
+per image.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric, MetricCollection
+
+from nsvq_lightning.quality.loss import check_pair, ssim
+
+__all__ = ["PSNR", "SSIM", "build_lpips", "eight_bit", "image_metrics", "psnr"]
+
+log = logging.getLogger(__name__)
+
+
+def eight_bit(image: Tensor) -> Tensor:
+    """A float image ``[H, W, 3]`` clamped to [0, 1] and rounded to multiples of 1/255; uint8 is only rescaled."""
+    if image.dtype == torch.uint8:
+        return image.float() / 255
+    return image.clamp(0.0, 1.0).mul_(255).round_().div_(255)
+
+
+def psnr(image: Tensor, target: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio in dB from the squared error pooled over pixels and RGB.
+
+    PSNR = -10 · log10(mean((image - target)²)), summed in float64; equal images give infinity.
+
+    Args:
+        image: ``[H, W, 3]`` in [0, 1].
+        target: ``[H, W, 3]`` in [0, 1].
+    """
+    # A norm adds up in float64 without a copy of the images in it.
+    error = torch.linalg.vector_norm(image - target, dtype=torch.float64)
+    return -20.0 * torch.log10(error / math.sqrt(image.numel()))
+
+
+class _MeanOverImages(Metric):
+    """Mean of one value per image; processes add their sums and counts."""
+
+    is_differentiable = False
+    higher_is_better = True
+    full_state_update = False
+    total: Tensor
+    images: Tensor
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.add_state("total", default=torch.tensor(0.0, dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("images", default=torch.tensor(0), dist_reduce_fx="sum")
+
+    def update(self, image: Tensor, target: Tensor) -> None:
+        """Add one image.
+
+        Args:
+            image: Rendered image ``[H, W, 3]``, float in any range or uint8.
+            target: Photo ``[H, W, 3]``, uint8 or float in [0, 1].
+
+        Raises:
+            ValueError: The shapes differ.
+        """
+        check_pair(image, target)
+        self.total += self._score(eight_bit(image), eight_bit(target))
+        self.images += 1
+
+    def compute(self) -> Tensor:
+        """Mean over the images so far, scalar float32."""
+        return (self.total / self.images).float()
+
+    def _score(self, image: Tensor, target: Tensor) -> Tensor:
+        raise NotImplementedError
+
+
+class PSNR(_MeanOverImages):
+    """Mean over images of the PSNR of each, see :func:`psnr`.
+
+    Example:
+        >>> metric = PSNR()
+        >>> metric.update(torch.full((2, 2, 3), 0.6), torch.full((2, 2, 3), 0.5))
+        >>> round(float(metric.compute()), 2)
+        20.0
+    """
+
+    def _score(self, image: Tensor, target: Tensor) -> Tensor:
+        return psnr(image, target)
+
+
+class SSIM(_MeanOverImages):
+    """Mean over images of the structural similarity of the training loss (11×11 Gaussian window, zero padding)."""
+
+    def _score(self, image: Tensor, target: Tensor) -> Tensor:
+        score: Tensor = ssim(image, target).double()
+        return score
+
+
+def image_metrics(prefix: str = "") -> MetricCollection:
+    """PSNR and SSIM under the names ``psnr`` and ``ssim``; calling it scores one image and adds it to the mean."""
+    # The two have states of the same shape, which torchmetrics would take for a group that shares them.
+    return MetricCollection({"psnr": PSNR(), "ssim": SSIM()}, prefix=prefix or None, compute_groups=False)
+
+
+def build_lpips() -> tuple[Metric | None, str | None]:
+    """LPIPS with VGG features as the tables of 3D Gaussian splatting compute it: images in [0, 1], not rescaled.
+
+    Returns:
+        The metric (images ``[1, 3, H, W]``) and None, or None and the reason why it is not available here.
+    """
+    try:
+        import torchvision  # noqa: F401
+    except (ImportError, RuntimeError, OSError) as error:
+        return None, f"LPIPS needs torchvision (pip install 'nsvq-lightning[lpips]'): {_first_line(error)}"
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+    try:
+        return LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=False), None
+    except (ImportError, RuntimeError, OSError) as error:
+        return None, f"LPIPS could not load the VGG-16 weights (a download of 528 MB): {_first_line(error)}"
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

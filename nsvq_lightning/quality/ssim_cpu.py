@@ -1,0 +1,276 @@
+"""L1 and D-SSIM with their gradient in one sweep down an image.
+
+Each row is met once: it is clamped and brought to [0, 1] on entering a ring of eleven rows; five rows later follow the
+vertical blur of the four moment planes, their horizontal blur, SSIM and its three derivative planes and the horizontal
+blur of those into a second ring; after another five rows their vertical blur, which is the gradient (the blur is its
+own adjoint). Nothing but these rows is ever in memory.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numba import prange
+from torch import Tensor
+
+from nsvq_lightning.compute.jit import inline, kernel, thread_count
+from nsvq_lightning.compute.lanes import (
+    WIDTH,
+    fma,
+    fnma,
+    get,
+    lane_sum,
+    load,
+    put,
+    select,
+    splat,
+    store,
+    vfabs,
+)
+from nsvq_lightning.compute.memory import FLOAT32, UINT8, flat_checked
+from nsvq_lightning.compute.workspace import Workspace, recycled
+from nsvq_lightning.quality.loss import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
+from nsvq_lightning.rendering.cpu.records import F
+
+__all__ = ["l1_dssim"]
+
+G0, G1, G2, G3, G4, G5 = (F(tap) for tap in ssim_window()[SSIM_RADIUS:].tolist())
+C1, C2 = F(SSIM_C1), F(SSIM_C2)
+PAD = 16
+"""Zeros beside every row, at least 3·radius floats, so that the horizontal blur needs no border case."""
+RING = 2 * SSIM_RADIUS + 1
+IMAGES = 2
+MOMENTS = 4
+DERIVATIVES = 3
+LANE_NUMBERS = np.arange(16, dtype=np.float32)
+
+
+@inline
+def row_of(y, planes, pitch):
+    """Offset of row y in a ring of rows with some planes each."""
+    return (y + RING) % RING * planes * pitch
+
+
+@inline
+def clear_row(ring, o, count):
+    """Write zeros over some floats."""
+    zero = splat(F(0))
+    for x in range(0, count, 16):
+        store(ring, o + x, zero)
+
+
+@inline
+def take_row(image, target, white, images, y, height, length, pitch):
+    """Bring row y of both images into their ring: the image clamped, the target divided by ``white``."""
+    o = row_of(y, IMAGES, pitch)
+    if y < 0 or y >= height:
+        clear_row(images, o, IMAGES * pitch)
+    else:
+        zero, one = splat(F(0)), splat(F(1))
+        for x_ in range(0, length, 16):
+            # The last vector of a row overlaps the one before instead of running over.
+            x = min(x_, length - 16)
+            p = load(image, y * length + x)
+            # Not a minimum and a maximum: a NaN must stay one.
+            store(images, o + x, select(p < zero, zero, select(p > one, one, p)))
+        for x in range(length):
+            put(images, o + pitch + x, F(get(target, y * length + x)) / white)
+
+
+@inline
+def blur_along(row, o):
+    """Eleven taps along a padded row of interleaved RGB (neighbouring pixels are 3 floats apart)."""
+    total = splat(G0) * load(row, o)
+    total = fma(splat(G1), load(row, o - 3) + load(row, o + 3), total)
+    total = fma(splat(G2), load(row, o - 6) + load(row, o + 6), total)
+    total = fma(splat(G3), load(row, o - 9) + load(row, o + 9), total)
+    total = fma(splat(G4), load(row, o - 12) + load(row, o + 12), total)
+    return fma(splat(G5), load(row, o - 15) + load(row, o + 15), total)
+
+
+@inline
+def add_pair(images, y, distance, x, pitch, weight, sums):
+    """Add the moments (p, q, p² + q², p·q) of the rows at a distance above and below row y, which share a tap."""
+    above = row_of(y - distance, IMAGES, pitch) + x
+    below = row_of(y + distance, IMAGES, pitch) + x
+    p, q = load(images, above), load(images, above + pitch)
+    r, s = load(images, below), load(images, below + pitch)
+    return (
+        fma(weight, p + r, sums[0]),
+        fma(weight, q + s, sums[1]),
+        fma(weight, fma(p, p, r * r) + fma(q, q, s * s), sums[2]),
+        fma(weight, fma(p, q, r * s), sums[3]),
+    )
+
+
+@inline
+def moments_of_row(images, y, length, pitch, moments):
+    """Vertical blur of the four moment planes at row y."""
+    for x_ in range(0, length, 16):
+        x = min(x_, length - 16)
+        o = row_of(y, IMAGES, pitch) + x
+        p, q, tap = load(images, o), load(images, o + pitch), splat(G0)
+        sums = (tap * p, tap * q, tap * fma(p, p, q * q), tap * (p * q))
+        sums = add_pair(images, y, 1, x, pitch, splat(G1), sums)
+        sums = add_pair(images, y, 2, x, pitch, splat(G2), sums)
+        sums = add_pair(images, y, 3, x, pitch, splat(G3), sums)
+        sums = add_pair(images, y, 4, x, pitch, splat(G4), sums)
+        sums = add_pair(images, y, 5, x, pitch, splat(G5), sums)
+        store(moments, PAD + x, sums[0])
+        store(moments, pitch + PAD + x, sums[1])
+        store(moments, 2 * pitch + PAD + x, sums[2])
+        store(moments, 3 * pitch + PAD + x, sums[3])
+
+
+@inline
+def similarity_of_row(moments, derivatives, length, pitch, lanes):
+    """Sum of SSIM over a row; its derivatives by blurred p, p² and pq into three padded rows."""
+    one, two, c1, c2 = splat(F(1)), splat(F(2)), splat(C1), splat(C2)
+    total = splat(F(0))
+    lane = load(lanes, 0)
+    for x_ in range(0, length, 16):
+        x = min(x_, length - 16)
+        o = PAD + x
+        m1, m2 = blur_along(moments, o), blur_along(moments, pitch + o)
+        m12 = m1 * m2
+        squares = fma(m1, m1, m2 * m2)
+        variances = blur_along(moments, 2 * pitch + o) - squares
+        covariance = blur_along(moments, 3 * pitch + o) - m12
+        a, d = fma(two, m12, c1), fma(two, covariance, c2)
+        e, f = squares + c1, variances + c2
+        ef = one / (e * f)
+        e, f = f * ef, e * ef
+        similarity = a * d * ef
+        by_product = two * a * ef
+        by_square = -(similarity * f)
+        by_mean = two * (m2 * d * ef - m1 * similarity * e - m1 * by_square) - m2 * by_product
+        store(derivatives, o, by_mean)
+        store(derivatives, pitch + o, by_square)
+        store(derivatives, 2 * pitch + o, by_product)
+        total = total + select(lane >= splat(F(x_ - x)), similarity, splat(F(0)))
+    return lane_sum(total)
+
+
+@inline
+def pair_sum(ring, y, distance, o, pitch):
+    """Sum of the rows at a distance above and below row y."""
+    above, below = row_of(y - distance, DERIVATIVES, pitch), row_of(y + distance, DERIVATIVES, pitch)
+    return load(ring, above + o) + load(ring, below + o)
+
+
+@inline
+def blur_across(ring, y, plane, x, pitch):
+    """Eleven taps down the ring, centred on row y, of one derivative plane."""
+    o = plane * pitch + x
+    total = splat(G0) * load(ring, row_of(y, DERIVATIVES, pitch) + o)
+    total = fma(splat(G1), pair_sum(ring, y, 1, o, pitch), total)
+    total = fma(splat(G2), pair_sum(ring, y, 2, o, pitch), total)
+    total = fma(splat(G3), pair_sum(ring, y, 3, o, pitch), total)
+    total = fma(splat(G4), pair_sum(ring, y, 4, o, pitch), total)
+    return fma(splat(G5), pair_sum(ring, y, 5, o, pitch), total)
+
+
+@inline
+def gradient_of_row(image, gradient, images, ring, y, length, pitch, l1_step, ssim_step, lanes):
+    """Gradient of the loss at row y, 0 where the image was clamped; returns the row's sum of absolute differences."""
+    zero, one, two = splat(F(0)), splat(F(1)), splat(F(2))
+    step, scale = splat(l1_step), splat(ssim_step)
+    total = zero
+    lane = load(lanes, 0)
+    for x_ in range(0, length, 16):
+        x = min(x_, length - 16)
+        o = row_of(y, IMAGES, pitch) + x
+        p, q = load(images, o), load(images, o + pitch)
+        g = blur_across(ring, y, 0, PAD + x, pitch)
+        g = fma(two * p, blur_across(ring, y, 1, PAD + x, pitch), g)
+        g = fma(q, blur_across(ring, y, 2, PAD + x, pitch), g)
+        sign = select(p > q, step, select(p < q, -step, zero))
+        raw = load(image, y * length + x)
+        inside = (raw >= zero) & (raw <= one)
+        store(gradient, y * length + x, select(inside, fnma(scale, g, sign), zero))
+        total = total + select(lane >= splat(F(x_ - x)), vfabs(p - q), zero)
+    return lane_sum(total)
+
+
+@inline
+def sweep(
+    image, target, white, gradient, first, last, height, length, pitch, l1_step, ssim_step, images, moments,
+    derivatives, ring, lanes, sums,
+):  # fmt: skip
+    """Do some rows; their sums of SSIM and of absolute differences go to ``sums[2·y]`` and ``sums[2·y + 1]``."""
+    for y in range(first - 2 * SSIM_RADIUS, first):
+        take_row(image, target, white, images, y, height, length, pitch)
+    for y in range(first - SSIM_RADIUS, last + SSIM_RADIUS):
+        take_row(image, target, white, images, y + SSIM_RADIUS, height, length, pitch)
+        slot = row_of(y, DERIVATIVES, pitch)
+        if y < 0 or y >= height:
+            clear_row(ring, slot, DERIVATIVES * pitch)
+        else:
+            moments_of_row(images, y, length, pitch, moments)
+            similarity = similarity_of_row(moments, derivatives, length, pitch, lanes)
+            if y >= first and y < last:
+                sums[2 * y] = similarity
+            for plane in range(DERIVATIVES):
+                for x_ in range(0, length, 16):
+                    x = plane * pitch + PAD + min(x_, length - 16)
+                    store(ring, slot + x, blur_along(derivatives, x))
+        done = y - SSIM_RADIUS
+        if done >= first:
+            sums[2 * done + 1] = gradient_of_row(
+                image, gradient, images, ring, done, length, pitch, l1_step, ssim_step, lanes
+            )
+
+
+@kernel
+def sweep_image(
+    threads, image, target, white, gradient, height, length, pitch, l1_step, ssim_step, images, moments, derivatives,
+    ring, lanes, sums,
+):  # fmt: skip
+    """Every thread sweeps a band of rows; a row's result does not depend on the band it is in."""
+    for thread in prange(threads):
+        sweep(
+            image, target, white, gradient, height * thread // threads, height * (thread + 1) // threads, height,
+            length, pitch, l1_step, ssim_step, images[thread], moments[thread], derivatives[thread], ring[thread],
+            lanes, sums,
+        )  # fmt: skip
+
+
+def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float) -> tuple[float, Tensor]:
+    """Loss and its gradient by ``image``, which counts as clamped to [0, 1]; W at least 6.
+
+    Args:
+        image: Contiguous float32 ``[H, W, 3]`` on the CPU.
+        target: Contiguous ``[H, W, 3]``, float32 in [0, 1] or uint8.
+        dssim_weight: Share of 1 - SSIM.
+
+    Raises:
+        ValueError: The shapes differ or are not ``[H, W, 3]``, W is below 6, or a picture has gaps.
+        TypeError: A type differs.
+    """
+    check_pair(image, target)
+    height, width = image.shape[:2]
+    length = 3 * width
+    if length < WIDTH:
+        raise ValueError(f"rows of the image must fill a vector, which takes a width of at least 6, got {width}")
+    kind = UINT8 if target.dtype == torch.uint8 else FLOAT32
+    pixels = flat_checked("image", image, tuple(image.shape)), flat_checked("target", target, tuple(target.shape), kind)
+    pitch = (length + 2 * PAD + 15) // 16 * 16
+    threads = max(1, min(thread_count(), height // RING))
+    gradient = recycled(tuple(image.shape))
+    work = Workspace.borrow()
+    planes = {"images": RING * IMAGES, "moments": MOMENTS, "derivatives": DERIVATIVES, "ring": RING * DERIVATIVES}
+    rows: dict[str, Any] = {name: work.rows(name, threads, count * pitch) for name, count in planes.items()}
+    for padded in (rows["moments"], rows["derivatives"]):
+        padded.fill(0)
+    sums = work.array("row_sums", 2 * height, np.float64)
+    count = length * height
+    white = F(255 if target.dtype == torch.uint8 else 1)
+    sweep_image(
+        threads, *pixels, white, gradient.numpy().reshape(-1), height, length, pitch,
+        F((1 - dssim_weight) / count), F(dssim_weight / count), *rows.values(), LANE_NUMBERS, sums,
+    )  # fmt: skip
+    similarity, difference = sums[0::2].sum() / count, sums[1::2].sum() / count
+    work.give_back()
+    return float((1 - dssim_weight) * difference + dssim_weight * (1 - similarity)), gradient

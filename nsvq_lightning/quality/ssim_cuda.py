@@ -1,0 +1,285 @@
+"""L1 and D-SSIM with their gradient: four passes over the image, each a separable half of a blur.
+
+Forward: vertical blur of the four moment planes, then their horizontal blur, SSIM and its derivatives by three of the
+blurred planes. Backward: vertical and horizontal blur of these derivatives (the blur is its own adjoint), which is the
+gradient. A program reads its neighbourhood tap by tap and leaves it to the first-level cache that it is fetched once.
+
+Every program writes its own sums and one program adds them up: no atomics, the same bits every time. Nothing is read
+back from the device.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from nsvq_lightning.compute.tensors import check_tensor
+from nsvq_lightning.quality.loss import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
+from nsvq_lightning.rendering.cuda.records import COMPILE
+
+__all__ = ["Derivatives", "l1_dssim", "l1_dssim_backward"]
+
+G0, G1, G2, G3, G4, G5 = (tl.constexpr(tap) for tap in ssim_window()[SSIM_RADIUS:].tolist())
+C1, C2 = tl.constexpr(SSIM_C1), tl.constexpr(SSIM_C2)
+WHITE = tl.constexpr(255.0)
+
+MOMENTS = 4
+DERIVATIVES = 3
+ROWS = 4
+"""Rows of an image a program does: four numbers a thread, so that registers suffice for all taps."""
+COLUMNS = 128
+"""Numbers of each row it does; three are a pixel."""
+BLOCK = 1024
+"""Programs whose sums are added up at a time."""
+
+
+class Derivatives(NamedTuple):
+    """What the backward pass needs besides the images.
+
+    Attributes:
+        planes: Derivatives of SSIM by the blurred p, p² and p·q, ``[3, H, W, 3]``.
+        dssim_weight: Share of 1 - SSIM in the loss.
+    """
+
+    planes: Tensor
+    dssim_weight: float
+
+
+@triton.jit
+def place(ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    """Rows ``[ROWS, 1]`` and numbers in a row ``[1, COLUMNS]`` of this program, and its number."""
+    row = tl.program_id(0) * ROWS + tl.arange(0, ROWS)[:, None]
+    column = tl.program_id(1) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
+    return row, column, tl.program_id(0) * tl.num_programs(1) + tl.program_id(1)
+
+
+@triton.jit
+def load_at(plane, row, column, height, length):
+    """Numbers of a plane, 0 outside of it."""
+    inside = (row >= 0) & (row < height) & (column >= 0) & (column < length)
+    return tl.load(plane + row.to(tl.int64) * length + column, mask=inside, other=0.0)
+
+
+@triton.jit
+def clamped(image, row, column, height, length):
+    """The image clamped to [0, 1]; not by a minimum and a maximum, since a NaN must stay one."""
+    raw = load_at(image, row, column, height, length)
+    return tl.where(raw < 0, 0.0, tl.where(raw > 1, 1.0, raw))
+
+
+@triton.jit
+def photo(target, row, column, height, length, BYTES: tl.constexpr):
+    """The target in [0, 1]."""
+    inside = (row >= 0) & (row < height) & (column < length)
+    value = tl.load(target + row.to(tl.int64) * length + column, mask=inside, other=0).to(tl.float32)
+    if BYTES:
+        value = tl.div_rn(value, tl.full(value.shape, WHITE, tl.float32))
+    return value
+
+
+@triton.jit
+def add_moments(sums, image, target, row, column, height, length, k, tap, BYTES: tl.constexpr):
+    """Add the moments (p, q, p² + q², p·q) of the rows k above and below, which share a tap."""
+    p, q = clamped(image, row - k, column, height, length), photo(target, row - k, column, height, length, BYTES)
+    r, s = clamped(image, row + k, column, height, length), photo(target, row + k, column, height, length, BYTES)
+    return (
+        sums[0] + (p + r) * tap,
+        sums[1] + (q + s) * tap,
+        sums[2] + (p * p + r * r + q * q + s * s) * tap,
+        sums[3] + (p * q + r * s) * tap,
+    )
+
+
+@triton.jit
+def moments_kernel(
+    image, target, moments, sums, height, length, BYTES: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr
+):  # fmt: skip
+    """Vertical blur of the four moment planes; sum of the absolute differences into ``sums[2·program]``."""
+    row, column, program = place(ROWS, COLUMNS)
+    p, q = clamped(image, row, column, height, length), photo(target, row, column, height, length, BYTES)
+    # Beyond the border both are 0.
+    tl.store(sums + 2 * program, tl.sum(tl.sum(tl.abs(p - q), 1), 0))
+    blurred = (p * G0, q * G0, (p * p + q * q) * G0, p * q * G0)
+    blurred = add_moments(blurred, image, target, row, column, height, length, 1, G1, BYTES)
+    blurred = add_moments(blurred, image, target, row, column, height, length, 2, G2, BYTES)
+    blurred = add_moments(blurred, image, target, row, column, height, length, 3, G3, BYTES)
+    blurred = add_moments(blurred, image, target, row, column, height, length, 4, G4, BYTES)
+    blurred = add_moments(blurred, image, target, row, column, height, length, 5, G5, BYTES)
+    inside = (row < height) & (column < length)
+    size = tl.cast(height, tl.int64) * length
+    at = moments + row.to(tl.int64) * length + column
+    tl.store(at, blurred[0], mask=inside)
+    tl.store(at + size, blurred[1], mask=inside)
+    tl.store(at + 2 * size, blurred[2], mask=inside)
+    tl.store(at + 3 * size, blurred[3], mask=inside)
+
+
+@triton.jit
+def blur_down(plane, row, column, height, length):
+    """Eleven taps down a plane."""
+    total = load_at(plane, row, column, height, length) * G0
+    total += (load_at(plane, row - 1, column, height, length) + load_at(plane, row + 1, column, height, length)) * G1
+    total += (load_at(plane, row - 2, column, height, length) + load_at(plane, row + 2, column, height, length)) * G2
+    total += (load_at(plane, row - 3, column, height, length) + load_at(plane, row + 3, column, height, length)) * G3
+    total += (load_at(plane, row - 4, column, height, length) + load_at(plane, row + 4, column, height, length)) * G4
+    total += (load_at(plane, row - 5, column, height, length) + load_at(plane, row + 5, column, height, length)) * G5
+    return total
+
+
+@triton.jit
+def blur_along(plane, row, column, height, length):
+    """Eleven taps along the rows of interleaved RGB: neighbouring pixels are 3 numbers apart."""
+    total = load_at(plane, row, column, height, length) * G0
+    total += (load_at(plane, row, column - 3, height, length) + load_at(plane, row, column + 3, height, length)) * G1
+    total += (load_at(plane, row, column - 6, height, length) + load_at(plane, row, column + 6, height, length)) * G2
+    total += (load_at(plane, row, column - 9, height, length) + load_at(plane, row, column + 9, height, length)) * G3
+    total += (load_at(plane, row, column - 12, height, length) + load_at(plane, row, column + 12, height, length)) * G4
+    total += (load_at(plane, row, column - 15, height, length) + load_at(plane, row, column + 15, height, length)) * G5
+    return total
+
+
+@triton.jit
+def similarity_kernel(
+    moments, derivatives, sums, height, length, DERIVED: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr
+):  # fmt: skip
+    """Sum of SSIM into ``sums[2·program + 1]``; its derivatives by blurred p, p² and p·q where they are wanted."""
+    row, column, program = place(ROWS, COLUMNS)
+    inside = (row < height) & (column < length)
+    size = tl.cast(height, tl.int64) * length
+    m1 = blur_along(moments, row, column, height, length)
+    m2 = blur_along(moments + size, row, column, height, length)
+    m12, squares = m1 * m2, m1 * m1 + m2 * m2
+    variances = blur_along(moments + 2 * size, row, column, height, length) - squares
+    covariance = blur_along(moments + 3 * size, row, column, height, length) - m12
+    a, d = m12 * 2 + C1, covariance * 2 + C2
+    e, f = squares + C1, variances + C2
+    inverse = 1 / (e * f)
+    similarity = a * d * inverse
+    tl.store(sums + 2 * program + 1, tl.sum(tl.sum(tl.where(inside, similarity, 0.0), 1), 0))
+    if DERIVED:
+        by_product = a * inverse * 2
+        by_square = -(similarity * e * inverse)
+        by_mean = (m2 * d * inverse - m1 * similarity * f * inverse - m1 * by_square) * 2 - m2 * by_product
+        at = derivatives + row.to(tl.int64) * length + column
+        tl.store(at, by_mean, mask=inside)
+        tl.store(at + size, by_square, mask=inside)
+        tl.store(at + 2 * size, by_product, mask=inside)
+
+
+@triton.jit
+def loss_kernel(sums, loss, programs, count, dssim_weight, BLOCK: tl.constexpr):
+    """Add up the sums of all programs, in float64: (1 - w)·Σ|p - q|/n + w·(1 - ΣSSIM/n)."""
+    difference, similarity = tl.zeros([BLOCK], tl.float64), tl.zeros([BLOCK], tl.float64)
+    for start in range(0, programs, BLOCK):
+        program = start + tl.arange(0, BLOCK)
+        difference += tl.load(sums + 2 * program, mask=program < programs, other=0.0).to(tl.float64)
+        similarity += tl.load(sums + 2 * program + 1, mask=program < programs, other=0.0).to(tl.float64)
+    weight = tl.cast(dssim_weight, tl.float64)
+    value = (1 - weight) * (tl.sum(difference, 0) / count) + weight * (1 - tl.sum(similarity, 0) / count)
+    tl.store(loss, value.to(tl.float32))
+
+
+@triton.jit
+def spread_kernel(derivatives, blurred, height, length, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    """Vertical blur of one of the derivative planes, the one that the third axis of the grid names."""
+    row, column, _ = place(ROWS, COLUMNS)
+    shift = tl.program_id(2).to(tl.int64) * height * length
+    value = blur_down(derivatives + shift, row, column, height, length)
+    at = row.to(tl.int64) * length + column
+    tl.store(blurred + shift + at, value, mask=(row < height) & (column < length))
+
+
+@triton.jit
+def gradient_kernel(
+    image, target, blurred, scale, gradient, height, length, l1_step, ssim_step, BYTES: tl.constexpr,
+    ROWS: tl.constexpr, COLUMNS: tl.constexpr,
+):  # fmt: skip
+    """Gradient of ``scale`` times the loss, 0 where the image was clamped."""
+    row, column, _ = place(ROWS, COLUMNS)
+    size = tl.cast(height, tl.int64) * length
+    raw = load_at(image, row, column, height, length)
+    p, q = clamped(image, row, column, height, length), photo(target, row, column, height, length, BYTES)
+    g = blur_along(blurred, row, column, height, length)
+    g += blur_along(blurred + size, row, column, height, length) * p * 2
+    g += blur_along(blurred + 2 * size, row, column, height, length) * q
+    sign = tl.where(p > q, 1.0, tl.where(p < q, -1.0, 0.0))
+    free = (raw >= 0) & (raw <= 1)
+    value = tl.where(free, (sign * l1_step - g * ssim_step) * tl.load(scale), 0.0)
+    at = row.to(tl.int64) * length + column
+    tl.store(gradient + at, value, mask=(row < height) & (column < length))
+
+
+def _grid(image: Tensor) -> tuple[int, int]:
+    """Programs down and along an image."""
+    return triton.cdiv(image.shape[0], ROWS), triton.cdiv(3 * image.shape[1], COLUMNS)
+
+
+def _check_pictures(image: Tensor, target: Tensor) -> None:
+    check_pair(image, target)
+    check_tensor("image", image, image.shape, image.device)
+    kind = torch.uint8 if target.dtype == torch.uint8 else torch.float32
+    check_tensor("target", target, image.shape, image.device, kind)
+
+
+def l1_dssim(
+    image: Tensor, target: Tensor, dssim_weight: float, *, derived: bool = True
+) -> tuple[Tensor, Derivatives | None]:
+    """Loss, a float32 scalar on the device, of ``image``, which counts as clamped to [0, 1].
+
+    Args:
+        image: Contiguous float32 ``[H, W, 3]`` on a CUDA device, H and W at least 1.
+        target: Contiguous ``[H, W, 3]`` there, float32 in [0, 1] or uint8.
+        dssim_weight: Share of 1 - SSIM.
+        derived: Whether :func:`l1_dssim_backward` will follow.
+
+    Raises:
+        ValueError: The pictures differ in shape or device or are not ``[H, W, 3]``, or one has gaps.
+        TypeError: A type differs.
+    """
+    _check_pictures(image, target)
+    height, width = image.shape[:2]
+    length, grid = 3 * width, _grid(image)
+    programs = grid[0] * grid[1]
+    tile = {"ROWS": ROWS, "COLUMNS": COLUMNS, **COMPILE}
+    moments = image.new_empty(MOMENTS, height, width, 3)
+    planes = image.new_empty(DERIVATIVES, height, width, 3) if derived else moments
+    sums, loss = image.new_empty(programs, 2), image.new_empty(())
+    with torch.cuda.device_of(image):
+        moments_kernel[grid](image, target, moments, sums, height, length, BYTES=target.dtype == torch.uint8, **tile)
+        similarity_kernel[grid](moments, planes, sums, height, length, DERIVED=derived, **tile)
+        loss_kernel[(1,)](sums, loss, programs, height * length, dssim_weight, BLOCK=BLOCK, **COMPILE)
+    return loss, Derivatives(planes, dssim_weight) if derived else None
+
+
+def l1_dssim_backward(image: Tensor, target: Tensor, derivatives: Derivatives, scale: Tensor) -> Tensor:
+    """Gradient ``[H, W, 3]`` of ``scale`` times the loss by ``image``; arguments are those of :func:`l1_dssim`.
+
+    Args:
+        image: As there.
+        target: As there.
+        derivatives: What it returned.
+        scale: float32 scalar on the device.
+
+    Raises:
+        ValueError: As of :func:`l1_dssim`, or the derivatives are those of another picture.
+        TypeError: A type differs.
+    """
+    _check_pictures(image, target)
+    check_tensor("derivatives", derivatives.planes, (DERIVATIVES, *image.shape), image.device)
+    check_tensor("scale", scale, (), image.device)
+    height, width = image.shape[:2]
+    length, grid, count = 3 * width, _grid(image), image.numel()
+    weight = derivatives.dssim_weight
+    tile = {"ROWS": ROWS, "COLUMNS": COLUMNS, **COMPILE}
+    blurred, gradient = torch.empty_like(derivatives.planes), torch.empty_like(image)
+    with torch.cuda.device_of(image):
+        spread_kernel[(*grid, DERIVATIVES)](derivatives.planes, blurred, height, length, **tile)
+        gradient_kernel[grid](
+            image, target, blurred, scale, gradient, height, length, (1 - weight) / count, weight / count,
+            BYTES=target.dtype == torch.uint8, **tile,
+        )  # fmt: skip
+    return gradient

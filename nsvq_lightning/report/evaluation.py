@@ -1,0 +1,58 @@
+"""Score rendered views against their photos."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from nsvq_lightning.data.scene import View
+from nsvq_lightning.quality.metrics import image_metrics
+from nsvq_lightning.rendering.camera import Camera
+
+__all__ = ["Quality", "ViewScore", "evaluate"]
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """Quality of one view: PSNR in dB, SSIM, and LPIPS where it was measured."""
+
+    name: str
+    psnr: float
+    ssim: float
+    lpips: float | None = None
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Mean quality over views, over all processes; ``views`` are those of this process."""
+
+    psnr: float
+    ssim: float
+    views: list[ViewScore] = field(default_factory=list)
+
+
+@torch.no_grad()
+def evaluate(render_image: Callable[[Camera], Tensor], views: Iterable[View], device: torch.device) -> Quality:
+    """Render every view and compare it with its photo.
+
+    Args:
+        render_image: Image ``[H, W, 3]`` of a camera.
+        views: What to compare with.
+        device: Where the splats are.
+
+    Raises:
+        ValueError: There is no view.
+    """
+    metrics = image_metrics().to(device)
+    scores = []
+    for view in views:
+        on_device = view.to(device)
+        values = metrics(render_image(on_device.camera), on_device.image)
+        scores.append(ViewScore(view.name, float(values["psnr"]), float(values["ssim"])))
+    if not scores:
+        raise ValueError("there is no view to evaluate; the scene needs at least one test view")
+    mean = metrics.compute()
+    return Quality(float(mean["psnr"]), float(mean["ssim"]), scores)

@@ -1,0 +1,130 @@
+"""The files of a report: ``metrics.json``, ``views.csv``, ``curve.csv``, ``curve.png``."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from nsvq_lightning.compression.stored import formula_bytes
+from nsvq_lightning.io.atomic import write_text
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.nsvq.file import read_header
+from nsvq_lightning.io.nsvq.paper import paper_header
+from nsvq_lightning.report.evaluation import ViewScore
+from nsvq_lightning.report.figures import new_figure, write_figure
+from nsvq_lightning.report.tables import write_csv
+from nsvq_lightning.training.host import SplatHost
+from nsvq_lightning.training.schedule import Phase, Schedule
+
+__all__ = ["paper_level", "summarize", "write_curve", "write_curve_csv", "write_metrics", "write_views"]
+
+PHASE_COLOURS = {Phase.WARMUP: "#dfe8f5", Phase.PRUNE: "#f8e6d0", Phase.QUANTIZE: "#dcefdc", Phase.FINETUNE: "#efe0f0"}
+
+
+def summarize(
+    path: Path,
+    scene: CompressedScene,
+    scores: Sequence[ViewScore],
+    lpips: tuple[float | None, str | None],
+    host: SplatHost,
+    paper: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Everything ``metrics.json`` says; sizes in bytes, PSNR in dB, times in seconds.
+
+    Args:
+        path: The file that was decoded.
+        scene: What it holds.
+        scores: Score of each test view.
+        lpips: Mean LPIPS, or None and why.
+        host: The module, for its history and schedule.
+        paper: :func:`paper_level` of the scene that was stored.
+    """
+    file_bytes = path.stat().st_size
+    ends = _phase_ends(host.history)
+    pruned = next((end for end in ends if end["phase"] == Phase.PRUNE.name.lower()), None)
+    return {
+        "psnr": _mean([score.psnr for score in scores]),
+        "ssim": _mean([score.ssim for score in scores]),
+        "lpips": lpips[0],
+        "lpips_reason": lpips[1],
+        "views": len(scores),
+        "num_splats": len(scene),
+        "file_bytes": file_bytes,
+        "plain_bytes": scene.plain_bytes,
+        "ratio": scene.plain_bytes / file_bytes,
+        "level": read_header(path).level,
+        "paper_level": dict(paper),
+        "train_seconds": host.train_seconds,
+        "before_quantization": pruned if scene.codebooks else None,
+        "phases": ends,
+    }
+
+
+def paper_level(scene: CompressedScene) -> dict[str, Any]:
+    """Bytes of the scene at level ``paper``, beside those of the paper's formula."""
+    header = paper_header(scene)
+    formula = formula_bytes(scene, header.size)
+    return {
+        "file_bytes": header.file_bytes,
+        "header_bytes": header.size,
+        "matches_formula": formula == header.file_bytes,
+    }
+
+
+def write_metrics(path: Path, metrics: Mapping[str, Any]) -> None:
+    """Write the numbers as JSON, atomically; a PSNR that is infinite (no error at all) becomes null."""
+    text = json.dumps(_json_value(metrics), indent=2, allow_nan=False) + "\n"
+    write_text(path, text)
+
+
+def write_views(path: Path, scores: Sequence[ViewScore]) -> None:
+    """Write one row a test view, atomically."""
+    write_csv(path, [asdict(score) for score in scores])
+
+
+def write_curve_csv(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
+    """Write one row an evaluation, atomically."""
+    write_csv(path, history)
+
+
+def write_curve(path: Path, history: Sequence[Mapping[str, Any]], schedule: Schedule) -> None:
+    """Draw PSNR and number of splats over the iterations, phases shaded, atomically."""
+    figure = new_figure(8, 4)
+    quality = figure.add_subplot()
+    count = quality.twinx()
+    iterations = [entry["iteration"] for entry in history]
+    start = 0
+    for phase, end in zip(Phase, schedule.ends, strict=True):
+        if end > start:
+            quality.axvspan(start, end, color=PHASE_COLOURS[phase], label=phase.name.lower(), linewidth=0)
+        start = end
+    quality.plot(iterations, [entry["psnr"] for entry in history], "o-", color="#1f4e9c", markersize=3)
+    count.plot(iterations, [entry["splats"] for entry in history], "-", color="#b5651d")
+    quality.set(xlabel="iteration", xlim=(0, max(schedule.total, 1)))
+    quality.set_ylabel("test PSNR, dB", color="#1f4e9c")
+    count.set_ylabel("splats", color="#b5651d")
+    count.set_ylim(bottom=0)
+    quality.legend(loc="lower right", fontsize="small")
+    write_figure(path, figure)
+
+
+def _phase_ends(history: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The last evaluation of each phase."""
+    last = {str(entry["phase"]): dict(entry) for entry in history}
+    return [last[phase.name.lower()] for phase in Phase if phase.name.lower() in last]
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _json_value(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _json_value(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_json_value(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

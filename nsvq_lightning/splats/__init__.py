@@ -1,0 +1,1 @@
+"""The six attributes of Gaussian splats and their geometry."""

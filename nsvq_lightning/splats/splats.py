@@ -1,0 +1,236 @@
+"""The scene: six raw attributes of N Gaussian splats."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from nsvq_lightning.splats.sh_degree import sh_coefficients, shN_degree
+
+__all__ = ["ATTRIBUTES", "RawSplats", "SplatTensors", "Splats", "check_shapes", "sh_degree_of"]
+
+ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+"""Names of the raw attributes, in the order of :meth:`Splats.from_tensors`."""
+
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh0."""
+
+
+class SplatTensors(Protocol):
+    """Anything with the six raw attributes; :func:`nsvq_lightning.render` takes it."""
+
+    @property
+    def means(self) -> Tensor:
+        """World positions ``[N, 3]``."""
+
+    @property
+    def quats(self) -> Tensor:
+        """Rotations ``[N, 4]``, wxyz, any norm."""
+
+    @property
+    def scales(self) -> Tensor:
+        """Logarithms of the axis lengths ``[N, 3]``, scene units."""
+
+    @property
+    def opacities(self) -> Tensor:
+        """Opacity logits ``[N]``."""
+
+    @property
+    def sh0(self) -> Tensor:
+        """Constant colour coefficients ``[N, 1, 3]``."""
+
+    @property
+    def shN(self) -> Tensor:
+        """Higher colour coefficients ``[N, (degree + 1)² - 1, 3]``."""
+
+
+class RawSplats(NamedTuple):
+    """The six raw attributes as plain tensors, see :class:`SplatTensors` for shapes and spaces."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh0: Tensor
+    shN: Tensor
+
+
+def sh_degree_of(shN: Tensor) -> int:
+    """Degree of the spherical harmonics whose higher coefficients are ``shN [N, (degree + 1)² - 1, 3]``.
+
+    Raises:
+        ValueError: No degree from 0 to 3 has that many coefficients.
+    """
+    return shN_degree(shN.shape[1])
+
+
+def check_shapes(tensors: Mapping[str, Tensor]) -> None:
+    """Refuse attributes whose shapes do not fit each other.
+
+    Raises:
+        ValueError: One does not fit.
+    """
+    n = tensors["means"].shape[0]
+    expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3)}
+    for name, shape in expected.items():
+        if tuple(tensors[name].shape) != shape:
+            raise ValueError(f"{name} must have shape {list(shape)}, got {list(tensors[name].shape)}")
+    shN = tensors["shN"]
+    if shN.dim() != 3 or shN.shape[0] != n or shN.shape[2] != 3:
+        raise ValueError(f"shN must have shape [{n}, (degree + 1)^2 - 1, 3], got {list(shN.shape)}")
+    sh_degree_of(shN)
+
+
+class Splats(nn.Module):
+    """N Gaussian splats as six trainable raw attributes (3D Gaussian Splatting, Kerbl et al. 2023).
+
+    Side tables (:meth:`add_table`) hold one row a splat, for example the statistics of density control; they are
+    buffers, so checkpoints carry them, and :mod:`nsvq_lightning.training.edit` keeps their rows together with the
+    attributes.
+
+    Attributes:
+        edits: How often rows were added or removed. What belongs to the rows of one count fits those of another no
+            more, even where there are as many.
+
+    Args:
+        sh_degree: Highest degree of the spherical harmonics, 0 to 3.
+
+    Raises:
+        ValueError: ``sh_degree`` is none of these.
+    """
+
+    means: nn.Parameter
+    quats: nn.Parameter
+    scales: nn.Parameter
+    opacities: nn.Parameter
+    sh0: nn.Parameter
+    shN: nn.Parameter
+
+    def __init__(self, sh_degree: int = 3) -> None:
+        super().__init__()
+        coefficients = sh_coefficients(sh_degree)
+        empty = {"means": (0, 3), "quats": (0, 4), "scales": (0, 3), "opacities": (0,), "sh0": (0, 1, 3)}
+        for name, shape in empty.items():
+            self.register_parameter(name, nn.Parameter(torch.zeros(shape)))
+        self.register_parameter("shN", nn.Parameter(torch.zeros(0, coefficients, 3)))
+        self._tables: list[str] = []
+        self.edits = 0
+
+    @classmethod
+    def from_tensors(
+        cls, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor
+    ) -> Splats:
+        """Splats from raw attributes.
+
+        Args:
+            means: World positions ``[N, 3]``.
+            quats: Rotations ``[N, 4]``, wxyz, any norm.
+            scales: Logarithms of the axis lengths ``[N, 3]``, log of scene units.
+            opacities: Opacity logits ``[N]``.
+            sh0: Constant colour coefficients ``[N, 1, 3]``; colour = 0.5 + 0.2821 · sh0.
+            shN: Higher colour coefficients ``[N, (degree + 1)² - 1, 3]``.
+
+        Raises:
+            ValueError: A shape does not fit the others.
+        """
+        tensors = dict(zip(ATTRIBUTES, (means, quats, scales, opacities, sh0, shN), strict=True))
+        check_shapes(tensors)
+        splats = cls(sh_degree_of(shN))
+        for name, tensor in tensors.items():
+            setattr(splats, name, nn.Parameter(tensor.detach().clone()))
+        return splats
+
+    @classmethod
+    def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3) -> Splats:
+        """One isotropic splat a point, as 3D Gaussian Splatting starts from a COLMAP model.
+
+        Opacity 0.1, no rotation, log-scale ½·log of the mean squared distance to the three nearest neighbours (clamped
+        to [1e-7, 4]), constant colour. Non-finite and duplicate points are dropped: a duplicate adds nothing and has no
+        distance of its own.
+
+        Args:
+            points: World positions ``[N, 3]``.
+            colors: RGB in [0, 1], ``[N, 3]``.
+            sh_degree: Highest degree of the spherical harmonics; the coefficients above 0 start at 0.
+
+        Raises:
+            ValueError: No usable point is left.
+        """
+        points, colors = points.detach().cpu().float(), colors.detach().cpu().float()
+        finite = torch.isfinite(points).all(1) & torch.isfinite(colors).all(1)
+        _, first = np.unique(points[finite].numpy(), axis=0, return_index=True)
+        rows = finite.nonzero()[:, 0][torch.from_numpy(np.sort(first))]
+        points, colors = points[rows], colors[rows]
+        n = points.shape[0]
+        if n == 0:
+            raise ValueError("the point cloud has no finite point; reconstruct the scene again or start from a .ply")
+        spread = _mean_squared_neighbour_distance(points).clamp(1e-7, 4.0)
+        return cls.from_tensors(
+            means=points,
+            quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+            scales=(0.5 * spread.log())[:, None].repeat(1, 3),
+            opacities=torch.full((n,), math.log(0.1 / 0.9)),
+            sh0=((colors - 0.5) / SH_C0)[:, None, :],
+            shN=torch.zeros(n, sh_coefficients(sh_degree), 3),
+        )
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree of the spherical harmonics."""
+        return sh_degree_of(self.shN)
+
+    def attributes(self) -> dict[str, nn.Parameter]:
+        """The six raw attributes by name, in the order of :data:`ATTRIBUTES`."""
+        return {name: getattr(self, name) for name in ATTRIBUTES}
+
+    def raw(self) -> RawSplats:
+        """The six raw attributes, attached to the graph."""
+        return RawSplats(*(getattr(self, name) for name in ATTRIBUTES))
+
+    def add_table(self, name: str, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Add (or get) a side table ``[N]`` of zeros that follows the rows through every edit and checkpoint."""
+        if name not in self._tables:
+            self._tables.append(name)
+            self.register_buffer(name, torch.zeros(len(self), dtype=dtype, device=self.means.device))
+        table: Tensor = getattr(self, name)
+        return table
+
+    def tables(self) -> dict[str, Tensor]:
+        """The side tables by name."""
+        return {name: getattr(self, name) for name in self._tables}
+
+    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
+        """Take over the stored number of rows before the values are copied."""
+        for key, stored in state_dict.items():
+            name = key.removeprefix(prefix)
+            if not key.startswith(prefix) or "." in name:
+                continue
+            if name in ATTRIBUTES:
+                current = getattr(self, name)
+                if current.shape != stored.shape:
+                    setattr(self, name, nn.Parameter(current.new_zeros(stored.shape)))
+            elif name not in self._tables:
+                self._tables.append(name)
+                self.register_buffer(name, torch.zeros_like(stored, device=self.means.device))
+            elif getattr(self, name).shape != stored.shape:
+                setattr(self, name, getattr(self, name).new_zeros(stored.shape))
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def _mean_squared_neighbour_distance(points: Tensor) -> Tensor:
+    """Mean squared distance ``[N]`` of distinct points ``[N, 3]`` to their three nearest neighbours."""
+    neighbours = min(3, points.shape[0] - 1)
+    if neighbours == 0:
+        return torch.ones(1)
+    positions = points.double().numpy()
+    distance, _ = cKDTree(positions).query(positions, k=neighbours + 1, workers=-1)
+    return torch.from_numpy(np.square(distance[:, 1:]).mean(1)).float()

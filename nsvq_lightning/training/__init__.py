@@ -1,0 +1,1 @@
+"""The Lightning module, its state, its optimiser, and the trainer around them."""

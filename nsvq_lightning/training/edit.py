@@ -1,0 +1,235 @@
+"""The only code that changes the rows of the splats.
+
+A splat is one row of six parameters, of their Adam moments and of every side table. All of them change together here:
+new ``nn.Parameter`` objects are bound in the module, in their parameter group (found by its name) and in the state of
+the optimiser. The step count of Adam belongs to the parameter, not to a row, and is kept.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from nsvq_lightning.splats.splats import ATTRIBUTES, Splats
+from nsvq_lightning.training.optim import find_group
+
+__all__ = [
+    "LARGEST_LOG_SCALE",
+    "append_rows",
+    "change_coordinates",
+    "drop_non_finite",
+    "finite_rows",
+    "finite_splats",
+    "keep_rows",
+    "raise_scales",
+    "replace_attribute",
+    "reset_moments",
+]
+
+log = logging.getLogger(__name__)
+
+LARGEST_LOG_SCALE = 32.0
+"""Up to here (8e13 scene units) float32 holds the square of what a splat covers on the near plane of any camera; no
+view shows larger ones, so nothing would ever train or prune them."""
+
+FIRST_MOMENT = "exp_avg"
+MOMENTS = (FIRST_MOMENT, "exp_avg_sq", "max_exp_avg_sq")
+"""Per-row state of Adam; everything else in its state belongs to the whole parameter."""
+
+
+def append_rows(splats: Splats, optimizer: Optimizer, new: Mapping[str, Tensor]) -> None:
+    """Add splats at the end; their Adam moments and side tables start at zero.
+
+    Args:
+        splats: The ``N`` splats to extend.
+        optimizer: Optimiser with one group per attribute, named after it.
+        new: Raw attributes ``[M, ...]`` by name, all six, see :class:`Splats`.
+
+    Raises:
+        ValueError: An attribute is missing or has another number of rows.
+    """
+    if set(new) != set(ATTRIBUTES):
+        raise ValueError(f"new splats need the attributes {', '.join(ATTRIBUTES)}, got {', '.join(sorted(new))}")
+    counts = {name: tensor.shape[0] for name, tensor in new.items()}
+    if len(set(counts.values())) > 1:
+        raise ValueError(f"all attributes of the new splats must have the same number of rows, got {counts}")
+    count = counts["means"]
+    if count == 0:
+        return
+
+    def extend_with_zeros(moment: Tensor) -> Tensor:
+        return torch.cat([moment, moment.new_zeros(count, *moment.shape[1:])])
+
+    for name, parameter in splats.attributes().items():
+        values = torch.cat([parameter.detach(), new[name].to(parameter)])
+        _rebind(splats, optimizer, name, values, extend_with_zeros)
+    _edit_tables(splats, extend_with_zeros)
+
+
+def keep_rows(splats: Splats, optimizer: Optimizer, mask: Tensor) -> None:
+    """Keep the splats where ``mask [N]`` (bool) is true, in their order, and drop the others.
+
+    Raises:
+        ValueError: The mask is not one boolean a splat.
+    """
+    if mask.dtype != torch.bool or mask.shape != (len(splats),):
+        raise ValueError(f"mask must be [{len(splats)}] bool, got {list(mask.shape)} {mask.dtype}")
+    rows = mask.nonzero()[:, 0]
+    if rows.shape[0] == len(splats):
+        return
+
+    def select(tensor: Tensor) -> Tensor:
+        return tensor.index_select(0, rows)
+
+    for name, parameter in splats.attributes().items():
+        _rebind(splats, optimizer, name, select(parameter.detach()), select)
+    _edit_tables(splats, select)
+
+
+def replace_attribute(splats: Splats, optimizer: Optimizer, name: str, values: Tensor) -> None:
+    """Overwrite all rows of one attribute; the moments stay, see :func:`reset_moments`.
+
+    Raises:
+        ValueError: ``values`` has another shape than the attribute.
+    """
+    parameter = splats.attributes()[name]
+    if values.shape != parameter.shape:
+        raise ValueError(f"{name} must keep its shape {list(parameter.shape)}, got {list(values.shape)}")
+    _rebind(splats, optimizer, name, values.detach().to(parameter), lambda moment: moment)
+
+
+def change_coordinates(splats: Splats, optimizer: Optimizer, name: str, values: Tensor, maps: Tensor) -> None:
+    """Overwrite all rows of one attribute by other coordinates of the same splats, and take the moments along.
+
+    The mean of gradients becomes ``maps · mean``, that of their squares ``maps² · mean``, which is exact where a map
+    only moves and scales components, and otherwise takes them for uncorrelated.
+
+    Args:
+        splats: The ``N`` splats.
+        optimizer: Their optimiser.
+        name: The attribute, with rows of D numbers.
+        values: Its rows ``[N, D]`` in the new coordinates.
+        maps: ``[N, D, D]``: a gradient by the old coordinates, multiplied by it, is that by the new ones.
+
+    Raises:
+        ValueError: ``values`` or ``maps`` has another shape than the attribute asks for.
+    """
+    if maps.shape != (*values.shape, values.shape[-1]):
+        raise ValueError(f"maps of {name} must be {[*values.shape, values.shape[-1]]}, got {list(maps.shape)}")
+    replace_attribute(splats, optimizer, name, values)
+    state = optimizer.state.get(find_group(optimizer, name)["params"][0], {})
+    for key in MOMENTS:
+        if key in state:
+            factors = maps if key == FIRST_MOMENT else maps.square()
+            state[key] = (factors * state[key][:, None, :]).sum(2)
+
+
+@torch.no_grad()
+def raise_scales(splats: Splats, floor: float) -> None:
+    """Raise all log-scales below ``floor`` to it, in place; the moments stay."""
+    splats.scales.clamp_(min=floor)
+
+
+def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -> None:
+    """Set the Adam moments of the group ``name`` to zero, of all rows or of ``rows`` (indices or a mask)."""
+    state = optimizer.state.get(find_group(optimizer, name)["params"][0], {})
+    for key in MOMENTS:
+        if key in state:
+            if rows is None:
+                state[key].zero_()
+            else:
+                state[key][rows] = 0.0
+
+
+def finite_rows(splats: Splats) -> tuple[Tensor, dict[str, int]]:
+    """Which splats are finite in every attribute, and so are their projections (:data:`LARGEST_LOG_SCALE`).
+
+    Returns:
+        A mask ``[N]`` (bool) and, for each attribute with other rows, how many.
+    """
+    mask = torch.ones(len(splats), dtype=torch.bool, device=splats.means.device)
+    culprits: dict[str, int] = {}
+    for name, parameter in splats.attributes().items():
+        finite = torch.isfinite(parameter.detach()).flatten(1).all(1) if parameter.dim() > 1 else parameter.isfinite()
+        if name == "scales":
+            finite &= (parameter.detach() <= LARGEST_LOG_SCALE).all(1)
+        bad = int((~finite).sum())
+        if bad:
+            culprits[name] = bad
+            mask &= finite
+    return mask, culprits
+
+
+def finite_splats(splats: Splats, source: str) -> Splats:
+    """The splats without those that :func:`finite_rows` leaves out, with a warning that names source and attributes.
+
+    Args:
+        splats: Splats that no optimiser knows yet.
+        source: Where they come from.
+
+    Raises:
+        ValueError: No finite splat is left.
+    """
+    kept = _finite_or_warn(
+        splats,
+        source,
+        lambda found: ValueError(f"{source} holds no splat with finite numbers ({found}); there is nothing to train"),
+    )
+    return splats if bool(kept.all()) else Splats.from_tensors(*(tensor.detach()[kept] for tensor in splats.raw()))
+
+
+def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> Tensor:
+    """Drop splats that :func:`finite_rows` leaves out, with a warning that names attribute, rows and step.
+
+    Returns:
+        Which of the splats before were kept, ``[N]`` bool.
+
+    Raises:
+        FloatingPointError: No finite splat is left.
+    """
+    kept = _finite_or_warn(
+        splats,
+        f"step {step}",
+        lambda found: FloatingPointError(
+            f"step {step}: all {len(splats)} splats are non-finite ({found}); lower the learning rates"
+        ),
+    )
+    keep_rows(splats, optimizer, kept)
+    return kept
+
+
+def _finite_or_warn(splats: Splats, where: str, none_left: Callable[[str], Exception]) -> Tensor:
+    """Mask ``[N]`` of :func:`finite_rows`, with a warning of the others; without any finite splat, the error."""
+    kept, culprits = finite_rows(splats)
+    if culprits:
+        found = ", ".join(f"{name} in {count} rows" for name, count in culprits.items())
+        if not bool(kept.any()):
+            raise none_left(found)
+        dropped = int((~kept).sum())
+        log.warning("%s: dropped %d of %d splats with non-finite values: %s", where, dropped, len(kept), found)
+    return kept
+
+
+def _rebind(
+    splats: Splats, optimizer: Optimizer, name: str, values: Tensor, edit_moment: Callable[[Tensor], Tensor]
+) -> None:
+    """Bind ``values`` as the new parameter ``name`` everywhere the old one was known."""
+    group = find_group(optimizer, name)
+    old = group["params"][0]
+    new = nn.Parameter(values.contiguous(), requires_grad=old.requires_grad)
+    state = optimizer.state.pop(old, None)
+    if state is not None:
+        optimizer.state[new] = {key: edit_moment(value) if key in MOMENTS else value for key, value in state.items()}
+    group["params"][0] = new
+    setattr(splats, name, new)
+
+
+def _edit_tables(splats: Splats, edit: Callable[[Tensor], Tensor]) -> None:
+    """Edit the rows of the side tables, the last of what an edit changes, and count it."""
+    splats.edits += 1
+    for name, table in splats.tables().items():
+        setattr(splats, name, edit(table))

@@ -1,0 +1,205 @@
+"""What a callback may touch of the module it is attached to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Protocol, cast
+
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from torch import Tensor
+from torch.optim import Optimizer
+
+from nsvq_lightning.compression.importance import contributions
+from nsvq_lightning.protocols import missing_members
+from nsvq_lightning.quantize.base import Quantizer
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.rasterize import Render
+from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats, Splats, SplatTensors
+from nsvq_lightning.training.optim import codebook_group
+from nsvq_lightning.training.schedule import Phase, Schedule
+from nsvq_lightning.training.state import Stopwatch
+
+if TYPE_CHECKING:
+    from nsvq_lightning.io.compressed import CompressedScene
+    from nsvq_lightning.io.nsvq.precision import Storage
+
+__all__ = [
+    "SplatHost",
+    "as_host",
+    "check_optimizer",
+    "from_first_process",
+    "log_interval",
+    "next_iteration",
+    "raw_optimizer",
+    "splat_host",
+    "sum_over_processes",
+    "train_cameras",
+    "train_contributions",
+]
+
+
+class SplatHost(Protocol):
+    """A module that trains splats; :class:`nsvq_lightning.SplatModule` is one.
+
+    Callbacks know each other only through this state, and take their decisions from ``schedule`` and the trainer's
+    step, so that each works without the others.
+
+    Besides the members below a host has
+
+    * one optimiser, with a parameter group of one parameter for each attribute of the splats, whose ``name`` is that of
+      the attribute, and for each codebook, named ``codebook_<attribute>``:
+      :func:`nsvq_lightning.training.optim.param_groups` makes them;
+    * a ``training_step`` that returns a dictionary with ``loss`` and, for density control, the ``render`` of the
+      splats, whose ``means2d`` retains its gradient while ``wants_screen_gradients`` is set, and ``edits``, the
+      ``splats.edits`` when they were rendered; None where the step is not to update anything;
+    * for reports, test and validation steps that return a dictionary with ``image``, ``psnr`` and ``ssim`` of a view.
+
+    Callbacks check members and groups before the first iteration (:func:`splat_host`, :func:`check_optimizer`).
+    """
+
+    splats: Splats
+    """The splats; rows are edited through :mod:`nsvq_lightning.training.edit` only."""
+    schedule: Schedule
+    """Phases and milestones of the run."""
+    phase: Phase
+    """Phase of the current iteration; a buffer behind it."""
+    active_sh_degree: int
+    """SH degree that is rendered; a buffer behind it."""
+    opacity_weight: float
+    """λ of the loss term λ · Σ opacity."""
+    wants_screen_gradients: bool
+    """Whether the training step retains the gradient of the projected centres."""
+    evaluation_splats: SplatTensors | None
+    """What test and predict steps render instead of the module's own splats."""
+    history: list[dict[str, Any]]
+    """Evaluations so far, one plain dictionary each; checkpoints carry it."""
+    stopwatch: Stopwatch
+    """Measures the time spent training."""
+    seed: int
+    """Seed of every draw."""
+    background: str
+    """``black``, ``white`` or ``random``."""
+    storage: Storage
+    """How the scene is stored."""
+
+    @property
+    def quantizers(self) -> Mapping[str, Quantizer]:
+        """Quantizer by attribute; empty for a run without quantization."""
+
+    @property
+    def extent(self) -> float:
+        """Extent of the scene, scene units."""
+
+    @property
+    def train_seconds(self) -> float:
+        """Seconds spent training so far."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the splats are."""
+
+    def rows(self, attribute: str) -> Tensor:
+        """Rows ``[N, D]`` of a quantized attribute, detached."""
+
+    def hard_splats(self, phase: Phase) -> RawSplats:
+        """The splats as a file written in ``phase`` would hold them, detached."""
+
+    def render_splats(self, splats: SplatTensors, camera: Camera) -> Render:
+        """Render any splats with the module's settings."""
+
+    def compressed(self) -> CompressedScene:
+        """The scene as it is stored."""
+
+
+def splat_host(module: LightningModule) -> SplatHost:
+    """The module as a host.
+
+    Raises:
+        TypeError: It lacks something that :class:`SplatHost` names.
+    """
+    missing = missing_members(module, SplatHost)
+    if missing:
+        raise TypeError(
+            f"{type(module).__name__} cannot host the splat callbacks, it lacks: {', '.join(missing)}; "
+            "use nsvq_lightning.SplatModule or offer the members of nsvq_lightning.training.host.SplatHost"
+        )
+    return as_host(module)
+
+
+def check_optimizer(trainer: Trainer, module: LightningModule) -> None:
+    """Check that the optimiser has the parameter groups that callbacks edit by their names.
+
+    Raises:
+        ValueError: It has not, or there are several optimisers.
+    """
+    groups = {group.get("name"): len(group["params"]) for each in trainer.optimizers for group in each.param_groups}
+    needed = (*ATTRIBUTES, *(codebook_group(name) for name in as_host(module).quantizers))
+    missing = [name for name in needed if groups.get(name) != 1]
+    if missing or len(trainer.optimizers) != 1:
+        raise ValueError(
+            f"{type(module).__name__} cannot host the splat callbacks: they need one optimiser with a parameter group "
+            f"of one parameter for each attribute and codebook, named after it; there are {len(trainer.optimizers)} "
+            f"optimisers, without groups for: {', '.join(missing) or 'none'}. Build the groups with "
+            "nsvq_lightning.training.optim.param_groups"
+        )
+
+
+def as_host(module: LightningModule) -> SplatHost:
+    """The module as a host, unchecked: what the hooks of every step use."""
+    return cast(SplatHost, module)
+
+
+def next_iteration(trainer: Trainer) -> int:
+    """1-based number of the iteration that starts (or runs) now; at the end of a step: of the next one."""
+    return trainer.global_step + 1
+
+
+def raw_optimizer(trainer: Trainer) -> Optimizer:
+    """The one optimiser, unwrapped."""
+    return trainer.optimizers[0]
+
+
+def log_interval(trainer: Trainer) -> int:
+    """Iterations between two lines of the loggers."""
+    return max(1, int(getattr(trainer, "log_every_n_steps", 50)))
+
+
+def from_first_process(trainer: Trainer, tensor: Tensor) -> Tensor:
+    """The first process's value of a tensor, on every process; its shape may differ before."""
+    # It travels pickled: from the CPU, or every process would load it onto the first one's device.
+    return tensor if trainer.world_size == 1 else trainer.strategy.broadcast(tensor.cpu()).to(tensor.device)
+
+
+def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:
+    """Sum of a tensor over all processes, written into it; the tensor itself where there is one."""
+    if trainer.world_size == 1:
+        return tensor
+    reduced = trainer.strategy.reduce(tensor, reduce_op="sum")
+    return cast(Tensor, reduced)
+
+
+def train_cameras(trainer: Trainer, host: SplatHost, *, share: bool = False) -> Iterator[Camera]:
+    """Cameras of the train views, on the device of the splats; with ``share`` only this process's part of them.
+
+    Raises:
+        ValueError: The trainer has no data module with a scene.
+    """
+    scene = getattr(getattr(trainer, "datamodule", None), "scene", None)
+    if scene is None:
+        raise ValueError(
+            "contributions of splats and the floor of scales need the train views: fit with a data module that has a "
+            "scene, or leave contribution pruning, weights by contribution and the floor off"
+        )
+    indices = scene.train[trainer.global_rank :: trainer.world_size] if share else scene.train
+    return (scene.cameras[index].to(host.device) for index in indices)
+
+
+def train_contributions(trainer: Trainer, host: SplatHost) -> Tensor:
+    """Blending weight ``[N]`` of each splat in all train views (:mod:`nsvq_lightning.compression.importance`).
+
+    Raises:
+        ValueError: The trainer has no data module with a scene.
+    """
+    cameras = train_cameras(trainer, host, share=True)
+    return sum_over_processes(trainer, contributions(host.splats, cameras, host.render_splats))

@@ -1,0 +1,264 @@
+"""The Lightning module: splats, codebooks, one optimiser; everything that happens at certain steps is a callback."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+from torchmetrics import Metric
+
+from nsvq_lightning.compute.environment import threads_spin
+from nsvq_lightning.data.scene import ONE_PLACE, View
+from nsvq_lightning.io.formats import load
+from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.quality.loss import photometric_loss
+from nsvq_lightning.quality.metrics import eight_bit, image_metrics, psnr
+from nsvq_lightning.quantize.nsvq import NSVQ
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.skips import is_on
+from nsvq_lightning.splats.sh_degree import sh_coefficients
+from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.training.branch import branch_checkpoint, can_branch, check_continuation
+from nsvq_lightning.training.edit import finite_splats
+from nsvq_lightning.training.host import log_interval
+from nsvq_lightning.training.model import SplatModel
+from nsvq_lightning.training.optim import (
+    LearningRates,
+    apply_rates,
+    build_adam,
+    param_groups,
+    position_lr,
+    set_columns,
+    set_lr,
+)
+from nsvq_lightning.training.schedule import Phase
+
+__all__ = ["SplatModule"]
+
+log = logging.getLogger(__name__)
+
+
+class SplatModule(SplatModel):
+    """Trains 3D Gaussian splats and the codebooks that store them (NSVQ-GS).
+
+    The module renders what its phase trains (:class:`~nsvq_lightning.training.model.SplatModel`) and computes the loss;
+    phases, density control, codebooks and reports are callbacks (:mod:`nsvq_lightning.callbacks`).
+
+    Args:
+        sh_degree: Highest degree of the spherical harmonics, 0 to 3.
+        quantizer: Makes the quantizer of an attribute from (number of codes, dimension).
+        codebooks: The paper's name of the codebook sizes ("0.5k" to "16k"), or number of codes by attribute (scales,
+            quats, sh0, shN; those left out stay unquantized), or None for plain 3D Gaussian splatting.
+        background: Colour behind the splats; ``random`` draws a new one each step and tests on black.
+        dssim_weight: Share of 1 - SSIM in the loss, the rest is L1.
+        rates: Learning rates.
+        backend: Rasterizer, see :func:`nsvq_lightning.render`.
+        seed: Seed of every draw of the run except the order of the views.
+        storage: Level of the compressed file, and how exactly it stores the scene.
+        init_from: Scene file of any format to start from instead of the scene's points; non-finite splats are left out.
+        splats: Splats to start from, for use from Python.
+
+    Raises:
+        ValueError: A codebook is for an unknown attribute or has no code, or an argument is out of range.
+        TypeError: What ``quantizer`` makes does not follow :class:`nsvq_lightning.quantize.base.Quantizer`.
+    """
+
+    def __init__(
+        self,
+        sh_degree: int = 3,
+        quantizer: Callable[[int, int], nn.Module] = NSVQ,
+        codebooks: str | dict[str, int] | None = "16k",
+        background: Literal["black", "white", "random"] = "black",
+        dssim_weight: float = 0.2,
+        rates: LearningRates = LearningRates(),  # noqa: B008  frozen
+        backend: str = "auto",
+        seed: int = 0,
+        storage: Storage = Storage(),  # noqa: B008  frozen
+        init_from: str | None = None,
+        splats: Splats | None = None,
+    ) -> None:
+        # A checkpoint stores these as plain dictionaries.
+        rates = LearningRates(**rates) if isinstance(rates, Mapping) else rates
+        storage = Storage.from_dict(storage) if isinstance(storage, Mapping) else storage
+        start = splats if splats is not None else Splats(sh_degree)
+        super().__init__(start, quantizer, codebooks, background, dssim_weight, rates, backend, seed, storage)
+        self.active_sh_degree = 0 if splats is None else splats.sh_degree
+        self.save_hyperparameters(ignore=["splats"])
+        self.init_from = init_from
+        self.view_metrics = image_metrics()
+        self._step_rates = rates
+        self._updates = True
+
+    def setup(self, stage: str) -> None:
+        """Fill empty splats from ``init_from`` or the scene's points; take over the extent of the scene.
+
+        Raises:
+            ValueError: There is nothing to start from, or the trainer has another precision than ``32-true``.
+        """
+        if self.trainer.precision != "32-true":
+            raise ValueError(
+                f"splats train in float32, trainer.precision is {self.trainer.precision}: kernels compute in float32 "
+                "whatever it says, and a scaled loss would grow splats without need; leave it at 32-true"
+            )
+        # An evaluation that was interrupted may have left its splats.
+        self.evaluation_splats = None
+        if stage != "fit":
+            return
+        scene = getattr(getattr(self.trainer, "datamodule", None), "scene", None)
+        if scene is not None and self.extent == 0.0:
+            self.state.extent = scene.extent
+        if len(self.splats) == 0:
+            self.splats = self._first_splats(scene).to(self.device)
+        if self.extent <= 0.0 and scene is not None:
+            raise ValueError(f"the {len(scene.train)} train photos of {scene.root} {ONE_PLACE}")
+        if self.extent <= 0.0:
+            raise ValueError("the extent of the scene is unknown; fit with a data module that has a scene")
+
+    def _first_splats(self, scene: Any) -> Splats:
+        if self.init_from is not None:
+            loaded = load(self.init_from)
+            if loaded.sh_degree != self.splats.sh_degree:
+                raise ValueError(
+                    f"{self.init_from} has SH degree {loaded.sh_degree}, the module has {self.splats.sh_degree}; "
+                    f"set sh_degree={loaded.sh_degree}"
+                )
+            self.active_sh_degree = loaded.sh_degree
+            return finite_splats(loaded, self.init_from)
+        if scene is None:
+            raise ValueError("no splats to start from: fit with a data module that has a scene, or set init_from")
+        return Splats.from_points(scene.points, scene.colors, self.splats.sh_degree)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """One Adam, one named group for each attribute and codebook."""
+        return build_adam(param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Take over history and schedule; a fit from before the quantize phase goes on with this module's codebooks.
+
+        Raises:
+            ValueError: A fit cannot go on from the checkpoint.
+        """
+        super().on_load_checkpoint(checkpoint)
+        if not self.is_fitting:
+            return
+        if can_branch(checkpoint, self.codebooks):
+            branch_checkpoint(checkpoint, self.codebooks, self.configure_optimizers())
+        check_continuation(checkpoint, self)
+
+    def on_fit_start(self) -> None:
+        """Say what the user should know of this device."""
+        if self.device.type == "cuda":
+            log.warning(
+                "training on %s with kernels that are tested under Triton's interpreter, but have never run on a GPU: "
+                "--trainer.accelerator=cpu trains without them, and docs/backends.md says more",
+                torch.cuda.get_device_name(self.device),
+            )
+        elif threads_spin() and torch.get_num_threads() > 1 and hasattr(os, "getloadavg") and os.getloadavg()[0] > 1.0:
+            log.warning(
+                "other processes need the cores, too, and waiting threads hold them: a run may take twice as long; "
+                "import nsvq_lightning before torch, or set OMP_WAIT_POLICY=passive"
+            )
+
+    def on_train_start(self) -> None:
+        """Take the learning rates of this run, not those of a checkpoint; start counting the training time."""
+        views = self.trainer.world_size * self.trainer.accumulate_grad_batches
+        apply_rates(self.trainer.optimizers[0], self.rates, self.extent, views)
+        self._step_rates = self.rates.of_step(views)
+        self.stopwatch.start()
+
+    def on_train_batch_start(self, batch: View, batch_idx: int) -> None:
+        """Set the position's learning rate of this iteration, and how many SH coefficients it can change."""
+        self._micro_batch = batch_idx % self.trainer.accumulate_grad_batches
+        if self._micro_batch == 0:
+            self._updates = True
+        optimizer = self.trainer.optimizers[0]
+        rate = position_lr(self.global_step + 1, self.extent, self._step_rates, self.schedule.position_decay_end)
+        set_lr(optimizer, "means", rate)
+        # Noise substitution scales a whole row, so from there on every coefficient has a gradient.
+        degree = self.active_sh_degree if self.phase < Phase.QUANTIZE else self.splats.sh_degree
+        set_columns(optimizer, "shN", 3 * sh_coefficients(degree))
+
+    def training_step(self, batch: View, batch_idx: int) -> dict[str, Any] | None:
+        """Loss of one view: (1 - w)·L1 + w·(1 - SSIM) + λ·Σ opacity (paper, section 3.3).
+
+        Returns:
+            ``loss``, the attached ``render`` and the ``edits`` that its splats had seen. When the loss is not finite,
+            the step will update nothing: then None, or with several processes, which go through the backward pass
+            together, the loss alone.
+        """
+        edits = self.splats.edits
+        rendered = self(batch.camera)
+        if self.wants_screen_gradients:
+            rendered.means2d.retain_grad()
+        loss = photometric_loss(rendered.image, batch.image, self.dssim_weight)
+        if self.opacity_weight:
+            loss = loss + self.opacity_weight * self.splats.opacities.sigmoid().sum()
+        if (self.global_step + 1) % log_interval(self.trainer) == 0 or not is_on("metrics"):
+            self._log_step(loss, rendered.image, batch.image)
+        if not math.isfinite(loss.item()):
+            log.warning("step %d: the loss of %s is %s, no update", self.global_step + 1, batch.name, loss.item())
+            self._updates = False
+            return {"loss": loss} if self.trainer.world_size > 1 else None
+        return {"loss": loss, "render": rendered, "edits": edits}
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Drop the gradients of a step that must not update; of several processes the strategy has done so."""
+        if not self._updates:
+            optimizer.zero_grad()
+
+    def _log_step(self, loss: Tensor, image: Tensor, target: Tensor) -> None:
+        quality = psnr(eight_bit(image.detach()), eight_bit(target)).float()
+        values: dict[str, Metric | Tensor | int | float] = {
+            "train/loss": loss.detach(),
+            "train/psnr": quality,
+            "train/splats": float(len(self.splats)),
+        }
+        self.log_dict(values, batch_size=1)
+
+    def on_train_batch_end(self, outputs: Any, batch: View, batch_idx: int) -> None:
+        """Add the time of this step."""
+        self.stopwatch.lap()
+
+    def on_train_end(self) -> None:
+        """Stop counting the training time."""
+        self.stopwatch.stop()
+
+    def _evaluation_start(self) -> None:
+        if len(self.splats) == 0:
+            raise ValueError("there are no splats to render: pass the checkpoint of a run (--ckpt_path)")
+        if self.evaluation_splats is None:
+            self.evaluation_splats = self.hard_splats(self.phase)
+
+    def _evaluation_end(self) -> None:
+        self.evaluation_splats = None
+
+    on_validation_start = on_test_start = on_predict_start = _evaluation_start
+    on_validation_end = on_test_end = on_predict_end = _evaluation_end
+
+    def _evaluation_step(self, view: View, prefix: str) -> dict[str, Any]:
+        image = self._evaluation_image(view.camera)
+        scores = self.view_metrics(image, view.image)
+        self.log_dict({f"{prefix}/{name}": metric for name, metric in self.view_metrics.items()}, batch_size=1)
+        return {"image": image, **scores}
+
+    def _evaluation_image(self, camera: Camera) -> Tensor:
+        if self.evaluation_splats is None:
+            raise RuntimeError("evaluation steps run inside Trainer.validate, test or predict only")
+        return eight_bit(self.render_splats(self.evaluation_splats, camera).image)
+
+    def validation_step(self, batch: View, batch_idx: int) -> dict[str, Any]:
+        """Score one view: ``image [H, W, 3]`` (8-bit values in [0, 1]), ``psnr``, ``ssim``."""
+        return self._evaluation_step(batch, "val")
+
+    def test_step(self, batch: View, batch_idx: int) -> dict[str, Any]:
+        """Score one view: ``image [H, W, 3]`` (8-bit values in [0, 1]), ``psnr``, ``ssim``."""
+        return self._evaluation_step(batch, "test")
+
+    def predict_step(self, batch: View, batch_idx: int) -> dict[str, Any]:
+        """Render one view: ``name`` and ``image [H, W, 3]`` (8-bit values in [0, 1])."""
+        return {"name": batch.name, "image": self._evaluation_image(batch.camera)}

@@ -1,0 +1,280 @@
+"""One Adam with a named parameter group for every attribute and every codebook, and the position's learning rate."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.graph import increment_version
+
+from nsvq_lightning.compute.devices import kernels_for
+from nsvq_lightning.skips import is_on
+from nsvq_lightning.splats.splats import ATTRIBUTES, Splats
+
+__all__ = [
+    "LearningRates",
+    "SplatAdam",
+    "apply_rates",
+    "build_adam",
+    "codebook_group",
+    "find_group",
+    "group_lr",
+    "param_groups",
+    "position_lr",
+    "set_columns",
+    "set_lr",
+]
+
+BETAS = 0.9, 0.999
+"""Adam's defaults."""
+
+EPS = 1e-15
+"""Adam's epsilon of 3D Gaussian splatting: gradients of a splat are far below PyTorch's default of 1e-8."""
+
+FUSED_DEVICES = frozenset({"cpu", "cuda"})
+"""Device types on which torch has a fused Adam."""
+
+CODEBOOK_PREFIX = "codebook_"
+"""A codebook's parameter group is named after its attribute with this in front."""
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Learning rates of 3D Gaussian splatting, which the paper keeps.
+
+    Attributes:
+        means: Position at the start, times the extent of the scene.
+        means_final: Position at the end of the decay, times the extent.
+        scales: Log-scale.
+        quats: Quaternion.
+        opacities: Opacity logit.
+        sh0: Constant colour coefficient.
+        shN: Higher colour coefficients.
+        codebook_factor: A codebook learns with the rate of its attribute times this.
+        scale_with_views: With B views in a step take √B times these rates, and Adam's other numbers to match
+            (:func:`apply_rates`); else those of one view.
+
+    Raises:
+        ValueError: A rate is negative or not finite, or a rate of the position is 0.
+    """
+
+    means: float = 1.6e-4
+    means_final: float = 1.6e-6
+    scales: float = 5e-3
+    quats: float = 1e-3
+    opacities: float = 0.05
+    sh0: float = 2.5e-3
+    shN: float = 1.25e-4
+    codebook_factor: float = 1.0
+    scale_with_views: bool = False
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            positive = field.name.startswith("means")  # interpolated in the logarithm
+            if not (math.isfinite(value) and (value > 0 if positive else value >= 0)):
+                raise ValueError(
+                    f"rate {field.name} must be finite and {'above' if positive else 'at least'} 0, got {value}"
+                )
+
+    def of_step(self, views: int) -> LearningRates:
+        """The rates of a step of ``views`` views, none left to scale."""
+        factor = math.sqrt(views) if self.scale_with_views else 1.0
+        scaled = {name: factor * getattr(self, name) for name in (*ATTRIBUTES, "means_final")}
+        return replace(self, **scaled, scale_with_views=False)
+
+
+def position_lr(iteration: int, extent: float, rates: LearningRates, decay_end: int) -> float:
+    """Learning rate of the positions at a 1-based iteration.
+
+    Log-linear from ``means · extent`` to ``means_final · extent`` at ``decay_end``, then constant.
+    """
+    t = min(max(iteration / decay_end, 0.0), 1.0)
+    return extent * math.exp((1.0 - t) * math.log(rates.means) + t * math.log(rates.means_final))
+
+
+def codebook_group(attribute: str) -> str:
+    """Name of the parameter group of an attribute's codebook."""
+    return f"{CODEBOOK_PREFIX}{attribute}"
+
+
+def param_groups(
+    splats: Splats, quantizers: Mapping[str, nn.Module], rates: LearningRates, extent: float
+) -> list[dict[str, Any]]:
+    """One group a parameter, named after its attribute (``means``) or its codebook (``codebook_scales``).
+
+    Codebooks are there from the start: without a gradient Adam skips them, and a checkpoint of any phase has the same
+    groups.
+
+    Args:
+        splats: The splats.
+        quantizers: Quantizer by attribute, each with a parameter ``codebook``.
+        rates: Learning rates.
+        extent: Extent of the scene, scene units; the position's rate is in its unit.
+    """
+    parameters: dict[str, Any] = dict(splats.attributes())
+    parameters |= {codebook_group(name): quantizer.codebook for name, quantizer in quantizers.items()}
+    return [
+        {"params": [parameter], "lr": group_lr(name, rates, extent), "name": name}
+        for name, parameter in parameters.items()
+    ]
+
+
+def group_lr(name: str, rates: LearningRates, extent: float) -> float:
+    """Learning rate at the start of the parameter group ``name``."""
+    attribute = name.removeprefix(CODEBOOK_PREFIX)
+    rate: float = getattr(rates, attribute)
+    if attribute != name:
+        return rate * rates.codebook_factor
+    return rate * extent if name == "means" else rate
+
+
+def apply_rates(optimizer: torch.optim.Optimizer, rates: LearningRates, extent: float, views: int = 1) -> None:
+    """Set learning rates, betas and epsilon of all groups, for example after a checkpoint has brought others.
+
+    With ``rates.scale_with_views``, of a step of B views, whose gradients are averaged: √B·lr, 1 - B·(1 - β), ε / √B.
+    B views in one step then move parameters as B steps of a view each, in mean and in variance (Malladi et al. 2022,
+    "On the SDEs and Scaling Rules for Adaptive Gradient Algorithms").
+
+    Args:
+        optimizer: Adam with named groups.
+        rates: Learning rates of a step of one view.
+        extent: Extent of the scene, scene units.
+        views: Views in a step, of all processes and micro-batches.
+
+    Raises:
+        ValueError: So many views that a beta would not be positive.
+    """
+    scale = views if rates.scale_with_views else 1
+    betas = tuple(1 - scale * (1 - beta) for beta in BETAS)
+    if min(betas) <= 0:
+        raise ValueError(
+            f"rates cannot scale with {views} views a step, as Adam's first beta would be {betas[0]:.2g}: train fewer "
+            "at once, or leave --model.rates.scale_with_views off"
+        )
+    scaled = rates.of_step(views)
+    for group in optimizer.param_groups:
+        group["lr"] = group_lr(group["name"], scaled, extent)
+        group["betas"], group["eps"] = betas, EPS / math.sqrt(scale)
+
+
+class SplatAdam(torch.optim.Adam):
+    """:class:`torch.optim.Adam` for contiguous float32 parameters, in one pass over the memory.
+
+    On the CPU and on CUDA devices, where nothing waits for the device. The same bits for any number of threads; the
+    state is that of torch's, the count of steps on the CPU, so checkpoints fit both. A group may name
+    ``columns`` (:func:`set_columns`): the leading numbers of a row that can have a gradient or ever had one; Adam
+    leaves the others as they are, so they are not looked at (switch ``adam_bands``). With the switch ``adam_rows``
+    splats without a gradient keep weights and moments; the count of steps, which corrects the bias, goes on for all.
+
+    Args:
+        groups: Parameter groups with their learning rates.
+        eps: Added to the root of the second moment.
+    """
+
+    def __init__(self, groups: list[dict[str, Any]], eps: float = EPS) -> None:
+        super().__init__(groups, eps=eps)
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
+        """Call ``closure``, if any, and update what has a gradient then.
+
+        Returns:
+            What ``closure`` returned.
+        """
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        # All are prepared before the first is done, see `adam_update`.
+        due = [(group, p) for group in self.param_groups for p in group["params"] if p.grad is not None]
+        updates = [self._update_of(group, parameter, parameter.grad) for group, parameter in due]
+        for update in updates:
+            update()
+        for _, parameter in due:  # autograd does not see kernels write
+            increment_version([parameter, *(self.state[parameter][name] for name in ("exp_avg", "exp_avg_sq"))])
+        return loss
+
+    def _update_of(self, group: dict[str, Any], parameter: Tensor, gradient: Tensor) -> Callable[[], None]:
+        """Count one more step of a parameter; the function that does it."""
+        state = self.state[parameter]
+        if not state:
+            state["step"] = torch.zeros(())
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        # A checkpoint of torch's fused Adam has it on the device, where reading it would wait.
+        state["step"] = state["step"].cpu() + 1
+        return _adam_of(parameter)(
+            parameter,
+            gradient.contiguous(),
+            state["exp_avg"],
+            state["exp_avg_sq"],
+            step=int(state["step"]),
+            lr=group["lr"],
+            betas=group["betas"],
+            eps=group["eps"],
+            columns=group.get("columns") if is_on("adam_bands") else None,
+            rows_with_gradient=is_on("adam_rows") and not group.get("name", "").startswith(CODEBOOK_PREFIX),
+        )
+
+
+def _adam_of(parameter: Tensor) -> Callable[..., Callable[[], None]]:
+    """The function that prepares Adam on the device of a parameter, whose kernels' compiler is imported only now."""
+    adam = importlib.import_module(f"nsvq_lightning.training.adam_{kernels_for(parameter)}")
+    prepare: Callable[..., Callable[[], None]] = adam.adam_update
+    return prepare
+
+
+def build_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
+    """Adam of the paper over ``groups``: default betas, epsilon 1e-15, no weight decay.
+
+    Returns:
+        :class:`SplatAdam` where it can take the parameters, else torch's, fused where there is such.
+
+    Raises:
+        ValueError: ``adam_rows`` is on, and only torch's can take the parameters.
+    """
+    parameters: list[Tensor] = [parameter for group in groups for parameter in group["params"]]
+    if all(kernels_for(p) is not None and p.is_contiguous() for p in parameters):
+        return SplatAdam(groups)
+    if is_on("adam_rows"):
+        raise ValueError(
+            "the switch adam_rows needs float32 parameters on the CPU, or on a CUDA device with Triton (pip install "
+            "triton); train there, or leave it off"
+        )
+    fused = all(p.device.type in FUSED_DEVICES and p.is_floating_point() for p in parameters)
+    return torch.optim.Adam(groups, eps=EPS, fused=True if fused else None)
+
+
+def set_columns(optimizer: torch.optim.Optimizer, name: str, columns: int) -> None:
+    """Say that from now on the leading ``columns`` numbers of a row of the group ``name`` can have a gradient.
+
+    Groups start without a limit. The first call at the start of a training sets one, later ones only raise it: moments
+    that were set once need their decay. The optimiser's state carries it.
+    """
+    group = find_group(optimizer, name)
+    fresh = not optimizer.state.get(group["params"][0])
+    if fresh or "columns" in group:
+        group["columns"] = max(columns, group.get("columns", 0))
+
+
+def set_lr(optimizer: torch.optim.Optimizer, name: str, rate: float) -> None:
+    """Set the learning rate of the group ``name``."""
+    find_group(optimizer, name)["lr"] = rate
+
+
+def find_group(optimizer: torch.optim.Optimizer, name: str) -> dict[str, Any]:
+    """The parameter group ``name``.
+
+    Raises:
+        ValueError: There is none.
+    """
+    for group in optimizer.param_groups:
+        if group.get("name") == name:
+            return group
+    names = ", ".join(str(group.get("name")) for group in optimizer.param_groups)
+    raise ValueError(f"the optimiser has no parameter group {name!r}, only: {names}")

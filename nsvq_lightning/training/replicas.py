@@ -1,0 +1,56 @@
+"""Replicas of one scene on several processes: start equal, and prove to be equal."""
+
+from __future__ import annotations
+
+import torch
+from lightning.pytorch import Trainer
+from lightning.pytorch.strategies import Strategy
+from torch import Tensor, nn
+
+from nsvq_lightning.training.host import from_first_process, raw_optimizer, sum_over_processes
+
+__all__ = ["check_replicas", "checksum", "follow_first"]
+
+
+def follow_first(strategy: Strategy, module: nn.Module) -> None:
+    """Give a module on every process the first one's parameters and buffers; numbers of rows may differ before."""
+    state = {name: tensor.cpu() for name, tensor in module.state_dict().items()}
+    module.load_state_dict(strategy.broadcast(state))
+
+
+@torch.no_grad()
+def checksum(tensor: Tensor) -> Tensor:
+    """Checksum of a tensor's bits and of their places, scalar int64: Σ (i + 1)·(bits of number i) modulo 2⁶⁴.
+
+    Args:
+        tensor: Float32, any shape.
+    """
+    bits = tensor.detach().contiguous().view(-1).view(torch.int32).long()
+    return (bits * torch.arange(1, bits.shape[0] + 1, device=bits.device)).sum()
+
+
+def check_replicas(trainer: Trainer, event: str) -> None:
+    """Check that all processes hold the same trained parameters, to the bit.
+
+    A collective: every process must call it at the same place.
+
+    Args:
+        trainer: The trainer, whose optimiser knows the parameters by name.
+        event: What has just happened, for the message.
+
+    Raises:
+        RuntimeError: A parameter differs; all processes raise it.
+    """
+    if trainer.world_size == 1:
+        return
+    parameters: dict[str, Tensor] = {group["name"]: group["params"][0] for group in raw_optimizer(trainer).param_groups}
+    own = torch.stack([checksum(parameter) for parameter in parameters.values()])
+    differ = sum_over_processes(trainer, (own != from_first_process(trainer, own)).long())
+    different = [name for name, processes in zip(parameters, differ.tolist(), strict=True) if processes]
+    if different:
+        raise RuntimeError(
+            f"iteration {trainer.global_step}, after {event}: the replicas of {trainer.world_size} processes differ in "
+            f"{', '.join(different)}. A decision was taken from what one process has alone, or the machines compute "
+            "differently: pass it through nsvq_lightning.training.host.sum_over_processes or from_first_process, and "
+            "train on machines of one kind"
+        )

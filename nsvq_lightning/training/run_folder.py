@@ -1,0 +1,141 @@
+"""Where a run writes its files: a folder of its own, whatever the logger, in which no other run is overwritten."""
+
+from __future__ import annotations
+
+from itertools import count
+from pathlib import Path
+from weakref import WeakKeyDictionary
+
+from lightning.pytorch import Trainer
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+
+__all__ = ["claim_version", "is_trial", "reserve", "run_folder", "take"]
+
+RUN_FILES = (
+    "scene.nsvq",
+    "metrics.json",
+    "metrics.csv",
+    "curve.csv",
+    "checkpoints",
+    "last.ckpt",
+    "renders",
+    "predictions",
+)
+"""What tells that a folder holds a run."""
+
+LOG = "metrics.csv"
+"""File of Lightning's CSV logger, which removes one that it finds."""
+
+_FOLDERS: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
+_RESERVED: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
+
+
+def run_folder(trainer: Trainer) -> Path:
+    """Folder of the trainer's run, which exists; the same one for all that this trainer does.
+
+    It is, of these the first one that is given: the trainer's ``run_folder`` (:class:`nsvq_lightning.training.trainer.
+    SplatTrainer`), the folder of a logger that has one for each run (CSV, TensorBoard), or a new
+    ``<default_root_dir>/<scene>/version_<n>``. The first process chooses: the first call is a collective, which every
+    process must make.
+
+    Raises:
+        FileExistsError: The folder holds another run. That of the checkpoint which a fit goes on from is its own.
+    """
+    folder = _FOLDERS.get(trainer)
+    if folder is None:
+        chosen: Path | str | None = None
+        if trainer.is_global_zero:
+            try:
+                chosen = _choose(trainer)
+            except OSError as error:
+                chosen = str(error)
+        chosen = trainer.strategy.broadcast(chosen)
+        if not isinstance(chosen, Path):
+            raise FileExistsError(chosen)  # on every process: none waits for another
+        folder = _FOLDERS[trainer] = chosen
+    return folder
+
+
+def is_trial(trainer: Trainer) -> bool:
+    """Whether this is ``fast_dev_run``, which must leave no files."""
+    return bool(getattr(trainer, "fast_dev_run", False))
+
+
+def reserve(trainer: Trainer, checkpoint: str | Path | None) -> None:
+    """Take a folder that was given before the trainer starts: its loggers write, and remove what they find, at once.
+
+    Args:
+        trainer: Trainer that is about to start.
+        checkpoint: What a fit goes on from, if it does.
+
+    Raises:
+        FileExistsError: The folder holds another run.
+    """
+    folder = _given(trainer)
+    if folder is not None and trainer.is_global_zero and not is_trial(trainer):
+        take(folder, checkpoint)
+        _RESERVED[trainer] = folder
+
+
+def claim_version(parent: Path) -> Path:
+    """Make and return the next folder ``version_<n>`` in ``parent``; runs that start together get different ones."""
+    parent.mkdir(parents=True, exist_ok=True)
+    numbers = [path.name.removeprefix("version_") for path in parent.glob("version_*")]
+    for number in count(max((int(number) + 1 for number in numbers if number.isdecimal()), default=0)):
+        folder = parent / f"version_{number}"
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            continue
+        return folder
+    raise AssertionError  # count() has no end
+
+
+def take(folder: Path, checkpoint: str | Path | None) -> None:
+    """Make the folder where there is none; set the log of the run in it aside, before a CSV logger removes it.
+
+    Args:
+        folder: Folder that was given for a run.
+        checkpoint: What a fit goes on from, if it does.
+
+    Raises:
+        FileExistsError: It holds a run, and the checkpoint is not in it.
+    """
+    if any((folder / name).exists() for name in RUN_FILES):
+        if checkpoint is None or not Path(checkpoint).resolve().is_relative_to(folder.resolve()):
+            raise FileExistsError(
+                f"{folder} holds a run already, and no run is overwritten: name another folder or version, or none, "
+                "and the next free one is taken"
+            )
+        _set_aside(folder / LOG)
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def _given(trainer: Trainer) -> Path | None:
+    """The folder that the trainer or one of its loggers was given for this run, if any."""
+    own = [logger.log_dir for logger in trainer.loggers if isinstance(logger, CSVLogger | TensorBoardLogger)]
+    given = getattr(trainer, "run_folder", None) or next(iter(own), None)
+    return None if given is None else Path(given)
+
+
+def _choose(trainer: Trainer) -> Path:
+    if is_trial(trainer):
+        return Path(trainer.default_root_dir)
+    if trainer in _RESERVED:
+        return _RESERVED.pop(trainer)
+    folder = _given(trainer)
+    if folder is None:
+        return claim_version(Path(trainer.default_root_dir) / _scene_name(trainer))
+    take(folder, trainer.ckpt_path if trainer.state.fn == "fit" else None)
+    return folder
+
+
+def _set_aside(path: Path) -> None:
+    """Give a file the next free name ``<stem>_<n>``."""
+    if path.exists():
+        path.rename(next(p for n in count(1) if not (p := path.with_stem(f"{path.stem}_{n}")).exists()))
+
+
+def _scene_name(trainer: Trainer) -> str:
+    root = getattr(getattr(trainer, "datamodule", None), "root", None)
+    return (root is not None and Path(root).resolve().name) or "scene"

@@ -1,0 +1,65 @@
+"""Lightning's trainer with the subcommand ``export``."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+from lightning.fabric.plugins import TorchCheckpointIO
+from lightning.pytorch import Trainer
+from lightning.pytorch.strategies import DDPStrategy
+
+from nsvq_lightning.compression.stored import save_as_stored
+from nsvq_lightning.training.checkpoints import PlainCheckpointIO, read_checkpoint
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.strategies import ViewParallelStrategy  # noqa: F401  registers its name
+
+__all__ = ["SplatTrainer"]
+
+log = logging.getLogger(__name__)
+
+
+class SplatTrainer(Trainer):
+    """:class:`lightning.pytorch.Trainer`; every public method below is a subcommand of ``nsvq``.
+
+    Checkpoints are read by :class:`~nsvq_lightning.training.checkpoints.PlainCheckpointIO` unless a plugin does it.
+
+    Where several devices or machines are asked for and no strategy is, it takes ``view_parallel``: DDP, which Lightning
+    would choose, cannot follow a changing number of splats.
+
+    Args:
+        run_folder: Folder for all files of the run; None is that of the logger if it has one for each run, else a new
+            ``<default_root_dir>/<scene>/version_<n>``. A run that is there already is not overwritten.
+    """
+
+    def __init__(self, *args: Any, run_folder: str | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        if kwargs.get("strategy", "auto") == "auto" and isinstance(self.strategy, DDPStrategy):
+            super().__init__(*args, **(kwargs | {"strategy": "view_parallel"}))
+        self.run_folder = run_folder
+        if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # Lightning's own
+            self.strategy.checkpoint_io = PlainCheckpointIO()
+
+    def export(self, model: SplatModule, ckpt_path: str, output: str = "scene.nsvq") -> Path:
+        """Write the scene of a checkpoint as a file.
+
+        Args:
+            model: Module that the checkpoint is loaded into.
+            ckpt_path: Checkpoint of a run.
+            output: File to write; its suffix names the format: .nsvq is the compressed scene, any other format holds
+                the decoded splats (.ply, .sog, .spz, .splat).
+
+        Raises:
+            FileNotFoundError: No such checkpoint.
+            FormatError: It is damaged.
+        """
+        checkpoint = read_checkpoint(ckpt_path)
+        model.on_load_checkpoint(checkpoint)
+        model.load_state_dict(checkpoint["state_dict"])
+        path = Path(output)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        scene = model.compressed()
+        save_as_stored(scene, path, model.storage)
+        log.info("wrote %s: %d splats, %d bytes", path, len(scene), path.stat().st_size)
+        return path
