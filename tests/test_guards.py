@@ -11,7 +11,7 @@ from guards import GuardError, guarded
 from numba import njit, typeof
 
 from nsvq_lightning.compute.lanes import put
-from nsvq_lightning.compute.workspace import Workspace, recycled
+from nsvq_lightning.compute.memory import Workspace, recycled
 
 
 @njit

@@ -6,11 +6,15 @@ from collections.abc import Callable
 from typing import Any
 
 import numba
+import numpy as np
 import torch
 
 from nsvq_lightning.compute.stamp import KernelStore
 
-__all__ = ["inline", "kernel", "thread_count"]
+__all__ = ["F", "inline", "kernel", "thread_count"]
+
+F = np.float32
+"""Numbers written in kernels have its type: Python's own would widen what they meet to float64."""
 
 _OPTIONS: dict[str, Any] = {
     # Products and sums may fuse; NaN and infinity keep their meaning because the guards of this package rely on them.

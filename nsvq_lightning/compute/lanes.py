@@ -338,6 +338,16 @@ def lane_sum(context, builder, sig, values):
     return builder.extract_element(total, _i32(0))
 
 
+@_function(types.float32, 1)
+def lane_min(context, builder, sig, values):
+    """Smallest of the 16 lanes; a NaN lane may be passed over or returned."""
+    smallest = values[0]
+    for step in (8, 4, 2, 1):
+        other = _shuffle(builder, smallest, smallest, [(lane + step) % WIDTH for lane in range(WIDTH)])
+        smallest = builder.select(builder.fcmp_ordered("<", other, smallest), other, smallest)
+    return builder.extract_element(smallest, _i32(0))
+
+
 @_function(Lanes, 1)
 def lane_sums(context, builder, sig, values):
     """``lane_sums((v0, v1, …))``: lane i of the result is the sum of the lanes of vector i, 0 beyond the last."""

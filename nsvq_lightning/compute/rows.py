@@ -2,16 +2,121 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, cast
 
 import torch
+from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.compute.rows_cpu import gather_rows, spread_rows
+from nsvq_lightning.compute.jit import inline, kernel, thread_count
+from nsvq_lightning.compute.lanes import get, put
+from nsvq_lightning.compute.memory import INT64, Array, flat, flat_checked, outside, recycled
 
-__all__ = ["put_rows", "take_rows"]
+__all__ = ["clear", "clear_between", "count_outside", "gather_rows", "put_rows", "spread_rows", "take_rows"]
+
+
+@inline
+def clear(array, first, last):
+    """Zero a range of elements."""
+    for i in range(first, last):
+        put(array, i, 0)
+
+
+@inline
+def clear_between(rows, i, columns, table):
+    """Zero the rows of a table between the ``i - 1``-th and the ``i``-th of ``rows``; past the last, up to the end."""
+    first = columns * (get(rows, i - 1) + 1) if i > 0 else 0
+    clear(table, first, columns * get(rows, i) if i < rows.shape[0] else table.shape[0])
+
+
+@inline
+def count_outside(rows, first, last, count):
+    """How many of ``rows[first:last]`` are no row of a table of ``count`` rows; ``first`` may be -1."""
+    found = 0
+    for i in range(max(first, 0), last):
+        found += get(rows, i) < 0 or get(rows, i) >= count
+    return found
+
+
+@inline
+def _copy(source, start, target, place, count):
+    for k in range(count):
+        put(target, place + k, get(source, start + k))
+
+
+@kernel
+def _gather(threads, height, columns, source, rows, target):
+    """Copy rows of a table of ``height`` rows; returns how many it does not have, and then has not copied all."""
+    count = rows.shape[0]
+    missing = 0
+    for thread in prange(threads):
+        first, last = count * thread // threads, count * (thread + 1) // threads
+        found = count_outside(rows, first, last, height)
+        missing += found
+        if found == 0:
+            for i in range(first, last):
+                _copy(source, columns * get(rows, i), target, columns * i, columns)
+    return missing
+
+
+@kernel
+def _spread(threads, height, columns, source, rows, target):
+    """The inverse of :func:`_gather`."""
+    count = rows.shape[0]
+    missing = 0
+    for thread in prange(threads):
+        first, last = count * thread // threads, count * (thread + 1) // threads
+        # The row before the first one says where to begin to clear.
+        found = count_outside(rows, first - 1, last, height)
+        missing += found
+        if found == 0:
+            for i in range(first, last):
+                clear_between(rows, i, columns, target)
+                _copy(source, columns * i, target, columns * get(rows, i), columns)
+            if thread == threads - 1:
+                clear_between(rows, count, columns, target)
+    return missing
+
+
+def gather_rows(table: Tensor, rows: Tensor) -> Tensor:
+    """The rows ``rows [V]`` of a float32 table ``[N, ...]`` on the CPU: ``[V, ...]``.
+
+    Raises:
+        ValueError: ``rows`` is not ``[V]``, or the table does not have one of them.
+        TypeError: The table is not float32, or the rows are not int64.
+    """
+    values = flat_checked("table", table.contiguous(), tuple(table.shape))
+    numbers = _numbers(rows)
+    out = torch.empty(len(numbers), *table.shape[1:])
+    if _gather(thread_count(), len(table), _columns(table), values, numbers, flat(out)):
+        raise outside("rows", numbers, len(table))
+    return out
+
+
+def spread_rows(values: Tensor, rows: Tensor, count: int) -> Tensor:
+    """A table ``[count, ...]`` of zeros but for ``values [V, ...]`` at the ascending ``rows [V]``.
+
+    Raises:
+        ValueError: ``rows`` is not ``[V]``, or the table does not have one of them.
+        TypeError: The values are not float32, or the rows are not int64.
+    """
+    numbers = _numbers(rows)
+    table = recycled((count, *values.shape[1:]))
+    given = flat_checked("values", values.contiguous(), (len(numbers), *values.shape[1:]))
+    if _spread(thread_count(), count, _columns(values), given, numbers, flat(table)):
+        raise outside("rows", numbers, count)
+    return table
+
+
+def _numbers(rows: Tensor) -> Array:
+    return flat_checked("rows", rows.contiguous(), (rows.numel(),), INT64)
+
+
+def _columns(table: Tensor) -> int:
+    return math.prod(table.shape[1:])
 
 
 def put_rows(values: Tensor, rows: Tensor, count: int) -> Tensor:

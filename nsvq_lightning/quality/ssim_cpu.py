@@ -15,7 +15,7 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from nsvq_lightning.compute.jit import inline, kernel, thread_count
+from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
 from nsvq_lightning.compute.lanes import (
     WIDTH,
     fma,
@@ -29,10 +29,8 @@ from nsvq_lightning.compute.lanes import (
     store,
     vfabs,
 )
-from nsvq_lightning.compute.memory import FLOAT32, UINT8, flat_checked
-from nsvq_lightning.compute.workspace import Workspace, recycled
+from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat_checked, recycled
 from nsvq_lightning.quality.loss import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
-from nsvq_lightning.rendering.cpu.records import F
 
 __all__ = ["l1_dssim"]
 

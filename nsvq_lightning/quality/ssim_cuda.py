@@ -17,9 +17,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nsvq_lightning.compute.tensors import check_tensor
+from nsvq_lightning.compute.launch import COMPILE
+from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quality.loss import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
-from nsvq_lightning.rendering.cuda.records import COMPILE
 
 __all__ = ["Derivatives", "l1_dssim", "l1_dssim_backward"]
 

@@ -24,6 +24,7 @@ from nsvq_lightning.compute.jit import inline, kernel, thread_count
 from nsvq_lightning.compute.lanes import (
     fma,
     get,
+    lane_min,
     load,
     lowest_bit,
     mask_bits,
@@ -35,8 +36,7 @@ from nsvq_lightning.compute.lanes import (
     vmin,
 )
 from nsvq_lightning.compute.memory import FLOAT32, FLOAT64, INT32, INT64, check_array, check_table, outside
-from nsvq_lightning.compute.rows_cpu import count_outside
-from nsvq_lightning.compute.vectors import lane_min
+from nsvq_lightning.compute.rows import count_outside
 from nsvq_lightning.quantize.boxes import NO_CODE, Boxes, check_boxes
 
 __all__ = ["MAX_DIM", "ROUNDING", "UNKNOWN", "BoxMemory", "box_search", "empty_memory"]

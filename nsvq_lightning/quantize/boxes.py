@@ -9,8 +9,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
-from nsvq_lightning.compute.memory import FLOAT32, INT32, check_array, check_table, outside
-from nsvq_lightning.compute.vectors import aligned_empty
+from nsvq_lightning.compute.memory import FLOAT32, INT32, aligned_empty, check_array, check_table, outside
 
 __all__ = ["NO_CODE", "Boxes", "build_boxes", "check_boxes"]
 

@@ -18,9 +18,8 @@ from numba import prange
 from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
-from nsvq_lightning.compute.lanes import fma, fnma, get, load, lowest_bit, mask_bits, put, splat, store, vmin
-from nsvq_lightning.compute.memory import FLOAT32, check_array, check_table
-from nsvq_lightning.compute.vectors import aligned_empty, lane_min
+from nsvq_lightning.compute.lanes import fma, fnma, get, lane_min, load, lowest_bit, mask_bits, put, splat, store, vmin
+from nsvq_lightning.compute.memory import FLOAT32, aligned_empty, check_array, check_table
 
 __all__ = ["LIST", "CentredCodes", "centre_codes", "score_search", "true_distance"]
 

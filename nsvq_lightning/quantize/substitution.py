@@ -20,11 +20,9 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
 from nsvq_lightning.compute.lanes import fma, get, lane_sum, load, put, select, splat, store, vsqrt
-from nsvq_lightning.compute.memory import FLOAT32, INT64, check_array, check_table, outside
-from nsvq_lightning.compute.rows_cpu import clear_between, count_outside
-from nsvq_lightning.compute.workspace import recycled
+from nsvq_lightning.compute.memory import FLOAT32, INT64, check_array, check_table, outside, recycled
+from nsvq_lightning.compute.rows import clear, clear_between, count_outside
 from nsvq_lightning.quantize.noise import fill_normal
-from nsvq_lightning.rendering.cpu.projection import clear
 
 __all__ = ["substitute", "substitute_backward"]
 

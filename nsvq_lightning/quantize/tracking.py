@@ -24,6 +24,7 @@ from nsvq_lightning.compute.jit import inline, kernel, thread_count
 from nsvq_lightning.compute.lanes import (
     fma,
     get,
+    lane_min,
     lane_sum,
     lane_sums,
     load,
@@ -34,7 +35,6 @@ from nsvq_lightning.compute.lanes import (
     store,
 )
 from nsvq_lightning.compute.memory import INT64, check_array
-from nsvq_lightning.compute.vectors import lane_min
 from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, BoxMemory, box_search, empty_memory
 from nsvq_lightning.quantize.boxes import build_boxes
 from nsvq_lightning.quantize.nearest import check_rows, nearest

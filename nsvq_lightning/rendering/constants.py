@@ -11,7 +11,6 @@ __all__ = [
     "HUGE_FOOTPRINT",
     "HUGE_QUATERNION",
     "LARGEST_FOOTPRINT",
-    "MIN_SQUARED_NORM",
     "NEAR",
     "SHRINK",
     "TRANSMITTANCE_MIN",
@@ -34,9 +33,6 @@ TRANSMITTANCE_MIN = 1e-4
 
 FRUSTUM_MARGIN = 0.3
 """The Jacobian of the projection is taken at most this fraction of the half image outside the image."""
-
-MIN_SQUARED_NORM = 1e-24
-"""Squared quaternion norms are floored here, so that a zero quaternion is the identity and has no gradient."""
 
 HUGE_QUATERNION, SHRINK = 1e18, 2.0**-66
 """Quaternions with a larger number are made smaller by this factor first: their squares would overflow in float32."""

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from nsvq_lightning.compute import support as cuda_support
-from nsvq_lightning.compute.devices import kernels_for
+from nsvq_lightning.compute.devices import kernels_for, triton_obstacle
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.gsplat import support as gsplat_support
 from nsvq_lightning.rendering.reference import render_reference, visible_rows
@@ -169,7 +168,7 @@ def _obstacle(backend: str, like: Tensor) -> str | None:
     if backend == "cpu" and not (like.device.type == "cpu" and like.dtype == torch.float32):
         return f"it renders float32 tensors on the CPU, got {like.dtype} on {like.device}; move the splats"
     if backend == "cuda":
-        return cuda_support.obstacle(like)
+        return triton_obstacle(like)
     return gsplat_support.obstacle(like) if backend == "gsplat" else None
 
 

@@ -19,12 +19,12 @@ from nsvq_lightning.rendering.constants import (
     FRUSTUM_MARGIN,
     HUGE_FOOTPRINT,
     HUGE_QUATERNION,
-    MIN_SQUARED_NORM,
     NEAR,
     SHRINK,
     TRANSMITTANCE_MIN,
 )
 from nsvq_lightning.rendering.sh import sh_colors
+from nsvq_lightning.splats.rotations import MIN_SQUARED_NORM
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors
 
 __all__ = ["Projection", "project", "render_reference", "rotation_matrices", "visible_rows"]

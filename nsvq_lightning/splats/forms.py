@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from nsvq_lightning.rendering.constants import MIN_SQUARED_NORM
+from nsvq_lightning.splats.rotations import MIN_SQUARED_NORM
 
 __all__ = ["FORMS", "Canonical", "Form", "canonical"]
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["from_smallest_three", "smallest_three", "unit"]
+__all__ = ["MIN_SQUARED_NORM", "from_smallest_three", "smallest_three", "unit"]
+
+MIN_SQUARED_NORM = 1e-24
+"""Squared quaternion norms are floored here, so that a zero quaternion is the identity and has no gradient."""
 
 
 def unit(quats: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -14,11 +14,9 @@ import numpy as np
 from numba import prange
 from torch import Tensor
 
-from nsvq_lightning.compute.jit import inline, kernel, thread_count
+from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
 from nsvq_lightning.compute.lanes import any_lane, fma, get, load, prefetch, put, select, splat, store, vsqrt
-from nsvq_lightning.compute.memory import Array, flat_checked
-from nsvq_lightning.compute.workspace import Workspace
-from nsvq_lightning.rendering.cpu.records import F
+from nsvq_lightning.compute.memory import Array, Workspace, flat_checked
 
 __all__ = ["adam_update"]
 

@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nsvq_lightning.compute import rows_cpu as rows_module
-from nsvq_lightning.compute.rows_cpu import gather_rows, spread_rows
+from nsvq_lightning.compute import rows as rows_module
+from nsvq_lightning.compute.rows import gather_rows, spread_rows
 from nsvq_lightning.random import generator
 
 

@@ -59,6 +59,6 @@ def test_error_without_gpu_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_error_without_triton_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TRITON_INTERPRET", "1")
-    monkeypatch.setattr("nsvq_lightning.compute.support.has_triton", lambda: False)
+    monkeypatch.setattr("nsvq_lightning.compute.devices._has_triton", lambda: False)
     with pytest.raises(ValueError, match="pip install triton"):
         resolve_backend("cuda", torch.zeros(1))

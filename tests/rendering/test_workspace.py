@@ -7,7 +7,7 @@ import threading
 
 import torch
 
-from nsvq_lightning.compute.workspace import Workspace, recycled
+from nsvq_lightning.compute.memory import Workspace, recycled
 
 # A shape of its own size, so that no buffer of another test fits.
 SHAPE = (123_457, 5)

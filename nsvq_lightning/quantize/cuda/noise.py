@@ -12,8 +12,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from nsvq_lightning.compute.launch import COMPILE
 from nsvq_lightning.quantize import noise
-from nsvq_lightning.rendering.cuda.records import COMPILE
 
 __all__ = ["normal", "normal_vectors"]
 

@@ -11,10 +11,10 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nsvq_lightning.compute.tensors import check_tensor
+from nsvq_lightning.compute.launch import COMPILE
+from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quantize.cuda.noise import normal
 from nsvq_lightning.quantize.cuda.sums import sum_rows
-from nsvq_lightning.rendering.cuda.records import COMPILE
 
 __all__ = ["substitute", "substitute_backward"]
 

@@ -7,8 +7,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nsvq_lightning.compute.tensors import check_tensor
-from nsvq_lightning.rendering.cuda.records import COMPILE
+from nsvq_lightning.compute.launch import COMPILE
+from nsvq_lightning.compute.memory import check_tensor
 
 __all__ = ["sorted_by_code", "sum_rows"]
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from nsvq_lightning.compute.jit import inline, kernel
+from nsvq_lightning.compute.jit import F, inline, kernel
 from nsvq_lightning.compute.lanes import (
     any_lane,
     column_bits,
@@ -61,7 +61,6 @@ from nsvq_lightning.rendering.cpu.records import (
     A,
     B,
     C,
-    F,
     X,
     Y,
 )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from nsvq_lightning.compute.jit import inline, kernel
+from nsvq_lightning.compute.jit import F, inline, kernel
 from nsvq_lightning.compute.lanes import (
     exp2_clamped,
     fma,
@@ -40,6 +40,7 @@ from nsvq_lightning.compute.lanes import (
     vmin,
     vsqrt,
 )
+from nsvq_lightning.compute.rows import clear
 from nsvq_lightning.rendering import constants, sh
 from nsvq_lightning.rendering.cpu.records import (
     BLUE,
@@ -80,15 +81,15 @@ from nsvq_lightning.rendering.cpu.records import (
     A,
     B,
     C,
-    F,
     X,
     Y,
 )
+from nsvq_lightning.splats import rotations
 
 NEAR = F(constants.NEAR)
 BLUR = F(constants.BLUR)
 BLUR_SQUARED = F(constants.BLUR**2)
-MIN_SQUARED_NORM = F(constants.MIN_SQUARED_NORM)
+MIN_SQUARED_NORM = F(rotations.MIN_SQUARED_NORM)
 FINITE = F(constants.FINITE)
 HUGE_FOOTPRINT, LARGEST_FOOTPRINT = F(constants.HUGE_FOOTPRINT), F(constants.LARGEST_FOOTPRINT)
 HUGE_QUATERNION, SHRINK = F(constants.HUGE_QUATERNION), F(constants.SHRINK)
@@ -611,13 +612,6 @@ def put_band(gradient, e, columns, k, basis, rgb):
     store(e, 16 * k, fma(load(columns, o + 32), rgb[2], total))
     for channel in range(3):
         store(gradient, o + 16 * channel, basis * rgb[channel])
-
-
-@inline
-def clear(array, first, last):
-    """Zero a range of elements."""
-    for i in range(first, last):
-        put(array, i, 0)
 
 
 @inline

@@ -10,8 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.jit import thread_count
-from nsvq_lightning.compute.memory import Array, flat, flat_checked
-from nsvq_lightning.compute.workspace import Workspace, recycled
+from nsvq_lightning.compute.memory import Array, Workspace, flat, flat_checked, recycled
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import FRUSTUM_MARGIN
 from nsvq_lightning.rendering.cpu.binning import DIGITS, count_tiles, fill_tiles, sort_by_depth

@@ -14,9 +14,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-F = np.float32
+from nsvq_lightning.compute.jit import F
 
 RECORD = 16
 """Floats in a record and in a slot."""

@@ -6,10 +6,9 @@ import numpy as np
 from numba import prange
 from torch import Tensor
 
-from nsvq_lightning.compute.jit import kernel, thread_count
+from nsvq_lightning.compute.jit import F, kernel, thread_count
 from nsvq_lightning.compute.lanes import get, put
 from nsvq_lightning.compute.memory import INT32, flat_checked
-from nsvq_lightning.rendering.cpu.records import F
 
 __all__ = ["add_view"]
 

@@ -16,13 +16,13 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nsvq_lightning.compute.tensors import check_tensor
+from nsvq_lightning.compute.launch import COMPILE
+from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.rendering.cuda.binning import Tiles
 from nsvq_lightning.rendering.cuda.projection import Lens
 from nsvq_lightning.rendering.cuda.records import (
     ALPHA_MAX,
     BLUE,
-    COMPILE,
     DEPTH,
     FIELDS,
     GREEN,

@@ -22,7 +22,6 @@ from nsvq_lightning.rendering import constants
 __all__ = [
     "ALPHA_MAX",
     "BLUE",
-    "COMPILE",
     "COVARIANCE_SCALE",
     "DEPTH",
     "FACTOR_SCALE",
@@ -52,10 +51,6 @@ __all__ = [
     "X",
     "Y",
 ]
-
-COMPILE = {"enable_fp_fusion": True}
-"""How all kernels are compiled. Triton's own default is about to change; what forward and backward pass must agree on
-to the bit is written as ``fma``."""
 
 RECORD = tl.constexpr(12)
 """Floats from one record, or slot, to the next: whole 16-byte words."""

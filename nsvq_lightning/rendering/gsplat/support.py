@@ -9,7 +9,7 @@ from functools import cache
 
 from torch import Tensor
 
-from nsvq_lightning.compute.device import not_on_cuda
+from nsvq_lightning.compute.devices import not_on_cuda
 
 __all__ = ["obstacle"]
 
