@@ -10,7 +10,8 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loops.loop import _Loop
 from torch import Tensor
 
-from nsvq_lightning.training.host import SplatHost, as_host, raw_optimizer
+from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.training.state import RunState
 

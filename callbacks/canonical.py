@@ -14,8 +14,10 @@ from nsvq_lightning.compression.pixel_size import scale_floor
 from nsvq_lightning.random import derive_seed
 from nsvq_lightning.splats.forms import Form, canonical
 from nsvq_lightning.training.edit import change_coordinates, finite_rows, raise_scales
-from nsvq_lightning.training.host import SplatHost, as_host, raw_optimizer, train_cameras
+from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.training.train_views import train_cameras
 
 from .latch import LatchedCallback
 

@@ -15,19 +15,13 @@ from nsvq_lightning.quantize.attributes import QUANTIZED
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.random import generator
 from nsvq_lightning.training.edit import reset_moments
-from nsvq_lightning.training.host import (
-    SplatHost,
-    as_host,
-    next_iteration,
-    raw_optimizer,
-    sum_over_processes,
-    train_contributions,
-)
-from nsvq_lightning.training.optim import codebook_group
-from nsvq_lightning.training.replicas import check_replicas, follow_first
-from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.optim import codebook_group, raw_optimizer
+from nsvq_lightning.training.replicas import check_replicas, follow_first, sum_over_processes
+from nsvq_lightning.training.schedule import Phase, next_iteration
+from nsvq_lightning.training.train_views import train_contributions
 
-from .finite_search import keep_finite_splats
+from .finite import keep_finite_splats
 from .latch import LatchedCallback
 
 __all__ = ["CodebookInit", "CodebookReplacement", "perplexity"]

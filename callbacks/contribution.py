@@ -9,8 +9,10 @@ from lightning.pytorch import LightningModule, Trainer
 
 from nsvq_lightning.compression.importance import least_contributing
 from nsvq_lightning.training.edit import keep_rows
-from nsvq_lightning.training.host import SplatHost, as_host, next_iteration, raw_optimizer, train_contributions
-from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.optim import raw_optimizer
+from nsvq_lightning.training.schedule import Phase, next_iteration
+from nsvq_lightning.training.train_views import train_contributions
 
 from .latch import LatchedCallback
 

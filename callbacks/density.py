@@ -16,16 +16,11 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.edit import append_rows, keep_rows, replace_attribute, reset_moments
-from nsvq_lightning.training.host import (
-    SplatHost,
-    as_host,
-    next_iteration,
-    raw_optimizer,
-    sum_over_processes,
-    train_contributions,
-)
-from nsvq_lightning.training.replicas import check_replicas
-from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.optim import raw_optimizer
+from nsvq_lightning.training.replicas import check_replicas, sum_over_processes
+from nsvq_lightning.training.schedule import Phase, next_iteration
+from nsvq_lightning.training.train_views import train_contributions
 
 from .density_rules import (
     DensityRules,
@@ -37,7 +32,7 @@ from .density_rules import (
     split,
     split_mask,
 )
-from .finite_search import FiniteSearch, keep_finite_splats
+from .finite import FiniteSearch, keep_finite_splats
 from .latch import LatchedCallback
 
 __all__ = ["DensityControl"]

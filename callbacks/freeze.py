@@ -9,11 +9,11 @@ from typing import Any
 from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor
 
-from nsvq_lightning.training.host import SplatHost, as_host, from_first_process, next_iteration
-from nsvq_lightning.training.replicas import check_replicas
-from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.replicas import check_replicas, from_first_process
+from nsvq_lightning.training.schedule import Phase, next_iteration
 
-from .finite_search import keep_finite_splats
+from .finite import keep_finite_splats
 from .latch import LatchedCallback
 
 __all__ = ["FreezeCodes"]

@@ -7,8 +7,8 @@ from typing import Any
 
 from lightning.pytorch import LightningModule, Trainer
 
-from nsvq_lightning.training.host import as_host, next_iteration
-from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.training.host import as_host
+from nsvq_lightning.training.schedule import Phase, next_iteration
 
 from .hosted import HostedCallback
 

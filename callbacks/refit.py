@@ -9,10 +9,11 @@ from lightning.pytorch import LightningModule, Trainer
 from torch.optim import Optimizer
 
 from nsvq_lightning.quantize.base import Refittable, is_refittable
-from nsvq_lightning.training.host import SplatHost, as_host, from_first_process, next_iteration
-from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.replicas import from_first_process
+from nsvq_lightning.training.schedule import Phase, next_iteration
 
-from .finite_search import keep_finite_splats
+from .finite import keep_finite_splats
 from .hosted import HostedCallback
 
 __all__ = ["CodebookRefit"]

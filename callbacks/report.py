@@ -23,8 +23,9 @@ from nsvq_lightning.report.files import paper_level, summarize, write_curve, wri
 from nsvq_lightning.report.picture_logs import log_pictures
 from nsvq_lightning.report.pictures import comparison, file_stem, write_png
 from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training.host import SplatHost, as_host, next_iteration
+from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.run_folder import is_trial, run_folder
+from nsvq_lightning.training.schedule import next_iteration
 
 from .hosted import WritingCallback
 from .watchers import tell_watchers

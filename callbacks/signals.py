@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from lightning.pytorch import Trainer
 
-from nsvq_lightning.training.host import sum_over_processes
+from nsvq_lightning.training.replicas import sum_over_processes
 
 __all__ = ["HeldSignals"]
 

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from nsvq_lightning.compute.environment import set_defaults
 from nsvq_lightning.top_level import find_callbacks
-
-__version__ = "0.1.0"
+from nsvq_lightning.version import __version__ as __version__
 
 set_defaults()  # before anything imports torch
 

@@ -307,7 +307,7 @@ def _read_checkpoint(path: Path) -> object:
 
 
 def _build_config(folder: Path) -> list[Path]:
-    from nsvq_lightning.commands.main import find_config
+    from nsvq_lightning.commands.configs import find_config
 
     files = []
     for name in ("nsvq_4k", "better_4k", "demo"):
@@ -334,7 +334,7 @@ def _parser() -> Callable[[list[str]], object]:
 
 def _read_config(path: Path) -> object:
     """Parse it as ``nsvq fit`` would; what is wrong ends the command with status 2 and a message."""
-    from nsvq_lightning.commands.main import check_config
+    from nsvq_lightning.commands.configs import check_config
 
     check_config(str(path))
     status: object = 0

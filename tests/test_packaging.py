@@ -55,7 +55,7 @@ def test_building_needs_no_torch() -> None:
 
 
 def test_version_is_stated_once() -> None:
-    assert _project()["project"]["version"] == nsvq_lightning.__version__
+    assert _project()["project"]["dynamic"] == ["version"]
     try:
         installed = importlib.metadata.version("nsvq-lightning")
     except importlib.metadata.PackageNotFoundError:
@@ -139,7 +139,7 @@ def test_checkout_runs_without_links(without_links: Path) -> None:
     lines = [
         "import importlib.util, os, pickle",
         "from nsvq_lightning.callbacks.density import DensityControl",
-        "from nsvq_lightning.commands.main import find_config",
+        "from nsvq_lightning.commands.configs import find_config",
         "assert pickle.loads(pickle.dumps(DensityControl)) is DensityControl",
         "assert DensityControl.__module__ == 'nsvq_lightning.callbacks.density'",
         "assert os.path.samefile(find_config('demo'), 'configs/demo.yaml')",

@@ -83,8 +83,7 @@ class Result:
 
 def _compress(options: argparse.Namespace) -> int:
     from nsvq_lightning.compression.ladder import Compressor
-    from nsvq_lightning.compression.picture_error import decibels
-    from nsvq_lightning.compression.pictures import measuring_cameras
+    from nsvq_lightning.compression.pictures import decibels, measuring_cameras
     from nsvq_lightning.io.formats import read_scene
     from nsvq_lightning.io.nsvq.frame import with_origin
     from nsvq_lightning.training.run_folder import claim_version

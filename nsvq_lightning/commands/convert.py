@@ -81,8 +81,7 @@ def _errors(scene: CompressedScene, output: Path) -> str:
 
 
 def _measure(source: Path, output: Path, root: Path | None) -> None:
-    from nsvq_lightning.compression.picture_error import decibels, picture_error, pictures
-    from nsvq_lightning.compression.pictures import measuring_cameras
+    from nsvq_lightning.compression.pictures import decibels, measuring_cameras, picture_error, pictures
 
     original = read_scene(source).finite()
     if len(original) == 0:

@@ -8,18 +8,15 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
-from pathlib import Path, PurePath
 from typing import TextIO
 
-from nsvq_lightning import __version__
+from nsvq_lightning.commands.configs import check_config, configs_among, resolve_configs
 from nsvq_lightning.commands.registry import COMMANDS, overview
-from nsvq_lightning.top_level import folder_of
+from nsvq_lightning.version import __version__
 
-__all__ = ["check_config", "find_config", "main", "resolve_configs"]
-
-CONFIG_OPTIONS = ("--config", "-c")
+__all__ = ["main"]
 
 TRACEBACK = "NSVQ_TRACEBACK"
 """Environment variable that makes errors show their traceback."""
@@ -79,7 +76,7 @@ def _run_lightning(arguments: list[str]) -> int:
     _quiet_lightning()
     if os.getcwd() not in sys.path:  # last, unlike `python -m`: for quantizers and callbacks of one's own
         sys.path.append(os.getcwd())
-    configs = _config_values(arguments)
+    configs = configs_among(arguments)
     try:
         for config in configs:
             check_config(config)
@@ -110,7 +107,7 @@ def _is_ours(error: BaseException) -> bool:
     frame = error.__traceback__
     while frame is not None and frame.tb_next is not None:
         frame = frame.tb_next
-    return frame is not None and str(frame.tb_frame.f_globals.get("__name__")).startswith(f"{__package__}.")
+    return frame is not None and str(frame.tb_frame.f_globals.get("__name__")).startswith("nsvq_lightning.")
 
 
 class BarHandler(logging.StreamHandler[TextIO]):
@@ -142,64 +139,3 @@ def _quiet_lightning() -> None:
 
     for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
         logging.getLogger(name).addFilter(keep)
-
-
-def resolve_configs(arguments: Sequence[str]) -> list[str]:
-    """The arguments with every ``--config NAME`` that is no file replaced by the shipped one of that name."""
-    resolved = list(arguments)
-    for place, name in _configs(arguments):
-        resolved[place] = resolved[place].removesuffix(name) + find_config(name)
-    return resolved
-
-
-def _config_values(arguments: Sequence[str]) -> list[str]:
-    return [name for _, name in _configs(arguments)]
-
-
-def _configs(arguments: Sequence[str]) -> Iterator[tuple[int, str]]:
-    """Place of each argument that ends with the name of a config, and that name."""
-    expects_config = False
-    for place, argument in enumerate(arguments):
-        option, equals, value = argument.partition("=")
-        if expects_config:
-            yield place, argument
-        elif option in CONFIG_OPTIONS and equals:
-            yield place, value
-        expects_config = not expects_config and argument in CONFIG_OPTIONS
-
-
-def check_config(path: str) -> None:
-    """Refuse a file that cannot be a config at all; a name that is no file is for the parser to complain about.
-
-    Raises:
-        ValueError: It is not text, not YAML, or not a table of settings.
-    """
-    import yaml
-
-    if not Path(path).is_file():
-        return
-    try:
-        settings = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error
-    if not isinstance(settings, dict):
-        found = "nothing" if settings is None else type(settings).__name__
-        raise ValueError(f"config {path} holds {found}: give settings by name, as 'trainer: {{max_steps: 1000}}'")
-
-
-def find_config(name: str) -> str:
-    """Path of a config: a file as given, else one shipped with the package (``nsvq_4k``, ``configs/nsvq_4k.yaml``).
-
-    A name that is neither is returned as it is, for the parser to complain about.
-    """
-    if Path(name).exists():
-        return name
-    plain = _without_folder(Path(name))
-    for shipped in (folder_of("configs") / plain, folder_of("configs") / f"{plain}.yaml"):
-        if shipped.is_file():
-            return str(shipped)
-    return name
-
-
-def _without_folder(path: PurePath) -> str:
-    return path.as_posix().removeprefix("configs/")

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nsvq_lightning.compression.covariance_error import form_errors
 from nsvq_lightning.compression.importance import contributions, row_weights
-from nsvq_lightning.compression.picture_error import decibels, picture_error, pictures
+from nsvq_lightning.compression.pictures import decibels, picture_error, pictures
 from nsvq_lightning.compression.pixel_size import scale_floor
 from nsvq_lightning.compression.stored import compress
 from nsvq_lightning.io.compressed import CompressedScene

@@ -23,7 +23,7 @@ from nsvq_lightning.data.model_files import SceneError
 from nsvq_lightning.data.undistort import Pinhole, Undistortion
 from nsvq_lightning.skips import is_on
 
-__all__ = ["ImageSource", "ImageStore", "image_size", "read_image"]
+__all__ = ["ImageSource", "ImageStore", "encode_png", "image_size", "read_image"]
 
 # COLMAP works on the pixels as stored, so the EXIF orientation must not turn them.
 _READ = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
@@ -97,6 +97,19 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     if image.dtype != np.uint8:
         raise _undecodable(path, f"its pixels are {image.dtype}, accepted are 8 and 16 bit integers")
     return _turned_back(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), orientation)
+
+
+def encode_png(rgb: NDArray[np.uint8]) -> bytes:
+    """A PNG file of RGB bytes ``[H, W, 3]``.
+
+    Raises:
+        OSError: The picture could not be encoded.
+    """
+    # Not imwrite, which on Windows fails on names outside the locale's character set.
+    encoded, data = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))
+    if not encoded:
+        raise OSError(f"cannot encode a picture of shape {list(rgb.shape)}")
+    return bytes(data)
 
 
 def _orientation(data: bytes) -> int:

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.data.colmap import import_pycolmap
 from nsvq_lightning.data.demo_room import demo_poses, demo_room, to_srgb
+from nsvq_lightning.data.images import encode_png
 from nsvq_lightning.data.raytrace import Room
 from nsvq_lightning.data.surfaces import Array
 from nsvq_lightning.random import generator
-from nsvq_lightning.report.pictures import write_pixels
 
 __all__ = ["render_view", "write_synthetic_scene"]
 
@@ -105,7 +105,7 @@ def write_synthetic_scene(
         names = [f"view_{i:03d}.png" for i in range(views)]
         (scene / "images").mkdir(parents=True)
         for name, pose in zip(names, poses, strict=True):
-            write_pixels(scene / "images" / name, render_view(room, pose, width, height))
+            (scene / "images" / name).write_bytes(encode_png(render_view(room, pose, width, height)))
         _write_model(scene / "sparse" / "0", lens, names, poses, _surface_points(room, lens, poses, points, seed))
         scene.rename(root)
     return root

@@ -167,20 +167,6 @@ class CompressedScene:
         """Bytes of the plain ``.ply`` of the same scene."""
         return plain_ply_bytes(len(self), self.sh_degree)
 
-    @property
-    def file_bytes(self) -> int:
-        """Bytes of the file: the one it was read from, else the one that level ``paper`` would give."""
-        if self.stored_bytes is not None:
-            return self.stored_bytes
-        from nsvq_lightning.io.nsvq.paper import paper_header
-
-        return paper_header(self).file_bytes
-
-    @property
-    def ratio(self) -> float:
-        """How many times smaller than the plain ``.ply``."""
-        return self.plain_bytes / self.file_bytes
-
     def _look_up(self, name: str) -> NDArray[np.float32]:
         rows: NDArray[np.float32] = self.codebooks[name][self.codes[name]]
         return rows

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from nsvq_lightning.compute.jit import kernel, thread_count
 from nsvq_lightning.compute.memory import INT64, check_array
 
-__all__ = ["AXIS_BITS", "Grid", "morton_keys", "nearest_before", "unmorton"]
+__all__ = ["AXIS_BITS", "Grid", "morton_keys", "nearest_before", "spatial_order", "unmorton"]
 
 AXIS_BITS = 21
 """Bits of a coordinate: three of them make a key of 63."""
@@ -139,3 +139,9 @@ def _search_before(cells, found):  # type: ignore[no-untyped-def]
             elif distance < second:
                 second, next_best = distance, j
         found[i, 0], found[i, 1] = best, next_best
+
+
+def spatial_order(means: NDArray[np.float32]) -> NDArray[np.intp]:
+    """Numbers ``[N]`` of splats in Morton order of their positions ``[N, 3]``; equal ones stay as they are."""
+    cells, _ = Grid.around(means, np.zeros(len(means))).cells(means)
+    return morton_keys(cells, np.full(len(means), AXIS_BITS)).argsort(kind="stable")

@@ -32,7 +32,6 @@ from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.lloyd import best_levels, nearest_level
 from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
 from nsvq_lightning.io.sog_archive import META, SogArchive, picture_shape, write_archive
-from nsvq_lightning.io.splat_order import spatial_order
 from nsvq_lightning.splats.rotations import from_smallest_three, smallest_three, unit
 from nsvq_lightning.splats.sh_degree import sh_coefficients
 
@@ -47,6 +46,8 @@ _FARTHEST = math.log1p(float(np.finfo(np.float32).max))
 
 def in_sog_order(scene: CompressedScene) -> CompressedScene:
     """The splats that a file holds, in its order: Morton order of the positions."""
+    from nsvq_lightning.io.morton import spatial_order  # brings Numba, which readers do without
+
     scene = scene.finite()
     return scene.take(spatial_order(scene.means))
 

@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 from nsvq_lightning.io.clamping import Clamped
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
-from nsvq_lightning.io.splat_order import spatial_order
 from nsvq_lightning.io.spz_frame import MOST_FRACTION, SPZ_VERSIONS, SpzHeader, read_frame, write_frame
 from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.splats.rotations import from_smallest_three, smallest_three, unit
@@ -63,6 +62,8 @@ def in_spz_order(scene: CompressedScene) -> CompressedScene:
 
     The codes of the spherical harmonics come first: equal rows compress best where they are near, in both versions.
     """
+    from nsvq_lightning.io.morton import spatial_order  # brings Numba, which readers do without
+
     scene = scene.finite()
     scene = scene.take(spatial_order(scene.means))
     codes = [scene.codes[name] for name in _ORDER if name in scene.codes]

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric, MetricCollection
 
-from nsvq_lightning.quality.loss import check_pair, ssim
+from nsvq_lightning.quality.loss import ssim
+from nsvq_lightning.quality.ssim import check_pair
 
 __all__ = ["PSNR", "SSIM", "build_lpips", "eight_bit", "image_metrics", "psnr"]
 

@@ -30,7 +30,7 @@ from nsvq_lightning.compute.lanes import (
     vfabs,
 )
 from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat_checked, recycled
-from nsvq_lightning.quality.loss import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
+from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
 
 __all__ = ["l1_dssim"]
 

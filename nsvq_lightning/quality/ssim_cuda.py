@@ -19,7 +19,7 @@ from torch import Tensor
 
 from nsvq_lightning.compute.launch import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
-from nsvq_lightning.quality.loss import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
+from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
 
 __all__ = ["Derivatives", "l1_dssim", "l1_dssim_backward"]
 

@@ -10,11 +10,10 @@ from numba import prange
 from torch import Tensor
 
 from nsvq_lightning.compute.jit import kernel, thread_count
-from nsvq_lightning.quantize.far_rows import spread_rows
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.quantize.sums import sum_by_code
 
-__all__ = ["distinct_rows", "kmeans"]
+__all__ = ["distinct_rows", "draw_far_rows", "kmeans", "rows_far_apart"]
 
 AllReduce = Callable[[Tensor], Tensor]
 """Sum of a tensor over the processes."""
@@ -44,7 +43,7 @@ def kmeans(
         all_reduce: Sum over processes that hold different rows; then every process must pass the same ``start``.
         start: Initial centroids ``[k, D]``; by default a random sample of the distinct rows.
         spread: Without ``start``: start from distinct rows far apart
-            (:func:`~nsvq_lightning.quantize.far_rows.spread_rows`) instead.
+            (:func:`~nsvq_lightning.quantize.kmeans.rows_far_apart`) instead.
 
     Returns:
         Centroids ``[k', D]`` with k' = min(k, number of distinct rows); where k is not smaller, the distinct rows
@@ -61,7 +60,7 @@ def kmeans(
         first = distinct_rows(x)
         if len(first) <= k:
             return x[first]
-        start = spread_rows(x[first], k, generator) if spread else _sample(x[first], k, generator)
+        start = rows_far_apart(x[first], k, generator) if spread else _sample(x[first], k, generator)
     centroids = start.detach().clone()
     for _ in range(steps):
         centroids = _lloyd_step(x, centroids, weight, all_reduce)
@@ -133,3 +132,41 @@ def _hash_rows(bits, hashes):  # type: ignore[no-untyped-def]
             value = (value ^ np.uint64(bits[i, j])) * np.uint64(0xBF58476D1CE4E5B9)
             value ^= value >> np.uint64(29)
         hashes[i] = value
+
+
+_ROUNDS = 3
+"""A spread start doubles its rows this often."""
+
+
+def draw_far_rows(rows: Tensor, codebook: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Numbers ``[count]`` of different rows, each drawn with a chance that grows with its squared distance to its code.
+
+    This is the D² sampling of k-means++ (Arthur and Vassilvitskii 2007), many rows at a time and without replacement.
+
+    Args:
+        rows: Rows ``[N, D]``.
+        codebook: Codes ``[K, D]``.
+        count: Rows wanted; fewer come where fewer have a distance to their code.
+        generator: Source of the draw.
+    """
+    squared = (rows - codebook[nearest(rows, codebook)]).square().sum(1).double()
+    # The largest of w / e with e ~ Exp(1) are a draw without replacement with chances w (Efraimidis and Spirakis 2006).
+    draws = torch.empty(len(rows), dtype=torch.float64, device=generator.device).exponential_(generator=generator)
+    return (squared / draws.to(rows.device)).topk(min(count, int((squared > 0).sum()))).indices
+
+
+def rows_far_apart(rows: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """``[count, D]`` of different rows ``[N, D]``, N ≥ count, that reach into all corners: a start for k-means.
+
+    An eighth is a random sample; then each round draws as many far rows as there are already. Rows too close to those
+    for their squared distance to be above 0 come last.
+    """
+    shuffled = torch.randperm(len(rows), generator=generator, device=generator.device).to(rows.device)
+    chosen = shuffled[: -(-count // 2**_ROUNDS)]
+    while len(chosen) < count:
+        far = draw_far_rows(rows, rows[chosen], min(len(chosen), count - len(chosen)), generator)
+        if len(far) == 0:
+            rest = shuffled[~torch.isin(shuffled, chosen)]
+            return rows[torch.cat([chosen, rest[: count - len(chosen)]])]
+        chosen = torch.cat([chosen, far])
+    return rows[chosen]

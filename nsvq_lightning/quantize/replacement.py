@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from nsvq_lightning.quantize.far_rows import draw_far_rows
+from nsvq_lightning.quantize.kmeans import draw_far_rows
 from nsvq_lightning.quantize.nearest import nearest
 
 __all__ = ["choose_replacements", "copy_codes", "inactive_codes", "split_codes"]
@@ -48,7 +48,7 @@ def copy_codes(active: Tensor, count: int, generator: torch.Generator) -> Tensor
 def split_codes(active: Tensor, rows: Tensor, count: int, jitter: float, generator: torch.Generator) -> Tensor:
     """New codes next to those active ones that distort the rows most, each where it takes rows over at once.
 
-    For each far row x that is drawn (:func:`~nsvq_lightning.quantize.far_rows.draw_far_rows`) its code c is split: the
+    For each far row x that is drawn (:func:`~nsvq_lightning.quantize.kmeans.draw_far_rows`) its code c is split: the
     new code c + jitter · (x − c) is by that share of the cell's radius away from c. So codes are split in proportion to
     their share of the distortion.
 

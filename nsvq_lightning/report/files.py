@@ -15,8 +15,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import read_header
 from nsvq_lightning.io.nsvq.paper import paper_header
 from nsvq_lightning.report.evaluation import ViewScore
-from nsvq_lightning.report.figures import new_figure, write_figure
-from nsvq_lightning.report.tables import write_csv
+from nsvq_lightning.report.figures import new_figure, write_csv, write_figure
 from nsvq_lightning.training.host import SplatHost
 from nsvq_lightning.training.schedule import Phase, Schedule
 

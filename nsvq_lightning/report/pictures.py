@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from nsvq_lightning.data.images import encode_png
 from nsvq_lightning.io.atomic import atomic_write
 
-__all__ = ["comparison", "file_stem", "write_pixels", "write_png"]
+__all__ = ["comparison", "file_stem", "write_png"]
 
 
 def file_stem(name: str) -> str:
@@ -37,18 +35,6 @@ def write_png(path: Path, image: Tensor) -> None:
     Raises:
         OSError: The image could not be encoded.
     """
-    write_pixels(path, (image.clamp(0.0, 1.0) * 255).round().to(torch.uint8).cpu().numpy())
-
-
-def write_pixels(path: Path, rgb: NDArray[np.uint8]) -> None:
-    """Write RGB bytes ``[H, W, 3]`` as PNG, atomically.
-
-    Raises:
-        OSError: The image could not be encoded.
-    """
-    # Not imwrite, which on Windows fails on names outside the locale's character set.
-    encoded, data = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))
-    if not encoded:
-        raise OSError(f"cannot encode {path}: image of shape {list(rgb.shape)}")
+    data = encode_png((image.clamp(0.0, 1.0) * 255).round().to(torch.uint8).cpu().numpy())
     with atomic_write(path) as file:
-        file.write(data.tobytes())
+        file.write(data)

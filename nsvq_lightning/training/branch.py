@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from nsvq_lightning.splats.splats import ATTRIBUTES, sh_degree_of
 from nsvq_lightning.training.schedule import Phase, Schedule
-
-if TYPE_CHECKING:
-    from nsvq_lightning.training.model import SplatModel
 
 __all__ = [
     "QUANTIZER_SETTINGS",
@@ -112,12 +109,15 @@ def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str |
     )
 
 
-def check_continuation(checkpoint: Mapping[str, Any], module: SplatModel) -> None:
+def check_continuation(
+    checkpoint: Mapping[str, Any], own: Mapping[str, Tensor], quantizers: Mapping[str, Mapping[str, Any]]
+) -> None:
     """Check that a module can be trained on from a checkpoint.
 
     Args:
         checkpoint: The checkpoint, codebooks exchanged where they may be (:func:`branch_checkpoint`).
-        module: The module; numbers of splats may differ, and those of codes where k-means has found fewer rows.
+        own: Its ``state_dict()``; numbers of splats may differ, and those of codes where k-means has found fewer rows.
+        quantizers: Its quantizers' class and number of codes by attribute, as asked for.
 
     Raises:
         ValueError: It holds weights only, or is of a module with other settings.
@@ -127,7 +127,7 @@ def check_continuation(checkpoint: Mapping[str, Any], module: SplatModel) -> Non
             "the checkpoint holds weights without the state of the optimiser, so that training cannot go on from it; "
             "export its scene and start from that (--model.init_from=scene.ply)"
         )
-    state, own = checkpoint["state_dict"], module.state_dict()
+    state = checkpoint["state_dict"]
     degrees = [sh_degree_of(values[f"{SPLATS}shN"]) for values in (state, own)]
     if degrees[0] != degrees[1]:
         raise ValueError(
@@ -135,10 +135,10 @@ def check_continuation(checkpoint: Mapping[str, Any], module: SplatModel) -> Non
             f"--model.sh_degree={degrees[0]}"
         )
     trained = checkpoint.get(QUANTIZER_SETTINGS)
-    if trained is not None and trained != module.quantizer_settings and not _is_unquantized(checkpoint):
+    if trained is not None and trained != quantizers and not _is_unquantized(checkpoint):
         raise ValueError(
             f"the checkpoint has quantized with {_described(trained)}, and this run would with "
-            f"{_described(module.quantizer_settings)}; that can change before the quantize phase only: pass "
+            f"{_described(quantizers)}; that can change before the quantize phase only: pass "
             f"{_options(trained)}, or a checkpoint from before it"
         )
     # Side tables of the splats come and go.

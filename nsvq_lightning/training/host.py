@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import torch
 from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor
-from torch.optim import Optimizer
 
-from nsvq_lightning.compression.importance import contributions
 from nsvq_lightning.protocols import missing_members
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.rendering.camera import Camera
@@ -28,14 +26,7 @@ __all__ = [
     "SplatHost",
     "as_host",
     "check_optimizer",
-    "from_first_process",
-    "log_interval",
-    "next_iteration",
-    "raw_optimizer",
     "splat_host",
-    "sum_over_processes",
-    "train_cameras",
-    "train_contributions",
 ]
 
 
@@ -148,58 +139,3 @@ def check_optimizer(trainer: Trainer, module: LightningModule) -> None:
 def as_host(module: LightningModule) -> SplatHost:
     """The module as a host, unchecked: what the hooks of every step use."""
     return cast(SplatHost, module)
-
-
-def next_iteration(trainer: Trainer) -> int:
-    """1-based number of the iteration that starts (or runs) now; at the end of a step: of the next one."""
-    return trainer.global_step + 1
-
-
-def raw_optimizer(trainer: Trainer) -> Optimizer:
-    """The one optimiser, unwrapped."""
-    return trainer.optimizers[0]
-
-
-def log_interval(trainer: Trainer) -> int:
-    """Iterations between two lines of the loggers."""
-    return max(1, int(getattr(trainer, "log_every_n_steps", 50)))
-
-
-def from_first_process(trainer: Trainer, tensor: Tensor) -> Tensor:
-    """The first process's value of a tensor, on every process; its shape may differ before."""
-    # It travels pickled: from the CPU, or every process would load it onto the first one's device.
-    return tensor if trainer.world_size == 1 else trainer.strategy.broadcast(tensor.cpu()).to(tensor.device)
-
-
-def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:
-    """Sum of a tensor over all processes, written into it; the tensor itself where there is one."""
-    if trainer.world_size == 1:
-        return tensor
-    reduced = trainer.strategy.reduce(tensor, reduce_op="sum")
-    return cast(Tensor, reduced)
-
-
-def train_cameras(trainer: Trainer, host: SplatHost, *, share: bool = False) -> Iterator[Camera]:
-    """Cameras of the train views, on the device of the splats; with ``share`` only this process's part of them.
-
-    Raises:
-        ValueError: The trainer has no data module with a scene.
-    """
-    scene = getattr(getattr(trainer, "datamodule", None), "scene", None)
-    if scene is None:
-        raise ValueError(
-            "contributions of splats and the floor of scales need the train views: fit with a data module that has a "
-            "scene, or leave contribution pruning, weights by contribution and the floor off"
-        )
-    indices = scene.train[trainer.global_rank :: trainer.world_size] if share else scene.train
-    return (scene.cameras[index].to(host.device) for index in indices)
-
-
-def train_contributions(trainer: Trainer, host: SplatHost) -> Tensor:
-    """Blending weight ``[N]`` of each splat in all train views (:mod:`nsvq_lightning.compression.importance`).
-
-    Raises:
-        ValueError: The trainer has no data module with a scene.
-    """
-    cameras = train_cameras(trainer, host, share=True)
-    return sum_over_processes(trainer, contributions(host.splats, cameras, host.render_splats))

@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
+from lightning.pytorch import Trainer
 from torch import Tensor, nn
 from torch.autograd.graph import increment_version
 
@@ -26,6 +27,7 @@ __all__ = [
     "group_lr",
     "param_groups",
     "position_lr",
+    "raw_optimizer",
     "set_columns",
     "set_lr",
 ]
@@ -278,3 +280,8 @@ def find_group(optimizer: torch.optim.Optimizer, name: str) -> dict[str, Any]:
             return group
     names = ", ".join(str(group.get("name")) for group in optimizer.param_groups)
     raise ValueError(f"the optimiser has no parameter group {name!r}, only: {names}")
+
+
+def raw_optimizer(trainer: Trainer) -> torch.optim.Optimizer:
+    """The one optimiser, unwrapped."""
+    return trainer.optimizers[0]

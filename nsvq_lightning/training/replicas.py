@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.strategies import Strategy
 from torch import Tensor, nn
 
-from nsvq_lightning.training.host import from_first_process, raw_optimizer, sum_over_processes
+from nsvq_lightning.training.optim import raw_optimizer
 
-__all__ = ["check_replicas", "checksum", "follow_first"]
+__all__ = ["check_replicas", "checksum", "follow_first", "from_first_process", "sum_over_processes"]
 
 
 def follow_first(strategy: Strategy, module: nn.Module) -> None:
@@ -51,6 +53,20 @@ def check_replicas(trainer: Trainer, event: str) -> None:
         raise RuntimeError(
             f"iteration {trainer.global_step}, after {event}: the replicas of {trainer.world_size} processes differ in "
             f"{', '.join(different)}. A decision was taken from what one process has alone, or the machines compute "
-            "differently: pass it through nsvq_lightning.training.host.sum_over_processes or from_first_process, and "
-            "train on machines of one kind"
+            "differently: pass it through nsvq_lightning.training.replicas.sum_over_processes or from_first_process, "
+            "and train on machines of one kind"
         )
+
+
+def from_first_process(trainer: Trainer, tensor: Tensor) -> Tensor:
+    """The first process's value of a tensor, on every process; its shape may differ before."""
+    # It travels pickled: from the CPU, or every process would load it onto the first one's device.
+    return tensor if trainer.world_size == 1 else trainer.strategy.broadcast(tensor.cpu()).to(tensor.device)
+
+
+def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:
+    """Sum of a tensor over all processes, written into it; the tensor itself where there is one."""
+    if trainer.world_size == 1:
+        return tensor
+    reduced = trainer.strategy.reduce(tensor, reduce_op="sum")
+    return cast(Tensor, reduced)

@@ -37,8 +37,12 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property, lru_cache
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
-__all__ = ["Phase", "Schedule"]
+if TYPE_CHECKING:
+    from lightning.pytorch import Trainer
+
+__all__ = ["Phase", "Schedule", "log_interval", "next_iteration"]
 
 POSITION_DECAY_END = 30_000
 """The position's learning rate falls until here in the paper's run, then stays."""
@@ -226,3 +230,13 @@ def _times(schedule: Schedule, start: float, last: float, stride: float) -> tupl
     """Kept, as callbacks ask in every step."""
     count = math.floor((last - start) / stride + 1e-9) + 1
     return tuple(dict.fromkeys(schedule.iteration(start + k * stride) for k in range(count)))
+
+
+def next_iteration(trainer: Trainer) -> int:
+    """1-based number of the iteration that starts (or runs) now; at the end of a step: of the next one."""
+    return trainer.global_step + 1
+
+
+def log_interval(trainer: Trainer) -> int:
+    """Iterations between two lines of the loggers."""
+    return max(1, int(getattr(trainer, "log_every_n_steps", 50)))

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from nsvq_lightning.callbacks import FreezeCodes
-from nsvq_lightning.callbacks.finite_search import keep_finite_splats
+from nsvq_lightning.callbacks.finite import keep_finite_splats
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training.edit import append_rows, keep_rows

@@ -17,8 +17,7 @@ import pytest
 import torch
 
 from nsvq_lightning.commands.info import main as info
-from nsvq_lightning.compression.picture_error import decibels, picture_error, pictures
-from nsvq_lightning.compression.pictures import cameras_around
+from nsvq_lightning.compression.pictures import cameras_around, decibels, picture_error, pictures
 from nsvq_lightning.io import CompressedScene, FormatError, SplatArrays, load, read_scene, save
 from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.sog import write_sog

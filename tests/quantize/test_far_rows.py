@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.quantize import NSVQ, kmeans
-from nsvq_lightning.quantize.far_rows import draw_far_rows, spread_rows
+from nsvq_lightning.quantize.kmeans import draw_far_rows, rows_far_apart
 from nsvq_lightning.random import generator
 
 
@@ -26,7 +26,7 @@ def test_rows_on_their_codes_are_never_drawn() -> None:
 @pytest.mark.parametrize("count", [1, 7, 8, 63, 64])
 def test_a_spread_start_is_different_rows(count: int) -> None:
     rows = torch.randn(64, 3, generator=generator(0))
-    chosen = spread_rows(rows, count, generator(1))
+    chosen = rows_far_apart(rows, count, generator(1))
     matches = (chosen[:, None] == rows).all(2)
     assert chosen.shape == (count, 3)
     assert (matches.sum(1) == 1).all()
@@ -35,7 +35,7 @@ def test_a_spread_start_is_different_rows(count: int) -> None:
 
 def test_a_spread_start_of_rows_too_close_to_tell_apart_ends() -> None:
     rows = torch.arange(100.0)[:, None] * 1e-25  # squares below float32
-    chosen = spread_rows(rows, 90, generator(1))
+    chosen = rows_far_apart(rows, 90, generator(1))
     assert len(chosen.unique()) == 90
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from nsvq_lightning.training.host import next_iteration
+from nsvq_lightning.training.schedule import next_iteration
 
 SECOND = 1
 """Number of the view in its step that trouble comes with: that of the second process, or the second micro-batch."""

@@ -12,8 +12,9 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.training.edit import append_rows, keep_rows
-from nsvq_lightning.training.host import as_host, raw_optimizer
+from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.optim import raw_optimizer
 
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 Recipe = Callable[..., dict[str, Callback]]

@@ -9,8 +9,9 @@ from conftest import Recipe, RunFactory
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.callbacks import DensityControl, DensityRules
-from nsvq_lightning.training.host import as_host, train_contributions
+from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.train_views import train_contributions
 
 
 class Counts(Callback):

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from llvmlite import binding
 
-from nsvq_lightning import __version__
 from nsvq_lightning.commands.benchmark.settings import usable_cores
+from nsvq_lightning.version import __version__
 
 __all__ = ["describe_machine"]
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from nsvq_lightning.commands.benchmark.row import Row
 from nsvq_lightning.commands.benchmark.settings import Settings
-from nsvq_lightning.report.tables import markdown_table
+from nsvq_lightning.report.figures import markdown_table
 
 __all__ = [
     "as_json",

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from nsvq_lightning.commands.benchmark.workloads import Workload
 from nsvq_lightning.data.colmap import import_pycolmap
+from nsvq_lightning.data.images import encode_png
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.report.pictures import write_pixels
 
 __all__ = ["write_views"]
 
@@ -49,7 +49,7 @@ def write_views(workload: Workload, root: Path, views: int = VIEWS) -> Path:
         name = f"view_{number:03d}.png"
         image = render(workload.splats, Camera(camera.K, viewmat, camera.width, camera.height)).image
         photo = (255 * FADING * image.clamp(0, 1)).round().byte().numpy()
-        write_pixels(root / "images" / name, photo)
+        (root / "images" / name).write_bytes(encode_png(photo))
         pose = pycolmap.Rigid3d(viewmat[:3].double().numpy())
         model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=number), pose)
     for point in workload.splats.means[:POINTS].double().numpy():

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.report.tables import markdown_table
+from nsvq_lightning.report.figures import markdown_table
 
 __all__ = ["Group", "Row", "as_markdown", "grouped", "series_of"]
 

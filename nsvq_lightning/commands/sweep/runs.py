@@ -13,7 +13,7 @@ from nsvq_lightning.commands.sweep.results import Row, as_markdown
 from nsvq_lightning.commands.sweep.settings import trunk_of
 from nsvq_lightning.commands.sweep.training import Runner, Training, TrainingError, run_subprocess
 from nsvq_lightning.io.atomic import write_text
-from nsvq_lightning.report.tables import write_csv
+from nsvq_lightning.report.figures import write_csv
 from nsvq_lightning.training.schedule import Phase
 
 __all__ = ["Sweep"]

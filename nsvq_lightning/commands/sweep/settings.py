@@ -9,12 +9,12 @@ from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from typing import Any
 
-from nsvq_lightning import __version__
 from nsvq_lightning.callbacks import PhaseSchedule
+from nsvq_lightning.commands.configs import resolve_configs
 from nsvq_lightning.commands.fit import SplatCLI
-from nsvq_lightning.commands.main import resolve_configs
 from nsvq_lightning.training.branch import QUANTIZE_RULES
 from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.version import __version__
 
 __all__ = ["BRANCH_CALLBACKS", "Settings", "digest", "resolve", "trunk_of"]
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning import __version__
 from nsvq_lightning.commands.sweep.settings import Settings, digest
 from nsvq_lightning.io.atomic import write_text
+from nsvq_lightning.version import __version__
 
 __all__ = ["Runner", "Training", "TrainingError", "run_subprocess"]
 

@@ -10,7 +10,8 @@ from nsvq_lightning.commands.benchmark.errors import relative_l2
 from nsvq_lightning.commands.benchmark.row import Row
 from nsvq_lightning.commands.benchmark.settings import Settings
 from nsvq_lightning.commands.benchmark.timing import Case, measure, use_threads
-from nsvq_lightning.quality.loss import SSIM_C1, SSIM_C2, SSIM_RADIUS, photometric_loss, ssim_window
+from nsvq_lightning.quality.loss import photometric_loss
+from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, ssim_window
 from nsvq_lightning.random import generator
 
 __all__ = ["run"]

@@ -1,0 +1,50 @@
+"""What structural similarity is made of (Wang et al. 2004): window, constants, and its sum in plain torch."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+__all__ = ["SSIM_C1", "SSIM_C2", "SSIM_RADIUS", "check_pair", "in_range", "plain_ssim", "ssim_window"]
+
+SSIM_RADIUS = 5
+SSIM_SIGMA = 1.5
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+
+
+def ssim_window() -> Tensor:
+    """The 11 taps of the Gaussian window with σ = 1.5, summing to 1; float64."""
+    offsets = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, dtype=torch.float64)
+    taps = torch.exp(-offsets.square() / (2 * SSIM_SIGMA**2))
+    return taps / taps.sum()
+
+
+def check_pair(image: Tensor, target: Tensor) -> None:
+    """Refuse pictures that cannot be compared.
+
+    Raises:
+        ValueError: They are not both ``[H, W, 3]``.
+    """
+    if image.shape != target.shape or image.dim() != 3 or image.shape[-1] != 3:
+        raise ValueError(f"image and target must both be [H, W, 3], got {list(image.shape)} and {list(target.shape)}")
+
+
+def in_range(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Two pictures as floats: the rendered one clamped to [0, 1], bytes of the other scaled to it."""
+    return image.clamp(0.0, 1.0), target.to(image.dtype) / 255 if target.dtype == torch.uint8 else target
+
+
+def plain_ssim(image: Tensor, target: Tensor) -> Tensor:
+    """SSIM of two float pictures ``[H, W, 3]``, a scalar: the mean over pixels and RGB, with zeros around them."""
+    planes = torch.cat([image, target, image * image, target * target, image * target], -1).movedim(-1, 0)[None]
+    channels = planes.shape[1]
+    taps = ssim_window().to(image).expand(channels, 1, -1)
+    planes = functional.conv2d(planes, taps[..., None], padding=(SSIM_RADIUS, 0), groups=channels)
+    planes = functional.conv2d(planes, taps[:, :, None], padding=(0, SSIM_RADIUS), groups=channels)
+    mean_x, mean_y, square_x, square_y, product = planes[0].chunk(5)
+    variance_x, variance_y = square_x - mean_x**2, square_y - mean_y**2
+    covariance = product - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
+    structure = (2 * covariance + SSIM_C2) / (variance_x + variance_y + SSIM_C2)
+    return (luminance * structure).mean()

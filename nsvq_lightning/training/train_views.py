@@ -1,0 +1,41 @@
+"""What callbacks ask of the train views, on all processes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from lightning.pytorch import Trainer
+from torch import Tensor
+
+from nsvq_lightning.compression.importance import contributions
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.training.host import SplatHost
+from nsvq_lightning.training.replicas import sum_over_processes
+
+__all__ = ["train_cameras", "train_contributions"]
+
+
+def train_cameras(trainer: Trainer, host: SplatHost, *, share: bool = False) -> Iterator[Camera]:
+    """Cameras of the train views, on the device of the splats; with ``share`` only this process's part of them.
+
+    Raises:
+        ValueError: The trainer has no data module with a scene.
+    """
+    scene = getattr(getattr(trainer, "datamodule", None), "scene", None)
+    if scene is None:
+        raise ValueError(
+            "contributions of splats and the floor of scales need the train views: fit with a data module that has a "
+            "scene, or leave contribution pruning, weights by contribution and the floor off"
+        )
+    indices = scene.train[trainer.global_rank :: trainer.world_size] if share else scene.train
+    return (scene.cameras[index].to(host.device) for index in indices)
+
+
+def train_contributions(trainer: Trainer, host: SplatHost) -> Tensor:
+    """Blending weight ``[N]`` of each splat in all train views (:mod:`nsvq_lightning.compression.importance`).
+
+    Raises:
+        ValueError: The trainer has no data module with a scene.
+    """
+    cameras = train_cameras(trainer, host, share=True)
+    return sum_over_processes(trainer, contributions(host.splats, cameras, host.render_splats))
