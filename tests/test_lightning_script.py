@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from nsvq_lightning.commands.registry import lightning_script
+from nsvq_lightning.commands import lightning_script
 
 Install = Callable[[str, str], None]
 

@@ -3,7 +3,7 @@
 Numba vectorizes plain loops only when LLVM feels like it; the kernels of this package say what they want instead.
 ``Lanes`` and ``Mask`` are Numba types that hold one LLVM ``<16 x float>`` and ``<16 x i1>``. LLVM turns them into one
 AVX-512, two AVX2 or four NEON/SSE registers, so one source serves every CPU. Operators work between two vectors;
-scalars enter through :func:`splat`. All functions here are intrinsics: they only exist inside ``@njit`` code.
+scalars enter through :func:`broadcast`. All functions here are intrinsics: they only exist inside ``@njit`` code.
 
 Conventions: a memory argument is a pair (one-dimensional contiguous array, element offset); nothing is
 bounds-checked. Floating-point code may be contracted (a·b + c in one rounding), never reassociated, so NaN and
@@ -151,7 +151,7 @@ _operator(operator.invert, Mask, (Mask,), lambda b, x: b.not_(x))
 
 
 @_function(Lanes, 1)
-def splat(context, builder, sig, values):
+def broadcast(context, builder, sig, values):
     """The scalar in every lane."""
     return _broadcast(builder, _VF, context.cast(builder, values[0], sig.args[0], types.float32))
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
 from nsvq_lightning.compute.lanes import (
     WIDTH,
+    broadcast,
     fma,
     fnma,
     get,
@@ -25,7 +26,6 @@ from nsvq_lightning.compute.lanes import (
     load,
     put,
     select,
-    splat,
     store,
     vfabs,
 )
@@ -54,7 +54,7 @@ def row_of(y, planes, pitch):
 @inline
 def clear_row(ring, o, count):
     """Write zeros over some floats."""
-    zero = splat(F(0))
+    zero = broadcast(F(0))
     for x in range(0, count, 16):
         store(ring, o + x, zero)
 
@@ -66,7 +66,7 @@ def take_row(image, target, white, images, y, height, length, pitch):
     if y < 0 or y >= height:
         clear_row(images, o, IMAGES * pitch)
     else:
-        zero, one = splat(F(0)), splat(F(1))
+        zero, one = broadcast(F(0)), broadcast(F(1))
         for x_ in range(0, length, 16):
             # The last vector of a row overlaps the one before instead of running over.
             x = min(x_, length - 16)
@@ -80,12 +80,12 @@ def take_row(image, target, white, images, y, height, length, pitch):
 @inline
 def blur_along(row, o):
     """Eleven taps along a padded row of interleaved RGB (neighbouring pixels are 3 floats apart)."""
-    total = splat(G0) * load(row, o)
-    total = fma(splat(G1), load(row, o - 3) + load(row, o + 3), total)
-    total = fma(splat(G2), load(row, o - 6) + load(row, o + 6), total)
-    total = fma(splat(G3), load(row, o - 9) + load(row, o + 9), total)
-    total = fma(splat(G4), load(row, o - 12) + load(row, o + 12), total)
-    return fma(splat(G5), load(row, o - 15) + load(row, o + 15), total)
+    total = broadcast(G0) * load(row, o)
+    total = fma(broadcast(G1), load(row, o - 3) + load(row, o + 3), total)
+    total = fma(broadcast(G2), load(row, o - 6) + load(row, o + 6), total)
+    total = fma(broadcast(G3), load(row, o - 9) + load(row, o + 9), total)
+    total = fma(broadcast(G4), load(row, o - 12) + load(row, o + 12), total)
+    return fma(broadcast(G5), load(row, o - 15) + load(row, o + 15), total)
 
 
 @inline
@@ -109,13 +109,13 @@ def moments_of_row(images, y, length, pitch, moments):
     for x_ in range(0, length, 16):
         x = min(x_, length - 16)
         o = row_of(y, IMAGES, pitch) + x
-        p, q, tap = load(images, o), load(images, o + pitch), splat(G0)
+        p, q, tap = load(images, o), load(images, o + pitch), broadcast(G0)
         sums = (tap * p, tap * q, tap * fma(p, p, q * q), tap * (p * q))
-        sums = add_pair(images, y, 1, x, pitch, splat(G1), sums)
-        sums = add_pair(images, y, 2, x, pitch, splat(G2), sums)
-        sums = add_pair(images, y, 3, x, pitch, splat(G3), sums)
-        sums = add_pair(images, y, 4, x, pitch, splat(G4), sums)
-        sums = add_pair(images, y, 5, x, pitch, splat(G5), sums)
+        sums = add_pair(images, y, 1, x, pitch, broadcast(G1), sums)
+        sums = add_pair(images, y, 2, x, pitch, broadcast(G2), sums)
+        sums = add_pair(images, y, 3, x, pitch, broadcast(G3), sums)
+        sums = add_pair(images, y, 4, x, pitch, broadcast(G4), sums)
+        sums = add_pair(images, y, 5, x, pitch, broadcast(G5), sums)
         store(moments, PAD + x, sums[0])
         store(moments, pitch + PAD + x, sums[1])
         store(moments, 2 * pitch + PAD + x, sums[2])
@@ -125,8 +125,8 @@ def moments_of_row(images, y, length, pitch, moments):
 @inline
 def similarity_of_row(moments, derivatives, length, pitch, lanes):
     """Sum of SSIM over a row; its derivatives by blurred p, p² and pq into three padded rows."""
-    one, two, c1, c2 = splat(F(1)), splat(F(2)), splat(C1), splat(C2)
-    total = splat(F(0))
+    one, two, c1, c2 = broadcast(F(1)), broadcast(F(2)), broadcast(C1), broadcast(C2)
+    total = broadcast(F(0))
     lane = load(lanes, 0)
     for x_ in range(0, length, 16):
         x = min(x_, length - 16)
@@ -147,7 +147,7 @@ def similarity_of_row(moments, derivatives, length, pitch, lanes):
         store(derivatives, o, by_mean)
         store(derivatives, pitch + o, by_square)
         store(derivatives, 2 * pitch + o, by_product)
-        total = total + select(lane >= splat(F(x_ - x)), similarity, splat(F(0)))
+        total = total + select(lane >= broadcast(F(x_ - x)), similarity, broadcast(F(0)))
     return lane_sum(total)
 
 
@@ -162,19 +162,19 @@ def pair_sum(ring, y, distance, o, pitch):
 def blur_across(ring, y, plane, x, pitch):
     """Eleven taps down the ring, centred on row y, of one derivative plane."""
     o = plane * pitch + x
-    total = splat(G0) * load(ring, row_of(y, DERIVATIVES, pitch) + o)
-    total = fma(splat(G1), pair_sum(ring, y, 1, o, pitch), total)
-    total = fma(splat(G2), pair_sum(ring, y, 2, o, pitch), total)
-    total = fma(splat(G3), pair_sum(ring, y, 3, o, pitch), total)
-    total = fma(splat(G4), pair_sum(ring, y, 4, o, pitch), total)
-    return fma(splat(G5), pair_sum(ring, y, 5, o, pitch), total)
+    total = broadcast(G0) * load(ring, row_of(y, DERIVATIVES, pitch) + o)
+    total = fma(broadcast(G1), pair_sum(ring, y, 1, o, pitch), total)
+    total = fma(broadcast(G2), pair_sum(ring, y, 2, o, pitch), total)
+    total = fma(broadcast(G3), pair_sum(ring, y, 3, o, pitch), total)
+    total = fma(broadcast(G4), pair_sum(ring, y, 4, o, pitch), total)
+    return fma(broadcast(G5), pair_sum(ring, y, 5, o, pitch), total)
 
 
 @inline
 def gradient_of_row(image, gradient, images, ring, y, length, pitch, l1_step, ssim_step, lanes):
     """Gradient of the loss at row y, 0 where the image was clamped; returns the row's sum of absolute differences."""
-    zero, one, two = splat(F(0)), splat(F(1)), splat(F(2))
-    step, scale = splat(l1_step), splat(ssim_step)
+    zero, one, two = broadcast(F(0)), broadcast(F(1)), broadcast(F(2))
+    step, scale = broadcast(l1_step), broadcast(ssim_step)
     total = zero
     lane = load(lanes, 0)
     for x_ in range(0, length, 16):
@@ -188,7 +188,7 @@ def gradient_of_row(image, gradient, images, ring, y, length, pitch, l1_step, ss
         raw = load(image, y * length + x)
         inside = (raw >= zero) & (raw <= one)
         store(gradient, y * length + x, select(inside, fnma(scale, g, sign), zero))
-        total = total + select(lane >= splat(F(x_ - x)), vfabs(p - q), zero)
+        total = total + select(lane >= broadcast(F(x_ - x)), vfabs(p - q), zero)
     return lane_sum(total)
 
 

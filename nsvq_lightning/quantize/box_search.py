@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
 from nsvq_lightning.compute.lanes import (
+    broadcast,
     fma,
     get,
     lane_min,
@@ -30,7 +31,6 @@ from nsvq_lightning.compute.lanes import (
     mask_bits,
     put,
     select,
-    splat,
     store,
     vmax,
     vmin,
@@ -63,13 +63,13 @@ class BoxMemory(NamedTuple):
     Attributes:
         last: Code, or ``UNKNOWN``, ``[N]`` int32.
         anchors: Where the row was then, ``[N, D]``.
-        lone: Distance below which there was no code but the last, plus the way of the codes until then, ``[N]`` in
+        clearance: Distance below which there was no code but the last, plus the way of the codes until then, ``[N]`` in
             float64, because ways add up over a whole run.
     """
 
     last: NDArray[np.int32]
     anchors: NDArray[np.float32]
-    lone: NDArray[np.float64]
+    clearance: NDArray[np.float64]
 
 
 def empty_memory(count: int, dim: int) -> BoxMemory:
@@ -80,10 +80,10 @@ def empty_memory(count: int, dim: int) -> BoxMemory:
 @inline
 def _box_distances(dim, boxes, at, x, row):  # type: ignore[no-untyped-def]
     """Squared distances of a query to 16 boxes."""
-    zero = splat(np.float32(0.0))
+    zero = broadcast(np.float32(0.0))
     total = zero
     for j in range(dim):
-        value = splat(get(x, row + j))
+        value = broadcast(get(x, row + j))
         below = load(boxes, at + 32 * j) - value
         above = value - load(boxes, at + 32 * j + 16)
         gap = vmax(vmax(below, above), zero)
@@ -94,9 +94,9 @@ def _box_distances(dim, boxes, at, x, row):  # type: ignore[no-untyped-def]
 @inline
 def _code_distances(dim, codes, leaf, x, row):  # type: ignore[no-untyped-def]
     """Squared distances of a query to the 16 codes of a leaf."""
-    total = splat(np.float32(0.0))
+    total = broadcast(np.float32(0.0))
     for j in range(dim):
-        difference = load(codes, (leaf * dim + j) * 16) - splat(get(x, row + j))
+        difference = load(codes, (leaf * dim + j) * 16) - broadcast(get(x, row + j))
         total = fma(difference, difference, total)
     return total
 
@@ -109,7 +109,7 @@ def _visit_leaf(dim, codes, labels, leaf, x, row, limit, scratch, found):  # typ
     """
     best, label, second = found
     distances = _code_distances(dim, codes, leaf, x, row)
-    bits = mask_bits(distances <= splat(limit))
+    bits = mask_bits(distances <= broadcast(limit))
     if bits != 0:
         store(scratch, 0, distances)
         while bits != 0:
@@ -126,21 +126,21 @@ def _visit_leaf(dim, codes, labels, leaf, x, row, limit, scratch, found):  # typ
 @inline
 def _nearest_node(dim, nodes, x, row):  # type: ignore[no-untyped-def]
     """Node whose box is nearest (0 for a query that is not a number)."""
-    nearest, group_of = splat(np.float32(np.inf)), splat(np.float32(0.0))
+    nearest, group_of = broadcast(np.float32(np.inf)), broadcast(np.float32(0.0))
     for group in range(nodes.size // (32 * dim)):
         distances = _box_distances(dim, nodes, group * 32 * dim, x, row)
-        group_of = select(distances < nearest, splat(np.float32(group)), group_of)
+        group_of = select(distances < nearest, broadcast(np.float32(group)), group_of)
         nearest = vmin(distances, nearest)
-    smallest = splat(lane_min(nearest))
-    group = lane_min(select(nearest <= smallest, group_of, splat(np.float32(np.inf))))
-    lane = mask_bits((nearest <= smallest) & (group_of <= splat(group)))
+    smallest = broadcast(lane_min(nearest))
+    group = lane_min(select(nearest <= smallest, group_of, broadcast(np.float32(np.inf))))
+    lane = mask_bits((nearest <= smallest) & (group_of <= broadcast(group)))
     return np.int64(group) * 16 + lowest_bit(lane)
 
 
 @inline
 def _prove(dim, codebook, x, row, code, memory, travelled):  # type: ignore[no-untyped-def]
     """Whether a bound proves that a row has kept its last code."""
-    _, anchors, lone = memory
+    _, anchors, clearance = memory
     moved = distance = np.float32(0.0)
     for j in range(dim):
         value = get(x, row * dim + j)
@@ -148,19 +148,19 @@ def _prove(dim, codebook, x, row, code, memory, travelled):  # type: ignore[no-u
         moved += from_anchor * from_anchor
         distance += from_code * from_code
     way = (np.float64(np.sqrt(distance)) + np.float64(np.sqrt(moved))) * ROUNDING
-    return way < get(lone, row) - travelled
+    return way < get(clearance, row) - travelled
 
 
 @inline
 def _remember(dim, x, at, found, memory, row, travelled):  # type: ignore[no-untyped-def]
     """Keep where a row was searched and the distance of the code that was second."""
-    last, anchors, lone = memory
+    last, anchors, clearance = memory
     _, code, second = found
     put(last, row, code)
     for j in range(dim):
         put(anchors, row * dim + j, get(x, at + j))
     # Beyond the largest number in float32 there may still be codes.
-    put(lone, row, np.sqrt(np.float64(min(second, _LARGEST))) / ROUNDING + travelled)
+    put(clearance, row, np.sqrt(np.float64(min(second, _LARGEST))) / ROUNDING + travelled)
 
 
 @inline
@@ -174,14 +174,14 @@ def _guess(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
     for i in range(count):
         node = get(guess, i)
         distances = _box_distances(dim, leaves, node * 32 * dim, x, i * dim)
-        lane = lowest_bit(mask_bits(distances <= splat(lane_min(distances))))
+        lane = lowest_bit(mask_bits(distances <= broadcast(lane_min(distances))))
         put(guess, i, node * 16 + lane)
     for i in range(count):
         leaf = get(guess, i)
         distances = _code_distances(dim, codes, leaf, x, i * dim)
         limit = lane_min(distances)
         if bounded:
-            limit = lane_min(select(distances > splat(limit), distances, splat(infinity)))
+            limit = lane_min(select(distances > broadcast(limit), distances, broadcast(infinity)))
         found = _visit_leaf(dim, codes, labels, leaf, x, i * dim, limit, scratch, (infinity, NO_CODE, infinity))
         put(best, i, found[0])
         put(label, i, found[1])
@@ -210,7 +210,7 @@ def _visit_near(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
     best, _, second, guess, tasks, _, bounded = state
     pending = 0
     for i in range(count):
-        row, limit = i * dim, splat(get(second, i) if bounded else get(best, i))
+        row, limit = i * dim, broadcast(get(second, i) if bounded else get(best, i))
         for group in range(nodes.size // (32 * dim)):
             near_nodes = mask_bits(_box_distances(dim, nodes, group * 32 * dim, x, row) <= limit)
             while near_nodes != 0:
@@ -300,7 +300,7 @@ def box_search(
     result = np.empty(len(rows), np.int64)
     thread_count()
     tree = (part.ravel() for part in boxes[:4])
-    flat = memory.last, memory.anchors.ravel(), memory.lone
+    flat = memory.last, memory.anchors.ravel(), memory.clearance
     if _search_kernel(x.shape[1])(x.ravel(), rows, codebook.ravel(), *tree, flat, float(travelled), result):
         raise outside("rows", rows, len(x))
     return result
@@ -313,4 +313,4 @@ def _check_memory(memory: BoxMemory, x: NDArray[np.float32]) -> None:
         raise ValueError(f"memory must have the {len(x)} rows of x, got {count}")
     check_array("memory.last", memory.last, (count,), INT32)
     check_array("memory.anchors", memory.anchors, (count, x.shape[1]), FLOAT32)
-    check_array("memory.lone", memory.lone, (count,), FLOAT64)
+    check_array("memory.clearance", memory.clearance, (count,), FLOAT64)

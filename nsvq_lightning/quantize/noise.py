@@ -12,7 +12,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
-from nsvq_lightning.compute.lanes import fma, load, log2, splat, store, vsqrt
+from nsvq_lightning.compute.lanes import broadcast, fma, load, log2, store, vsqrt
 
 __all__ = ["COS", "MULTIPLIERS", "SIN", "draw_seed", "fill_normal", "normal_vectors"]
 
@@ -50,16 +50,16 @@ def _uniforms(seed, pair, radius, angle):  # type: ignore[no-untyped-def]
 
 @inline
 def _cosine(t):  # type: ignore[no-untyped-def]
-    value = fma(splat(_C0), t, splat(_C1))
-    value = fma(fma(value, t, splat(_C2)), t, splat(_C3))
-    return fma(fma(value, t, splat(_C4)), t, splat(_C5))
+    value = fma(broadcast(_C0), t, broadcast(_C1))
+    value = fma(fma(value, t, broadcast(_C2)), t, broadcast(_C3))
+    return fma(fma(value, t, broadcast(_C4)), t, broadcast(_C5))
 
 
 @inline
 def _sine(t):  # type: ignore[no-untyped-def]
-    value = fma(splat(_S0), t, splat(_S1))
-    value = fma(fma(value, t, splat(_S2)), t, splat(_S3))
-    return fma(fma(value, t, splat(_S4)), t, splat(_S5))
+    value = fma(broadcast(_S0), t, broadcast(_S1))
+    value = fma(fma(value, t, broadcast(_S2)), t, broadcast(_S3))
+    return fma(fma(value, t, broadcast(_S4)), t, broadcast(_S5))
 
 
 @inline
@@ -70,7 +70,7 @@ def fill_normal(seed, first, count, out, radius, angle):  # type: ignore[no-unty
     """
     for pair in range(count // 2):
         _uniforms(seed, (first // 2 + pair) * 16, radius, angle)
-        length = vsqrt(log2(load(radius, 0)) * splat(_MINUS_TWO_LN2))
+        length = vsqrt(log2(load(radius, 0)) * broadcast(_MINUS_TWO_LN2))
         turn = load(angle, 0)
         store(out, pair * 32, length * _cosine(turn * turn))
         store(out, pair * 32 + 16, length * (turn * _sine(turn * turn)))

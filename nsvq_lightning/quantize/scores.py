@@ -18,7 +18,19 @@ from numba import prange
 from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
-from nsvq_lightning.compute.lanes import fma, fnma, get, lane_min, load, lowest_bit, mask_bits, put, splat, store, vmin
+from nsvq_lightning.compute.lanes import (
+    broadcast,
+    fma,
+    fnma,
+    get,
+    lane_min,
+    load,
+    lowest_bit,
+    mask_bits,
+    put,
+    store,
+    vmin,
+)
 from nsvq_lightning.compute.memory import FLOAT32, aligned_empty, check_array, check_table
 
 __all__ = ["LIST", "CentredCodes", "centre_codes", "score_search", "true_distance"]
@@ -102,9 +114,9 @@ def centre_codes(codebook: NDArray[np.float32]) -> CentredCodes:
 @inline
 def true_distance(dim, x, row, codebook, code):  # type: ignore[no-untyped-def]
     """Squared distance as a sum of squared differences in one fixed order; it decides between codes that tie."""
-    total = splat(np.float32(0.0))
+    total = broadcast(np.float32(0.0))
     for j in range(dim):
-        difference = splat(get(codebook, code * dim + j) - get(x, row * dim + j))
+        difference = broadcast(get(codebook, code * dim + j) - get(x, row * dim + j))
         total = fma(difference, difference, total)
     return lane_min(total)
 
@@ -125,7 +137,7 @@ def _insert(scores, codes, at, kept, score, code):  # type: ignore[no-untyped-de
 def _keep(scores, codes, limits, slack, kept, first, block, found):  # type: ignore[no-untyped-def]
     """Insert what is below the limits of 6 rows from their scores ``found`` of a block."""
     for i in range(_GROUP):
-        limit = splat(get(limits, first + i))
+        limit = broadcast(get(limits, first + i))
         below = mask_bits(load(found, 32 * i) < limit) | (mask_bits(load(found, 32 * i + 16) < limit) << 16)
         while below != 0:
             lane = lowest_bit(below)
@@ -145,25 +157,25 @@ def _score_block(dim, blocks, halves, block, rows, first, kept, state):  # type:
     at, row = block * dim * 32, first * dim
     for j in range(dim):
         low, high = load(blocks, at + 32 * j), load(blocks, at + 32 * j + 16)
-        value = splat(get(rows, row + j))
+        value = broadcast(get(rows, row + j))
         a0, b0 = fnma(value, low, a0), fnma(value, high, b0)
-        value = splat(get(rows, row + dim + j))
+        value = broadcast(get(rows, row + dim + j))
         a1, b1 = fnma(value, low, a1), fnma(value, high, b1)
-        value = splat(get(rows, row + 2 * dim + j))
+        value = broadcast(get(rows, row + 2 * dim + j))
         a2, b2 = fnma(value, low, a2), fnma(value, high, b2)
-        value = splat(get(rows, row + 3 * dim + j))
+        value = broadcast(get(rows, row + 3 * dim + j))
         a3, b3 = fnma(value, low, a3), fnma(value, high, b3)
-        value = splat(get(rows, row + 4 * dim + j))
+        value = broadcast(get(rows, row + 4 * dim + j))
         a4, b4 = fnma(value, low, a4), fnma(value, high, b4)
-        value = splat(get(rows, row + 5 * dim + j))
+        value = broadcast(get(rows, row + 5 * dim + j))
         a5, b5 = fnma(value, low, a5), fnma(value, high, b5)
     below = (
-        (vmin(a0, b0) < splat(get(limits, first)))
-        | (vmin(a1, b1) < splat(get(limits, first + 1)))
-        | (vmin(a2, b2) < splat(get(limits, first + 2)))
-        | (vmin(a3, b3) < splat(get(limits, first + 3)))
-        | (vmin(a4, b4) < splat(get(limits, first + 4)))
-        | (vmin(a5, b5) < splat(get(limits, first + 5)))
+        (vmin(a0, b0) < broadcast(get(limits, first)))
+        | (vmin(a1, b1) < broadcast(get(limits, first + 1)))
+        | (vmin(a2, b2) < broadcast(get(limits, first + 2)))
+        | (vmin(a3, b3) < broadcast(get(limits, first + 3)))
+        | (vmin(a4, b4) < broadcast(get(limits, first + 4)))
+        | (vmin(a5, b5) < broadcast(get(limits, first + 5)))
     )
     if mask_bits(below) != 0:
         store(found, 0, a0)
@@ -260,10 +272,10 @@ def _search_kernel(dim: int) -> Any:
                         lists[row * LIST + k] = codes[at + k] if scores[at + k] < np.float32(np.inf) else codes[at]
                     distances[row] = np.sqrt(max(np.float32(0.0), squared[i] + np.float32(2.0) * (others - margin)))
                     second = scores[at + 1]
-                    lone = np.float32(0.0)
+                    clearance = np.float32(0.0)
                     if second > limit:
-                        lone = np.sqrt(max(np.float32(0.0), squared[i] + np.float32(2.0) * (second - margin)))
-                    distances[count + row] = lone
+                        clearance = np.sqrt(max(np.float32(0.0), squared[i] + np.float32(2.0) * (second - margin)))
+                    distances[count + row] = clearance
 
     return kernel(search)
 

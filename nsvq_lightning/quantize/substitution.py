@@ -19,7 +19,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
-from nsvq_lightning.compute.lanes import fma, get, lane_sum, load, put, select, splat, store, vsqrt
+from nsvq_lightning.compute.lanes import broadcast, fma, get, lane_sum, load, put, select, store, vsqrt
 from nsvq_lightning.compute.memory import FLOAT32, INT64, check_array, check_table, outside, recycled
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside
 from nsvq_lightning.quantize.noise import fill_normal
@@ -70,7 +70,7 @@ def _part(dim, x, rows, codebook, codes, part, parts):  # type: ignore[no-untype
 @inline
 def _dots(dim, a, b):  # type: ignore[no-untyped-def]
     """Products of rows with rows, one a lane."""
-    total = splat(np.float32(0.0))
+    total = broadcast(np.float32(0.0))
     for j in range(dim):
         total = fma(load(a, 16 * j), load(b, 16 * j), total)
     return total
@@ -78,7 +78,7 @@ def _dots(dim, a, b):  # type: ignore[no-untyped-def]
 
 @inline
 def _residuals_squared(dim, rows, chosen):  # type: ignore[no-untyped-def]
-    total = splat(np.float32(0.0))
+    total = broadcast(np.float32(0.0))
     for j in range(dim):
         residual = load(rows, 16 * j) - load(chosen, 16 * j)
         total = fma(residual, residual, total)
@@ -88,13 +88,13 @@ def _residuals_squared(dim, rows, chosen):  # type: ignore[no-untyped-def]
 @inline
 def _inverses(squared):  # type: ignore[no-untyped-def]
     """1/s, and 0 where s is 0 (or its inverse too large): a vector without length has no direction."""
-    return select(squared > splat(_TINY), splat(np.float32(1.0)) / squared, splat(np.float32(0.0)))
+    return select(squared > broadcast(_TINY), broadcast(np.float32(1.0)) / squared, broadcast(np.float32(0.0)))
 
 
 @inline
 def _dot_difference(dim, g, at_g, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
     """Product of a long row with a difference. ``keep`` leaves out what the last two vectors have in common."""
-    total = splat(np.float32(0.0))
+    total = broadcast(np.float32(0.0))
     for j in range(0, dim // 16 * 16, 16):
         total = fma(load(g, at_g + j), load(a, at_a + j) - load(b, at_b + j), total)
     if dim % 16:
@@ -105,7 +105,7 @@ def _dot_difference(dim, g, at_g, a, at_a, b, at_b, keep):  # type: ignore[no-un
 
 @inline
 def _residual_squared(dim, x, at, codebook, code, keep):  # type: ignore[no-untyped-def]
-    total = splat(np.float32(0.0))
+    total = broadcast(np.float32(0.0))
     for j in range(0, dim // 16 * 16, 16):
         residual = load(x, at + j) - load(codebook, code + j)
         total = fma(residual, residual, total)
@@ -134,10 +134,10 @@ def _short_forward(dim: int) -> Any:
                 _copy_in(dim, x, rows, first, valid, values)
                 _copy_in(dim, codebook, codes, first, valid, chosen)
                 at = (first - block * _ROWS) * dim
-                error, squared = splat(np.float32(0.0)), splat(np.float32(0.0))
+                error, squared = broadcast(np.float32(0.0)), broadcast(np.float32(0.0))
                 for j in range(dim):
                     residual = load(chosen, 16 * j) - load(values, 16 * j)
-                    direction = fma(splat(aim), residual, splat(spread) * load(noise, at + 16 * j))
+                    direction = fma(broadcast(aim), residual, broadcast(spread) * load(noise, at + 16 * j))
                     store(noise, at + 16 * j, direction)
                     error, squared = fma(residual, residual, error), fma(direction, direction, squared)
                 length = vsqrt(error * _inverses(squared))
@@ -167,16 +167,16 @@ def _long_forward(dim: int) -> Any:
                 if start == 0:
                     fill_normal(seed, i * vectors, 2 * vectors, noise, radius, angle)
                 at, code = get(rows, i) * dim, get(codes, i) * dim
-                error, squared = splat(np.float32(0.0)), splat(np.float32(0.0))
+                error, squared = broadcast(np.float32(0.0)), broadcast(np.float32(0.0))
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
                     residual = load(codebook, code + place) - load(x, at + place)
-                    way = fma(splat(aim), residual, splat(spread) * load(noise, start + place))
+                    way = fma(broadcast(aim), residual, broadcast(spread) * load(noise, start + place))
                     store(direction, place, way)
                     if j == vectors - 1:
                         residual, way = residual * load(keep, 0), way * load(keep, 0)
                     error, squared = fma(residual, residual, error), fma(way, way, squared)
-                length = splat(np.sqrt(lane_sum(error) * _inverse(lane_sum(squared))))
+                length = broadcast(np.sqrt(lane_sum(error) * _inverse(lane_sum(squared))))
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
                     store(out, i * dim + place, fma(length, load(direction, place), load(x, at + place)))
@@ -245,7 +245,7 @@ def _long_backward(dim: int) -> Any:
                 last = load(total, code + dim - 16)
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
-                    radial = splat(scale) * (load(x, at + place) - load(codebook, code + place))
+                    radial = broadcast(scale) * (load(x, at + place) - load(codebook, code + place))
                     store(grad_x, at + place, load(grad, i * dim + place) + radial)
                     before = last if j == vectors - 1 else load(total, code + place)
                     store(total, code + place, before - radial)

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
 from nsvq_lightning.compute.lanes import (
+    broadcast,
     fma,
     get,
     lane_min,
@@ -31,7 +32,6 @@ from nsvq_lightning.compute.lanes import (
     lowest_bit,
     mask_bits,
     put,
-    splat,
     store,
 )
 from nsvq_lightning.compute.memory import INT64, check_array
@@ -56,10 +56,10 @@ Floats = NDArray[np.float32]
 @inline
 def _squares(dim, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
     """Squared differences of two rows, to be summed. ``keep`` leaves out where the last two vectors overlap."""
-    total = splat(np.float32(0.0))
+    total = broadcast(np.float32(0.0))
     if dim < 16:
         for j in range(dim):
-            difference = splat(get(a, at_a + j) - get(b, at_b + j)) * load(keep, 0)
+            difference = broadcast(get(a, at_a + j) - get(b, at_b + j)) * load(keep, 0)
             total = fma(difference, difference, total)
         return total
     for j in range(0, dim // 16 * 16, 16):
@@ -129,7 +129,7 @@ def _check_kernel(dim: int) -> Any:
     """The check for one dimension, a constant for the compiler."""
 
     def check(x, rows, codebook, memory, keep, travelled, drift, result):  # type: ignore[no-untyped-def]
-        last, lists, anchors, lone, limits = memory
+        last, lists, anchors, clearance, limits = memory
         way = travelled + drift
         for block in prange((rows.shape[0] + _BLOCK - 1) // _BLOCK):
             unused, scratch = np.zeros(16, np.float32), np.empty(16, np.float32)
@@ -142,14 +142,14 @@ def _check_kernel(dim: int) -> Any:
                     continue
                 moved = np.float64(np.sqrt(lane_sum(_squares(dim, x, at, anchors, at, keep)))) * ROUNDING
                 distance = np.sqrt(lane_sum(_squares(dim, x, at, codebook, code * dim, keep)))
-                if np.float64(distance) * ROUNDING + moved < get(lone, row) - way:
+                if np.float64(distance) * ROUNDING + moved < get(clearance, row) - way:
                     put(result, i, code)
                     continue
                 squared = _list_squared(dim, x, at, codebook, lists, start, keep) + load(unused, 0)
                 best = lane_min(squared)
                 distance = np.sqrt(best)
                 if np.float64(distance) * ROUNDING + moved < get(limits, row) - way:
-                    near = mask_bits(squared <= splat(best * np.float32(ROUNDING)))
+                    near = mask_bits(squared <= broadcast(best * np.float32(ROUNDING)))
                     code = _settle(dim, x, row, codebook, lists, start, near)
                     put(result, i, code)
                     put(last, row, np.int32(code))
@@ -160,7 +160,7 @@ def _check_kernel(dim: int) -> Any:
                             put(anchors, at + j, get(x, at + j))
                         limit = get(limits, row) - moved
                         put(limits, row, limit)
-                        put(lone, row, min(limit, second / ROUNDING - drift + travelled))
+                        put(clearance, row, min(limit, second / ROUNDING - drift + travelled))
 
     return kernel(check)
 
@@ -206,7 +206,7 @@ class NearestTracker:
         self._lists = np.zeros((0, LIST), np.int32)
         self._anchors = np.zeros((0, 0), np.float32)
         # In float64, because ways add up over a whole run.
-        self._lone, self._limits = np.zeros(0), np.zeros(0)
+        self._clearance, self._limits = np.zeros(0), np.zeros(0)
 
     def search(self, x: Tensor, codebook: Tensor, rows: Tensor | None = None) -> Tensor:
         """Nearest codes, the result of :func:`nearest` for the chosen rows.
@@ -244,12 +244,14 @@ class NearestTracker:
         boxes = build_boxes(codebook, self._order if self._steps % _BOX_STEPS else None)
         self._order = boxes.order
         self._drift(codebook, 1)
-        return box_search(x, codebook, boxes, rows, BoxMemory(self._last, self._anchors, self._lone), self._travelled)
+        return box_search(
+            x, codebook, boxes, rows, BoxMemory(self._last, self._anchors, self._clearance), self._travelled
+        )
 
     def _search_lists(self, x: Floats, codebook: Floats, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         drift = self._drift(codebook, _SNAPSHOT_STEPS)
         result = np.empty(len(rows), np.int64)
-        memory = self._last, self._lists.ravel(), self._anchors.ravel(), self._lone, self._limits
+        memory = self._last, self._lists.ravel(), self._anchors.ravel(), self._clearance, self._limits
         dim = x.shape[1]
         thread_count()
         _check_kernel(dim)(x.ravel(), rows, codebook.ravel(), memory, _overlap(dim), self._travelled, drift, result)
@@ -261,7 +263,7 @@ class NearestTracker:
             found, lists, distances = score_search(x[where], centre_codes(codebook), with_lists=True)
             self._last[where] = result[unsure] = found
             self._lists[where], self._anchors[where] = lists, x[where]
-            self._limits[where], self._lone[where] = distances / ROUNDING - drift + self._travelled
+            self._limits[where], self._clearance[where] = distances / ROUNDING - drift + self._travelled
         return result
 
     def _drift(self, codebook: Floats, every: int) -> float:
@@ -288,8 +290,8 @@ class NearestTracker:
             return
         with_lists, dim = self._codebook_shape[1] > MAX_DIM, self._codebook_shape[1]
         more = empty_memory(count - old, dim)
-        self._last, self._lone = np.append(self._last, more.last), np.append(self._lone, more.lone)
+        self._last, self._clearance = np.append(self._last, more.last), np.append(self._clearance, more.clearance)
         self._anchors = np.append(self._anchors.reshape(old, dim), more.anchors, 0)
         if with_lists:
             self._lists = np.append(self._lists, np.zeros((count - old, LIST), np.int32), 0)
-            self._limits = np.append(self._limits, more.lone)
+            self._limits = np.append(self._limits, more.clearance)

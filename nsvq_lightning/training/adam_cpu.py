@@ -15,7 +15,7 @@ from numba import prange
 from torch import Tensor
 
 from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
-from nsvq_lightning.compute.lanes import any_lane, fma, get, load, prefetch, put, select, splat, store, vsqrt
+from nsvq_lightning.compute.lanes import any_lane, broadcast, fma, get, load, prefetch, put, select, store, vsqrt
 from nsvq_lightning.compute.memory import Array, Workspace, flat_checked
 
 __all__ = ["adam_update"]
@@ -40,9 +40,9 @@ def update(weights, gradients, firsts, seconds, o, factors, chosen):
         prefetch(table, o + AHEAD)
     step, gain, decay, fresh, root, eps = factors
     weight, gradient, first, second = load(weights, o), load(gradients, o), load(firsts, o), load(seconds, o)
-    mean = fma(splat(gain), gradient - first, first)
-    square = fma(splat(decay), second, splat(fresh) * (gradient * gradient))
-    moved = weight - splat(step) * mean / fma(vsqrt(square), splat(root), splat(eps))
+    mean = fma(broadcast(gain), gradient - first, first)
+    square = fma(broadcast(decay), second, broadcast(fresh) * (gradient * gradient))
+    moved = weight - broadcast(step) * mean / fma(vsqrt(square), broadcast(root), broadcast(eps))
     store(weights, o, select(chosen, moved, weight))
     store(firsts, o, select(chosen, mean, first))
     store(seconds, o, select(chosen, square, second))
@@ -66,7 +66,7 @@ def update_all(threads, weights, gradients, firsts, seconds, packed):
     vectors = weights.shape[0] // WIDTH
     for thread in prange(threads):
         factors = unpack(packed)
-        every = splat(F(1)) > splat(F(0))
+        every = broadcast(F(1)) > broadcast(F(0))
         for i in range(vectors * thread // threads, vectors * (thread + 1) // threads):
             update(weights, gradients, firsts, seconds, WIDTH * i, factors, every)
         if thread == threads - 1:
@@ -79,7 +79,7 @@ def update_columns(threads, rows, stride, columns, weights, gradients, firsts, s
     """The leading ``columns`` of each row, and what shares a vector with them; at most ``stride`` in all."""
     for thread in prange(threads):
         factors = unpack(packed)
-        every = splat(F(1)) > splat(F(0))
+        every = broadcast(F(1)) > broadcast(F(0))
         for row in range(rows * thread // threads, rows * (thread + 1) // threads):
             for k in range(0, columns, WIDTH):
                 update(weights, gradients, firsts, seconds, row * stride + k, factors, every)
@@ -88,7 +88,7 @@ def update_columns(threads, rows, stride, columns, weights, gradients, firsts, s
 @inline
 def has_gradient(gradients, o, columns):
     """Whether any of some numbers is not 0; what is not a number counts too."""
-    zero = splat(F(0))
+    zero = broadcast(F(0))
     if columns >= WIDTH:
         for k in range(0, columns, WIDTH):
             # The last vector overlaps the one before.
@@ -110,7 +110,7 @@ def mark_rows(gradients, o, rows, columns, marks):
         mark = F(1) if has_gradient(gradients, o + start, columns) else F(0)
         if columns >= WIDTH:
             for k in range(0, columns, WIDTH):
-                store(marks, start + min(k, columns - WIDTH), splat(mark))
+                store(marks, start + min(k, columns - WIDTH), broadcast(mark))
         else:
             for k in range(start, start + columns):
                 put(marks, k, mark)
@@ -129,7 +129,7 @@ def update_rows(threads, rows, stride, weights, gradients, firsts, seconds, pack
             mark_rows(gradients, o, here, stride, marks)
             whole = here * stride // WIDTH * WIDTH
             for k in range(0, whole, WIDTH):
-                chosen = load(marks, k) > splat(F(0))
+                chosen = load(marks, k) > broadcast(F(0))
                 if any_lane(chosen):
                     update(weights, gradients, firsts, seconds, o + k, factors, chosen)
             for k in range(whole, here * stride):

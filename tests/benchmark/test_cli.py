@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from nsvq_lightning.commands import main as front_end
 from nsvq_lightning.commands.benchmark import cli, timing
 from nsvq_lightning.commands.benchmark.registry import SUITES
 from nsvq_lightning.commands.benchmark.report import fill_in
 from nsvq_lightning.commands.benchmark.suites import loss
 from nsvq_lightning.commands.registry import COMMANDS
-from nsvq_lightning.commands.registry import main as front_end
 from nsvq_lightning.skips import SKIPS
 
 SMALL = ["loss", "--quick", "--repeats", "1", "--threads", "1"]

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nsvq_lightning.commands import main as cli
 from nsvq_lightning.commands.info import main
-from nsvq_lightning.commands.registry import main as cli
 from nsvq_lightning.io import CompressedScene, SplatArrays, write_nsvq, write_ply
 
 

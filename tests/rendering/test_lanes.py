@@ -32,8 +32,8 @@ def test_operators(values: Array) -> None:
         lanes.store(out, 32, x * y)
         lanes.store(out, 48, x / y)
         lanes.store(out, 64, -x)
-        lanes.store(out, 80, lanes.fma(x, y, lanes.splat(a[40])))
-        lanes.store(out, 96, lanes.fnma(x, y, lanes.splat(a[40])))
+        lanes.store(out, 80, lanes.fma(x, y, lanes.broadcast(a[40])))
+        lanes.store(out, 96, lanes.fnma(x, y, lanes.broadcast(a[40])))
 
     x, y, z = values[:16], values[16:32], np.float64(values[40])
     out = run(kernel, values, outputs=7)

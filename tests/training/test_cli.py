@@ -13,9 +13,9 @@ import pytest
 import torch
 import yaml
 
+from nsvq_lightning.commands import main as cli
 from nsvq_lightning.commands.configs import _without_folder, check_config, find_config, resolve_configs
 from nsvq_lightning.commands.main import main
-from nsvq_lightning.commands.registry import main as cli
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.skips import is_on

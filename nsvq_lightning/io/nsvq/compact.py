@@ -30,6 +30,7 @@ import math
 import struct
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -104,7 +105,7 @@ def encode_compact(scene: CompressedScene, precision: Precision | None = None) -
     precision = precision or Precision()
     _check_finite({"means": scene.means, "opacities": scene.opacities, **scene.raw})
     dims = attribute_dims(scene.sh_degree)
-    stored = _all_of({name: _bind(_stored, scene, name, dim, precision) for name, dim in dims.items()})
+    stored = _all_of({name: partial(_stored, scene, name, dim, precision) for name, dim in dims.items()})
     stored["opacities"] = _levels(scene.opacities, precision.opacity_levels)
     sums, step = stored["scales"].rows().sum(1), stored["scales"].entry.step
     size = np.exp(np.minimum(sums * (step / 3), _LARGEST_LOG_SIZE))
@@ -128,8 +129,8 @@ def encode_compact(scene: CompressedScene, precision: Precision | None = None) -
     tasks: dict[str, Callable[[], bytes]] = {}
     for name, attribute in stored.items():
         if attribute.codebook is not None:
-            tasks[f"{name}.codebook"] = _bind(encode_integers, attribute.codebook)
-        tasks[name] = _bind(_encode_values, attribute, neighbours.get(name, others))
+            tasks[f"{name}.codebook"] = partial(encode_integers, attribute.codebook)
+        tasks[name] = partial(_encode_values, attribute, neighbours.get(name, others))
     streams |= _all_of(tasks)
     entries = {name: attribute.entry for name, attribute in stored.items()}
     entries["means"] = AttributeEntry("means", 3, "grid", step=grid.step)
@@ -158,7 +159,7 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
     stored = {"scales": _decode(entries["scales"], streams, _before(n))}
     means, others = _decode_means(entries["means"].step, stored["scales"], streams)
     names = [name for name in _ORDER if name not in ("scales", "means")]
-    stored |= _all_of({name: _bind(_decode, entries[name], streams, others) for name in names})
+    stored |= _all_of({name: partial(_decode, entries[name], streams, others) for name in names})
     levels = stored.pop("opacities")
     shares = (np.arange(levels.entry.codes) + 0.5) / levels.entry.codes
     logits = (np.log(shares) - np.log1p(-shares)).astype(np.float32)
@@ -310,13 +311,6 @@ def _all_of(tasks: Mapping[str, Callable[[], _T]]) -> dict[str, _T]:
     with ThreadPoolExecutor(max_workers=torch.get_num_threads()) as pool:
         futures = {name: pool.submit(task) for name, task in tasks.items()}
         return {name: future.result() for name, future in futures.items()}
-
-
-def _bind(function: Callable[..., _T], *arguments: object) -> Callable[[], _T]:
-    return lambda: function(*arguments)
-
-
-# Tables
 
 
 def _stream_names(attributes: tuple[AttributeEntry, ...]) -> list[tuple[str, str]]:

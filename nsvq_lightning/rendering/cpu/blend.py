@@ -17,6 +17,7 @@ from numba import prange
 from nsvq_lightning.compute.jit import F, inline, kernel
 from nsvq_lightning.compute.lanes import (
     any_lane,
+    broadcast,
     column_bits,
     exp2,
     fetch_add,
@@ -32,7 +33,6 @@ from nsvq_lightning.compute.lanes import (
     prefetch,
     put,
     select,
-    splat,
     store,
     store_block,
     store_rgb_block,
@@ -84,7 +84,7 @@ BLOCK_SIDE = 4
 T, T_LEFT, R_SUM, G_SUM, B_SUM, Z_SUM = (256 * plane for plane in range(6))
 FORWARD_SCRATCH = 6 * 256 + (BATCH + 1) * RECORD
 # Vectors a block owns in the scratch of the backward pass.
-B_T, B_REST, B_RED, B_GREEN, B_BLUE, B_DEPTH, B_X, B_Y = (16 * part for part in range(8))
+BACK_T, BACK_REST, BACK_RED, BACK_GREEN, BACK_BLUE, BACK_DEPTH, BACK_X, BACK_Y = (16 * part for part in range(8))
 BLOCK_STATE = 16 * 8
 BACKWARD_SCRATCH = BLOCKS * BLOCK_STATE
 TWO_LN2 = F(2 * np.log(2.0))
@@ -115,7 +115,7 @@ def exponent(a, b, c, u0, v0, peak, x, y):
 @inline
 def highest_exponent(a, b, c, slope_x, slope_y, left, right, top, bottom):
     """Largest value of -(u² + v²) on rectangles relative to the splat's centre: it lies on the edges facing it."""
-    zero = splat(F(0))
+    zero = broadcast(F(0))
     dx, dy = vmax(left, vmin(right, zero)), vmax(top, vmin(bottom, zero))
     along_y = vmax(top, vmin(bottom, slope_x * dx))
     along_x = vmax(left, vmin(right, slope_y * dy))
@@ -127,36 +127,36 @@ def highest_exponent(a, b, c, slope_x, slope_y, left, right, top, bottom):
 @inline
 def reachable_blocks(batch, o, x, y, grid):
     """Mask of the blocks of a tile in which a splat can reach α = 1/255."""
-    left, top = load(grid, 512) - splat(x), load(grid, 528) - splat(y)
-    side = splat(F(BLOCK_SIDE - 1))
+    left, top = load(grid, 512) - broadcast(x), load(grid, 528) - broadcast(y)
+    side = broadcast(F(BLOCK_SIDE - 1))
     peak = highest_exponent(
-        splat(get(batch, o + A)),
-        splat(get(batch, o + B)),
-        splat(get(batch, o + C)),
-        splat(get(batch, o + SLOPE_X)),
-        splat(get(batch, o + SLOPE_Y)),
+        broadcast(get(batch, o + A)),
+        broadcast(get(batch, o + B)),
+        broadcast(get(batch, o + C)),
+        broadcast(get(batch, o + SLOPE_X)),
+        broadcast(get(batch, o + SLOPE_Y)),
         left,
         left + side,
         top,
         top + side,
     )
-    return mask_bits(peak >= splat(LOG2_ALPHA_MIN - REACH_MARGIN - get(batch, o + LOG2_OPACITY)))
+    return mask_bits(peak >= broadcast(LOG2_ALPHA_MIN - REACH_MARGIN - get(batch, o + LOG2_OPACITY)))
 
 
 @inline
 def alpha_at(batch, r, x, y):
     """α of one splat of a batch on a block of pixels, 0 below 1/255; a batch holds (u0, v0) in place of the centre."""
     power, _, _ = exponent(
-        splat(get(batch, r + A)),
-        splat(get(batch, r + B)),
-        splat(get(batch, r + C)),
-        splat(get(batch, r + X)),
-        splat(get(batch, r + Y)),
-        splat(get(batch, r + LOG2_OPACITY)),
+        broadcast(get(batch, r + A)),
+        broadcast(get(batch, r + B)),
+        broadcast(get(batch, r + C)),
+        broadcast(get(batch, r + X)),
+        broadcast(get(batch, r + Y)),
+        broadcast(get(batch, r + LOG2_OPACITY)),
         x,
         y,
     )
-    return select(power >= splat(LOG2_ALPHA_MIN), vmin(exp2(power), splat(ALPHA_MAX)), splat(F(0)))
+    return select(power >= broadcast(LOG2_ALPHA_MIN), vmin(exp2(power), broadcast(ALPHA_MAX)), broadcast(F(0)))
 
 
 @inline
@@ -164,10 +164,10 @@ def accumulate(batch, r, weight, sums):
     """Add colour and depth of one splat."""
     red, green, blue, depth = sums
     return (
-        fma(weight, splat(get(batch, r + RED)), red),
-        fma(weight, splat(get(batch, r + GREEN)), green),
-        fma(weight, splat(get(batch, r + BLUE)), blue),
-        fma(weight, splat(get(batch, r + DEPTH)), depth),
+        fma(weight, broadcast(get(batch, r + RED)), red),
+        fma(weight, broadcast(get(batch, r + GREEN)), green),
+        fma(weight, broadcast(get(batch, r + BLUE)), blue),
+        fma(weight, broadcast(get(batch, r + DEPTH)), depth),
     )
 
 
@@ -191,8 +191,8 @@ def next_splat(low, high, base):
 @inline
 def blend_one(batch, r, alpha, t, after, left, sums):
     """Add one splat where it leaves the pixel open; returns the transmittance left and the sums."""
-    open_ = after >= splat(TRANSMITTANCE_MIN)
-    weight = select(open_, alpha * t, splat(F(0)))
+    open_ = after >= broadcast(TRANSMITTANCE_MIN)
+    weight = select(open_, alpha * t, broadcast(F(0)))
     return select(open_, after, left), accumulate(batch, r, weight, sums)
 
 
@@ -223,13 +223,13 @@ def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
         left, sums = blend_one(batch, r1, a1, t1, t2, left, sums)
         left, sums = blend_one(batch, r2, a2, t2, t3, left, sums)
         left, sums = blend_one(batch, r3, a3, t3, t4, left, sums)
-        if drop_closed and not any_lane(t4 >= splat(TRANSMITTANCE_MIN)):
+        if drop_closed and not any_lane(t4 >= broadcast(TRANSMITTANCE_MIN)):
             for j in range(j3 + 1, count):
                 put(touched, first + j, get(touched, first + j) & ~bit)
             bit = 0
             low, high = np.int64(0), np.int64(0)
         # Pixels that are closed fall on; keep them clear of denormals.
-        t = vmax(t4, splat(TINY))
+        t = vmax(t4, broadcast(TINY))
     store(state, T + o, t)
     store(state, T_LEFT + o, left)
     store(state, R_SUM + o, sums[0])
@@ -245,9 +245,9 @@ def write_block(block, left, top, width, height, background, state, image, trans
     o = 16 * block
     x0, y0 = left + (block & 3) * BLOCK_SIDE, top + (block >> 2) * BLOCK_SIDE
     t = load(state, T_LEFT + o)
-    red = fma(t, splat(get(background, 0)), load(state, R_SUM + o))
-    green = fma(t, splat(get(background, 1)), load(state, G_SUM + o))
-    blue = fma(t, splat(get(background, 2)), load(state, B_SUM + o))
+    red = fma(t, broadcast(get(background, 0)), load(state, R_SUM + o))
+    green = fma(t, broadcast(get(background, 1)), load(state, G_SUM + o))
+    blue = fma(t, broadcast(get(background, 2)), load(state, B_SUM + o))
     if x0 + BLOCK_SIDE <= width and y0 + BLOCK_SIDE <= height:
         pixel = y0 * width + x0
         store_rgb_block(image, 3 * pixel, 3 * width, red, green, blue)
@@ -290,8 +290,8 @@ def blend_tile(
     drop_closed,
 ):
     """Blend one tile; returns the end of the part of its list that was looked at."""
-    zero, one = splat(F(0)), splat(F(1))
-    columns, rows = splat(F(width - left)), splat(F(height - top))
+    zero, one = broadcast(F(0)), broadcast(F(1))
+    columns, rows = broadcast(F(width - left)), broadcast(F(height - top))
     alive = 0
     for block in range(BLOCKS):
         inside = (load(grid, 16 * block) < columns) & (load(grid, 256 + 16 * block) < rows)
@@ -400,8 +400,8 @@ def start_block(
     """
     s = BLOCK_STATE * block
     x0, y0 = left + (block & 3) * BLOCK_SIDE, top + (block >> 2) * BLOCK_SIDE
-    store(state, s + B_X, load(grid, 16 * block))
-    store(state, s + B_Y, load(grid, 256 + 16 * block))
+    store(state, s + BACK_X, load(grid, 16 * block))
+    store(state, s + BACK_Y, load(grid, 256 + 16 * block))
     if x0 + BLOCK_SIDE <= width and y0 + BLOCK_SIDE <= height:
         pixel = y0 * width + x0
         red, green, blue = load_rgb_block(g_image, 3 * pixel, 3 * width)
@@ -411,16 +411,16 @@ def start_block(
             rest = fnma(load_block(g_alpha, pixel, width), load_block(transmittance, pixel, width), rest)
         if with_depth:
             far = load_block(g_depth, pixel, width)
-            store(state, s + B_DEPTH, far)
+            store(state, s + BACK_DEPTH, far)
             rest = fma(far, load_block(depth, pixel, width), rest)
-        store(state, s + B_T, splat(F(1)))
-        store(state, s + B_REST, rest)
-        store(state, s + B_RED, red)
-        store(state, s + B_GREEN, green)
-        store(state, s + B_BLUE, blue)
+        store(state, s + BACK_T, broadcast(F(1)))
+        store(state, s + BACK_REST, rest)
+        store(state, s + BACK_RED, red)
+        store(state, s + BACK_GREEN, green)
+        store(state, s + BACK_BLUE, blue)
         return
-    for part in range(0, B_X, 16):
-        store(state, s + part, splat(F(0)))
+    for part in range(0, BACK_X, 16):
+        store(state, s + part, broadcast(F(0)))
     for lane in range(16):
         x, y = x0 + (lane & 3), y0 + (lane >> 2)
         if x < width and y < height:
@@ -430,13 +430,13 @@ def start_block(
                 rest -= get(g_alpha, pixel) * get(transmittance, pixel)
             for channel in range(3):
                 gradient = get(g_image, 3 * pixel + channel)
-                put(state, o + B_RED + 16 * channel, gradient)
+                put(state, o + BACK_RED + 16 * channel, gradient)
                 rest += gradient * get(image, 3 * pixel + channel)
             if with_depth:
-                put(state, o + B_DEPTH, get(g_depth, pixel))
+                put(state, o + BACK_DEPTH, get(g_depth, pixel))
                 rest += get(g_depth, pixel) * get(depth, pixel)
-            put(state, o + B_REST, rest)
-            put(state, o + B_T, F(1))
+            put(state, o + BACK_REST, rest)
+            put(state, o + BACK_T, F(1))
 
 
 @inline
@@ -453,40 +453,44 @@ def slot_of(integers, row, group_x, group_y):
 @inline
 def splat_backward(records, row, blocks, left, top, with_depth, state):
     """Sums of one splat over the blocks it changed in a tile (the fields of a slot); moves the blocks' state on."""
-    zero, one = splat(F(0)), splat(F(1))
-    lowest, highest = splat(LOG2_ALPHA_MIN), splat(ALPHA_MAX)
+    zero, one = broadcast(F(0)), broadcast(F(1))
+    lowest, highest = broadcast(LOG2_ALPHA_MIN), broadcast(ALPHA_MAX)
     r = RECORD * row
     fa, fb, fc = get(records, r + A), get(records, r + B), get(records, r + C)
     u0, v0 = offsets_at(fa, fb, fc, get(records, r + X) - F(left), get(records, r + Y) - F(top))
-    a, b, c, u0, v0 = splat(fa), splat(fb), splat(fc), splat(u0), splat(v0)
-    peak = splat(get(records, r + LOG2_OPACITY))
-    red, green, blue = splat(get(records, r + RED)), splat(get(records, r + GREEN)), splat(get(records, r + BLUE))
-    z = splat(get(records, r + DEPTH))
+    a, b, c, u0, v0 = broadcast(fa), broadcast(fb), broadcast(fc), broadcast(u0), broadcast(v0)
+    peak = broadcast(get(records, r + LOG2_OPACITY))
+    red, green, blue = (
+        broadcast(get(records, r + RED)),
+        broadcast(get(records, r + GREEN)),
+        broadcast(get(records, r + BLUE)),
+    )
+    z = broadcast(get(records, r + DEPTH))
     s_r, s_g, s_b, s_h, s_u, s_v, s_uu, s_uv, s_vv, s_z = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
     while blocks != 0:
         s = BLOCK_STATE * lowest_bit(blocks)
         blocks &= blocks - 1
-        power, u, v = exponent(a, b, c, u0, v0, peak, load(state, s + B_X), load(state, s + B_Y))
+        power, u, v = exponent(a, b, c, u0, v0, peak, load(state, s + BACK_X), load(state, s + BACK_Y))
         raw = exp2(power)
         alpha = select(power >= lowest, vmin(raw, highest), zero)
-        g_r, g_g, g_b = load(state, s + B_RED), load(state, s + B_GREEN), load(state, s + B_BLUE)
+        g_r, g_g, g_b = load(state, s + BACK_RED), load(state, s + BACK_GREEN), load(state, s + BACK_BLUE)
         d = fma(g_r, red, fma(g_g, green, g_b * blue))
         if with_depth:
-            d = fma(load(state, s + B_DEPTH), z, d)
-        t, rest = load(state, s + B_T), load(state, s + B_REST)
+            d = fma(load(state, s + BACK_DEPTH), z, d)
+        t, rest = load(state, s + BACK_T), load(state, s + BACK_REST)
         after = fnma(alpha, t, t)
-        open_ = after >= splat(TRANSMITTANCE_MIN)
+        open_ = after >= broadcast(TRANSMITTANCE_MIN)
         td = t * d
         weight = select(open_, alpha * t, zero)
-        store(state, s + B_REST, fnma(weight, d, rest))
-        store(state, s + B_T, vmax(after, splat(TINY)))
+        store(state, s + BACK_REST, fnma(weight, d, rest))
+        store(state, s + BACK_T, vmax(after, broadcast(TINY)))
         h = select(open_ & (raw <= highest), alpha / (one - alpha) * (td - rest), zero)
         s_r, s_g, s_b = fma(weight, g_r, s_r), fma(weight, g_g, s_g), fma(weight, g_b, s_b)
         hu, hv = h * u, h * v
         s_h, s_u, s_v = s_h + h, s_u + hu, s_v + hv
         s_uu, s_uv, s_vv = fma(hu, u, s_uu), fma(hu, v, s_uv), fma(hv, v, s_vv)
         if with_depth:
-            s_z = fma(weight, load(state, s + B_DEPTH), s_z)
+            s_z = fma(weight, load(state, s + BACK_DEPTH), s_z)
     return lane_sums((s_r, s_g, s_b, s_h, s_u, s_v, s_uu, s_uv, s_vv, s_z))
 
 
@@ -541,7 +545,7 @@ def blend_backward(
     for thread in prange(threads):
         first, last = slots * thread // threads, slots * (thread + 1) // threads
         for slot in range(first, last):
-            store(sums, RECORD * slot, splat(F(0)))
+            store(sums, RECORD * slot, broadcast(F(0)))
     for thread in prange(threads):
         state = scratch[thread]
         while True:

@@ -23,7 +23,8 @@ from nsvq_lightning.rendering.cpu.blend import (
     pixel_grid,
     total_slots,
 )
-from nsvq_lightning.rendering.cpu.projection import find_visible, finish_records, project_backward, project_splats
+from nsvq_lightning.rendering.cpu.projection import find_visible, finish_records, project_splats
+from nsvq_lightning.rendering.cpu.projection_backward import project_backward
 from nsvq_lightning.rendering.cpu.records import CAMERA, GROUP_TILES, RECORD, TILE, group_grid
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.splats import ATTRIBUTES, SplatTensors, sh_degree_of
