@@ -1,9 +1,7 @@
 """Lightning callbacks: everything of a run that happens at certain steps.
 
 Each takes its decisions from the module's schedule and the trainer's step alone, through
-:class:`nsvq_lightning.training.host.SplatHost`; none knows another. The order of their list matters in two places only:
-:class:`DensityControl` belongs before :class:`CanonicalCovariance`, which may come after the same iteration, and
-:class:`ContributionPruning` before :class:`MetricReport`, whose figures are then those of the splats that are left.
+:class:`nsvq_lightning.training.host.SplatHost`; none knows another. :func:`standard` makes those of ``nsvq fit``.
 """
 
 from .canonical import CanonicalCovariance
@@ -18,11 +16,14 @@ from .freeze import FreezeCodes
 from .opacity import OpacityRegularization
 from .phases import PhaseSchedule
 from .predictions import RenderWriter
+from .progress import SplatProgressBar
 from .refit import CodebookRefit
 from .report import MetricReport
 from .sh_degree import ShDegreeSchedule
+from .standard import STANDARD, standard
 
 __all__ = [
+    "STANDARD",
     "CanonicalCovariance",
     "CodebookInit",
     "CodebookRefit",
@@ -39,4 +40,6 @@ __all__ = [
     "RenderWriter",
     "RunCheckpoint",
     "ShDegreeSchedule",
+    "SplatProgressBar",
+    "standard",
 ]

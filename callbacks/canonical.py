@@ -13,7 +13,7 @@ from nsvq_lightning.compression.covariance_error import form_errors
 from nsvq_lightning.compression.pixel_size import scale_floor
 from nsvq_lightning.random import derive_seed
 from nsvq_lightning.splats.forms import Form, canonical
-from nsvq_lightning.training.edit import change_coordinates, finite_rows, raise_scales
+from nsvq_lightning.training.edit import change_coordinates, raise_scales, trainable_rows
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.schedule import Phase
@@ -109,7 +109,7 @@ class CanonicalCovariance(LatchedCallback):
 
     def _chosen(self, trainer: Trainer, host: SplatHost) -> Form:
         """The form with the smallest error over the finite splats; of equals the one that changes least."""
-        finite, _ = finite_rows(host.splats)
+        finite, _ = trainable_rows(host.splats)
         scales, quats = host.splats.scales.detach()[finite], host.splats.quats.detach()[finite]
         codes = {name: len(q.codebook) for name, q in host.quantizers.items() if name in ("scales", "quats")}
         errors = form_errors(scales, quats, codes, derive_seed(host.seed, trainer.global_step, "canonical"))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lightning.pytorch import LightningModule, Trainer
 
-from nsvq_lightning.compression.stored import DEFAULT_EXPORT, EXPORT_FORMATS, export_scene
+from nsvq_lightning.io.formats import FORMATS, save
 from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.run_folder import is_trial, run_folder
 
@@ -17,6 +17,12 @@ from .hosted import WritingCallback
 __all__ = ["ExportScene"]
 
 log = logging.getLogger(__name__)
+
+
+EXPORT_FORMATS = tuple(suffix.removeprefix(".") for suffix, entry in FORMATS.items() if entry.write is not None)
+"""Formats that can be written."""
+DEFAULT_EXPORT = ("nsvq", "ply")
+"""The compressed scene, and its decoded splats for viewers."""
 
 
 class ExportScene(WritingCallback):
@@ -43,5 +49,8 @@ class ExportScene(WritingCallback):
         if is_trial(trainer) or not trainer.is_global_zero:
             return
         host = as_host(pl_module)
-        for path in export_scene(host.compressed(), folder, host.storage, self.formats).values():
-            log.info("wrote %s (%d bytes)", path, path.stat().st_size)
+        scene = host.compressed()
+        folder.mkdir(parents=True, exist_ok=True)
+        for suffix in self.formats:
+            path = folder / f"scene.{suffix}"
+            log.info("wrote %s (%d bytes)", path, save(scene, path, host.storage))

@@ -12,9 +12,9 @@ from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor
 from torchmetrics import Metric
 
-from nsvq_lightning.compression.stored import export_scene
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.quality.metrics import build_lpips, eight_bit
 from nsvq_lightning.rendering.camera import Camera
@@ -160,7 +160,7 @@ class MetricReport(WritingCallback):
         path = self._folder / "scene.nsvq"
         if trainer.is_global_zero:
             scene = host.compressed()
-            export_scene(scene, self._folder, host.storage, ("nsvq",))
+            save(scene, path, host.storage)
             self._paper_level = paper_level(scene)
         trainer.strategy.barrier("scene.nsvq")
         self._scene = read_nsvq(path)

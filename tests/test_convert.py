@@ -9,13 +9,20 @@ import pytest
 
 from nsvq_lightning.commands.convert import main
 from nsvq_lightning.commands.registry import COMMANDS
-from nsvq_lightning.compression.stored import export_scene
-from nsvq_lightning.io import FORMATS, read_scene, save
+from nsvq_lightning.io import FORMATS, CompressedScene, read_scene, save
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.spz_frame import read_spz_header
 
 sys.path.insert(0, str(Path(__file__).parent / "io"))
 from viewer_scenes import coded_scene, nearest_in, needs_zstd, plain_scene
+
+
+def exported(scene: CompressedScene, folder: Path, storage: Storage, *formats: str) -> dict[str, Path]:
+    """The files that a run writes of a scene."""
+    paths = {suffix: folder / f"scene.{suffix}" for suffix in formats}
+    for path in paths.values():
+        save(scene, path, storage)
+    return paths
 
 
 def test_every_readable_format_becomes_every_writable_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -32,7 +39,7 @@ def test_every_readable_format_becomes_every_writable_one(tmp_path: Path, capsys
 
 def test_codebooks_survive_where_the_format_has_them(tmp_path: Path) -> None:
     scene = coded_scene(50, 2)
-    save(scene, tmp_path / "a.nsvq", level="paper")
+    save(scene, tmp_path / "a.nsvq", Storage("paper"))
     assert main([str(tmp_path / "a.nsvq"), str(tmp_path / "b.nsvq"), "--level", "paper"]) == 0
     assert (tmp_path / "b.nsvq").read_bytes() == (tmp_path / "a.nsvq").read_bytes()
     assert main([str(tmp_path / "a.nsvq"), str(tmp_path / "c.sog")]) == 0
@@ -43,21 +50,17 @@ def test_codebooks_survive_where_the_format_has_them(tmp_path: Path) -> None:
 
 def test_a_run_exports_its_codes_as_labels(tmp_path: Path) -> None:
     scene = coded_scene(50, 1)
-    paths = export_scene(scene, tmp_path, Storage("paper"), ("nsvq", "sog", "spz"))
-    assert [path.name for path in paths.values()] == ["scene.nsvq", "scene.sog", "scene.spz"]
+    paths = exported(scene, tmp_path, Storage("paper"), "nsvq", "sog", "spz")
     sog, plain = read_scene(paths["sog"]), read_scene(paths["nsvq"])
     order = nearest_in(sog.arrays(), plain.arrays())
     pairs = set(zip(sog.codes["shN"].tolist(), plain.codes["shN"][order].tolist(), strict=True))
     assert len(pairs) == len(np.unique(scene.codes["shN"]))
-    with pytest.raises(ValueError, match=r"unknown export format 'obj'; choose from ply, nsvq, sog, spz, splat"):
-        export_scene(scene, tmp_path, Storage(), ("obj",))
 
 
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("suffix", [".sog", ".spz", ".splat"])
 def test_exports_and_conversions_of_a_scene_are_the_same_file(tmp_path: Path, suffix: str, level: str) -> None:
-    formats = ("nsvq", "ply", suffix[1:])
-    paths = export_scene(coded_scene(300), tmp_path, Storage(level), formats)
+    paths = exported(coded_scene(300), tmp_path, Storage(level), "nsvq", "ply", suffix[1:])
     assert main([str(paths["nsvq"]), str(tmp_path / f"converted{suffix}")]) == 0
     expected = paths[suffix[1:]].read_bytes()
     assert (tmp_path / f"converted{suffix}").read_bytes() == expected
@@ -70,7 +73,7 @@ def test_exports_and_conversions_of_a_scene_are_the_same_file(tmp_path: Path, su
 
 def test_a_plain_scene_is_exported_as_it_is(tmp_path: Path) -> None:
     scene = plain_scene(40, 1)
-    paths = export_scene(scene, tmp_path, Storage(), ("nsvq", "ply", "sog"))
+    paths = exported(scene, tmp_path, Storage(), "nsvq", "ply", "sog")
     for name, values in vars(scene.arrays()).items():
         np.testing.assert_array_equal(getattr(read_scene(paths["ply"]).arrays(), name), values, err_msg=name)
     assert main([str(paths["ply"]), str(tmp_path / "converted.sog")]) == 0

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import nsvq_lightning
-from nsvq_lightning.commands.fit import DEFAULT_CALLBACKS
+from nsvq_lightning.callbacks import STANDARD
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.commands.option_help import first_sentence
 from nsvq_lightning.commands.registry import COMMANDS
@@ -50,7 +50,7 @@ def fit_help() -> str:
 
 
 def test_help_has_every_option_of_the_default_callbacks_and_none_of_torchs_classes(fit_help: str) -> None:
-    for key, kind in DEFAULT_CALLBACKS.items():
+    for key, kind in STANDARD.items():
         for name in inspect.signature(kind).parameters:
             assert f"--callbacks.{key}.{name}" in fit_help
     assert "--callbacks.density.max_splats=null\n        " in fit_help

@@ -191,7 +191,7 @@ def test_photos_train_the_codebooks(tmp_path: Path, demo_scene: Path, capsys: py
 @pytest.mark.parametrize("steps", ["0", "4"])
 def test_the_origin_of_the_positions_stays(steps: str, tmp_path: Path, demo_scene: Path) -> None:
     source, output, origin = tmp_path / "scene.nsvq", tmp_path / "out.nsvq", (500_000.0, 4.5e6, 30.0)
-    save(arrays(300, degree=0).to_splats(), source, origin=origin)
+    save(CompressedScene.from_arrays(arrays(300, degree=0), origin=origin), source)
     options = ["--codebooks=0.5k", f"--data.root={demo_scene}", f"--max-steps={steps}"]
     assert main(["compress", str(source), str(output), *options]) == 0
     assert read_nsvq(output).origin == origin

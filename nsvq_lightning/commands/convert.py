@@ -12,7 +12,7 @@ from typing import Any
 from nsvq_lightning.io.attribute_error import attribute_errors
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import FORMATS, read_scene, save
-from nsvq_lightning.io.nsvq.precision import LEVELS
+from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.sog import PALETTE_LIMIT
 from nsvq_lightning.io.spz import DEFAULT_VERSION
 from nsvq_lightning.io.spz_frame import SPZ_VERSIONS
@@ -52,6 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("--data.root says where to measure: add --measure")
     logging.basicConfig(format="%(message)s")
     logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
+    if "level" in chosen:
+        chosen["storage"] = Storage(chosen.pop("level"))
     try:
         _convert(options.input, options.output, chosen)
         if options.measure:

@@ -19,7 +19,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 import nsvq_lightning.callbacks as callbacks
 import nsvq_lightning.quantize  # noqa: F401  short class names resolve to what is imported
-from nsvq_lightning.callbacks.progress import SplatProgressBar
+from nsvq_lightning.callbacks.standard import STANDARD
 from nsvq_lightning.commands.option_help import class_help, command_help, first_sentence
 from nsvq_lightning.commands.registry import COMMANDS
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
@@ -30,27 +30,7 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_trial, reserve, run_folder
 from nsvq_lightning.training.trainer import SplatTrainer
 
-__all__ = ["DEFAULT_CALLBACKS", "SplatCLI", "default_loggers"]
-
-DEFAULT_CALLBACKS: dict[str, type[Callback]] = {
-    "phases": callbacks.PhaseSchedule,
-    "sh_degree": callbacks.ShDegreeSchedule,
-    "density": callbacks.DensityControl,
-    "opacity": callbacks.OpacityRegularization,
-    "contribution": callbacks.ContributionPruning,
-    "canonical": callbacks.CanonicalCovariance,
-    "codebook_init": callbacks.CodebookInit,
-    "codebook_refit": callbacks.CodebookRefit,
-    "codebook_replacement": callbacks.CodebookReplacement,
-    "codebook_finite": callbacks.FiniteCodes,
-    "freeze": callbacks.FreezeCodes,
-    "report": callbacks.MetricReport,
-    "export": callbacks.ExportScene,
-    "predictions": callbacks.RenderWriter,
-    "checkpoint": callbacks.RunCheckpoint,
-    "progress": SplatProgressBar,
-}
-"""Callback of each option group ``callbacks.<name>``. Each can be configured, exchanged for another class, or null."""
+__all__ = ["SplatCLI", "default_loggers"]
 
 TRAINER_DEFAULTS: dict[str, Any] = {
     "max_steps": 45_000,  # the paper's run; phases and everything that depends on them follow
@@ -81,9 +61,7 @@ class QuietParser(LightningArgumentParser):
         if subcommand not in COMMANDS:
             return super().format_help(*args)
         data = {} if subcommand == "export" else {"data": ColmapDataModule}
-        return command_help(
-            self, subcommand, data | {f"callbacks.{key}": kind for key, kind in DEFAULT_CALLBACKS.items()}
-        )
+        return command_help(self, subcommand, data | {f"callbacks.{key}": kind for key, kind in STANDARD.items()})
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Write the message to stderr and exit with status 2."""
@@ -131,8 +109,8 @@ class SplatCLI(LightningCLI):
         self._arguments = args
         for argument in args:
             asked = re.fullmatch(r"--callbacks\.(\w+)\.help", argument)
-            if asked and asked[1] in DEFAULT_CALLBACKS:
-                sys.stdout.write(class_help(f"callbacks.{asked[1]}", DEFAULT_CALLBACKS[asked[1]]))
+            if asked and asked[1] in STANDARD:
+                sys.stdout.write(class_help(f"callbacks.{asked[1]}", STANDARD[asked[1]]))
                 raise SystemExit(0)
         with switched():  # they hold for this command only
             super().__init__(
@@ -158,7 +136,7 @@ class SplatCLI(LightningCLI):
         """Add the callbacks and the switches."""
         for skip in SKIPS.values():
             parser.add_argument(f"--skips.{skip.name}", type=bool, default=skip.default, help=skip.summary)
-        for name, kind in DEFAULT_CALLBACKS.items():
+        for name, kind in STANDARD.items():
             key = f"callbacks.{name}"
             path = f"{kind.__module__}.{kind.__qualname__}"
             parser.add_argument(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,20 +11,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nsvq_lightning.io.compressed import QUANTIZABLE, CompressedScene
-from nsvq_lightning.io.formats import FORMATS, save
-from nsvq_lightning.io.nsvq.file import decode, encode
-from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.quantize.scene import attribute_rows, codes_of
-from nsvq_lightning.splats.arrays import finite_rows
+from nsvq_lightning.splats.finite import finite_rows, listed
 from nsvq_lightning.splats.splats import RawSplats, sh_degree_of
 
-__all__ = ["DEFAULT_EXPORT", "EXPORT_FORMATS", "compress", "export_scene", "formula_bytes", "save_as_stored"]
+__all__ = ["compress", "formula_bytes"]
 
-EXPORT_FORMATS = tuple(suffix.removeprefix(".") for suffix, entry in FORMATS.items() if entry.write is not None)
-"""Formats that :func:`export_scene` writes: the compressed scene, and its decoded splats for viewers."""
-DEFAULT_EXPORT = ("nsvq", "ply")
-"""Those that a run writes unless told otherwise."""
+log = logging.getLogger(__name__)
 
 
 @torch.no_grad()
@@ -37,63 +31,20 @@ def compress(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> Compress
         splats: Raw attributes.
         quantizers: Quantizer by attribute; empty stores everything as it is.
     """
-    finite = finite_rows({name: _numpy(tensor) for name, tensor in splats._asdict().items()})
-    codes = {name: _numpy(codes_of(splats, name, quantizer)) for name, quantizer in quantizers.items()}
-    return CompressedScene(
-        means=_numpy(splats.means)[finite],
-        opacities=_numpy(splats.opacities)[finite],
-        codes={name: values[finite] for name, values in codes.items()},
+    # Before they are quantized: the code of a row with NaN would be finite.
+    finite, culprits = finite_rows(splats._asdict())
+    scene = CompressedScene(
+        means=_numpy(splats.means),
+        opacities=_numpy(splats.opacities),
+        codes={name: _numpy(codes_of(splats, name, quantizer)) for name, quantizer in quantizers.items()},
         codebooks={name: _numpy(quantizer.codebook) for name, quantizer in quantizers.items()},
-        raw={name: _numpy(attribute_rows(splats, name))[finite] for name in QUANTIZABLE if name not in quantizers},
+        raw={name: _numpy(attribute_rows(splats, name)) for name in QUANTIZABLE if name not in quantizers},
         sh_degree=sh_degree_of(splats.shN),
     )
-
-
-def export_scene(
-    scene: CompressedScene, folder: Path, storage: Storage, formats: tuple[str, ...] = DEFAULT_EXPORT
-) -> dict[str, Path]:
-    """Write ``scene.<format>`` into ``folder`` for each format, atomically; the same scene gives the same bytes.
-
-    Returns:
-        Path by format.
-
-    Raises:
-        ValueError: A format is not one of :data:`EXPORT_FORMATS`.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    for suffix in formats:
-        if suffix not in EXPORT_FORMATS:
-            raise ValueError(f"unknown export format {suffix!r}; choose from {', '.join(EXPORT_FORMATS)}")
-    paths = {suffix: folder / f"scene.{suffix}" for suffix in formats}
-    stored = _as_stored(scene, storage) if set(formats) - {"nsvq"} else scene
-    for suffix, path in paths.items():
-        if suffix == "nsvq":
-            save_as_stored(scene, path, storage)
-        else:
-            save(stored, path)
-    return paths
-
-
-def save_as_stored(scene: CompressedScene, path: Path, storage: Storage) -> int:
-    """Save a scene in the format of the suffix: ``.nsvq`` as a run stores it, any other from what that file decodes to.
-
-    Returns:
-        Bytes of the file.
-    """
-    if path.suffix.lower() == ".nsvq":
-        return save(scene, path, level=storage.level, precision=storage.precision)
-    return save(_as_stored(scene, storage), path)
-
-
-def _as_stored(scene: CompressedScene, storage: Storage) -> CompressedScene:
-    """What a run's ``.nsvq`` file decodes to, so that all files of a scene hold the same splats.
-
-    A scene without codebooks stays as it is: rounding it would only cost quality, and its record is the ``.ply``.
-    """
-    if not scene.codes:
+    if not culprits:
         return scene
-    header, streams = encode(scene, storage.level, storage.precision)
-    return decode(header, {name: memoryview(data) for name, data in streams.items()})
+    log.warning("left out %d of %d splats with non-finite values: %s", (~finite).sum(), len(scene), listed(culprits))
+    return scene.take(_numpy(finite))
 
 
 def formula_bytes(scene: CompressedScene, header_bytes: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -10,11 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.ply import plain_ply_bytes
-from nsvq_lightning.splats.arrays import SplatArrays, check_floats, finite_rows
+from nsvq_lightning.splats.arrays import SplatArrays, check_floats
+from nsvq_lightning.splats.finite import finite_rows, listed
 from nsvq_lightning.splats.sh_degree import sh_coefficients
 
 if TYPE_CHECKING:
     from nsvq_lightning.splats.splats import Splats
+
+log = logging.getLogger(__name__)
 
 _T = TypeVar("_T", bound=np.generic)
 
@@ -136,11 +140,15 @@ class CompressedScene:
         )
 
     def finite(self) -> CompressedScene:
-        """The splats without NaN or infinite values, see :func:`~nsvq_lightning.splats.arrays.finite_rows`."""
+        """The splats without NaN or infinite numbers; a warning names the attributes of the others."""
         bad = {name: np.where(np.isfinite(rows).all(1), 0, np.nan) for name, rows in self.codebooks.items()}
         flags = {name: flags.astype(np.float32)[self.codes[name]] for name, flags in bad.items()}
-        keep = finite_rows({"means": self.means, "opacities": self.opacities, **self.raw, **flags})
-        return self if keep.all() else self.take(keep)
+        keep, culprits = finite_rows({"means": self.means, "opacities": self.opacities, **self.raw, **flags})
+        if not culprits:
+            return self
+        dropped = len(self) - int(keep.sum())
+        log.warning("dropped %d of %d splats with non-finite values: %s", dropped, len(self), listed(culprits))
+        return self.take(keep)
 
     def arrays(self) -> SplatArrays:
         """The decoded scene, bit for bit the rows of the codebooks; positions stay relative to ``origin``."""

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.nsvq.file import read_nsvq, write_nsvq
-from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, Precision
+from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_nsvq
+from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.io.ply import read_ply, write_ply
 from nsvq_lightning.io.sog import in_sog_order, read_sog, write_sog
 from nsvq_lightning.io.splat import read_splat, write_splat
@@ -74,18 +74,22 @@ def read_scene(path: str | os.PathLike[str]) -> CompressedScene:
     return replace(reader(path), stored_bytes=path.stat().st_size)
 
 
-def save(splats: SplatTensors | CompressedScene, path: str | os.PathLike[str], **options: Any) -> int:
-    """Save a scene in any supported format; splats with non-finite values are left out with a warning.
+def save(
+    scene: SplatTensors | CompressedScene,
+    path: str | os.PathLike[str],
+    storage: Storage | None = None,
+    **options: Any,
+) -> int:
+    """Save a scene in any supported format; splats with NaN or infinite numbers are left out with a warning.
 
     Args:
-        splats: The scene, for example :class:`nsvq_lightning.Splats`. A :class:`CompressedScene` keeps its codebooks
-            where the format has them: all of them in ``.nsvq``, that of the spherical harmonics in ``.sog``.
+        scene: For example :class:`nsvq_lightning.Splats`. A :class:`CompressedScene` keeps its codebooks where the
+            format has them: all of them in ``.nsvq``, that of the spherical harmonics in ``.sog``.
         path: File to write, replaced atomically; its suffix names the format.
-        options: For ``.ply``: ``normals`` (bool, default True). For ``.nsvq``: ``config``, ``metrics``, ``origin``,
-            ``level`` and ``precision``; plain splats have no codebooks, so level ``paper`` stores all attributes as
-            they are, and ``compact`` within its precision and in another order. For ``.sog``: ``palette`` (most rows of
-            the palette of spherical harmonics without a codebook, default 65536). For ``.spz``: ``version`` (3 or 4,
-            default 3).
+        storage: Level and precision of ``.nsvq``. Given for another format, the file holds what the ``.nsvq`` file
+            would decode to, so that all files of a run hold the same splats.
+        options: For ``.sog``: ``palette`` (most rows of the palette of spherical harmonics without a codebook, default
+            65536). For ``.spz``: ``version`` (3 or 4, default 3).
 
     Returns:
         Bytes of the file.
@@ -98,11 +102,16 @@ def save(splats: SplatTensors | CompressedScene, path: str | os.PathLike[str], *
     entry = _format_of(path, "write")
     if entry.write is None:
         raise ValueError(f"cannot save {path}: {path.suffix} files are only read")
-    if not isinstance(splats, CompressedScene):
-        splats = CompressedScene.from_arrays(SplatArrays.from_splats(splats))
-    if any(splats.origin) and not entry.keeps_origin:
-        logger.warning("%s: the origin %s of the positions is not stored; add it in the viewer", path, splats.origin)
-    return entry.write(path, splats, **options)
+    if not isinstance(scene, CompressedScene):
+        scene = CompressedScene.from_arrays(SplatArrays.from_splats(scene))
+    scene = scene.finite()
+    if any(scene.origin) and not entry.keeps_origin:
+        logger.warning("%s: the origin %s of the positions is not stored; add it in the viewer", path, scene.origin)
+    if entry.write is _write_nsvq:
+        options["storage"] = storage or Storage()
+    elif storage is not None:
+        scene = as_stored(scene, storage)
+    return entry.write(path, scene, **options)
 
 
 def _format_of(path: Path, action: str) -> Format:
@@ -117,19 +126,12 @@ def _read_ply(path: Path) -> CompressedScene:
     return CompressedScene.from_arrays(read_ply(path))
 
 
-def _write_ply(path: Path, scene: CompressedScene, *, normals: bool = True) -> int:
-    return write_ply(path, scene.arrays(), normals=normals)
+def _write_ply(path: Path, scene: CompressedScene) -> int:
+    return write_ply(path, scene.arrays())
 
 
-def _write_nsvq(
-    path: Path,
-    scene: CompressedScene,
-    *,
-    level: str = DEFAULT_LEVEL,
-    precision: Precision | None = None,
-    **header: Any,
-) -> int:
-    return write_nsvq(path, replace(scene.finite(), **header), level, precision)
+def _write_nsvq(path: Path, scene: CompressedScene, *, storage: Storage) -> int:
+    return write_nsvq(path, scene, storage.level, storage.precision)
 
 
 FORMATS: dict[str, Format] = {
@@ -141,7 +143,7 @@ FORMATS: dict[str, Format] = {
         "first viewers on the web, without spherical harmonics",
         read_splat,
         write_splat,
-        in_order=CompressedScene.finite,
+        in_order=lambda scene: scene,
     ),
 }
 """Formats by suffix; a new format is one more entry."""

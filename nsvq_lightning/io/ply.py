@@ -56,37 +56,35 @@ def read_ply_size(path: str | os.PathLike[str]) -> tuple[PlyHeader, int]:
     return header, file_bytes
 
 
-def write_ply(path: str | os.PathLike[str], splats: SplatArrays, *, normals: bool = True) -> int:
+def write_ply(path: str | os.PathLike[str], splats: SplatArrays) -> int:
     """Write splats as little-endian ``.ply``, 62 float32 a splat at SH degree 3.
-
-    Splats with a non-finite value are left out with a warning; viewers fail on them.
 
     Args:
         path: File to write, replaced atomically.
-        splats: The scene.
-        normals: Write the three unused normals (zeros) of the authors' layout; without them 59 float32 a splat.
+        splats: The scene; :func:`nsvq_lightning.save` leaves non-finite splats out, on which viewers fail.
 
     Returns:
         Bytes of the file.
     """
-    splats = splats.finite()
-    header = _header_text(len(splats), splats.sh_degree, normals)
+    header = _header_text(len(splats), splats.sh_degree)
     with atomic_write(path) as file:
         file.write(header)
         for start in range(0, len(splats), _ROWS):
-            file.write(_rows(splats, slice(start, start + _ROWS), normals).tobytes())
+            file.write(_rows(splats, slice(start, start + _ROWS)).tobytes())
         return file.tell()
 
 
-def plain_ply_bytes(splats: int, sh_degree: int, *, normals: bool = True) -> int:
+def plain_ply_bytes(splats: int, sh_degree: int) -> int:
     """Bytes of the file :func:`write_ply` makes: what a compressed scene is compared with."""
-    return len(_header_text(splats, sh_degree, normals)) + 4 * splats * len(_property_names(sh_degree, normals))
+    return len(_header_text(splats, sh_degree)) + 4 * splats * len(_property_names(sh_degree))
 
 
-def _property_names(sh_degree: int, normals: bool) -> list[str]:
+def _property_names(sh_degree: int) -> list[str]:
     return [
         *"xyz",
-        *(["nx", "ny", "nz"] if normals else []),
+        "nx",
+        "ny",
+        "nz",
         *(f"f_dc_{i}" for i in range(3)),
         *(f"f_rest_{i}" for i in range(3 * sh_coefficients(sh_degree))),
         "opacity",
@@ -95,18 +93,18 @@ def _property_names(sh_degree: int, normals: bool) -> list[str]:
     ]
 
 
-def _header_text(count: int, sh_degree: int, normals: bool) -> bytes:
-    properties = "".join(f"property float {name}\n" for name in _property_names(sh_degree, normals))
+def _header_text(count: int, sh_degree: int) -> bytes:
+    properties = "".join(f"property float {name}\n" for name in _property_names(sh_degree))
     return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n".encode("ascii")
 
 
-def _rows(splats: SplatArrays, rows: slice, normals: bool) -> NDArray[np.float32]:
+def _rows(splats: SplatArrays, rows: slice) -> NDArray[np.float32]:
     means = splats.means[rows]
     # Channel-major: all red coefficients first; ours are [coefficient, channel].
     rest = splats.shN[rows].transpose(0, 2, 1).reshape(len(means), -1)
     columns = [
         means,
-        *([np.zeros_like(means)] if normals else []),
+        np.zeros_like(means),
         splats.sh0[rows, 0],
         rest,
         splats.opacities[rows, None],

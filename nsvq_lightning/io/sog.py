@@ -48,7 +48,6 @@ def in_sog_order(scene: CompressedScene) -> CompressedScene:
     """The splats that a file holds, in its order: Morton order of the positions."""
     from nsvq_lightning.io.morton import spatial_order  # brings Numba, which readers do without
 
-    scene = scene.finite()
     return scene.take(spatial_order(scene.means))
 
 

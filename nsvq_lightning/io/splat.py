@@ -49,7 +49,6 @@ def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:
     Returns:
         Bytes of the file.
     """
-    scene = scene.finite()
     if scene.sh_degree:
         logger.warning("%s: .splat files hold no spherical harmonics; colours no longer change with the view", path)
     clamped = Clamped()

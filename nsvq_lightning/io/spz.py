@@ -64,7 +64,6 @@ def in_spz_order(scene: CompressedScene) -> CompressedScene:
     """
     from nsvq_lightning.io.morton import spatial_order  # brings Numba, which readers do without
 
-    scene = scene.finite()
     scene = scene.take(spatial_order(scene.means))
     codes = [scene.codes[name] for name in _ORDER if name in scene.codes]
     return scene.take(np.lexsort([np.arange(len(scene)), *codes]))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,9 +13,7 @@ from nsvq_lightning.splats.sh_degree import shN_degree
 if TYPE_CHECKING:
     from nsvq_lightning.splats.splats import Splats, SplatTensors
 
-__all__ = ["SplatArrays", "check_floats", "finite_rows"]
-
-logger = logging.getLogger(__name__)
+__all__ = ["SplatArrays", "check_floats"]
 
 
 def check_floats(name: str, array: NDArray[np.float32], shape: tuple[int, ...]) -> None:
@@ -99,25 +95,3 @@ class SplatArrays:
     def sh_degree(self) -> int:
         """Highest degree of the spherical harmonics."""
         return shN_degree(self.shN.shape[1])
-
-    def finite(self) -> SplatArrays:
-        """The splats without NaN or infinite values, see :func:`finite_rows`."""
-        attributes: dict[str, NDArray[np.float32]] = vars(self)
-        keep = finite_rows(attributes)
-        return self if keep.all() else SplatArrays(**{name: array[keep] for name, array in attributes.items()})
-
-
-def finite_rows(attributes: Mapping[str, NDArray[np.float32]]) -> NDArray[np.bool_]:
-    """Which rows ``[N]`` of the arrays ``[N, ...]`` are finite in all; a warning names the attributes of the others."""
-    count = len(next(iter(attributes.values())))
-    keep = np.ones(count, dtype=bool)
-    culprits = []
-    for name, array in attributes.items():
-        good = np.isfinite(array).all(tuple(range(1, array.ndim)))
-        if not good.all():
-            culprits.append(f"{name} {int((~good).sum())}")
-            keep &= good
-    if culprits:
-        dropped = count - int(keep.sum())
-        logger.warning("dropped %d of %d splats with non-finite values (%s)", dropped, count, ", ".join(culprits))
-    return keep

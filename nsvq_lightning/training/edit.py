@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from nsvq_lightning.splats.finite import finite_rows, listed
 from nsvq_lightning.splats.splats import ATTRIBUTES, Splats
 from nsvq_lightning.training.optim import find_group
 
@@ -22,12 +23,12 @@ __all__ = [
     "append_rows",
     "change_coordinates",
     "drop_non_finite",
-    "finite_rows",
     "finite_splats",
     "keep_rows",
     "raise_scales",
     "replace_attribute",
     "reset_moments",
+    "trainable_rows",
 ]
 
 log = logging.getLogger(__name__)
@@ -145,27 +146,19 @@ def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -
                 state[key][rows] = 0.0
 
 
-def finite_rows(splats: Splats) -> tuple[Tensor, dict[str, int]]:
+def trainable_rows(splats: Splats) -> tuple[Tensor, dict[str, int]]:
     """Which splats are finite in every attribute, and so are their projections (:data:`LARGEST_LOG_SCALE`).
 
     Returns:
         A mask ``[N]`` (bool) and, for each attribute with other rows, how many.
     """
-    mask = torch.ones(len(splats), dtype=torch.bool, device=splats.means.device)
-    culprits: dict[str, int] = {}
-    for name, parameter in splats.attributes().items():
-        finite = torch.isfinite(parameter.detach()).flatten(1).all(1) if parameter.dim() > 1 else parameter.isfinite()
-        if name == "scales":
-            finite &= (parameter.detach() <= LARGEST_LOG_SCALE).all(1)
-        bad = int((~finite).sum())
-        if bad:
-            culprits[name] = bad
-            mask &= finite
-    return mask, culprits
+    attributes = {name: parameter.detach() for name, parameter in splats.attributes().items()}
+    attributes["scales"] = attributes["scales"].masked_fill(attributes["scales"] > LARGEST_LOG_SCALE, torch.inf)
+    return finite_rows(attributes)
 
 
 def finite_splats(splats: Splats, source: str) -> Splats:
-    """The splats without those that :func:`finite_rows` leaves out, with a warning that names source and attributes.
+    """The splats without those that :func:`trainable_rows` leaves out, with a warning that names source and attributes.
 
     Args:
         splats: Splats that no optimiser knows yet.
@@ -183,7 +176,7 @@ def finite_splats(splats: Splats, source: str) -> Splats:
 
 
 def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> Tensor:
-    """Drop splats that :func:`finite_rows` leaves out, with a warning that names attribute, rows and step.
+    """Drop splats that :func:`trainable_rows` leaves out, with a warning that names attribute, rows and step.
 
     Returns:
         Which of the splats before were kept, ``[N]`` bool.
@@ -203,10 +196,10 @@ def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> Tensor:
 
 
 def _finite_or_warn(splats: Splats, where: str, none_left: Callable[[str], Exception]) -> Tensor:
-    """Mask ``[N]`` of :func:`finite_rows`, with a warning of the others; without any finite splat, the error."""
-    kept, culprits = finite_rows(splats)
+    """Mask ``[N]`` of :func:`trainable_rows`, with a warning of the others; without any finite splat, the error."""
+    kept, culprits = trainable_rows(splats)
     if culprits:
-        found = ", ".join(f"{name} in {count} rows" for name, count in culprits.items())
+        found = listed(culprits)
         if not bool(kept.any()):
             raise none_left(found)
         dropped = int((~kept).sum())

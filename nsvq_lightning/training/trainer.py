@@ -10,7 +10,7 @@ from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch import Trainer
 from lightning.pytorch.strategies import DDPStrategy
 
-from nsvq_lightning.compression.stored import save_as_stored
+from nsvq_lightning.io.formats import save
 from nsvq_lightning.training.checkpoints import PlainCheckpointIO, read_checkpoint
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.strategies import ViewParallelStrategy  # noqa: F401  registers its name
@@ -60,6 +60,6 @@ class SplatTrainer(Trainer):
         path = Path(output)
         path.parent.mkdir(parents=True, exist_ok=True)
         scene = model.compressed()
-        save_as_stored(scene, path, model.storage)
+        save(scene, path, model.storage)
         log.info("wrote %s: %d splats, %d bytes", path, len(scene), path.stat().st_size)
         return path

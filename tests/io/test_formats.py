@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from nsvq_lightning import Splats, load, save
-from nsvq_lightning.io import FormatError, plain_ply_bytes, read_nsvq
+from nsvq_lightning.io import CompressedScene, FormatError, SplatArrays
+from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.random import generator
 
 
@@ -20,20 +21,17 @@ def scene(n: int, degree: int) -> Splats:
 @pytest.mark.parametrize("suffix", [".ply", ".nsvq", ".PLY"])
 def test_save_then_load_is_exact(tmp_path: Path, suffix: str, degree: int) -> None:
     splats, path = scene(20, degree), tmp_path / f"x{suffix}"
-    options = {"level": "paper"} if suffix == ".nsvq" else {}
-    assert save(splats, path, **options) == path.stat().st_size
+    assert save(splats, path, Storage("paper")) == path.stat().st_size
     back = load(str(path))
     for name, values in splats.attributes().items():
         assert torch.equal(getattr(back, name), values)
 
 
 def test_options_reach_the_format(tmp_path: Path) -> None:
-    splats = scene(20, 3)
-    assert save(splats, tmp_path / "x.ply", normals=False) == plain_ply_bytes(20, 3, normals=False)
-    save(splats.raw(), tmp_path / "x.nsvq", config={"seed": 1}, metrics={"psnr": 30.0})
-    assert read_nsvq(tmp_path / "x.nsvq").config == {"seed": 1}
-    with pytest.raises(TypeError, match="normals"):
-        save(splats, tmp_path / "x.nsvq", normals=False)
+    splats = scene(200, 3)
+    assert save(splats, tmp_path / "few.sog", palette=8) < save(splats, tmp_path / "all.sog")
+    with pytest.raises(TypeError, match="palette"):
+        save(splats, tmp_path / "x.nsvq", palette=8)
 
 
 def test_unknown_suffix_lists_what_is_supported(tmp_path: Path) -> None:
@@ -52,21 +50,27 @@ def test_wrong_content_is_named(tmp_path: Path) -> None:
         load(tmp_path / "no.ply")
 
 
+@pytest.mark.parametrize("suffix", [".nsvq", ".ply"])
 def test_non_finite_rows_are_dropped_and_the_scene_itself_is_left_alone(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, suffix: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    splats = scene(5, 1)
+    splats = scene(10, 1)
     with torch.no_grad():
-        splats.quats[2, 0] = torch.nan
+        splats.scales[3, 1] = torch.nan
+        splats.shN[3, 2, 2] = torch.inf
+        splats.means[8, 0] = -torch.inf
     with caplog.at_level(logging.WARNING):
-        save(splats, tmp_path / "x.nsvq")
-    assert "dropped 1 of 5" in caplog.text
-    assert len(load(tmp_path / "x.nsvq")) == 4
-    assert len(splats) == 5
+        save(splats, tmp_path / f"x{suffix}", Storage("paper"))
+    assert "dropped 2 of 10 splats with non-finite values: means in 1 rows" in caplog.text
+    back = load(tmp_path / f"x{suffix}")
+    keep = [0, 1, 2, 4, 5, 6, 7, 9]
+    assert all(torch.equal(getattr(back, name), values[keep]) for name, values in splats.attributes().items())
+    assert len(splats) == 10
 
 
 def test_an_origin_is_not_lost_silently(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    save(scene(5, 1), tmp_path / "x.nsvq", origin=(4e6, 0.0, 0.0))
+    arrays = SplatArrays.from_splats(scene(5, 1))
+    save(CompressedScene.from_arrays(arrays, origin=(4e6, 0.0, 0.0)), tmp_path / "x.nsvq")
     with caplog.at_level(logging.WARNING):
         load(tmp_path / "x.nsvq")
     assert "4000000.0" in caplog.text

@@ -103,7 +103,7 @@ def test_sog_takes_the_codebook_as_its_palette_and_the_codes_as_labels(tmp_path:
     scene = coded_scene(200, 3, rows=80)
     save(scene, tmp_path / "x.sog")
     back = read_scene(tmp_path / "x.sog")
-    assert back.file_bytes == (tmp_path / "x.sog").stat().st_size
+    assert back.stored_bytes == (tmp_path / "x.sog").stat().st_size
     order = nearest_in(back.arrays(), scene.arrays())
     codes, first = np.unique(scene.codes["shN"][order], return_index=True)
     used = codes[np.argsort(first)]  # in the order of the splats of the file

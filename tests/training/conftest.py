@@ -11,19 +11,7 @@ import pytest
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 
-from nsvq_lightning.callbacks import (
-    CodebookInit,
-    CodebookReplacement,
-    DensityControl,
-    DensityRules,
-    ExportScene,
-    FiniteCodes,
-    FreezeCodes,
-    MetricReport,
-    OpacityRegularization,
-    PhaseSchedule,
-    ShDegreeSchedule,
-)
+from nsvq_lightning.callbacks import STANDARD, DensityControl, DensityRules, MetricReport, PhaseSchedule, standard
 from nsvq_lightning.commands.benchmark.fitting import quiet_trainer
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.training.module import SplatModule
@@ -42,21 +30,17 @@ def recipe() -> Recipe:
     """``recipe(**replaced)``: the callbacks of a full run, with intervals that fit 60 steps."""
 
     def build(**replaced: Callback) -> dict[str, Callback]:
-        standard: dict[str, Callback] = {
+        chosen: dict[str, Callback | None] = {
             "phases": PhaseSchedule(
                 min_density_interval=4, min_reset_interval=11, min_replacement_interval=5, min_finetune=1
             ),
-            "sh_degree": ShDegreeSchedule(),
             "density": DensityControl(DensityRules(grad_threshold=5e-6)),
-            "opacity": OpacityRegularization(),
-            "codebook_init": CodebookInit(),
-            "codebook_replacement": CodebookReplacement(),
-            "codebook_finite": FiniteCodes(),
-            "freeze": FreezeCodes(),
             "report": MetricReport(every=20),
-            "export": ExportScene(),
+            **dict.fromkeys(("predictions", "checkpoint", "progress")),
+            **replaced,
         }
-        return standard | replaced
+        names = [name for name in STANDARD if name not in chosen or chosen[name] is not None]
+        return dict(zip(names, standard(**chosen), strict=True))
 
     return build
 

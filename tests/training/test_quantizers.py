@@ -74,7 +74,7 @@ def assert_nearest(codes: torch.Tensor, rows: torch.Tensor, book: torch.Tensor) 
 @pytest.fixture(scope="module")
 def quantized_recipe(recipe: Recipe) -> Recipe:
     """The recipe with refits that fit 60 steps, and without evaluations."""
-    return lambda **replaced: recipe(refit=CodebookRefit(every=6000), report=Callback(), **replaced)
+    return lambda **replaced: recipe(codebook_refit=CodebookRefit(every=6000), report=Callback(), **replaced)
 
 
 Finished = tuple[Quantizers, Trainer, SplatModule, Books]

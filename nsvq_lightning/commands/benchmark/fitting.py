@@ -15,8 +15,9 @@ from lightning.pytorch import Callback, LightningDataModule, LightningModule, Tr
 from lightning.pytorch.profilers import Profiler
 
 from nsvq_lightning.callbacks import PhaseSchedule
+from nsvq_lightning.callbacks.standard import standard
 from nsvq_lightning.commands.benchmark.timing import finish
-from nsvq_lightning.commands.fit import DEFAULT_CALLBACKS, default_loggers
+from nsvq_lightning.commands.fit import default_loggers
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.schedule import Phase
@@ -65,11 +66,7 @@ class StepClock(Callback):
 
 def training_callbacks(**replaced: Callback) -> list[Callback]:
     """The callbacks of ``nsvq fit`` that take part in the training, some of them replaced by name."""
-    return [
-        replaced[name] if name in replaced else kind()
-        for name, kind in DEFAULT_CALLBACKS.items()
-        if name not in WATCHING
-    ]
+    return standard(**dict.fromkeys(WATCHING), **replaced)
 
 
 def one_phase(phase: Phase, steps: int) -> PhaseSchedule:

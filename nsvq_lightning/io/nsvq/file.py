@@ -11,9 +11,19 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.nsvq.frame import frame, read_frame, read_header
 from nsvq_lightning.io.nsvq.header import Header
-from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Precision, check_level
+from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Precision, Storage, check_level
 
-__all__ = ["DEFAULT_LEVEL", "LEVELS", "CompressedScene", "decode", "encode", "read_header", "read_nsvq", "write_nsvq"]
+__all__ = [
+    "DEFAULT_LEVEL",
+    "LEVELS",
+    "CompressedScene",
+    "as_stored",
+    "decode",
+    "encode",
+    "read_header",
+    "read_nsvq",
+    "write_nsvq",
+]
 
 
 def encode(
@@ -55,6 +65,17 @@ def write_nsvq(
     with atomic_write(path) as file:
         file.writelines(parts)
     return sum(map(len, parts))
+
+
+def as_stored(scene: CompressedScene, storage: Storage) -> CompressedScene:
+    """What the ``.nsvq`` file of a scene decodes to, for files of other formats that hold the same splats.
+
+    A scene without codebooks stays as it is: rounding it would only cost quality, and its record is the ``.ply``.
+    """
+    if not scene.codes:
+        return scene
+    header, streams = encode(scene, storage.level, storage.precision)
+    return decode(header, {name: memoryview(data) for name, data in streams.items()})
 
 
 def read_nsvq(path: str | os.PathLike[str]) -> CompressedScene:

@@ -25,7 +25,7 @@ from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import fast_backends
 from nsvq_lightning.splats.splats import RawSplats, Splats
-from nsvq_lightning.training.edit import finite_rows
+from nsvq_lightning.training.edit import trainable_rows
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 
 __all__ = ["Beside", "Outcome", "cases", "errors", "quantizer_errors", "quantizers", "run", "step"]
@@ -113,14 +113,14 @@ def step(scene: Extreme, backend: str) -> Outcome:
     """One training step on a random photo: forward, backward and Adam, or a refusal where the loss is not finite."""
     splats = Splats.from_tensors(*map(torch.cat, zip(scene.planted, scene.workload.splats, strict=True)))
     optimizer = build_adam(param_groups(splats, {}, LearningRates(), extent=1.0))
-    before, _ = finite_rows(splats)
+    before, _ = trainable_rows(splats)
     photo = torch.rand(scene.workload.image_gradient.shape, generator=generator(0, 0, "photo"))
     loss = photometric_loss(render.Method(backend).picture(splats.raw(), scene.workload), photo)
     refused = not bool(loss.isfinite())
     if not refused:
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
-    after, named = finite_rows(splats)
+    after, named = trainable_rows(splats)
     return Outcome(refused, named, int((before & ~after).sum()))
 
 

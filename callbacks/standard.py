@@ -1,0 +1,68 @@
+"""The callbacks of a run, one of each, in their order: those of ``nsvq fit``."""
+
+from __future__ import annotations
+
+from lightning.pytorch import Callback
+
+from .canonical import CanonicalCovariance
+from .checkpoint import RunCheckpoint
+from .codebooks import CodebookInit, CodebookReplacement
+from .contribution import ContributionPruning
+from .density import DensityControl
+from .export import ExportScene
+from .finite import FiniteCodes
+from .freeze import FreezeCodes
+from .opacity import OpacityRegularization
+from .phases import PhaseSchedule
+from .predictions import RenderWriter
+from .progress import SplatProgressBar
+from .refit import CodebookRefit
+from .report import MetricReport
+from .sh_degree import ShDegreeSchedule
+
+__all__ = ["STANDARD", "standard"]
+
+STANDARD: dict[str, type[Callback]] = {
+    "phases": PhaseSchedule,
+    "sh_degree": ShDegreeSchedule,
+    "density": DensityControl,
+    "opacity": OpacityRegularization,
+    "contribution": ContributionPruning,
+    "canonical": CanonicalCovariance,
+    "codebook_init": CodebookInit,
+    "codebook_refit": CodebookRefit,
+    "codebook_replacement": CodebookReplacement,
+    "codebook_finite": FiniteCodes,
+    "freeze": FreezeCodes,
+    "report": MetricReport,
+    "export": ExportScene,
+    "predictions": RenderWriter,
+    "checkpoint": RunCheckpoint,
+    "progress": SplatProgressBar,
+}
+"""Callback by name. The order matters in two places: density control comes before the canonical form, which may act
+after the same iteration, and contribution pruning before the report, whose figures are then those of the splats left.
+"""
+
+
+def standard(**replaced: Callback | None) -> list[Callback]:
+    """The callbacks of ``nsvq fit``, with their defaults.
+
+    Args:
+        replaced: Callbacks to have in the place of those of the same name in :data:`STANDARD`; None leaves one out.
+
+    Raises:
+        ValueError: There is no callback of that name.
+
+    Example:
+        >>> len(standard()) == len(STANDARD)
+        True
+        >>> few = standard(density=DensityControl(max_splats=200_000), report=None, progress=None)
+        >>> [type(callback).__name__ for callback in few[:3]]
+        ['PhaseSchedule', 'ShDegreeSchedule', 'DensityControl']
+    """
+    unknown = sorted(set(replaced) - set(STANDARD))
+    if unknown:
+        raise ValueError(f"there is no standard callback {', '.join(unknown)}; there are {', '.join(STANDARD)}")
+    made = (replaced[name] if name in replaced else kind() for name, kind in STANDARD.items())
+    return [callback for callback in made if callback is not None]

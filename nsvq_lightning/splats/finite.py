@@ -1,0 +1,40 @@
+"""Which splats are finite: those without NaN or infinite numbers in any attribute."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+import numpy as np
+
+__all__ = ["finite_rows", "listed"]
+
+_Array = TypeVar("_Array")
+"""NumPy's arrays or torch's tensors, on any device; torch is not imported for the former."""
+
+
+def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int]]:
+    """Which rows are finite in all attributes.
+
+    Args:
+        attributes: Arrays or tensors ``[N, ...]`` by name, at least one.
+
+    Returns:
+        A mask ``[N]`` of booleans and, for each attribute with other rows, how many.
+    """
+    mask: Any = None
+    culprits: dict[str, int] = {}
+    for name, values in attributes.items():
+        array: Any = values
+        flags = np.isfinite(array) if isinstance(array, np.ndarray) else array.isfinite()
+        good = flags.reshape(len(array), math.prod(array.shape[1:])).all(1)
+        mask = good if mask is None else mask & good
+        if bad := len(array) - int(good.sum()):
+            culprits[name] = bad
+    return mask, culprits
+
+
+def listed(culprits: Mapping[str, int]) -> str:
+    """The attributes with rows that are not finite, for a message."""
+    return ", ".join(f"{name} in {count} rows" for name, count in culprits.items())
