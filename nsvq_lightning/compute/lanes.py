@@ -453,7 +453,7 @@ def _scatterer(columns: int) -> Any:
 
 
 gather_rows1, gather_rows3, gather_rows4 = (_gatherer(columns) for columns in (1, 3, 4))
-scatter_rows1, scatter_rows2, scatter_rows3, scatter_rows4 = (_scatterer(columns) for columns in (1, 2, 3, 4))
+scatter_rows1, scatter_rows3, scatter_rows4 = (_scatterer(columns) for columns in (1, 3, 4))
 
 
 def _split_columns(builder: Any, parts: Sequence[Any], columns: int) -> list[Any]:
@@ -468,20 +468,6 @@ def _split_columns(builder: Any, parts: Sequence[Any], columns: int) -> list[Any
         for part in range(1, columns):
             lanes = [WIDTH + lane if at == part else row for row, (at, lane) in enumerate(source)]
             value = _shuffle(builder, value, parts[part], lanes)
-        result.append(value)
-    return result
-
-
-def _join_columns(builder: Any, vectors: Sequence[Any]) -> list[Any]:
-    """The inverse of :func:`_split_columns`."""
-    columns = len(vectors)
-    result = []
-    for part in range(columns):
-        positions = [divmod(part * WIDTH + lane, columns) for lane in range(WIDTH)]
-        value = _shuffle(builder, vectors[0], vectors[0], [row if column == 0 else 0 for row, column in positions])
-        for at in range(1, columns):
-            lanes = [WIDTH + row if column == at else lane for lane, (row, column) in enumerate(positions)]
-            value = _shuffle(builder, value, vectors[at], lanes)
         result.append(value)
     return result
 
@@ -568,23 +554,3 @@ def store_block(context, builder, sig, values):
         address = _address(context, builder, sig.args[0], image, builder.add(offset, builder.mul(_i64(row), stride)))
         _write(builder, address, _shuffle(builder, lanes, lanes, list(range(4 * row, 4 * row + 4))))
     return context.get_dummy_value()
-
-
-def _row_storer(columns: int) -> Any:
-    def emit(context, builder, sig, values):
-        array, offset, rows = values
-        vectors = cgutils.unpack_tuple(builder, rows, columns)
-        for part, value in enumerate(_join_columns(builder, vectors)):
-            place = builder.add(offset, _i64(WIDTH * part))
-            _write(builder, _address(context, builder, sig.args[0], array, place), value)
-        return context.get_dummy_value()
-
-    emit.__name__ = f"store_rows{columns}"
-    emit.__doc__ = (
-        f"``store_rows{columns}(array, offset, ({columns} vectors))``: the inverse of ``load_rows{columns}``."
-    )
-    return _function(types.void, 3)(emit)
-
-
-store_rows3 = _row_storer(3)
-store_rows4 = _row_storer(4)

@@ -101,10 +101,10 @@ class SSIM(_MeanOverImages):
         return score
 
 
-def image_metrics(prefix: str = "") -> MetricCollection:
+def image_metrics() -> MetricCollection:
     """PSNR and SSIM under the names ``psnr`` and ``ssim``; calling it scores one image and adds it to the mean."""
     # The two have states of the same shape, which torchmetrics would take for a group that shares them.
-    return MetricCollection({"psnr": PSNR(), "ssim": SSIM()}, prefix=prefix or None, compute_groups=False)
+    return MetricCollection({"psnr": PSNR(), "ssim": SSIM()}, compute_groups=False)
 
 
 def build_lpips() -> tuple[Metric | None, str | None]:

@@ -15,12 +15,10 @@ class QuantizedAttribute:
 
     Attributes:
         name: Name of the raw attribute.
-        dim: Numbers in a row; for ``shN`` that of degree 3.
         code_share: Number of codes as a share of those for scales (paper, section 4: Ks = Kr = 4·Kc = 4·Ksh).
     """
 
     name: str
-    dim: int
     code_share: float
 
     def rows(self, tensor: Tensor) -> Tensor:
@@ -44,10 +42,10 @@ class QuantizedAttribute:
 QUANTIZED = {
     attribute.name: attribute
     for attribute in (
-        QuantizedAttribute("scales", 3, 1.0),
-        QuantizedAttribute("quats", 4, 1.0),
-        QuantizedAttribute("sh0", 3, 0.25),
-        QuantizedAttribute("shN", 45, 0.25),
+        QuantizedAttribute("scales", 1.0),
+        QuantizedAttribute("quats", 1.0),
+        QuantizedAttribute("sh0", 0.25),
+        QuantizedAttribute("shN", 0.25),
     )
 }
 """The quantized attributes by name. Positions and opacities are not vector quantized."""

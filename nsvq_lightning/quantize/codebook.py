@@ -88,11 +88,6 @@ class CodebookQuantizer(nn.Module, ABC):
         return self.codebook.shape[1]
 
     @property
-    def bits(self) -> int:
-        """Bits of a stored code: ⌈log2 K⌉, at least 1."""
-        return max(1, (self.num_codes - 1).bit_length())
-
-    @property
     def frozen(self) -> bool:
         """Whether :meth:`freeze` has fixed the codes."""
         return self.codes.numel() > 0

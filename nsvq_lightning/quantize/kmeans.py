@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from numba import prange
@@ -15,9 +13,6 @@ from nsvq_lightning.quantize.sums import sum_by_code
 
 __all__ = ["distinct_rows", "draw_far_rows", "kmeans", "rows_far_apart"]
 
-AllReduce = Callable[[Tensor], Tensor]
-"""Sum of a tensor over the processes."""
-
 
 @torch.no_grad()
 def kmeans(
@@ -26,7 +21,6 @@ def kmeans(
     generator: torch.Generator,
     weight: Tensor | None = None,
     steps: int = 10,
-    all_reduce: AllReduce | None = None,
     start: Tensor | None = None,
     spread: bool = False,
 ) -> Tensor:
@@ -40,7 +34,6 @@ def kmeans(
         generator: Source of the start.
         weight: Weight of each row, ``[N]``, not negative; rows of weight 0 are left out.
         steps: Lloyd steps.
-        all_reduce: Sum over processes that hold different rows; then every process must pass the same ``start``.
         start: Initial centroids ``[k, D]``; by default a random sample of the distinct rows.
         spread: Without ``start``: start from distinct rows far apart
             (:func:`~nsvq_lightning.quantize.kmeans.rows_far_apart`) instead.
@@ -50,20 +43,17 @@ def kmeans(
         themselves, in the order of their first occurrence.
 
     Raises:
-        ValueError: A shape does not fit, there is no row, a number is not finite, a weight is negative, or rows are
-            spread over processes without a common start.
+        ValueError: A shape does not fit, there is no row, a number is not finite, or a weight is negative.
     """
     x, weight = _checked(x, k, weight)
     if start is None:
-        if all_reduce is not None:
-            raise ValueError("k-means over several processes needs a common `start`, broadcast from one of them")
         first = distinct_rows(x)
         if len(first) <= k:
             return x[first]
         start = rows_far_apart(x[first], k, generator) if spread else _sample(x[first], k, generator)
     centroids = start.detach().clone()
     for _ in range(steps):
-        centroids = _lloyd_step(x, centroids, weight, all_reduce)
+        centroids = _lloyd_step(x, centroids, weight)
     return centroids
 
 
@@ -87,7 +77,7 @@ def _checked(x: Tensor, k: int, weight: Tensor | None) -> tuple[Tensor, Tensor |
     return x[used], weight.detach()[used].double()
 
 
-def _lloyd_step(x: Tensor, centroids: Tensor, weight: Tensor | None, all_reduce: AllReduce | None) -> Tensor:
+def _lloyd_step(x: Tensor, centroids: Tensor, weight: Tensor | None) -> Tensor:
     """Mean of the rows nearest to each centroid; a centroid without rows stays."""
     codes = nearest(x, centroids)
     k = centroids.shape[0]
@@ -96,8 +86,6 @@ def _lloyd_step(x: Tensor, centroids: Tensor, weight: Tensor | None, all_reduce:
     else:
         sums = sum_by_code(x * weight[:, None], codes, k)
         mass = sum_by_code(weight[:, None], codes, k)[:, 0]
-    if all_reduce is not None:
-        sums, mass = all_reduce(sums), all_reduce(mass)
     means = sums / mass.clamp_min(torch.finfo(torch.float64).tiny)[:, None]
     return torch.where(mass[:, None] > 0, means.to(centroids.dtype), centroids)
 

@@ -28,13 +28,6 @@ def test_is_a_quantizer() -> None:
     assert as_quantizer(NSVQ(4, 3))
 
 
-@pytest.mark.parametrize(
-    ("num_codes", "bits"), [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3), (4096, 12), (16384, 14), (16385, 15)]
-)
-def test_bits(num_codes: int, bits: int) -> None:
-    assert NSVQ(num_codes, 2).bits == bits
-
-
 def test_fit_shrinks_and_keeps_the_parameter() -> None:
     quantizer = NSVQ(16, 3)
     parameter = quantizer.codebook

@@ -70,23 +70,6 @@ def test_rows_of_weight_zero_count_for_nothing() -> None:
     assert torch.equal(kmeans(x, 8, generator(0), weight), kmeans(x[:50], 8, generator(0), torch.ones(50)))
 
 
-def test_two_processes_equal_one() -> None:
-    """The reduction is played by adding what the other half of the rows contributes."""
-    x, start = rows(1000, 3), rows(10, 3, 1)
-    parts = x[:400], x[400:]
-    centroids = start
-    for _ in range(3):
-        contributions: list[list[Tensor]] = [[], []]
-        for part, seen in zip(parts, contributions, strict=True):
-            kmeans(part, 10, generator(0), steps=1, start=centroids, all_reduce=lambda t, s=seen: s.append(t) or t)
-        sums, mass = (a + b for a, b in zip(*contributions, strict=True))
-        reduced = [sums, mass]
-        centroids = kmeans(
-            parts[0], 10, generator(0), steps=1, start=centroids, all_reduce=lambda _, parts=reduced: parts.pop(0)
-        )
-    torch.testing.assert_close(centroids, kmeans(x, 10, generator(0), steps=3, start=start))
-
-
 def test_distinct_rows_of_signed_zeros_and_repeats() -> None:
     x = torch.tensor([[0.0, 1.0], [-0.0, 1.0], [2.0, 1.0], [0.0, 1.0], [2.0, 1.0], [1.0, 0.0]])
     assert distinct_rows(x).tolist() == [0, 2, 5]
@@ -112,8 +95,6 @@ def test_refusals() -> None:
         kmeans(torch.zeros(0, 3), 2, generator(0))
     with pytest.raises(ValueError, match="weight"):
         kmeans(rows(3, 3), 2, generator(0), -torch.ones(3))
-    with pytest.raises(ValueError, match="start"):
-        kmeans(rows(3, 3), 2, generator(0), all_reduce=lambda t: t)
 
 
 def test_sums_agree_with_index_add() -> None:

@@ -93,19 +93,17 @@ def test_masks() -> None:
 
 
 @pytest.mark.parametrize("columns", [3, 4])
-def test_rows_come_apart_and_together(values: Array, columns: int) -> None:
-    loader, storer = getattr(lanes, f"load_rows{columns}"), getattr(lanes, f"store_rows{columns}")
+def test_rows_come_apart(values: Array, columns: int) -> None:
+    loader = getattr(lanes, f"load_rows{columns}")
 
     def kernel(a: Array, out: Array) -> None:
         rows = loader(a, 1)
         lanes.store(out, 0, rows[0])
         lanes.store(out, 16, rows[2])
-        storer(out, 32, rows)
 
-    out = run(kernel, values, outputs=2 + columns)
+    out = run(kernel, values, outputs=2)
     matrix = values[1 : 1 + 16 * columns].reshape(16, columns)
-    np.testing.assert_array_equal(out[:2], [matrix[:, 0], matrix[:, 2]])
-    np.testing.assert_array_equal(out[2:].ravel(), matrix.ravel())
+    np.testing.assert_array_equal(out, [matrix[:, 0], matrix[:, 2]])
 
 
 def test_gather_and_scatter(values: Array) -> None:
