@@ -1,5 +1,6 @@
 """Vector quantization of splat attributes."""
 
+from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.quantize.attributes import QUANTIZED, QuantizedAttribute, codebook_sizes
 from nsvq_lightning.quantize.base import Quantizer, Refittable
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
@@ -27,4 +28,5 @@ __all__ = [
     "kmeans",
     "nearest",
     "nearest_reference",
+    "take_rows",
 ]
