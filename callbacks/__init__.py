@@ -13,12 +13,12 @@ from .density_rules import DensityRules
 from .export import ExportScene
 from .finite import FiniteCodes
 from .freeze import FreezeCodes
+from .metric_report import MetricReport
 from .opacity import OpacityRegularization
 from .phases import PhaseSchedule
 from .predictions import RenderWriter
 from .progress import SplatProgressBar
 from .refit import CodebookRefit
-from .report import MetricReport
 from .sh_degree import ShDegreeSchedule
 from .standard import STANDARD, standard
 
