@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 
 # Before torch loads OpenMP: threads that wait by spinning slow everything down where cores are shared.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -13,12 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from guards import guarded
 
 from nsvq_lightning.data.colmap import import_pycolmap
 from nsvq_lightning.data.synthetic import write_synthetic_scene
-
-sys.path.insert(0, str(Path(__file__).parent))  # guards, which tests of several folders share
-from guards import guarded
 
 SceneFactory = Callable[..., Path]
 

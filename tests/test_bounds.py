@@ -24,7 +24,7 @@ def _checked(what: str, cache: Path) -> subprocess.CompletedProcess[str]:
         "NUMBA_CACHE_DIR": str(cache),
         "NUMBA_NUM_THREADS": "1",  # errors of other threads are lost
     }
-    command = [sys.executable, str(HERE / "kernel_calls.py"), what]
+    command = [sys.executable, str(HERE / "support" / "kernel_calls.py"), what]
     return subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", env=environment)
 
 

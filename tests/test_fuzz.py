@@ -9,8 +9,6 @@ import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent / "io"))
 from viewer_scenes import HAS_ZSTD
 
 pytestmark = pytest.mark.skipif(
@@ -39,7 +37,7 @@ def test_damaged_files_are_read_or_refused_with_one_clear_error(kind: str, tmp_p
         pytest.skip("no Zstandard: pip install 'nsvq-lightning[spz]'")
     cases = int(os.environ.get("NSVQ_FUZZ_CASES", CASES[kind]))
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, str(ROOT / "tests" / "fuzzing.py"), kind, str(tmp_path), str(cases)]
+    command = [sys.executable, str(ROOT / "tests" / "support" / "fuzzing.py"), kind, str(tmp_path), str(cases)]
     run = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", env=environment)
     assert run.returncode == 0, f"status {run.returncode}, damaged file kept in {tmp_path}: ...{run.stderr[-3000:]}"
     found = re.fullmatch(r"(\d+) read, (\d+) refused\n", run.stdout)

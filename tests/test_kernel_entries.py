@@ -73,7 +73,7 @@ def _lines(compiler: str) -> tuple[list[list[str]], str]:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE.parent), str(HERE)])}
     if compiler == "triton":
         environment["TRITON_INTERPRET"] = "1"
-    command = [sys.executable, str(HERE / "kernel_calls.py"), compiler]
+    command = [sys.executable, str(HERE / "support" / "kernel_calls.py"), compiler]
     done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", env=environment)
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     return lines, f"status {done.returncode}, last call {lines[-1:]}: ...{done.stderr[-3000:]}"

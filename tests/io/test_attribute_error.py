@@ -1,16 +1,12 @@
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from viewer_scenes import plain_scene
 
 from nsvq_lightning.io.attribute_error import attribute_errors
-
-sys.path.insert(0, str(Path(__file__).parent))
-from viewer_scenes import plain_scene
 
 
 def test_known_changes_are_found() -> None:

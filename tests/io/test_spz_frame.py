@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import struct
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from viewer_scenes import assert_same, coded_scene, needs_zstd, plain_scene, read_table
 
 from nsvq_lightning.io import FormatError, read_scene, save
 from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.spz_frame import read_spz_header
-
-sys.path.insert(0, str(Path(__file__).parent))
-from viewer_scenes import assert_same, coded_scene, needs_zstd, plain_scene, read_table
 
 HEAD = struct.Struct("<4sIIBBBBI12x")
 ENTRY = struct.Struct("<QQ")

@@ -7,7 +7,6 @@ import json
 import logging
 import math
 import struct
-import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from viewer_scenes import angles, coded_scene, nearest_in, needs_zstd, plain_scene, sigmoid
 
 from nsvq_lightning.commands.info import main as info
 from nsvq_lightning.compression.pictures import cameras_around, decibels, picture_error, pictures
@@ -22,9 +22,6 @@ from nsvq_lightning.io import CompressedScene, FormatError, SplatArrays, load, r
 from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.sog import write_sog
 from nsvq_lightning.io.spz_frame import read_spz_header
-
-sys.path.insert(0, str(Path(__file__).parent))
-from viewer_scenes import angles, coded_scene, nearest_in, needs_zstd, plain_scene, sigmoid
 
 SUFFIXES = (".splat", ".spz", ".sog")
 SH_C0 = 0.28209479177387814

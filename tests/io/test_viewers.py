@@ -6,16 +6,10 @@ import math
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-
-from nsvq_lightning.io import SplatArrays, read_scene, save
-from nsvq_lightning.io.spz_frame import read_spz_header
-
-sys.path.insert(0, str(Path(__file__).parent))
 from viewer_scenes import (
     angles,
     assert_same,
@@ -26,6 +20,9 @@ from viewer_scenes import (
     read_table,
     sigmoid,
 )
+
+from nsvq_lightning.io import SplatArrays, read_scene, save
+from nsvq_lightning.io.spz_frame import read_spz_header
 
 pytestmark = pytest.mark.viewers
 

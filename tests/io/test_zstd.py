@@ -1,15 +1,11 @@
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from types import ModuleType
 
 import pytest
+from viewer_scenes import needs_zstd
 
 from nsvq_lightning.io import FormatError, zstd
-
-sys.path.insert(0, str(Path(__file__).parent))
-from viewer_scenes import needs_zstd
 
 DATA = b"many equal bytes " * 100
 

@@ -7,19 +7,17 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
+import gsplat_standin
+import oracle
 import pytest
 import torch
+from oracle import run
+from splat_scenes import front_camera, random_splats
 
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.rendering.gsplat import support
 from nsvq_lightning.rendering.rasterize import BACKENDS, fast_backends, render, resolve_backend, visible
 from nsvq_lightning.splats.splats import RawSplats
-
-sys.path.insert(0, str(Path(__file__).parent))
-import gsplat_standin
-import oracle
-from oracle import run
-from scenes import front_camera, random_splats
 
 assert_same = partial(oracle.assert_same, "gsplat", sees_more=True)
 ADAPTER = "nsvq_lightning.rendering.gsplat.rasterizer"

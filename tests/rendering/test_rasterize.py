@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import math
-import sys
 from functools import partial
-from pathlib import Path
 
 import numba
+import oracle
 import pytest
 import torch
+from oracle import run
+from splat_scenes import front_camera, random_splats
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu import rasterizer
 from nsvq_lightning.rendering.rasterize import _warn_of_plain_torch, render, resolve_backend, visible
 from nsvq_lightning.skips import switched
 from nsvq_lightning.splats.splats import RawSplats, Splats
-
-sys.path.insert(0, str(Path(__file__).parent))
-import oracle
-from oracle import run
-from scenes import front_camera, random_splats
 
 assert_same = partial(oracle.assert_same, "cpu")
 

@@ -8,11 +8,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cross_compile
 import llvmlite.binding as llvm
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 from cross_compile import SIGNATURES
 
 ARM, INTEL = "aarch64-unknown-linux-gnu", "x86_64-unknown-linux-gnu"
@@ -32,7 +30,7 @@ def _compiled(processor: str, *kernels: str) -> dict[str, Any]:
         llvm.Target.from_triple(PROCESSORS[processor])
     except RuntimeError as error:
         pytest.skip(f"this llvmlite was built without that target: {error}")
-    script = Path(__file__).with_name("cross_compile.py")
+    script = Path(cross_compile.__file__)
     command = [sys.executable, str(script), PROCESSORS[processor], processor, *kernels]
     measured: dict[str, Any] = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
     return measured

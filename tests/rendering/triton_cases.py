@@ -8,14 +8,15 @@ milliseconds for a splat in a tile, so scenes are tiny.
 from __future__ import annotations
 
 import math
-import sys
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
+import oracle
 import pytest
 import torch
+from oracle import run
+from splat_scenes import front_camera, random_splats
 from triton.runtime.interpreter import InterpreterBuilder
 
 from nsvq_lightning.rendering.cuda.binning import list_tiles
@@ -23,11 +24,6 @@ from nsvq_lightning.rendering.cuda.blend import blend, tile_grid
 from nsvq_lightning.rendering.cuda.projection import Lens, project
 from nsvq_lightning.rendering.rasterize import render, resolve_backend, visible
 from nsvq_lightning.splats.splats import RawSplats
-
-sys.path.insert(0, str(Path(__file__).parent))
-import oracle
-from oracle import run
-from scenes import front_camera, random_splats
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 assert_same = partial(oracle.assert_same, "cuda")

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import Checkpoint
+from runs import Recipe, RunFactory
 
 from nsvq_lightning.callbacks import STANDARD, DensityControl, DensityRules, MetricReport, PhaseSchedule, standard
 from nsvq_lightning.commands.benchmark.fitting import quiet_trainer
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.training.module import SplatModule
 
-sys.path.insert(0, str(Path(__file__).parent))  # test modules share what stands in modules beside them
-
 STEPS = 60
 CODES = {"scales": 24, "quats": 24, "sh0": 16, "shN": 16}
-
-
-Recipe = Callable[..., dict[str, Callback]]
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +38,6 @@ def recipe() -> Recipe:
         return dict(zip(names, standard(**chosen), strict=True))
 
     return build
-
-
-RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import torch
 import yaml
 from checkpoints import CheckpointAt
 from lightning.pytorch import Callback, LightningModule, Trainer
+from runs import Recipe, RunFactory
 from torch import Tensor
 
 from nsvq_lightning.callbacks import (
@@ -30,9 +30,6 @@ from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import run_folder
 from nsvq_lightning.training.schedule import Phase
-
-RunFactory = Callable[..., tuple[Trainer, SplatModule]]
-Recipe = Callable[..., dict[str, Callback]]
 
 LAST_BEFORE_CODEBOOKS = 27
 """Of the recipe's 60 iterations."""

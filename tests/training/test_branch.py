@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from lightning.pytorch import Callback, Trainer
+from lightning.pytorch import Trainer
+from runs import Recipe, RunFactory
 from torch import nn
 
 from nsvq_lightning.callbacks import PhaseSchedule, RunCheckpoint
@@ -25,9 +25,6 @@ from nsvq_lightning.training.branch import (
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import run_folder
 from nsvq_lightning.training.schedule import Phase, Schedule
-
-RunFactory = Callable[..., tuple[Trainer, SplatModule]]
-Recipe = Callable[..., dict[str, Callback]]
 
 INTERVALS = {"min_density_interval": 4, "min_reset_interval": 11, "min_replacement_interval": 5, "min_finetune": 1}
 PRUNE_END = Schedule(total=60, **INTERVALS).ends[Phase.PRUNE]

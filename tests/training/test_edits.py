@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
+from runs import Recipe, RunFactory
 
 from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.training.edit import append_rows, keep_rows
 from nsvq_lightning.training.host import as_host
-from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import raw_optimizer
-
-RunFactory = Callable[..., tuple[Trainer, SplatModule]]
-Recipe = Callable[..., dict[str, Callback]]
 
 STEPS = 60
 AMOUNT = 7

@@ -19,6 +19,7 @@ from checkpoints import assert_same, assert_same_end, iteration_of, read
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import SIGTERMException
+from runs import Recipe, RunFactory
 
 from nsvq_lightning.callbacks import (
     CanonicalCovariance,
@@ -36,9 +37,6 @@ from nsvq_lightning.quantize import StraightThrough
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import run_folder
 from nsvq_lightning.training.schedule import Schedule
-
-RunFactory = Callable[..., tuple[Trainer, SplatModule]]
-Recipe = Callable[..., dict[str, Callback]]
 
 PHASES = {"warmup": 13, "prune": 24, "quantize": 41, "finetune": 59}
 """An iteration of each phase, of the recipe's 60; none of them has a periodic checkpoint."""

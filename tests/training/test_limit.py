@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from conftest import Recipe, RunFactory
 from lightning.pytorch import Callback, LightningModule, Trainer
+from runs import Recipe, RunFactory
 
 from nsvq_lightning.callbacks import DensityControl, DensityRules
 from nsvq_lightning.training.host import as_host

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
+from runs import Recipe, RunFactory
 
 from nsvq_lightning.callbacks import CodebookRefit, CodebookReplacement, MetricReport, PhaseSchedule, RunCheckpoint
 from nsvq_lightning.io.nsvq.file import read_nsvq
@@ -29,8 +29,6 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import run_folder
 from nsvq_lightning.training.schedule import Phase, Schedule
 
-RunFactory = Callable[..., tuple[Trainer, SplatModule]]
-Recipe = Callable[..., dict[str, Callback]]
 Quantizers = type[CodebookQuantizer]
 
 KINDS = [StraightThrough, TrainedStraightThrough, DiVeQ, PostHoc, VectorQuantizeAdapter]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import random
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import pytest
 import torch
 from checkpoints import CheckpointAt, read
 from lightning.pytorch import Callback, LightningModule, Trainer
+from runs import Recipe, RunFactory
 
 from nsvq_lightning.callbacks import (
     CanonicalCovariance,
@@ -38,9 +39,6 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates, position_lr
 from nsvq_lightning.training.run_folder import run_folder
 from nsvq_lightning.training.schedule import Phase, Schedule
-
-RunFactory = Callable[..., tuple[Trainer, SplatModule]]
-Recipe = Callable[..., dict[str, Callback]]
 
 
 class Witness(Callback):

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import RunFactory
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import CSVLogger, Logger
+from runs import RunFactory
 
 from nsvq_lightning.callbacks import ExportScene, MetricReport, PhaseSchedule, RenderWriter, RunCheckpoint
 from nsvq_lightning.commands.benchmark.fitting import quiet_trainer

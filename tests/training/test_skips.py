@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
-from lightning.pytorch import Callback, Trainer
+from runs import Recipe, RunFactory
 from torch import Tensor
 
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.skips import SKIPS, switched
-from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import run_folder
-
-RunFactory = Callable[..., tuple[Trainer, SplatModule]]
-Recipe = Callable[..., dict[str, Callback]]
 
 EXACT = [name for name, skip in SKIPS.items() if skip.exact]
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import Recipe, RunFactory
 from lightning.pytorch import Callback
 from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
+from runs import Recipe, RunFactory
 
 from nsvq_lightning.callbacks import MetricReport, RunCheckpoint
 from nsvq_lightning.data.datamodule import ColmapDataModule

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import torch
+from splat_scenes import front_camera, random_splats
 from torch import Tensor
 
 from nsvq_lightning.compression.importance import contributions, least_contributing, most_contributing, row_weights
@@ -13,9 +11,6 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, render
 from nsvq_lightning.rendering.sh import C0
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors
-
-sys.path.insert(0, str(Path(__file__).parent / "rendering"))
-from scenes import front_camera, random_splats
 
 
 def rendered(splats: SplatTensors, camera: Camera) -> Render:

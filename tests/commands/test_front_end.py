@@ -62,7 +62,7 @@ def test_help_has_every_option_of_the_default_callbacks_and_none_of_torchs_class
 
 
 def test_options_that_the_readme_names_are_in_the_help(fit_help: str) -> None:
-    root = Path(__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     if not (root / "README.md").exists():
         pytest.skip("a source distribution has no README beside the tests")
     pages = "".join(path.read_text(encoding="utf-8") for path in (root / "README.md", root / "docs" / "your_photos.md"))

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from splat_scenes import front_camera, random_splats
 from torch import Tensor
 
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.forms import Form, canonical
-
-sys.path.insert(0, str(Path(__file__).parent / "rendering"))
-from scenes import front_camera, random_splats
 
 
 def rows(count: int = 500, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:

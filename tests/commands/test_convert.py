@@ -1,20 +1,17 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from viewer_scenes import coded_scene, nearest_in, needs_zstd, plain_scene
 
 from nsvq_lightning.commands.convert import main
 from nsvq_lightning.commands.registry import COMMANDS
 from nsvq_lightning.io import FORMATS, CompressedScene, read_scene, save
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.spz_frame import read_spz_header
-
-sys.path.insert(0, str(Path(__file__).parent / "io"))
-from viewer_scenes import coded_scene, nearest_in, needs_zstd, plain_scene
 
 
 def exported(scene: CompressedScene, folder: Path, storage: Storage, *formats: str) -> dict[str, Path]:
