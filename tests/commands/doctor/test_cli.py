@@ -50,7 +50,7 @@ def test_help_answers_before_torch_is_imported() -> None:
 def test_threads_and_waiting_are_judged(monkeypatch: pytest.MonkeyPatch) -> None:
     for used, verdict in ((2, "note"), (4, "good"), (8, "note")):
         monkeypatch.setattr(machine, "usable_cores", lambda: 4)
-        monkeypatch.setattr(machine.jit, "thread_count", lambda used=used: used)
+        monkeypatch.setattr(machine, "thread_count", lambda used=used: used)
         assert next(iter(machine.check_threads())).verdict == verdict
     for policy, verdict in (("passive", "good"), ("ACTIVE", "note")):
         monkeypatch.setenv("OMP_WAIT_POLICY", policy)
@@ -59,7 +59,7 @@ def test_threads_and_waiting_are_judged(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_the_slow_cores_of_a_mac_are_not_missed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "usable_cores", lambda: 8)
-    monkeypatch.setattr(machine.jit, "thread_count", lambda: 4)
+    monkeypatch.setattr(machine, "thread_count", lambda: 4)
     monkeypatch.setattr(platform, "system", lambda: "Darwin")
     monkeypatch.setattr(platform, "machine", lambda: "arm64")
     for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
