@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.commands.sweep.results import Group, Row, grouped, series_of
+from nsvq_lightning.commands.sweep.results import Group, RunResult, grouped, series_of
 from nsvq_lightning.report.figures import colours_of, draw_keys, markers_of, new_figure, write_figure
 
 __all__ = ["draw_sweep"]
@@ -18,7 +18,7 @@ PANEL = (6.4, 4.6)
 LEGEND_LINE = 0.19
 
 
-def draw_sweep(path: Path, rows: Sequence[Row]) -> None:
+def draw_sweep(path: Path, rows: Sequence[RunResult]) -> None:
     """Draw PSNR over file size: a panel and a marker for each scene, a colour for each quantizer or configuration.
 
     A point is the mean over the seeds, its whiskers the standard deviation; lines join the codebook sizes. Runs without
