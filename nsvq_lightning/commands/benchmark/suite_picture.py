@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.commands.benchmark.registry import Suite
-from nsvq_lightning.commands.benchmark.row import Row
+from nsvq_lightning.commands.benchmark.measurement import Measurement
+from nsvq_lightning.commands.benchmark.suite_list import Suite
 from nsvq_lightning.report.figures import colours_of, draw_keys, markers_of, new_figure, write_figure
 
 __all__ = ["draw_suite"]
@@ -20,7 +20,7 @@ LEGEND_LINE = 0.19
 SHARE = "share %"
 
 
-def draw_suite(path: Path, rows: Sequence[Row], suite: Suite) -> None:
+def draw_suite(path: Path, rows: Sequence[Measurement], suite: Suite) -> None:
     """Draw the rows of one suite.
 
     ``errors``: a panel for each operation and value, a colour for each method, a marker for each workload. The time is
@@ -51,11 +51,11 @@ def draw_suite(path: Path, rows: Sequence[Row], suite: Suite) -> None:
     write_figure(path, figure)
 
 
-Panel = tuple[Sequence[Row], str, str]
+Panel = tuple[Sequence[Measurement], str, str]
 """All rows, the operation that is drawn, and the value."""
 
 
-def _values(rows: Sequence[Row], drawn: Sequence[str]) -> list[Panel]:
+def _values(rows: Sequence[Measurement], drawn: Sequence[str]) -> list[Panel]:
     """The panels: what is to be drawn where the rows of an operation have it, else their first value."""
     panels: list[Panel] = []
     for operation in _distinct(rows, "operation"):
@@ -65,7 +65,7 @@ def _values(rows: Sequence[Row], drawn: Sequence[str]) -> list[Panel]:
     return panels or [(rows, rows[0].operation, next(iter(rows[0].values)))]
 
 
-def _figure(panels: Sequence[Panel], draw: Callable[[Any, Sequence[Row], Panel], None]) -> Any:
+def _figure(panels: Sequence[Panel], draw: Callable[[Any, Sequence[Measurement], Panel], None]) -> Any:
     across = min(COLUMNS, len(panels))
     down = -(-len(panels) // across)
     rows = panels[0][0]
@@ -80,12 +80,12 @@ def _figure(panels: Sequence[Panel], draw: Callable[[Any, Sequence[Row], Panel],
     return figure
 
 
-def _styles(rows: Sequence[Row]) -> tuple[dict[str, Any], dict[str, str]]:
+def _styles(rows: Sequence[Measurement]) -> tuple[dict[str, Any], dict[str, str]]:
     """Colour of each method and marker of each workload, the same in all panels."""
     return colours_of(_distinct(rows, "method")), markers_of(_distinct(rows, "workload"))
 
 
-def _draw_values(axis: Any, rows: Sequence[Row], panel: Panel) -> None:
+def _draw_values(axis: Any, rows: Sequence[Measurement], panel: Panel) -> None:
     everything, _, value = panel
     styles = _styles(everything)
     rows = [row for row in rows if value in row.values]
@@ -96,7 +96,9 @@ def _draw_values(axis: Any, rows: Sequence[Row], panel: Panel) -> None:
     axis.grid(alpha=0.3, which="major")
 
 
-def _draw_courses(axis: Any, rows: Sequence[Row], value: str, styles: tuple[dict[str, Any], dict[str, str]]) -> None:
+def _draw_courses(
+    axis: Any, rows: Sequence[Measurement], value: str, styles: tuple[dict[str, Any], dict[str, str]]
+) -> None:
     colours, markers = styles
     for row in rows:
         seconds, values = zip(*row.course, strict=True)
@@ -106,7 +108,9 @@ def _draw_courses(axis: Any, rows: Sequence[Row], value: str, styles: tuple[dict
     axis.set(xlabel="seconds", ylabel=value)
 
 
-def _draw_points(axis: Any, rows: Sequence[Row], value: str, styles: tuple[dict[str, Any], dict[str, str]]) -> None:
+def _draw_points(
+    axis: Any, rows: Sequence[Measurement], value: str, styles: tuple[dict[str, Any], dict[str, str]]
+) -> None:
     colours, markers = styles
     most = max(row.threads for row in rows)
     for row in rows:
@@ -132,14 +136,14 @@ def _draw_points(axis: Any, rows: Sequence[Row], value: str, styles: tuple[dict[
     axis.set(xlabel="ms", ylabel=value)
 
 
-def _draw_keys(figure: Any, rows: Sequence[Row]) -> None:
+def _draw_keys(figure: Any, rows: Sequence[Measurement]) -> None:
     """What colours, markers and hollow markers mean, below the panels."""
     threads = sorted({row.threads for row in rows})
     hollow = f"hollow: {', '.join(map(str, threads[:-1]))} instead of {threads[-1]} threads"
     draw_keys(figure, *_styles(rows), hollow if len(threads) > 1 else None)
 
 
-def _draw_bars(axis: Any, rows: Sequence[Row], panel: Panel) -> None:
+def _draw_bars(axis: Any, rows: Sequence[Measurement], panel: Panel) -> None:
     """One bar a row below the first, which is the whole of them."""
     whole, *parts = rows
     axis.set_title(f"{whole.suite}: {panel[1]}, {whole.timing.median:.3g} ms", fontsize="medium")
@@ -161,5 +165,5 @@ def _decades(values: Sequence[float]) -> tuple[float, float]:
     return 10.0**bottom, 10.0 ** max(math.ceil(high + 0.05), bottom + 1)
 
 
-def _distinct(rows: Sequence[Row], field: str) -> list[str]:
+def _distinct(rows: Sequence[Measurement], field: str) -> list[str]:
     return list(dict.fromkeys(str(getattr(row, field)) for row in rows))

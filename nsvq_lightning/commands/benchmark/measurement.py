@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["Row", "Timing"]
+__all__ = ["Measurement", "Timing"]
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Timing:
 
 
 @dataclass(frozen=True)
-class Row:
+class Measurement:
     """One line of a table.
 
     Attributes:
