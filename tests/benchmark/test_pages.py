@@ -23,4 +23,4 @@ def test_every_switch_is_described_as_it_is() -> None:
     for name, skip in SKIPS.items():
         result = (skip.changes or "same bits") + "; off by default" * (not skip.default)
         assert f"| `{name}` | {skip.work} | {skip.when} | {result} |" in explained
-        assert f"| `{name}` |" in measured
+        assert f"| `{name}` " in measured
