@@ -1,4 +1,4 @@
-"""``nsvq benchmark SUITE``: how fast the parts are here, and how wrong."""
+"""``nsvq benchmark SUITE``: how fast the parts are on this machine, and how wrong."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def _fault_of_scene(scope: Scope) -> str | None:
 
 
 class _Results(NamedTuple):
-    """What was measured, where, and how much of it."""
+    """What was measured, where, and how thoroughly."""
 
     machine: Mapping[str, Any]
     scope: Scope

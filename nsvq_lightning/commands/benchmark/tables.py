@@ -20,7 +20,7 @@ def as_json(machine: Mapping[str, Any], scope: Scope, rows: Sequence[Measurement
     Args:
         machine: From :func:`nsvq_lightning.commands.benchmark.hardware.describe_machine`.
         scope: What was measured, and how thoroughly.
-        rows: Results.
+        rows: Measurements.
     """
     chosen = {name: _plain(value) for name, value in asdict(scope).items()}
     return {"machine": dict(machine), "settings": chosen, "rows": [row.as_json() for row in rows]}

@@ -1,4 +1,4 @@
-"""Fair times on a machine that is not ours alone: what is compared takes turns, and a matrix product takes part."""
+"""Fair times on a shared machine: what is compared takes turns, and a matrix product takes part."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the runs of a sweep came to: one row a run, and means over the seeds."""
+"""The results of a sweep: one row for each run, and means over the seeds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["Group", "RunResult", "as_markdown", "grouped", "series_of"]
 
 @dataclass(frozen=True)
 class RunResult:
-    """One run; what is not known, as in a failed one, is None.
+    """What one run came to; what is not known, as in a failed one, is None.
 
     Attributes:
         scene: Name of the scene.

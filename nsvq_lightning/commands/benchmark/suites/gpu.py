@@ -2,7 +2,7 @@
 
 Times are those between two events in the GPU's stream. No render can be faster than its memory gives and takes what it
 must read and write once: ``share of memory limit %`` is that time, at the speed of a plain copy, as a share of the
-measured one. What a back-end reads again, sorts or keeps for the backward pass is its own affair and not in the limit.
+measured one. What a back-end reads again, sorts or keeps for the backward pass is not in the limit.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ __all__ = ["copy_speed", "least_bytes", "run", "run_on"]
 log = logging.getLogger(__name__)
 
 COMPARED = ("cuda", "gsplat")
-"""Back-ends that are missed where they are not there."""
+"""Back-ends whose absence is reported with its reason."""
 COPIED = 2**28
 """Bytes of the copy that says how fast the memory is: more than any cache holds."""
 COPIES = 5

@@ -1,9 +1,9 @@
 """Whole runs, PSNR against seconds, and one step beside the render it contains.
 
-Runs are those of ``nsvq fit``: its module, data, callbacks, loggers and trainer; what only watches a run (reports,
-checkpoints, the progress bar) is left out, and pictures are compared while the clock stands. Every run has the same
-number of steps. Variants differ from the first one in one thing. Where one promises the same bits, the column ``other
-numbers`` checks it: it counts the trained numbers that are not those of the first row.
+Runs are those of ``nsvq fit``: its module, data, callbacks, loggers and trainer. What only watches a run (reports,
+checkpoints, the progress bar) is left out, and test views are compared while the clock is stopped. Every run has the
+same number of steps. Variants differ from the first one in one thing. Where one promises the same bits, the column
+``other numbers`` checks it: it counts the trained numbers that are not those of the first row.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ CODEBOOKS = {True: "0.5k", False: "1k"}
 ROUNDS = {True: 1, False: 2}
 """Runs of every variant; their order turns, their steps are counted together."""
 EVALUATIONS = 16
-"""Points on the way of a run at which its test views are compared, besides the ends of the phases."""
+"""Points during a run at which its test views are compared, besides the ends of the phases."""
 PRODUCT_EVERY = {True: 8, False: 10}
 """Steps between two matrix products."""
 WARM_STEPS, STEPS = {True: 4, False: 10}, {True: 10, False: 60}
@@ -60,11 +60,11 @@ class Variant(NamedTuple):
 
 
 class Trained(NamedTuple):
-    """What one run came to.
+    """The result of one run.
 
     Attributes:
         steps: All steps.
-        course: Seconds, test PSNR in dB, on the way and at the end.
+        course: Seconds and test PSNR in dB, during the run and at its end.
         numbers: Everything that was trained, by name.
         file_bytes: Size of the compressed file.
         sgemm: Matrix products in between, ms.
@@ -206,7 +206,7 @@ def _timing(runs: Sequence[Trained]) -> Timing:
 
 
 def _relative_mean(timing: Timing) -> float:
-    """Mean step in matrix products, so that a busy hour of the machine is not taken for a slow variant."""
+    """Mean step in matrix products, so that a busy machine is not mistaken for a slow variant."""
     return fmean(timing.samples) / median(timing.sgemm)
 
 
