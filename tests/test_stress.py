@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from nsvq_lightning.commands.benchmark.extremes import BROKEN, BROKEN_ROWS
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.suites import quantize, stability
 from nsvq_lightning.commands.benchmark.suites.render import Method, trace
 from nsvq_lightning.rendering.camera import Camera
@@ -20,7 +20,7 @@ from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats, Splats
 from nsvq_lightning.training.edit import LARGEST_LOG_SCALE, drop_non_finite
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 
-SCENES = {scene.name: scene for scene in stability.cases(Settings((1,), quick=True))}
+SCENES = {scene.name: scene for scene in stability.cases(Scope((1,), quick=True))}
 BACKENDS = ("cpu", "reference")
 COARSE = {"scene at 1e+03": 1e-3, "scene at 1e+06": 1.0}
 """Largest relative errors where float32 does not know the positions themselves."""
@@ -164,7 +164,7 @@ def test_two_points_a_hair_apart_get_the_smallest_scale() -> None:
 
 
 def test_scenes_are_the_same_at_every_call() -> None:
-    again = {scene.name: scene for scene in stability.cases(Settings((1,), quick=True))}
+    again = {scene.name: scene for scene in stability.cases(Scope((1,), quick=True))}
     assert again.keys() == SCENES.keys()
     for name, scene in again.items():
         pairs = zip(scene.workload.splats, SCENES[name].workload.splats, strict=True)

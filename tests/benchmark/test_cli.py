@@ -9,13 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from nsvq_lightning.commands import main as front_end
 from nsvq_lightning.commands.benchmark import cli, timing
-from nsvq_lightning.commands.benchmark.registry import SUITES
-from nsvq_lightning.commands.benchmark.report import fill_in
 from nsvq_lightning.commands.benchmark.suites import loss
+from nsvq_lightning.commands.main import main as nsvq
 from nsvq_lightning.commands.registry import COMMANDS
-from nsvq_lightning.skips import SKIPS
 
 SMALL = ["loss", "--quick", "--repeats", "1", "--threads", "1"]
 
@@ -27,7 +24,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_tables_go_to_the_output(capsys: pytest.CaptureFixture[str]) -> None:
-    assert front_end.main(["benchmark", *SMALL]) == 0
+    assert nsvq(["benchmark", *SMALL]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith("# nsvq benchmark\n")
     assert "### forward + backward, 48x40, 1 thread\n" in printed
@@ -65,38 +62,6 @@ def test_wrong_arguments_are_explained(arguments: list[str], message: str, capsy
     assert message in capsys.readouterr().err
 
 
-def test_document_gets_the_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    document = tmp_path / "page.md"
-    document.write_text("before\n<!-- results: loss -->\n<!-- end -->\nafter\n")
-    assert cli.main([*SMALL, "--document", str(document)]) == 0
-    text = document.read_text()
-    assert text.startswith("before\n<!-- results: loss -->\n\n#### forward + backward, 48x40, 1 thread\n")
-    assert text.endswith("\n<!-- end -->\nafter\n")
-    assert "| fused " in text
-    document.write_text("no place")
-    with pytest.raises(SystemExit):
-        cli.main([*SMALL, "--document", str(document)])
-    assert "it needs the lines '<!-- results: loss -->'" in capsys.readouterr().err
-    assert document.read_text() == "no place"
-
-
-def test_switches_have_their_own_table(tmp_path: Path) -> None:
-    document = tmp_path / "page.md"
-    document.write_text("<!-- switches -->\n<!-- end -->\n")
-    arguments = ["train", "--quick", "--threads", "1", "--steps", "4", "--document", str(document)]
-    assert cli.main([*arguments, "--switches", "metrics,adam_rows"]) == 0
-    lines = {line.split("|")[1].strip(): line for line in document.read_text().splitlines() if line.startswith("|")}
-    assert lines["switch"].endswith("| saves on demo |")
-    assert lines["`metrics`"].endswith(" % |")
-    assert lines["`blocks`"].endswith("| – |")
-    assert {f"`{name}`" for name in SKIPS} == lines.keys() - {"switch", "---"}
-
-
-def test_every_suite_has_its_place_in_the_documentation() -> None:
-    page = (Path(__file__).resolve().parents[2] / "docs" / "benchmark.md").read_text()
-    assert fill_in(page, dict.fromkeys(SUITES, "x")).count("\n\nx\n\n") == len(SUITES)
-
-
 @pytest.mark.parametrize(("name", "message"), [("none.ply", "No such file"), ("bad.ply", "bad.ply"), ("x.md", ".md")])
 def test_unreadable_scene_is_one_line(
     name: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -121,11 +86,6 @@ def test_help_does_not_load_torch() -> None:
     root = Path(__file__).resolve().parents[2]
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
     assert "--quick" in done.stdout
-
-
-def test_a_place_is_a_line_of_its_own() -> None:
-    document = f"text about `{cli.SWITCHES}`\n<!-- results: train -->\n<!-- end -->\n"
-    assert cli._filled(document, {"train": "table"}) == document.replace("<!-- end -->", "\ntable\n\n<!-- end -->")
 
 
 def test_suite_that_cannot_run_here_is_left_out_with_its_reason(

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from nsvq_lightning.commands.benchmark import timing
-from nsvq_lightning.commands.benchmark.row import Timing
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.measurement import Timing
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.timing import Case, measure
 
 
@@ -20,7 +20,7 @@ def small_product(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_cases_take_turns_in_a_rotating_order_after_one_call_that_is_not_counted() -> None:
     calls: list[str] = []
     cases = [Case(name, lambda name=name: calls.append(name)) for name in "ab"]  # type: ignore[misc]
-    timings = measure(cases, Settings((1,), repeats=3), 1)
+    timings = measure(cases, Scope((1,), repeats=3), 1)
     # The product goes first in the first round; then the order is turned by one place a round.
     assert "".join(calls) == "ab" + "ab" + "ab" + "ba"
     assert {name: len(result.samples) for name, result in timings.items()} == {"a": 3, "b": 3}
@@ -29,7 +29,7 @@ def test_cases_take_turns_in_a_rotating_order_after_one_call_that_is_not_counted
 
 
 def test_times_are_milliseconds_without_the_preparation() -> None:
-    result = measure([Case("nap", lambda: time.sleep(0.02), lambda: time.sleep(0.2))], Settings((1,), repeats=2), 1)
+    result = measure([Case("nap", lambda: time.sleep(0.02), lambda: time.sleep(0.2))], Scope((1,), repeats=2), 1)
     assert 20 <= result["nap"].minimum < 200
 
 
@@ -57,7 +57,7 @@ def test_gpu_is_timed_by_events_around_the_call(monkeypatch: pytest.MonkeyPatch)
 
 def test_slow_case_sits_out_once_its_time_is_used_up() -> None:
     cases = [Case("slow", lambda: time.sleep(0.03)), Case("fast", lambda: None)]
-    timings = measure(cases, Settings((1,), repeats=6, seconds=0.05), 1)
+    timings = measure(cases, Scope((1,), repeats=6, seconds=0.05), 1)
     assert len(timings["slow"].samples) == 2
     assert len(timings["fast"].samples) == len(timings["fast"].sgemm) == 6
 
@@ -73,7 +73,7 @@ def test_threads_and_collector_are_put_back(monkeypatch: pytest.MonkeyPatch) -> 
         raise RuntimeError("broken case")
 
     with pytest.raises(RuntimeError, match="broken case"):
-        measure([Case("a", fail)], Settings((1,)), 3)
+        measure([Case("a", fail)], Scope((1,)), 3)
     assert counts == [3, 7]
     assert seen == [False]
     assert gc.isenabled()
@@ -81,7 +81,7 @@ def test_threads_and_collector_are_put_back(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_names_must_differ() -> None:
     with pytest.raises(ValueError, match="different names"):
-        measure([Case("a", lambda: None), Case("a", lambda: None)], Settings((1,)), 1)
+        measure([Case("a", lambda: None), Case("a", lambda: None)], Scope((1,)), 1)
 
 
 def test_summary_of_known_samples() -> None:

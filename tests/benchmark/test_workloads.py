@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nsvq_lightning import save
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.sizes import STANDARD
 from nsvq_lightning.commands.benchmark.views import FADING, write_views
 from nsvq_lightning.commands.benchmark.workloads import scene_workload, single_workload, synthetic_workload, workloads
@@ -87,7 +87,7 @@ def test_scene_file_is_seen_whole_and_without_broken_splats(tmp_path: Path, monk
     whole = scene_workload(path)
     assert str(whole) == "scene.ply 800x533"
     assert float((render(whole.splats, whole.camera).radii > 0).float().mean()) > 0.7
-    assert [workload.name for workload in workloads(Settings((1,), scene=path))] == ["scene.ply"]
+    assert [workload.name for workload in workloads(Scope((1,), scene=path))] == ["scene.ply"]
     # Our own writer drops such rows; files of others have them.
     source.opacities[3] = torch.nan
     monkeypatch.setattr("nsvq_lightning.commands.benchmark.workloads.load", lambda _: Splats.from_tensors(*source))
@@ -103,21 +103,21 @@ def test_empty_scene_is_refused(tmp_path: Path) -> None:
 
 def test_folder_is_seen_by_its_first_train_camera(demo_scene: Path, tmp_path: Path) -> None:
     scene = load_scene(demo_scene)
-    (workload,) = workloads(Settings((1,), scene=demo_scene))
+    (workload,) = workloads(Scope((1,), scene=demo_scene))
     assert str(workload) == "scene 96x72"
     assert workload.camera is not scene.cameras[0]
     assert torch.equal(workload.camera.viewmat, scene.cameras[scene.train[0]].viewmat)
     assert torch.equal(workload.splats.means, scene.points)
     path = tmp_path / "trained.ply"
     save(RawSplats(*(tensor[:50] for tensor in synthetic_workload("A20k").splats)), path)
-    other = single_workload(Settings((1,), scene=demo_scene, init_from=path), "B100k")
+    other = single_workload(Scope((1,), scene=demo_scene, init_from=path), "B100k")
     assert str(other) == "scene trained.ply 96x72"
     assert torch.equal(other.camera.viewmat, workload.camera.viewmat)
     assert len(other.splats.means) == 50
 
 
 def test_quick_runs_take_the_smallest_scene() -> None:
-    assert single_workload(Settings((1,), quick=True), "B100k").name == "A20k"
+    assert single_workload(Scope((1,), quick=True), "B100k").name == "A20k"
 
 
 def test_views_are_photos_of_the_workload_from_around(tmp_path: Path) -> None:

@@ -7,14 +7,14 @@ from pathlib import Path
 import cv2
 import pytest
 
-from nsvq_lightning.commands.sweep.plot import draw_sweep
-from nsvq_lightning.commands.sweep.results import Row, as_markdown, grouped, series_of
+from nsvq_lightning.commands.sweep.rate_distortion import draw_sweep
+from nsvq_lightning.commands.sweep.results import RunResult, as_markdown, grouped, series_of
 
 
-def row(seed: int = 0, psnr: float | None = 30.0, **other: object) -> Row:
+def row(seed: int = 0, psnr: float | None = 30.0, **other: object) -> RunResult:
     values = {"scene": "fox", "config": "nsvq_1k", "quantizer": "NSVQ", "codebooks": "1k", "steps": 9, "splats": 7}
     values |= {"ssim": 0.9, "bytes": 2_000_000, "seconds": 50.0, "trunk_seconds": 20.0, "psnr_before": 31.0}
-    return Row(**(values | {"seed": seed, "psnr": psnr} | other))  # type: ignore[arg-type]
+    return RunResult(**(values | {"seed": seed, "psnr": psnr} | other))  # type: ignore[arg-type]
 
 
 def test_mean_and_spread_are_over_the_seeds() -> None:
@@ -61,7 +61,7 @@ def test_a_line_of_the_csv_has_both_levels() -> None:
 def test_the_picture_shows_every_point(tmp_path: Path) -> None:
     blue, orange = (180, 119, 31), (14, 127, 255)  # the first two of tab10, BGR
 
-    def drawn(rows: list[Row], colour: tuple[int, int, int] = blue) -> int:
+    def drawn(rows: list[RunResult], colour: tuple[int, int, int] = blue) -> int:
         """Pixels in the colour of a curve, the first by default."""
         draw_sweep(tmp_path / "sweep.png", rows)
         image = cv2.imread(str(tmp_path / "sweep.png"))

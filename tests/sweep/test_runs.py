@@ -19,7 +19,7 @@ import pytest
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.commands.sweep.cli import main as sweep_main
 from nsvq_lightning.commands.sweep.plan import Request, Run, plan
-from nsvq_lightning.commands.sweep.results import Row
+from nsvq_lightning.commands.sweep.results import RunResult
 from nsvq_lightning.commands.sweep.runs import Sweep
 from nsvq_lightning.commands.sweep.training import Training, TrainingError, run_subprocess
 
@@ -68,7 +68,7 @@ def runs(demo_scene: Path, configs: tuple[str, ...]) -> list[Run]:
 
 
 @pytest.fixture(scope="module")
-def swept(runs: list[Run], tmp_path_factory: pytest.TempPathFactory) -> tuple[Sweep, InProcess, list[Row]]:
+def swept(runs: list[Run], tmp_path_factory: pytest.TempPathFactory) -> tuple[Sweep, InProcess, list[RunResult]]:
     """The sweep once it is through."""
     runner = InProcess()
     sweep = Sweep(tmp_path_factory.mktemp("sweep"), runner)
@@ -85,7 +85,7 @@ def metrics_of(folder: Path) -> dict[str, object]:
 
 
 def test_a_run_of_a_sweep_is_the_run_alone(
-    swept: tuple[Sweep, InProcess, list[Row]], demo_scene: Path, configs: tuple[str, ...], tmp_path: Path
+    swept: tuple[Sweep, InProcess, list[RunResult]], demo_scene: Path, configs: tuple[str, ...], tmp_path: Path
 ) -> None:
     _, _, rows = swept
     alone = ["fit", f"--config={configs[1]}", f"--data.root={demo_scene}", "--trainer.max_steps=60", *OPTIONS]
@@ -95,7 +95,7 @@ def test_a_run_of_a_sweep_is_the_run_alone(
     assert metrics_of(folder) == metrics_of(tmp_path / "alone")
 
 
-def test_what_the_runs_share_is_trained_once(swept: tuple[Sweep, InProcess, list[Row]]) -> None:
+def test_what_the_runs_share_is_trained_once(swept: tuple[Sweep, InProcess, list[RunResult]]) -> None:
     sweep, runner, rows = swept
     (trunk,) = (sweep.folder / "trunks").iterdir()
     checkpoint = f"--ckpt_path={trunk / 'checkpoints' / 'last.ckpt'}"
@@ -107,7 +107,7 @@ def test_what_the_runs_share_is_trained_once(swept: tuple[Sweep, InProcess, list
         assert row.seconds > seconds
 
 
-def test_a_run_that_fails_is_noted_and_stops_no_other(swept: tuple[Sweep, InProcess, list[Row]]) -> None:
+def test_a_run_that_fails_is_noted_and_stops_no_other(swept: tuple[Sweep, InProcess, list[RunResult]]) -> None:
     sweep, _, rows = swept
     assert [bool(row.error) for row in rows] == [False, False, False, True]
     with open(sweep.folder / "results.csv", newline="") as file:
@@ -126,7 +126,7 @@ def test_a_run_that_fails_is_noted_and_stops_no_other(swept: tuple[Sweep, InProc
     assert "Failed:" in (sweep.folder / "results.md").read_text()
 
 
-def test_a_rerun_skips_what_is_finished(swept: tuple[Sweep, InProcess, list[Row]], runs: list[Run]) -> None:
+def test_a_rerun_skips_what_is_finished(swept: tuple[Sweep, InProcess, list[RunResult]], runs: list[Run]) -> None:
     sweep, _, rows = swept
     runner = InProcess()
     assert Sweep(sweep.folder, runner).train(runs)[:3] == rows[:3]
@@ -135,7 +135,7 @@ def test_a_rerun_skips_what_is_finished(swept: tuple[Sweep, InProcess, list[Row]
 
 
 def test_settings_are_known_again_under_another_name(
-    swept: tuple[Sweep, InProcess, list[Row]], runs: list[Run]
+    swept: tuple[Sweep, InProcess, list[RunResult]], runs: list[Run]
 ) -> None:
     sweep, _, rows = swept
     runner = InProcess()
@@ -145,7 +145,7 @@ def test_settings_are_known_again_under_another_name(
 
 
 def test_a_run_stopped_after_its_last_step_is_only_measured(
-    swept: tuple[Sweep, InProcess, list[Row]], runs: list[Run], tmp_path: Path
+    swept: tuple[Sweep, InProcess, list[RunResult]], runs: list[Run], tmp_path: Path
 ) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(swept[0].folder, copy)
@@ -161,7 +161,7 @@ def test_a_run_stopped_after_its_last_step_is_only_measured(
 
 
 def test_an_interrupted_run_goes_on_from_its_checkpoint(
-    swept: tuple[Sweep, InProcess, list[Row]], runs: list[Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    swept: tuple[Sweep, InProcess, list[RunResult]], runs: list[Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(arguments: Sequence[str], log: Path) -> int:
         """Stop at the first checkpoint after the trunk, as a killed process would."""

@@ -1,4 +1,4 @@
-"""Small scenes that go to the limits of float32, or have numbers that are none."""
+"""Small scenes that go to the limits of float32, or have numbers that are not finite."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats
 
 __all__ = ["BROKEN", "BROKEN_ROWS", "CAMERAS", "SPLATS", "Extreme", "extremes"]
 
-SPLATS, CAMERAS, BROKEN = "extreme splats", "extreme cameras", "numbers that are none"
+SPLATS, CAMERAS, BROKEN = "extreme splats", "extreme cameras", "non-finite numbers"
 """Kinds of scenes."""
 BROKEN_ROWS = 7
-"""Splats of a broken scene with a number that is none."""
+"""Splats of a broken scene with a number that is not finite."""
 WIDTH, HEIGHT = 72, 48
 DISTANCE = 4.0
 BACKGROUND = (0.2, 0.3, 0.4)
@@ -36,8 +36,8 @@ class Extreme:
     Attributes:
         kind: :data:`SPLATS`, :data:`CAMERAS` or :data:`BROKEN`.
         workload: The view, and its splats with finite numbers.
-        planted: Splats beside them that have a number that is none each, ``[B]``.
-        culprit: The attribute that has these numbers; empty where there is none.
+        planted: Splats beside them with one non-finite number each, ``[B]``.
+        culprit: The attribute that has these numbers; empty where all are finite.
     """
 
     kind: str
@@ -79,7 +79,7 @@ def _splats(count: int) -> RawSplats:
 
 
 def _camera(width: int = WIDTH, height: int = HEIGHT, origin: float = 0.0) -> Camera:
-    """A camera in front of the ball, slightly turned; ``origin`` is how far the ball is from that of the world."""
+    """A camera in front of the ball, slightly rotated; ``origin`` is how far the ball is from that of the world."""
     focal, angle = 0.9 * max(width, height), torch.tensor(0.3, dtype=torch.float64)
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, 1.1 * focal, height / 2], [0.0, 0.0, 1.0]])
     view = torch.eye(4, dtype=torch.float64)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lightning.pytorch import Callback, LightningDataModule, LightningModule, Trainer
-from lightning.pytorch.profilers import Profiler
 
 from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.callbacks.standard import standard
@@ -85,10 +84,9 @@ def fit(
     data: LightningDataModule,
     callbacks: Sequence[Callback],
     steps: int,
-    profiler: Profiler | None = None,
     accelerator: str = "cpu",
 ) -> None:
-    """Train without a word, with loggers that write into a folder that is removed afterwards."""
+    """Train silently, with loggers that write into a folder that is removed afterwards."""
     with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder, quiet():
         loggers = default_loggers(Path(folder, "benchmark"))
         trainer = quiet_trainer(
@@ -97,19 +95,18 @@ def fit(
             limit_val_batches=0,
             logger=loggers,
             callbacks=list(callbacks),
-            profiler=profiler,
             accelerator=accelerator,
         )
         trainer.fit(module, datamodule=data)
 
 
-def quiet_trainer(folder: str | Path, steps: int, **settings: Any) -> Trainer:
+def quiet_trainer(folder: str | Path, steps: int, **options: Any) -> Trainer:
     """A trainer of ``steps`` iterations on the CPU that shows nothing and stores nothing.
 
     Args:
-        folder: Where what ``settings`` ask for is written.
+        folder: Where what ``options`` ask for is written.
         steps: Optimiser steps.
-        settings: Further arguments of :class:`lightning.pytorch.Trainer`, or others in place of those chosen here.
+        options: Further arguments of :class:`lightning.pytorch.Trainer`, or others in place of those chosen here.
     """
     chosen: dict[str, Any] = {
         "accelerator": "cpu",
@@ -124,7 +121,7 @@ def quiet_trainer(folder: str | Path, steps: int, **settings: Any) -> Trainer:
         "enable_model_summary": False,
         "default_root_dir": folder,
     }
-    return Trainer(**(chosen | settings))
+    return Trainer(**(chosen | options))
 
 
 @contextmanager

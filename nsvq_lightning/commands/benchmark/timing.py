@@ -1,4 +1,4 @@
-"""Fair times on a machine that is not ours alone: what is compared takes turns, and a matrix product takes part."""
+"""Fair times on a shared machine: what is compared takes turns, and a matrix product takes part."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import torch
 
-from nsvq_lightning.commands.benchmark.row import Timing
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.measurement import Timing
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.random import generator
 
 __all__ = ["Case", "finish", "measure", "milliseconds", "sgemm", "use_threads"]
@@ -34,17 +34,15 @@ class Case:
     prepare: Callable[[], object] | None = None
 
 
-def measure(
-    cases: Sequence[Case], settings: Settings, threads: int, device: torch.device | str = "cpu"
-) -> dict[str, Timing]:
+def measure(cases: Sequence[Case], scope: Scope, threads: int, device: torch.device | str = "cpu") -> dict[str, Timing]:
     """Time cases in turns, in an order that rotates from round to round, after one call each that is not counted.
 
-    The first call compiles kernels and grows buffers. A case that has used up ``settings.seconds`` sits out the
+    The first call compiles kernels and grows buffers. A case that has used up ``scope.seconds`` sits out the
     remaining rounds, so that one slow method does not make the run endless; the matrix product never sits out.
 
     Args:
         cases: What to time, by different names.
-        settings: Number of rounds and time limit.
+        scope: Number of rounds and time limit.
         threads: Threads of torch and of the kernels.
         device: Where the work is done, and the matrix product.
 
@@ -63,10 +61,10 @@ def measure(
     with use_threads(threads), _no_collection():
         for case in players:
             milliseconds(case, device)
-        for turn in range(settings.repeats):
+        for turn in range(scope.repeats):
             shift = turn % len(players)
             for case in players[shift:] + players[:shift]:
-                if case is product or sum(samples[case.name]) < 1000 * settings.seconds:
+                if case is product or sum(samples[case.name]) < 1000 * scope.seconds:
                     samples[case.name].append(milliseconds(case, device))
     return {name: Timing(tuple(samples[name]), tuple(samples[product.name])) for name in names}
 

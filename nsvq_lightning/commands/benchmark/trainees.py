@@ -2,51 +2,68 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lightning.pytorch import LightningDataModule
-
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.fitting import Step, StepClock, fit, one_phase, quiet, training_callbacks
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.views import write_views
 from nsvq_lightning.commands.benchmark.workloads import single_workload
 from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.data.scene import View
+from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.schedule import Phase
 
 __all__ = ["Trainee", "trainee"]
 
 
 class Trainee(NamedTuple):
-    """Splats in the middle of a training, and where their photos are.
+    """Splats in the middle of a training, and their photos.
 
     Attributes:
         name: Name in the tables.
         splats: Raw attributes.
-        root: COLMAP folder.
+        data: The photos, decoded: nothing is loaded in the background of a step.
     """
 
     name: str
     splats: RawSplats
-    root: Path
+    data: ColmapDataModule
 
-    def module(self, **options: Any) -> SplatModule:
-        """A module that trains a copy of the splats, at their full SH degree."""
+    def train(
+        self,
+        phase: Phase,
+        steps: int,
+        between: Callable[[Any, View, Step], None],
+        accelerator: str = "cpu",
+        **options: Any,
+    ) -> None:
+        """Train a copy of the splats in one phase, at their full SH degree, with codebooks of one Lloyd step.
+
+        Args:
+            phase: Which.
+            steps: How many.
+            between: Called after every step, see :class:`~nsvq_lightning.commands.benchmark.fitting.StepClock`.
+            accelerator: That of the trainer.
+            options: Further arguments of :class:`~nsvq_lightning.training.module.SplatModule`.
+        """
         splats = Splats.from_tensors(*(tensor.clone() for tensor in self.splats))
-        module = SplatModule(sh_degree=splats.sh_degree, splats=splats, **options)
+        quantizer = partial(NSVQ, kmeans_steps=1)
+        module = SplatModule(sh_degree=splats.sh_degree, splats=splats, quantizer=quantizer, **options)
         module.active_sh_degree = splats.sh_degree
-        return module
-
-    def data(self) -> LightningDataModule:
-        """The photos."""
-        return ColmapDataModule(str(self.root))
+        callbacks = [*training_callbacks(phases=one_phase(phase, steps)), StepClock(between)]
+        fit(module, self.data, callbacks, steps, accelerator)
 
 
-def trainee(settings: Settings, folder: Path, full: str = "B100k") -> Trainee:
+def trainee(scope: Scope, folder: Path, full: str = "B100k") -> Trainee:
     """The user's scene, or a synthetic one; where it has no photos of its own, they are rendered.
 
     Args:
-        settings: Say which.
+        scope: Says which.
         folder: Where photos are written.
         full: Synthetic scene of a full run.
 
@@ -54,9 +71,11 @@ def trainee(settings: Settings, folder: Path, full: str = "B100k") -> Trainee:
         ValueError: As :func:`nsvq_lightning.commands.benchmark.workloads.workloads`.
         SceneError: The COLMAP folder cannot be used.
     """
-    workload = single_workload(settings, full)
-    photographed = settings.scene is not None and settings.scene.is_dir()
-    root = settings.scene if photographed else write_views(workload, folder / "scene")
-    assert root is not None
-    count = len(workload.splats.means)
-    return Trainee(f"{workload}, {count} splats", workload.splats, root)
+    workload = single_workload(scope, full)
+    photographed = scope.scene is not None and scope.scene.is_dir()
+    root = scope.scene if photographed else write_views(workload, folder / "scene")
+    data = ColmapDataModule(str(root))
+    with quiet():
+        for index in data.scene.train:
+            data.scene.view(index)
+    return Trainee(f"{workload}, {len(workload.splats.means)} splats", workload.splats, data)

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.sizes import SIZES
 from nsvq_lightning.compression.pictures import look_at, middle_of
 from nsvq_lightning.data.scene import load_scene
@@ -75,30 +75,30 @@ class Workload:
         return f"{self.name} {self.camera.width}x{self.camera.height}"
 
 
-def workloads(settings: Settings) -> list[Workload]:
-    """The scene that the user gives, or the synthetic scenes that the settings name.
+def workloads(scope: Scope) -> list[Workload]:
+    """The scene that the user gives, or the synthetic scenes that the scope names.
 
     Raises:
         ValueError: As :func:`scene_workload`.
         SceneError: The COLMAP folder cannot be used.
     """
-    if settings.scene is None:
-        return [synthetic_workload(name) for name in settings.workloads]
-    if settings.scene.is_dir():
-        return [folder_workload(settings.scene, settings.init_from)]
-    return [scene_workload(settings.scene)]
+    if scope.scene is None:
+        return [synthetic_workload(name) for name in scope.workloads]
+    if scope.scene.is_dir():
+        return [folder_workload(scope.scene, scope.init_from)]
+    return [scene_workload(scope.scene)]
 
 
-def single_workload(settings: Settings, full: str) -> Workload:
+def single_workload(scope: Scope, full: str) -> Workload:
     """The scene that the user gives, or one synthetic scene: ``full``, in a quick run the smallest.
 
     Raises:
         ValueError: As :func:`workloads`.
         SceneError: As :func:`workloads`.
     """
-    if settings.scene is None:
-        return synthetic_workload(next(iter(SIZES)) if settings.quick else full)
-    return workloads(settings)[0]
+    if scope.scene is None:
+        return synthetic_workload(next(iter(SIZES)) if scope.quick else full)
+    return workloads(scope)[0]
 
 
 def synthetic_workload(name: str, seed: int = SEED) -> Workload:

@@ -11,6 +11,8 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
 
+from nsvq_lightning.commands.comma_lists import integers, names
+
 if TYPE_CHECKING:
     from nsvq_lightning.commands.sweep.plan import Run
     from nsvq_lightning.commands.sweep.runs import Sweep
@@ -85,26 +87,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="where all results go")
     add = parser.add_argument_group("what is combined; lists have commas between their entries").add_argument
-    add("--scenes", type=_names, default=(), metavar="A,B", help="COLMAP folders (default: that of the configuration)")
-    add("--configs", type=_names, default=(), metavar="A,B", help="files or shipped names, as for nsvq fit --config")
-    add("--quantizers", type=_names, default=(), metavar="A,B", help="classes, as for nsvq fit --model.quantizer")
-    add("--codebooks", type=_names, default=(), metavar="1k,4k", help="sizes, for configurations that have codebooks")
-    add("--seeds", type=_integers, default=(), metavar="0,1,2", help="of the draws and of the order of the views")
+    add("--scenes", type=names, default=(), metavar="A,B", help="COLMAP folders (default: that of the configuration)")
+    add("--configs", type=names, default=(), metavar="A,B", help="files or shipped names, as for nsvq fit --config")
+    add("--quantizers", type=names, default=(), metavar="A,B", help="classes, as for nsvq fit --model.quantizer")
+    add("--codebooks", type=names, default=(), metavar="1k,4k", help="sizes, for configurations that have codebooks")
+    add("--seeds", type=integers, default=(), metavar="0,1,2", help="of the draws and of the order of the views")
     add("--max-steps", type=int, metavar="N", help="iterations of every run (default: those of its configuration)")
     parser.add_argument("--keep-checkpoints", action="store_true", help="keep those of finished runs")
     parser.add_argument("--dry-run", action="store_true", help="only say which runs there are")
     return parser
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
-
-
-def _integers(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(dict.fromkeys(int(part) for part in text.split(",")))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected whole numbers with commas between them, got {text!r}") from None
 
 
 def _preview(sweep: Sweep, runs: Sequence[Run]) -> list[str]:

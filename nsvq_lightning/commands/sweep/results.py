@@ -1,4 +1,4 @@
-"""What the runs of a sweep came to: one row a run, and means over the seeds."""
+"""The results of a sweep: one row for each run, and means over the seeds."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 
 from nsvq_lightning.report.figures import markdown_table
 
-__all__ = ["Group", "Row", "as_markdown", "grouped", "series_of"]
+__all__ = ["Group", "RunResult", "as_markdown", "grouped", "series_of"]
 
 
 @dataclass(frozen=True)
-class Row:
-    """One run; what is not known, as in a failed one, is None.
+class RunResult:
+    """What one run came to; what is not known, as in a failed one, is None.
 
     Attributes:
         scene: Name of the scene.
@@ -66,7 +66,7 @@ class Row:
 class Group:
     """Finished runs that differ in the seed alone."""
 
-    rows: Sequence[Row]
+    rows: Sequence[RunResult]
 
     def mean(self, name: str, scale: float = 1.0) -> float | None:
         """Mean of an attribute over the seeds, times ``scale``; None where no run knows it."""
@@ -82,18 +82,18 @@ class Group:
         return [value for row in self.rows if (value := getattr(row, name)) is not None]
 
 
-def grouped(rows: Sequence[Row]) -> list[Group]:
+def grouped(rows: Sequence[RunResult]) -> list[Group]:
     """The runs that have not failed, with those that differ in the seed alone together, in the order of the first."""
-    groups: dict[tuple[str, ...], list[Row]] = {}
+    groups: dict[tuple[str, ...], list[RunResult]] = {}
     for row in rows:
         if not row.error:
             groups.setdefault((row.scene, row.config, row.quantizer, row.codebooks), []).append(row)
     return [Group(members) for members in groups.values()]
 
 
-def series_of(rows: Sequence[Row]) -> Callable[[Row], str]:
+def series_of(rows: Sequence[RunResult]) -> Callable[[RunResult], str]:
     """Name of the curve a run belongs to: its quantizer, if that and the sizes tell the runs apart, else more of it."""
-    names: list[Callable[[Row], str]] = [
+    names: list[Callable[[RunResult], str]] = [
         lambda row: row.quantizer or "not quantized",
         lambda row: row.config,
         lambda row: f"{row.config}, {row.quantizer or 'not quantized'}",
@@ -124,7 +124,7 @@ LEGEND = (
 )
 
 
-def as_markdown(rows: Sequence[Row]) -> str:
+def as_markdown(rows: Sequence[RunResult]) -> str:
     """A table of the means over the seeds, with their standard deviation, and a list of what has failed."""
     cells = []
     for group in grouped(rows):

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from nsvq_lightning.commands.sweep.plan import Run
-from nsvq_lightning.commands.sweep.plot import draw_sweep
-from nsvq_lightning.commands.sweep.results import Row, as_markdown
+from nsvq_lightning.commands.sweep.rate_distortion import draw_sweep
+from nsvq_lightning.commands.sweep.results import RunResult, as_markdown
 from nsvq_lightning.commands.sweep.settings import trunk_of
 from nsvq_lightning.commands.sweep.training import Runner, Training, TrainingError, run_subprocess
 from nsvq_lightning.io.atomic import write_text
@@ -52,7 +52,7 @@ class Sweep:
         title = f"{run.scene}-seed{run.seed}"
         return None if settings is None else Training.under(self.folder / "trunks", title, settings)
 
-    def train(self, runs: Sequence[Run]) -> list[Row]:
+    def train(self, runs: Sequence[Run]) -> list[RunResult]:
         """Train what is not finished yet; a run that fails does not keep the others from theirs.
 
         The tables are written anew after each run, so they are complete whenever this is interrupted.
@@ -75,7 +75,7 @@ class Sweep:
             self._write([rows[t.folder] for t in trainings if t.folder in rows])
         return [rows[training.folder] for training in trainings]
 
-    def _train_one(self, run: Run, training: Training) -> Row:
+    def _train_one(self, run: Run, training: Training) -> RunResult:
         try:
             trunk = self.trunk(run)
             # A run that was interrupted after its trunk goes on from its own checkpoint.
@@ -84,7 +84,7 @@ class Sweep:
             training.run(self._runner, trunk.checkpoint if trunk is not None else None)
             training.finish(trunk=trunk.folder.name if trunk is not None else None)
         except (TrainingError, OSError) as error:
-            return Row(**_names(run), folder=training.folder, error=str(error))
+            return RunResult(**_names(run), folder=training.folder, error=str(error))
         if not self.keep_checkpoints:
             training.drop_checkpoints()
         return _row(run, training)
@@ -102,7 +102,7 @@ class Sweep:
             raise TrainingError(self._failed[trunk.folder]) from error
         trunk.finish()
 
-    def _write(self, rows: Sequence[Row]) -> None:
+    def _write(self, rows: Sequence[RunResult]) -> None:
         write_csv(self.folder / "results.csv", [row.as_csv() for row in rows])
         write_text(self.folder / "results.md", as_markdown(rows))
         if any(row.psnr is not None for row in rows):
@@ -114,11 +114,11 @@ def _names(run: Run) -> dict[str, Any]:
     return {name: getattr(run, name) for name in names}
 
 
-def _row(run: Run, training: Training) -> Row:
+def _row(run: Run, training: Training) -> RunResult:
     """The row of a finished run."""
     metrics, record = training.metrics, training.record or {}
     before = metrics["before_quantization"]
-    return Row(
+    return RunResult(
         **_names(run),
         psnr=metrics["psnr"],
         ssim=metrics["ssim"],
@@ -140,7 +140,7 @@ def _trunk_seconds(metrics: Mapping[str, Any]) -> float:
     return seconds
 
 
-def _said(row: Row) -> str:
+def _said(row: RunResult) -> str:
     if row.error:
         return f"failed: {row.error}"
     psnr = "infinite" if row.psnr is None else f"{row.psnr:.2f} dB"

@@ -1,1 +1,1 @@
-"""One suite a file; each has ``run(settings)``, which gives the rows of its tables."""
+"""One suite a file; each has ``run(scope)``, which gives the rows of its tables."""

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark.row import Row
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.measurement import Measurement
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.timing import Case, measure, use_threads
 from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.compression.stored import compress
@@ -54,26 +54,25 @@ class Codec(NamedTuple):
     read: Callable[[Path], SplatArrays]
 
 
-def run(settings: Settings) -> list[Row]:
+def run(scope: Scope) -> list[Measurement]:
     """Time writing and reading every workload in every format with every number of threads."""
-    setting = "1k" if settings.quick else "16k"
     with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder:
-        return [row for workload in workloads(settings) for row in _rows(workload, setting, settings, Path(folder))]
+        return [row for workload in workloads(scope) for row in _rows(workload, scope, Path(folder))]
 
 
-def _rows(workload: Workload, setting: str, settings: Settings, folder: Path) -> list[Row]:
-    with use_threads(max(settings.threads)):
-        kinds = codecs(workload, setting)
+def _rows(workload: Workload, scope: Scope, folder: Path) -> list[Measurement]:
+    with use_threads(max(scope.threads)):
+        kinds = codecs(workload, scope.codebooks)
     count = len(workload.splats.means)
-    name = f"{workload.name}, {setting} codebooks"
+    name = f"{workload.name}, {scope.codebooks} codebooks"
     sizes, errors, cases = {}, {}, []
-    with use_threads(max(settings.threads)):
+    with use_threads(max(scope.threads)):
         truth = _image(workload.splats, workload)
     for index, codec in enumerate(kinds):
         path = folder / f"{index}{codec.suffix}"
         sizes[codec.name] = codec.write(path)
         read = codec.read(path)
-        with use_threads(max(settings.threads)):
+        with use_threads(max(scope.threads)):
             image = _image(read.to_splats(), workload)
             meant = _image(codec.stored.to_splats(), workload)
         errors[codec.name] = {
@@ -83,8 +82,8 @@ def _rows(workload: Workload, setting: str, settings: Settings, folder: Path) ->
         }
         cases += [_write_case(codec, path), _read_case(codec, path)]
     rows = []
-    for threads in settings.threads:
-        timings = measure(cases, settings, threads)
+    for threads in scope.threads:
+        timings = measure(cases, scope, threads)
         for codec in kinds:
             for operation in ("write", "read"):
                 timing = timings[f"{codec.name} {operation}"]
@@ -94,7 +93,7 @@ def _rows(workload: Workload, setting: str, settings: Settings, folder: Path) ->
                     "splats a second": 1000 * count / timing.median,
                     **errors[codec.name],
                 }
-                rows.append(Row("codec", name, codec.name, operation, threads, timing, values))
+                rows.append(Measurement("codec", name, codec.name, operation, threads, timing, values))
     return rows
 
 
@@ -112,9 +111,9 @@ def _read_case(codec: Codec, path: Path) -> Case:
     return Case(f"{codec.name} read", lambda: codec.read(path))
 
 
-def codecs(workload: Workload, setting: str) -> list[Codec]:
+def codecs(workload: Workload, codebooks: str) -> list[Codec]:
     """Every level of the compressed file, and the plain file."""
-    scene = compressed(workload, setting)
+    scene = compressed(workload, codebooks)
     plain = SplatArrays.from_splats(workload.splats)
     kinds = [_nsvq(scene, level) for level in LEVELS]
     return [*kinds, Codec(".ply", ".ply", plain, lambda path: write_ply(path, plain), read_ply)]
@@ -127,11 +126,11 @@ def _nsvq(scene: CompressedScene, level: str) -> Codec:
     return Codec(f".nsvq {level}", ".nsvq", scene.arrays(), write, lambda path: read_nsvq(path).arrays())
 
 
-def compressed(workload: Workload, setting: str) -> CompressedScene:
+def compressed(workload: Workload, codebooks: str) -> CompressedScene:
     """The scene with codebooks of one step of k-means: sizes and times do not depend on how good they are."""
     splats = Splats.from_tensors(*workload.splats)
     quantizers: dict[str, Quantizer] = {}
-    for name, module in build_quantizers(lambda k, d: NSVQ(k, d, kmeans_steps=1), setting, splats).items():
+    for name, module in build_quantizers(lambda k, d: NSVQ(k, d, kmeans_steps=1), codebooks, splats).items():
         rows = QUANTIZED[name].rows(getattr(workload.splats, name))
         quantizers[name] = as_quantizer(module)
         quantizers[name].fit(rows, generator=generator(0, 0, "codec", name))

@@ -2,7 +2,7 @@
 
 Times are those between two events in the GPU's stream. No render can be faster than its memory gives and takes what it
 must read and write once: ``share of memory limit %`` is that time, at the speed of a plain copy, as a share of the
-measured one. What a back-end reads again, sorts or keeps for the backward pass is its own affair and not in the limit.
+measured one. What a back-end reads again, sorts or keeps for the backward pass is not in the limit.
 """
 
 from __future__ import annotations
@@ -10,17 +10,16 @@ from __future__ import annotations
 import logging
 import tempfile
 from collections.abc import Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from statistics import median
 
 import torch
 
-from nsvq_lightning.commands.benchmark.fitting import Step, StepClock, fit, one_phase, training_callbacks
-from nsvq_lightning.commands.benchmark.registry import Unavailable
-from nsvq_lightning.commands.benchmark.row import Row, Timing
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.fitting import Step
+from nsvq_lightning.commands.benchmark.measurement import Measurement, Timing
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.sizes import LARGE, STANDARD
+from nsvq_lightning.commands.benchmark.suite_list import Unavailable
 from nsvq_lightning.commands.benchmark.suites.render import (
     BOTH,
     FORWARD,
@@ -36,7 +35,6 @@ from nsvq_lightning.commands.benchmark.timing import Case, finish, measure, mill
 from nsvq_lightning.commands.benchmark.trainees import Trainee, trainee
 from nsvq_lightning.commands.benchmark.workloads import Workload, synthetic_workload, workloads
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.rendering.rasterize import fast_backends, resolve_backend, visible
 from nsvq_lightning.training.schedule import Phase
 
@@ -45,7 +43,7 @@ __all__ = ["copy_speed", "least_bytes", "run", "run_on"]
 log = logging.getLogger(__name__)
 
 COMPARED = ("cuda", "gsplat")
-"""Back-ends that are missed where they are not there."""
+"""Back-ends whose absence is reported with its reason."""
 COPIED = 2**28
 """Bytes of the copy that says how fast the memory is: more than any cache holds."""
 COPIES = 5
@@ -55,7 +53,7 @@ WARM_STEPS, STEPS = {True: 6, False: 60}, {True: 8, False: 60}
 """Steps that are not counted, and those that are: searches that remember need some to have something to."""
 
 
-def run(settings: Settings) -> list[Row]:
+def run(scope: Scope) -> list[Measurement]:
     """Measure on the first CUDA device.
 
     Raises:
@@ -69,10 +67,10 @@ def run(settings: Settings) -> list[Row]:
             resolve_backend(name, torch.zeros(1, device=device))
         except ValueError as reason:
             log.warning("gpu: left out: %s", reason)
-    return run_on(device, settings)
+    return run_on(device, scope)
 
 
-def run_on(device: torch.device, settings: Settings) -> list[Row]:
+def run_on(device: torch.device, scope: Scope) -> list[Measurement]:
     """Measure every fast back-end that a device has.
 
     Raises:
@@ -81,39 +79,39 @@ def run_on(device: torch.device, settings: Settings) -> list[Row]:
     names = fast_backends(torch.zeros(1, device=device))
     if not names:
         raise Unavailable(f"no fast back-end renders on {device}: pip install triton")
-    with use_threads(max(settings.threads)):
+    with use_threads(max(scope.threads)):
         speed = copy_speed(device)
-        rows: list[Row] = []
-        for workload in _workloads(settings):
-            rows += _render_rows(workload.to(device), names, speed, settings)
-        return [*rows, *_step_rows(device, names, settings)]
+        rows: list[Measurement] = []
+        for workload in _workloads(scope):
+            rows += _render_rows(workload.to(device), names, speed, scope)
+        return [*rows, *_step_rows(device, names, scope)]
 
 
-def _workloads(settings: Settings) -> Iterator[Workload]:
+def _workloads(scope: Scope) -> Iterator[Workload]:
     """What the user names; the standard scenes are followed, one at a time, by those that are too much for a CPU."""
-    yield from workloads(settings)
-    if settings.scene is None and settings.workloads == STANDARD:
+    yield from workloads(scope)
+    if scope.scene is None and scope.workloads == STANDARD:
         yield from map(synthetic_workload, LARGE)
 
 
 # Renders
 
 
-def _render_rows(workload: Workload, names: Sequence[str], speed: float, settings: Settings) -> list[Row]:
+def _render_rows(workload: Workload, names: Sequence[str], speed: float, scope: Scope) -> list[Measurement]:
     device, methods = workload.splats.means.device, [Method(name) for name in names]
-    crop = crop_for_oracle(workload, ORACLE_PAIRS[settings.quick])
+    crop = crop_for_oracle(workload, ORACLE_PAIRS[scope.quick])
     errors, note = method_errors(crop, methods), crop_note(crop, workload)
     seen = len(visible(workload.splats, workload.camera, backend=names[0]))
     keys, leaves = [(method, operation) for method in methods for operation in (FORWARD, BOTH)], leaves_of(workload)
     cases = [case_of(workload, leaves, *key) for key in keys]
-    threads = max(settings.threads)
-    timings = measure(cases, settings, threads, device).values()
+    threads = max(scope.threads)
+    timings = measure(cases, scope, threads, device).values()
     rows = []
     for (method, operation), case, timing in zip(keys, cases, timings, strict=True):
         limit = 1000 * least_bytes(workload, seen, backward=operation == BOTH) / speed
         values = {**errors[method, operation], "share of memory limit %": 100 * limit / timing.median}
         values.update(_peak_memory(case, device))
-        rows.append(Row("gpu", str(workload), str(method), operation, threads, timing, values, note))
+        rows.append(Measurement("gpu", str(workload), str(method), operation, threads, timing, values, note))
     return rows
 
 
@@ -160,35 +158,31 @@ def _peak_memory(case: Case, device: torch.device) -> dict[str, float]:
 # Training steps
 
 
-def _step_rows(device: torch.device, names: Sequence[str], settings: Settings) -> list[Row]:
+def _step_rows(device: torch.device, names: Sequence[str], scope: Scope) -> list[Measurement]:
     with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder:
-        subject = trainee(settings, Path(folder), "C500k")
+        subject = trainee(scope, Path(folder), "C500k")
         rows = []
         for phase in Phase:
             for name in names:
-                timing = _steps(subject, phase, name, device, settings.quick)
+                timing = _steps(subject, phase, name, device, scope)
                 values = {"steps a second": 1000 / median(timing.samples)}
-                operation, threads = f"{phase.name.lower()} step", max(settings.threads)
+                operation, threads = f"{phase.name.lower()} step", max(scope.threads)
                 note = "whole steps by the clock, Lightning included"
-                rows.append(Row("gpu", subject.name, name, operation, threads, timing, values, note))
+                rows.append(Measurement("gpu", subject.name, name, operation, threads, timing, values, note))
         return rows
 
 
-def _steps(subject: Trainee, phase: Phase, backend: str, device: torch.device, quick: bool) -> Timing:
+def _steps(subject: Trainee, phase: Phase, backend: str, device: torch.device, scope: Scope) -> Timing:
     """Steps of one phase with one back-end, each followed by a matrix product."""
     steps: list[float] = []
     products: list[float] = []
     product = sgemm(device)
 
     def between(_: object, __: View, step: Step) -> None:
-        if step.iteration > WARM_STEPS[quick]:
+        if step.iteration > WARM_STEPS[scope.quick]:
             steps.append(step.milliseconds)
             products.append(milliseconds(product, device))
 
-    count = WARM_STEPS[quick] + STEPS[quick]
-    module = subject.module(
-        codebooks="1k" if quick else "16k", quantizer=partial(NSVQ, kmeans_steps=1), backend=backend
-    )
-    callbacks = [*training_callbacks(phases=one_phase(phase, count)), StepClock(between)]
-    fit(module, subject.data(), callbacks, count, accelerator=device.type)
+    count = WARM_STEPS[scope.quick] + STEPS[scope.quick]
+    subject.train(phase, count, between, device.type, codebooks=scope.codebooks, backend=backend)
     return Timing(tuple(steps), tuple(products))

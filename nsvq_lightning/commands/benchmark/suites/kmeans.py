@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark.row import Row, Timing
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.measurement import Measurement, Timing
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.timing import Case, measure, use_threads
 from nsvq_lightning.commands.benchmark.workloads import single_workload
 from nsvq_lightning.quantize import QUANTIZED, codebook_sizes, kmeans, nearest, nearest_reference
@@ -23,32 +23,30 @@ CHECKED_ROWS, CHECKED_CODES = 4_000, 256
 EVERY = "all attributes"
 
 
-def run(settings: Settings) -> list[Row]:
+def run(scope: Scope) -> list[Measurement]:
     """Time the start of every codebook with every number of threads, fewer Lloyd steps with the largest only."""
-    setting = "1k" if settings.quick else "16k"
-    source = single_workload(settings, "C500k")
+    source = single_workload(scope, "C500k")
     tables = {name: attribute.rows(getattr(source.splats, name)) for name, attribute in QUANTIZED.items()}
     tables = {name: rows for name, rows in tables.items() if rows.shape[1] > 0}
-    most = max(settings.threads)
+    most = max(scope.threads)
     with use_threads(most):
         rounding = {name: rounding_error(rows) for name, rows in tables.items()}
     found = []
-    for threads in settings.threads:
-        steps = LLOYD_STEPS[settings.quick] if threads == most else LLOYD_STEPS[settings.quick][-1:]
-        found += _rows(source.name, setting, tables, steps, rounding, threads, settings)
+    for threads in scope.threads:
+        steps = LLOYD_STEPS[scope.quick] if threads == most else LLOYD_STEPS[scope.quick][-1:]
+        found += _rows(source.name, tables, steps, rounding, threads, scope)
     return found
 
 
 def _rows(
     source: str,
-    setting: str,
     tables: Mapping[str, Tensor],
     steps: tuple[int, ...],
     rounding: Mapping[str, float],
     threads: int,
-    settings: Settings,
-) -> list[Row]:
-    sizes, codebooks = codebook_sizes(setting), dict[tuple[str, int], Tensor]()
+    scope: Scope,
+) -> list[Measurement]:
+    sizes, codebooks = codebook_sizes(scope.codebooks), dict[tuple[str, int], Tensor]()
 
     def start(name: str, count: int) -> None:
         draw = generator(0, 0, "start", name)
@@ -56,20 +54,20 @@ def _rows(
 
     keys = [(name, count) for name in tables for count in steps]
     cases = [Case(f"{name} {count}", lambda name=name, count=count: start(name, count)) for name, count in keys]  # type: ignore[misc]
-    timings = dict(zip(keys, measure(cases, settings, threads).values(), strict=True))
+    timings = dict(zip(keys, measure(cases, scope, threads).values(), strict=True))
     with use_threads(threads):
         kept = {(name, count): distortion(tables[name], codebook) for (name, count), codebook in codebooks.items()}
-    note = f"{setting} codebooks; rounding error on {CHECKED_ROWS} rows with {CHECKED_CODES} codes"
+    note = f"{scope.codebooks} codebooks; rounding error on {CHECKED_ROWS} rows with {CHECKED_CODES} codes"
     rows = []
     for count in steps:
         method = f"{count} Lloyd step{'s' * (count > 1)}"
         for name, table in tables.items():
             workload = f"{source} {name}: {len(table)} rows, D {table.shape[1]}, K {sizes[name]}"
             values = {"distortion": kept[name, count], "rounding error": rounding[name]}
-            rows.append(Row("kmeans", workload, method, "start", threads, timings[name, count], values, note))
+            rows.append(Measurement("kmeans", workload, method, "start", threads, timings[name, count], values, note))
         whole = _sum([timings[name, count] for name in tables])
         values = {"distortion": max(kept[name, count] for name in tables), "rounding error": max(rounding.values())}
-        rows.append(Row("kmeans", f"{source} {EVERY}", method, "start", threads, whole, values, note))
+        rows.append(Measurement("kmeans", f"{source} {EVERY}", method, "start", threads, whole, values, note))
     return rows
 
 

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from nsvq_lightning.commands.benchmark.errors import relative_l2
-from nsvq_lightning.commands.benchmark.row import Row
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.error_measures import relative_l2
+from nsvq_lightning.commands.benchmark.measurement import Measurement
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.timing import Case, measure, use_threads
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, ssim_window
@@ -21,17 +21,19 @@ METHODS = ("fused", "plain torch")
 DSSIM_WEIGHT = 0.2
 
 
-def run(settings: Settings) -> list[Row]:
+def run(scope: Scope) -> list[Measurement]:
     """Time loss and gradient of one image pair with every number of threads."""
     image, target = image_pair(*SIZE)
-    with use_threads(max(settings.threads)):
+    with use_threads(max(scope.threads)):
         truth = loss_and_gradient("plain torch", image.double(), target)
         errors = {name: _errors(loss_and_gradient(name, image, target), truth) for name in METHODS}
     rows = []
-    for threads in settings.threads:
-        timings = measure([_case(name, image, target) for name in METHODS], settings, threads)
+    for threads in scope.threads:
+        timings = measure([_case(name, image, target) for name in METHODS], scope, threads)
         workload = f"{SIZE[1]}x{SIZE[0]}"
-        rows += [Row("loss", workload, n, "forward + backward", threads, timings[n], errors[n]) for n in METHODS]
+        rows += [
+            Measurement("loss", workload, n, "forward + backward", threads, timings[n], errors[n]) for n in METHODS
+        ]
     return rows
 
 

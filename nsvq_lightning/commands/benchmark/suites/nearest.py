@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark.row import Row
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.measurement import Measurement
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.timing import Case, measure, use_threads
 from nsvq_lightning.commands.benchmark.workloads import Workload, single_workload
 from nsvq_lightning.quantize import QUANTIZED, codebook_sizes, kmeans, nearest, nearest_reference
@@ -36,16 +36,15 @@ class Search(NamedTuple):
         return f"{self.attribute}: {len(self.x)} rows, D {self.x.shape[1]}, K {len(self.codebook)}"
 
 
-def run(settings: Settings) -> list[Row]:
+def run(scope: Scope) -> list[Measurement]:
     """Time every method on every attribute with every number of threads."""
-    setting = "1k" if settings.quick else "16k"
-    found = searches(single_workload(settings, "B100k"), ROWS[settings.quick], setting)
-    return [row for search in found for row in _rows(search, settings)]
+    found = searches(single_workload(scope, "B100k"), ROWS[scope.quick], scope.codebooks)
+    return [row for search in found for row in _rows(search, scope)]
 
 
-def searches(source: Workload, rows: int, setting: str) -> list[Search]:
+def searches(source: Workload, rows: int, codebooks: str) -> list[Search]:
     """A search for each quantized attribute, with codebooks of two steps of k-means on all splats."""
-    sizes = codebook_sizes(setting)
+    sizes = codebook_sizes(codebooks)
     found = []
     for name, attribute in QUANTIZED.items():
         every = attribute.rows(getattr(source.splats, name))
@@ -57,16 +56,18 @@ def searches(source: Workload, rows: int, setting: str) -> list[Search]:
     return found
 
 
-def _rows(search: Search, settings: Settings) -> list[Row]:
-    with use_threads(max(settings.threads)):
+def _rows(search: Search, scope: Scope) -> list[Measurement]:
+    with use_threads(max(scope.threads)):
         some = search._replace(x=search.x[:CHECKED_ROWS])
         best = nearest_reference(some.x.double(), some.codebook.double())
         errors = {name: code_errors(some, method(some.x, some.codebook), best) for name, method in METHODS.items()}
     note = f"codes of {len(some.x)} rows checked"
     rows = []
-    for threads in settings.threads:
-        timings = measure([_case(name, search) for name in METHODS], settings, threads)
-        rows += [Row("nearest", str(search), n, "search", threads, timings[n], errors[n], note) for n in METHODS]
+    for threads in scope.threads:
+        timings = measure([_case(name, search) for name in METHODS], scope, threads)
+        rows += [
+            Measurement("nearest", str(search), n, "search", threads, timings[n], errors[n], note) for n in METHODS
+        ]
     return rows
 
 

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark.errors import relative_l2, worst_first
-from nsvq_lightning.commands.benchmark.row import Row
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.error_measures import relative_l2, worst_first
+from nsvq_lightning.commands.benchmark.measurement import Measurement
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.timing import Case, measure, use_threads
 from nsvq_lightning.random import generator
 from nsvq_lightning.skips import switched
@@ -19,7 +19,7 @@ from nsvq_lightning.splats.sh_degree import sh_coefficients
 from nsvq_lightning.splats.splats import ATTRIBUTES, Splats
 from nsvq_lightning.training.optim import EPS, LearningRates, build_adam, param_groups, set_columns
 
-__all__ = ["METHODS", "SCENARIOS", "Method", "Scenario", "errors_after", "run"]
+__all__ = ["METHODS", "SCENARIOS", "AdamVariant", "Scenario", "errors_after", "run"]
 
 Groups = list[dict[str, Any]]
 
@@ -41,7 +41,7 @@ class Scenario(NamedTuple):
     sh_degree: int = 3
 
 
-class Method(NamedTuple):
+class AdamVariant(NamedTuple):
     """An optimiser, and switches that are set while it steps."""
 
     build: Callable[[Groups], torch.optim.Optimizer]
@@ -54,12 +54,12 @@ SCENARIOS = (
     Scenario("step, SH degree 0", sh_degree=0),
 )
 METHODS = {
-    "build_adam": Method(build_adam),
-    "build_adam, skip adam_rows": Method(build_adam, {"adam_rows": True}),
-    "build_adam, no skip of adam_bands": Method(build_adam, {"adam_bands": False}),
-    "torch, fused": Method(lambda groups: torch.optim.Adam(groups, eps=EPS, fused=True)),
-    "torch, foreach": Method(lambda groups: torch.optim.Adam(groups, eps=EPS, foreach=True)),
-    "torch, for loop": Method(lambda groups: torch.optim.Adam(groups, eps=EPS, foreach=False)),
+    "build_adam": AdamVariant(build_adam),
+    "build_adam, skip adam_rows": AdamVariant(build_adam, {"adam_rows": True}),
+    "build_adam, no skip of adam_bands": AdamVariant(build_adam, {"adam_bands": False}),
+    "torch, fused": AdamVariant(lambda groups: torch.optim.Adam(groups, eps=EPS, fused=True)),
+    "torch, foreach": AdamVariant(lambda groups: torch.optim.Adam(groups, eps=EPS, foreach=True)),
+    "torch, for loop": AdamVariant(lambda groups: torch.optim.Adam(groups, eps=EPS, foreach=False)),
 }
 """Optimisers by name; ``build_adam`` is what training uses."""
 ORACLE = "torch, for loop"
@@ -71,29 +71,29 @@ COMPARED = (
 """Methods of each scenario: where there is nothing to skip, the others say nothing new."""
 
 
-def run(settings: Settings) -> list[Row]:
+def run(scope: Scope) -> list[Measurement]:
     """Time one step of every implementation at every size with every number of threads."""
     rows = []
     for scenario, names in zip(SCENARIOS, COMPARED, strict=True):
-        with use_threads(max(settings.threads)):
+        with use_threads(max(scope.threads)):
             errors = {name: errors_after(CHECKED_STEPS, METHODS[name], scenario) for name in names}
-        for count in SPLATS[settings.quick]:
-            rows += _rows(scenario, names, count, errors, settings)
+        for count in SPLATS[scope.quick]:
+            rows += _rows(scenario, names, count, errors, scope)
     return rows
 
 
 def _rows(
-    scenario: Scenario, names: Sequence[str], count: int, errors: Mapping[str, dict[str, float]], settings: Settings
-) -> list[Row]:
+    scenario: Scenario, names: Sequence[str], count: int, errors: Mapping[str, dict[str, float]], scope: Scope
+) -> list[Measurement]:
     splats = random_splats(count)
     gradients = _gradients(splats, 0, scenario)
     cases = [_case(name, splats, gradients, scenario) for name in names]
     note = f"error of what {CHECKED_STEPS} steps add to {CHECKED_SPLATS} splats"
     rows = []
-    for threads in settings.threads:
-        timings, workload = measure(cases, settings, threads), f"{count // 1000}k splats, SH 3"
+    for threads in scope.threads:
+        timings, workload = measure(cases, scope, threads), f"{count // 1000}k splats, SH 3"
         rows += [
-            Row("optimizer", workload, name, scenario.operation, threads, timings[name], errors[name], note)
+            Measurement("optimizer", workload, name, scenario.operation, threads, timings[name], errors[name], note)
             for name in names
         ]
     return rows
@@ -118,7 +118,7 @@ def _gradients(splats: Splats, step: int, scenario: Scenario) -> dict[str, Tenso
     return gradients
 
 
-def _optimizer(method: Method, splats: Splats, scenario: Scenario) -> torch.optim.Optimizer:
+def _optimizer(method: AdamVariant, splats: Splats, scenario: Scenario) -> torch.optim.Optimizer:
     optimizer = method.build(param_groups(splats, {}, LearningRates(), extent=1.0))
     set_columns(optimizer, "shN", 3 * sh_coefficients(scenario.sh_degree))
     return optimizer
@@ -137,14 +137,14 @@ def _case(name: str, splats: Splats, gradients: dict[str, Tensor], scenario: Sce
     return Case(name, step)
 
 
-def errors_after(steps: int, method: Method, scenario: Scenario) -> dict[str, float]:
+def errors_after(steps: int, method: AdamVariant, scenario: Scenario) -> dict[str, float]:
     """Relative error of the sum of some updates, the worst attribute first."""
     truth = _moved(steps, METHODS[ORACLE], scenario, torch.float64)
     moved = _moved(steps, method, scenario, torch.float32)
     return worst_first("update error", {name: relative_l2(moved[name], truth[name]) for name in ATTRIBUTES})
 
 
-def _moved(steps: int, method: Method, scenario: Scenario, dtype: torch.dtype) -> dict[str, Tensor]:
+def _moved(steps: int, method: AdamVariant, scenario: Scenario, dtype: torch.dtype) -> dict[str, Tensor]:
     """How far some steps move each attribute, in float64."""
     splats = random_splats(CHECKED_SPLATS, dtype)
     before = {name: value.detach().double().clone() for name, value in splats.attributes().items()}

@@ -8,9 +8,9 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from nsvq_lightning.commands.benchmark.errors import relative_l2
-from nsvq_lightning.commands.benchmark.row import Row
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.error_measures import relative_l2
+from nsvq_lightning.commands.benchmark.measurement import Measurement
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.timing import Case, measure, use_threads
 from nsvq_lightning.commands.benchmark.workloads import single_workload
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, CodebookQuantizer, nearest_reference
@@ -50,16 +50,15 @@ Results = dict[str, tuple[Tensor, Tensor, Tensor]]
 """Quantized rows ``[V, D]``, their gradient by the rows ``[N, D]``, and codes ``[V]`` by attribute."""
 
 
-def run(settings: Settings) -> list[Row]:
+def run(scope: Scope) -> list[Measurement]:
     """Time the step with every number of threads."""
-    setting = "1k" if settings.quick else "16k"
-    source = single_workload(settings, "B100k")
-    with use_threads(max(settings.threads)):
-        attributes = prepare(source.splats, setting)
+    source = single_workload(scope, "B100k")
+    with use_threads(max(scope.threads)):
+        attributes = prepare(source.splats, scope.codebooks)
         errors = {"NSVQ": step_errors(attributes, step(attributes, 0))}
         errors["plain torch"] = step_errors(attributes, plain_step(attributes, 0))
     seen = max((len(attribute.rows) for attribute in attributes.values()), default=0)
-    workload = f"{source.name}, {seen} visible splats, {setting} codebooks"
+    workload = f"{source.name}, {seen} visible splats, {scope.codebooks} codebooks"
     note = f"codes checked on at most {CHECKED_ROWS} rows an attribute"
     clock = iter(range(1, 1 << 62))
 
@@ -71,21 +70,22 @@ def run(settings: Settings) -> list[Row]:
         Case("plain torch", lambda: plain_step(attributes, next(clock)), move),
     ]
     rows = []
-    for threads in settings.threads:
-        timings = measure(cases, settings, threads)
+    for threads in scope.threads:
+        timings = measure(cases, scope, threads)
         rows += [
-            Row("quantize", workload, n, "forward + backward", threads, timings[n], errors[n], note) for n in timings
+            Measurement("quantize", workload, n, "forward + backward", threads, timings[n], errors[n], note)
+            for n in timings
         ]
     return rows
 
 
-def prepare(splats: RawSplats, setting: str) -> dict[str, Attribute]:
-    """Quantizers of the paper's setting, fitted by one step of k-means, with the rows of a training view."""
+def prepare(splats: RawSplats, codebooks: str) -> dict[str, Attribute]:
+    """Quantizers with the paper's codebook sizes, fitted by one step of k-means, with the rows of a training view."""
     scene = Splats.from_tensors(*splats)
     count = int(VISIBLE * len(scene))
     chosen = torch.randperm(len(scene), generator=generator(0, 0, "visible"))[:count].sort().values
     prepared = {}
-    for name, module in build_quantizers(lambda k, d: NSVQ(k, d, kmeans_steps=1), setting, scene).items():
+    for name, module in build_quantizers(lambda k, d: NSVQ(k, d, kmeans_steps=1), codebooks, scene).items():
         quantizer = cast(CodebookQuantizer, module)
         every = QUANTIZED[name].rows(getattr(scene, name).detach())
         quantizer.fit(every, generator=generator(0, 0, "fit", name))

@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from nsvq_lightning.commands.benchmark.errors import relative_l2, worst_first
-from nsvq_lightning.commands.benchmark.row import Row
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.error_measures import relative_l2, worst_first
+from nsvq_lightning.commands.benchmark.measurement import Measurement
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.timing import Case, measure, use_threads
 from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.rendering.camera import Camera
@@ -122,9 +122,9 @@ class Traced(NamedTuple):
     image: Tensor
 
 
-def run(settings: Settings) -> list[Row]:
+def run(scope: Scope) -> list[Measurement]:
     """Time every method on every workload with every number of threads; errors once a workload."""
-    return [row for workload in workloads(settings) for row in _rows(workload, settings)]
+    return [row for workload in workloads(scope) for row in _rows(workload, scope)]
 
 
 def accuracies(stored_degree: int) -> list[Accuracy]:
@@ -142,28 +142,30 @@ def _smaller(camera: Camera, shrink: int) -> Camera:
     return Camera(camera.K * scale, camera.viewmat, width, height)
 
 
-def _rows(workload: Workload, settings: Settings) -> list[Row]:
+def _rows(workload: Workload, scope: Scope) -> list[Measurement]:
     small = len(workload.splats.means) <= REFERENCE_SPLATS
-    crop = crop_for_oracle(workload, ORACLE_PAIRS[settings.quick])
+    crop = crop_for_oracle(workload, ORACLE_PAIRS[scope.quick])
     asked = accuracies(sh_degree_of(workload.splats.shN))
     fast = [Method(name, accuracy) for name in fast_backends(workload.splats.means) for accuracy in asked]
     plain = Method(REFERENCE)
     # In a quick run even 20k splats are too much for plain torch: it is compared on the crop.
-    jobs = [(workload, [*fast, plain] if small and not settings.quick else fast)]
-    if small and settings.quick:
+    jobs = [(workload, [*fast, plain] if small and not scope.quick else fast)]
+    if small and scope.quick:
         jobs.append((crop, [fast[0], plain]))
-    with use_threads(max(settings.threads)):
+    with use_threads(max(scope.threads)):
         errors = method_errors(crop, list(dict.fromkeys(method for _, methods in jobs for method in methods)))
     note = crop_note(crop, workload)
     rows = []
-    for threads in settings.threads:
+    for threads in scope.threads:
         for where, methods in jobs:
             keys = [(method, operation) for method in methods for operation in (FORWARD, BOTH)]
             leaves = leaves_of(where)
             cases = [case_of(where, leaves, *key) for key in keys]
-            for key, timing in zip(keys, measure(cases, settings, threads).values(), strict=True):
+            for key, timing in zip(keys, measure(cases, scope, threads).values(), strict=True):
                 method, operation = key
-                rows.append(Row("render", str(where), str(method), operation, threads, timing, errors[key], note))
+                rows.append(
+                    Measurement("render", str(where), str(method), operation, threads, timing, errors[key], note)
+                )
     return rows
 
 

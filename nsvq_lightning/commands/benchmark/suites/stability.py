@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.commands.benchmark.extremes import Extreme, extremes
-from nsvq_lightning.commands.benchmark.row import Row
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.measurement import Measurement
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.suites import quantize, render
 from nsvq_lightning.commands.benchmark.timing import Case, measure, use_threads
 from nsvq_lightning.commands.benchmark.workloads import Workload
@@ -63,11 +63,11 @@ class Outcome(NamedTuple):
     lost: int
 
 
-def run(settings: Settings) -> list[Row]:
+def run(scope: Scope) -> list[Measurement]:
     """Time every scene with every number of threads; errors once a scene."""
-    scenes = cases(settings)
+    scenes = cases(scope)
     methods = {str(render.Method(name)): name for name in (*fast_backends(torch.zeros(1)), render.REFERENCE)}
-    with use_threads(max(settings.threads)):
+    with use_threads(max(scope.threads)):
         values = {(scene.name, m): errors(scene, backend) for scene in scenes for m, backend in methods.items()}
         prepared = quantizers()
         for name, attribute in prepared.items():
@@ -76,17 +76,17 @@ def run(settings: Settings) -> list[Row]:
     timed = [_case(scene, m, backend) for scene in scenes for m, backend in methods.items()]
     timed += [_quantizer_case(name, prepared[name], m) for name in prepared for m in QUANTIZE_STEPS]
     rows = []
-    for threads in settings.threads:
-        timings = measure(timed, settings, threads)
+    for threads in scope.threads:
+        timings = measure(timed, scope, threads)
         for (name, method), found in values.items():
             timing = timings[_key(name, method)]
-            rows.append(Row("stability", name, method, f"{OPERATION}, {kinds[name]}", threads, timing, found))
+            rows.append(Measurement("stability", name, method, f"{OPERATION}, {kinds[name]}", threads, timing, found))
     return rows
 
 
-def cases(settings: Settings) -> list[Extreme]:
+def cases(scope: Scope) -> list[Extreme]:
     """The scenes of a quick or a full run."""
-    return extremes(*SIZES[settings.quick])
+    return extremes(*SIZES[scope.quick])
 
 
 def errors(scene: Extreme, backend: str) -> dict[str, float]:

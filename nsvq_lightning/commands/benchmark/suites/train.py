@@ -1,16 +1,15 @@
 """Whole runs, PSNR against seconds, and one step beside the render it contains.
 
-Runs are those of ``nsvq fit``: its module, data, callbacks, loggers and trainer; what only watches a run (reports,
-checkpoints, the progress bar) is left out, and pictures are compared while the clock stands. Every run has the same
-number of steps. Settings differ in one thing from the first one; where a setting promises the same bits, the column
-``other numbers`` says whether it keeps its word: how many of the trained numbers are not those of the first row.
+Runs are those of ``nsvq fit``: its module, data, callbacks, loggers and trainer. What only watches a run (reports,
+checkpoints, the progress bar) is left out, and test views are compared while the clock is stopped. Every run has the
+same number of steps. Variants differ from the first one in one thing. Where one promises the same bits, the column
+``other numbers`` checks it: it counts the trained numbers that are not those of the first row.
 """
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean, median
@@ -19,10 +18,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark.fitting import Step, StepClock, fit, one_phase, quiet, training_callbacks
-from nsvq_lightning.commands.benchmark.row import Row, Timing
-from nsvq_lightning.commands.benchmark.settings import Settings
-from nsvq_lightning.commands.benchmark.switch_table import turned_round
+from nsvq_lightning.commands.benchmark.fitting import Step, StepClock, fit, quiet, training_callbacks
+from nsvq_lightning.commands.benchmark.measurement import Measurement, Timing
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.timing import Case, milliseconds, sgemm, use_threads
 from nsvq_lightning.commands.benchmark.trainees import Trainee, trainee
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
@@ -34,15 +32,15 @@ from nsvq_lightning.skips import SKIPS, switched
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
-__all__ = ["Setting", "Trained", "different_numbers", "run", "settings_of"]
+__all__ = ["Trained", "Variant", "different_numbers", "run", "variants"]
 
 DEMO = {True: {"views": 9, "width": 96, "height": 72}, False: {}}
 """Size of the demo scene, quick and full; the full one is that of ``configs/demo.yaml``."""
 CODEBOOKS = {True: "0.5k", False: "1k"}
 ROUNDS = {True: 1, False: 2}
-"""Runs of every setting; their order turns, their steps are counted together."""
+"""Runs of every variant; their order turns, their steps are counted together."""
 EVALUATIONS = 16
-"""Points on the way of a run at which its test views are compared, besides the ends of the phases."""
+"""Points during a run at which its test views are compared, besides the ends of the phases."""
 PRODUCT_EVERY = {True: 8, False: 10}
 """Steps between two matrix products."""
 WARM_STEPS, STEPS = {True: 4, False: 10}, {True: 10, False: 60}
@@ -52,8 +50,8 @@ FIRST_STEPS = 8
 SHIPPED = "as shipped"
 
 
-class Setting(NamedTuple):
-    """One way to run: options of the module, switches that are turned round, threads."""
+class Variant(NamedTuple):
+    """One way to run: options of the module, switches that are inverted, threads."""
 
     name: str
     options: Mapping[str, Any]
@@ -62,11 +60,11 @@ class Setting(NamedTuple):
 
 
 class Trained(NamedTuple):
-    """What one run came to.
+    """The result of one run.
 
     Attributes:
         steps: All steps.
-        course: Seconds, test PSNR in dB, on the way and at the end.
+        course: Seconds and test PSNR in dB, during the run and at its end.
         numbers: Everything that was trained, by name.
         file_bytes: Size of the compressed file.
         sgemm: Matrix products in between, ms.
@@ -79,45 +77,46 @@ class Trained(NamedTuple):
     sgemm: list[float]
 
 
-def run(settings: Settings) -> list[Row]:
-    """Train with every setting, then time single steps with every number of threads."""
+def run(scope: Scope) -> list[Measurement]:
+    """Train with every variant, then time single steps with every number of threads."""
     with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder:
-        return [*_run_rows(settings, Path(folder)), *_step_rows(settings, Path(folder))]
+        return [*_run_rows(scope, Path(folder)), *_step_rows(scope, Path(folder))]
 
 
 # Whole runs
 
 
-def settings_of(settings: Settings) -> list[Setting]:
-    """What is compared: threads, the run without codebooks, and each switch that is asked for the other way round."""
-    most, codebooks = max(settings.threads), {"codebooks": CODEBOOKS[settings.quick]}
-    chosen = [Setting(SHIPPED, codebooks, {}, most)]
-    chosen += [Setting(f"{n} thread{'s' * (n > 1)}", codebooks, {}, n) for n in settings.threads if n != most]
-    if not settings.switches:
-        chosen.append(Setting("without codebooks", {"codebooks": None}, {}, most))
-    for name in settings.switches:
-        chosen.append(Setting(turned_round(name), codebooks, {name: not SKIPS[name].default}, most))
+def variants(scope: Scope) -> list[Variant]:
+    """What is compared: threads, the run without codebooks, and each switch that is asked for, inverted."""
+    most, codebooks = max(scope.threads), {"codebooks": CODEBOOKS[scope.quick]}
+    chosen = [Variant(SHIPPED, codebooks, {}, most)]
+    chosen += [Variant(f"{n} thread{'s' * (n > 1)}", codebooks, {}, n) for n in scope.threads if n != most]
+    if not scope.switches:
+        chosen.append(Variant("without codebooks", {"codebooks": None}, {}, most))
+    for name in scope.switches:
+        inverted = f"{'no skip of' if SKIPS[name].default else 'skip'} {name}"
+        chosen.append(Variant(inverted, codebooks, {name: not SKIPS[name].default}, most))
     return chosen
 
 
-def _run_rows(settings: Settings, folder: Path) -> list[Row]:
-    chosen = settings_of(settings)
+def _run_rows(scope: Scope, folder: Path) -> list[Measurement]:
+    chosen = variants(scope)
     # Not counted: kernels are loaded, and compiled where they never were.
-    _train(chosen[0], replace(settings, steps=FIRST_STEPS), folder)
-    trained: dict[str, list[Trained]] = {setting.name: [] for setting in chosen}
-    for turn in range(ROUNDS[settings.quick]):
-        for setting in chosen[turn:] + chosen[:turn]:
-            trained[setting.name].append(_train(setting, settings, folder))
-    workload = f"{_described(_photos(settings, folder))}, {settings.steps} steps"
+    _train(chosen[0], replace(scope, steps=FIRST_STEPS), folder)
+    trained: dict[str, list[Trained]] = {variant.name: [] for variant in chosen}
+    for turn in range(ROUNDS[scope.quick]):
+        for variant in chosen[turn:] + chosen[:turn]:
+            trained[variant.name].append(_train(variant, scope, folder))
+    workload = f"{_described(_photos(scope, folder))}, {scope.steps} steps"
     shipped = trained[SHIPPED]
-    return [_run_row(workload, setting, trained[setting.name], shipped) for setting in chosen]
+    return [_run_row(workload, variant, trained[variant.name], shipped) for variant in chosen]
 
 
-def _photos(settings: Settings, folder: Path) -> ColmapDataModule:
+def _photos(scope: Scope, folder: Path) -> ColmapDataModule:
     """New at every run: some switches are about how photos are loaded."""
-    if settings.scene is not None and settings.scene.is_dir():
-        return ColmapDataModule(str(settings.scene))
-    demo = DemoDataModule(str(folder / "demo"), **DEMO[settings.quick])
+    if scope.scene is not None and scope.scene.is_dir():
+        return ColmapDataModule(str(scope.scene))
+    demo = DemoDataModule(str(folder / "demo"), **DEMO[scope.quick])
     with quiet():
         demo.prepare_data()
     return demo
@@ -130,12 +129,12 @@ def _described(data: ColmapDataModule) -> str:
     return f"{Path(data.root).resolve().name}, {len(scene.train)} photos of {camera.width}x{camera.height}"
 
 
-def _train(setting: Setting, settings: Settings, folder: Path) -> Trained:
+def _train(variant: Variant, scope: Scope, folder: Path) -> Trained:
     steps: list[Step] = []
     course: list[tuple[float, float]] = []
     products: list[float] = []
-    product, every = sgemm(), max(1, settings.steps // EVALUATIONS)
-    product_every = min(PRODUCT_EVERY[settings.quick], settings.steps)
+    product, every = sgemm(), max(1, scope.steps // EVALUATIONS)
+    product_every = min(PRODUCT_EVERY[scope.quick], scope.steps)
 
     def between(module: SplatModule, _: View, step: Step) -> None:
         steps.append(step)
@@ -145,11 +144,11 @@ def _train(setting: Setting, settings: Settings, folder: Path) -> Trained:
         if step.iteration % product_every == 0:
             products.append(milliseconds(product))
 
-    init_from = None if settings.init_from is None else str(settings.init_from)
-    with use_threads(setting.threads), _switches(setting):
-        data = _photos(settings, folder)
-        module = SplatModule(**setting.options, init_from=init_from)
-        fit(module, data, [*training_callbacks(), StepClock(between)], settings.steps)
+    init_from = None if scope.init_from is None else str(scope.init_from)
+    with use_threads(variant.threads), switched(**variant.switches):
+        data = _photos(scope, folder)
+        module = SplatModule(**variant.options, init_from=init_from)
+        fit(module, data, [*training_callbacks(), StepClock(between)], scope.steps)
         file_bytes = write_nsvq(folder / "scene.nsvq", module.compressed())
     numbers = {name: tensor.detach() for name, tensor in module.named_parameters()}
     return Trained(steps, course, numbers, file_bytes, products)
@@ -157,10 +156,6 @@ def _train(setting: Setting, settings: Settings, folder: Path) -> Trained:
 
 def _seconds(steps: Sequence[Step]) -> float:
     return sum(step.milliseconds for step in steps) / 1000
-
-
-def _switches(setting: Setting) -> AbstractContextManager[None]:
-    return switched(**setting.switches) if setting.switches else nullcontext()
 
 
 def _test_psnr(module: SplatModule, data: ColmapDataModule) -> float:
@@ -171,24 +166,38 @@ def _test_psnr(module: SplatModule, data: ColmapDataModule) -> float:
         ).psnr
 
 
-def _run_row(workload: str, setting: Setting, runs: Sequence[Trained], shipped: Sequence[Trained]) -> Row:
-    timing, usual = _timing(runs), _timing(shipped)
-    first = runs[0]
+def _run_row(workload: str, variant: Variant, runs: Sequence[Trained], shipped: Sequence[Trained]) -> Measurement:
+    timing, first = _timing(runs), runs[0]
+    ratio = _relative_mean(timing) / _relative_mean(_timing(shipped))
     by_phase: dict[Phase, list[float]] = {}
     for step in (step for trained in runs for step in trained.steps):
         by_phase.setdefault(step.phase, []).append(step.milliseconds)
     values = {
         "PSNR dB": first.course[-1][1],
         "seconds": fmean(_seconds(trained.steps) for trained in runs),
-        "times as shipped": _relative_mean(timing) / _relative_mean(usual),
+        "times as shipped": ratio,
         "steps a second": 1000 / fmean(timing.samples),
         **{f"{phase.name.lower()} ms": median(times) for phase, times in by_phase.items()},
         "splats": float(len(first.numbers["splats.means"])),
         "file bytes": float(first.file_bytes),
         "other numbers": float(different_numbers(first.numbers, shipped[0].numbers)),
     }
+    for name in variant.switches:
+        values["saves %"] = 100 * _saved(ratio, SKIPS[name].default)
     note = "times are of whole steps, those that start a phase included; PSNR is that of the test views"
-    return Row("train", workload, setting.name, "run", setting.threads, timing, values, note, tuple(first.course))
+    return Measurement(
+        "train", workload, variant.name, "run", variant.threads, timing, values, note, tuple(first.course)
+    )
+
+
+def _saved(ratio: float, default: bool) -> float:
+    """Share of the time that a switch saves; negative where it costs.
+
+    Args:
+        ratio: Time of the run with the switch inverted, as a multiple of the time as shipped.
+        default: Whether the switch is on as shipped.
+    """
+    return 1 - 1 / ratio if default else 1 - ratio
 
 
 def _timing(runs: Sequence[Trained]) -> Timing:
@@ -197,7 +206,7 @@ def _timing(runs: Sequence[Trained]) -> Timing:
 
 
 def _relative_mean(timing: Timing) -> float:
-    """Mean step in matrix products, so that a busy hour of the machine is not taken for a slow setting."""
+    """Mean step in matrix products, so that a busy machine is not mistaken for a slow variant."""
     return fmean(timing.samples) / median(timing.sgemm)
 
 
@@ -216,15 +225,15 @@ def different_numbers(found: Mapping[str, Tensor], expected: Mapping[str, Tensor
 # One step beside its render
 
 
-def _step_rows(settings: Settings, folder: Path) -> list[Row]:
-    subject = trainee(settings, folder)
+def _step_rows(scope: Scope, folder: Path) -> list[Measurement]:
+    subject = trainee(scope, folder)
     rows = []
-    for threads in settings.threads:
-        steps, renders, products = _steps_and_renders(subject, threads, settings.quick)
+    for threads in scope.threads:
+        steps, renders, products = _steps_and_renders(subject, threads, scope.quick)
         for method, times in (("render forward + backward", renders), ("training step, Lightning included", steps)):
             values = {"times its render": median(times) / median(renders)}
             timing = Timing(tuple(times), tuple(products))
-            rows.append(Row("train", subject.name, method, "warmup step", threads, timing, values))
+            rows.append(Measurement("train", subject.name, method, "warmup step", threads, timing, values))
     return rows
 
 
@@ -246,8 +255,7 @@ def _steps_and_renders(subject: Trainee, threads: int, quick: bool) -> tuple[lis
 
     count = WARM_STEPS[quick] + STEPS[quick]
     with use_threads(threads):
-        callbacks = [*training_callbacks(phases=one_phase(Phase.WARMUP, count)), StepClock(between)]
-        fit(subject.module(codebooks=None), subject.data(), callbacks, count)
+        subject.train(Phase.WARMUP, count, between, codebooks=None)
     return steps, renders, products
 
 

@@ -6,19 +6,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.commands.sweep.results import Group, Row, grouped, series_of
-from nsvq_lightning.report.figures import colours_of, draw_keys, markers_of, new_figure, write_figure
+from nsvq_lightning.commands.panels import panels
+from nsvq_lightning.commands.sweep.results import Group, RunResult, grouped, series_of
+from nsvq_lightning.report.figures import colours_of, draw_keys, markers_of, write_figure
 
 __all__ = ["draw_sweep"]
 
-COLUMNS = 2
-PANEL = (6.4, 4.6)
-"""Inches across and down."""
-
-LEGEND_LINE = 0.19
+PANEL_HEIGHT = 4.6
+"""Inches."""
 
 
-def draw_sweep(path: Path, rows: Sequence[Row]) -> None:
+def draw_sweep(path: Path, rows: Sequence[RunResult]) -> None:
     """Draw PSNR over file size: a panel and a marker for each scene, a colour for each quantizer or configuration.
 
     A point is the mean over the seeds, its whiskers the standard deviation; lines join the codebook sizes. Runs without
@@ -37,14 +35,8 @@ def draw_sweep(path: Path, rows: Sequence[Row]) -> None:
     series = series_of(rows)
     colours = colours_of(list(dict.fromkeys(map(series, rows))))
     markers = markers_of(list(dict.fromkeys(row.scene for row in rows)))
-    across = min(COLUMNS, len(markers))
-    down = -(-len(markers) // across)
-    keys = LEGEND_LINE * max(len(colours), len(markers))
-    figure = new_figure(PANEL[0] * across, PANEL[1] * down + keys)
-    axes = figure.subplots(down, across, squeeze=False).ravel()
-    for axis in axes[len(markers) :]:
-        axis.set_axis_off()
-    for axis, (scene, marker) in zip(axes, markers.items(), strict=False):
+    figure, axes = panels(len(markers), PANEL_HEIGHT, max(len(colours), len(markers)))
+    for axis, (scene, marker) in zip(axes, markers.items(), strict=True):
         curves: dict[str, list[Group]] = {}
         for group in grouped([row for row in rows if row.scene == scene]):
             curves.setdefault(series(group.rows[0]), []).append(group)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["Row", "Timing"]
+__all__ = ["Measurement", "Timing"]
 
 
 @dataclass(frozen=True)
@@ -65,19 +65,19 @@ class Timing:
 
 
 @dataclass(frozen=True)
-class Row:
-    """One line of a table.
+class Measurement:
+    """One row of a table.
 
     Attributes:
         suite: Name of the suite.
         workload: What it was done to.
-        method: Who did it; rows of one operation differ in the method.
-        operation: What was done; rows of one operation are compared with each other.
+        method: How it was done; measurements of one operation differ in the method.
+        operation: What was done; measurements of one operation are compared with each other.
         threads: Threads it was done with.
         timing: How long it took.
         values: Errors and sizes by name, the unit in the name where there is one; the first is drawn against the time.
         note: How the errors were measured, where that is not on the workload itself.
-        course: Seconds and the first value on the way to the end, for what takes its time; drawn as a line.
+        course: Seconds and the first value during a run, ``(s, value)``; drawn as a line. Empty for single calls.
     """
 
     suite: str
@@ -91,7 +91,7 @@ class Row:
     course: tuple[tuple[float, float], ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        """The row as JSON values."""
+        """The measurement as JSON values."""
         return {
             "suite": self.suite,
             "workload": self.workload,

@@ -8,12 +8,12 @@ from typing import Any
 import cv2
 import pytest
 
-from nsvq_lightning.commands.benchmark.machine import describe_machine
-from nsvq_lightning.commands.benchmark.plot import draw_suite
-from nsvq_lightning.commands.benchmark.registry import Suite
-from nsvq_lightning.commands.benchmark.report import as_json, as_markdown, fill_in, number, suite_tables
-from nsvq_lightning.commands.benchmark.row import Row, Timing
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.hardware import describe_machine
+from nsvq_lightning.commands.benchmark.measurement import Measurement, Timing
+from nsvq_lightning.commands.benchmark.scope import Scope
+from nsvq_lightning.commands.benchmark.suite_list import Suite
+from nsvq_lightning.commands.benchmark.suite_picture import draw_suite
+from nsvq_lightning.commands.benchmark.tables import as_json, as_markdown, number
 
 MACHINE: dict[str, Any] = {
     "cpu": "Abacus 1",
@@ -29,9 +29,11 @@ MACHINE: dict[str, Any] = {
 }
 
 
-def _row(method: str, ms: float, error: float, operation: str = "search", note: str = "", **values: float) -> Row:
+def _row(
+    method: str, ms: float, error: float, operation: str = "search", note: str = "", **values: float
+) -> Measurement:
     timing = Timing((ms, 2 * ms, 3 * ms), (10.0,))
-    return Row("nearest", "W", method, operation, 1, timing, {"wrong": error, **values}, note)
+    return Measurement("nearest", "W", method, operation, 1, timing, {"wrong": error, **values}, note)
 
 
 ROWS = [_row("fast", 1.0, 0.0), _row("slow", 300.0, 1e-6), _row("slow", 5.0, 12.0, "other", note="only half", extra=1)]
@@ -54,7 +56,7 @@ def test_numbers_have_three_digits(value: float, text: str) -> None:
 
 
 def test_tables_name_the_machine_and_every_operation() -> None:
-    text = as_markdown(MACHINE, Settings((1, 2), quick=True), ROWS)
+    text = as_markdown(MACHINE, Scope((1, 2), quick=True), ROWS)
     assert "Abacus 1 (wood), 2 of 4 cores, 256-bit vectors (avx2, fma), Linux x86_64, load average 0.2 at" in text
     assert "python 3.11.0, torch 2.0" in text
     assert "Rounds: 15; threads: 1, 2; quick." in text
@@ -70,32 +72,17 @@ def test_tables_name_the_machine_and_every_operation() -> None:
 
 def test_workload_and_threads_are_columns_where_they_differ() -> None:
     other = [dataclasses.replace(ROWS[0], workload="V"), dataclasses.replace(ROWS[0], threads=2), ROWS[0]]
-    text = suite_tables(MACHINE, Settings((1, 2)), other)
-    assert text.startswith("#### search\n\n| workload | method | threads |")
-    assert "Abacus 1" in text
-    one_workload = suite_tables(MACHINE, Settings((1, 2)), other[1:])
-    assert one_workload.startswith("#### search, W\n\n| method | threads |")
-
-
-def test_tables_are_put_where_a_document_has_a_place() -> None:
-    document = "a\n<!-- results: loss -->\nold\n<!-- end -->\nb\n<!-- results: codec -->\n<!-- end -->\n"
-    once = fill_in(document, {"loss": "new"})
-    assert once == document.replace("old\n", "\nnew\n\n")
-    assert fill_in(once, {"loss": "new"}) == once
-    assert "<!-- results: codec -->\n\nx\n\n<!-- end -->\n" in fill_in(once, {"codec": "x"})
-    with pytest.raises(ValueError, match="it needs the lines '<!-- results: nearest -->'"):
-        fill_in(document, {"nearest": "x"})
-    with pytest.raises(ValueError, match="results: loss"):
-        fill_in("<!-- results: loss -->\n", {"loss": "x"})
+    assert "### search\n\n| workload | method | threads |" in as_markdown(MACHINE, Scope((1, 2)), other)
+    assert "### search, W\n\n| method | threads |" in as_markdown(MACHINE, Scope((1, 2)), other[1:])
 
 
 def test_lines_of_a_table_are_equally_long() -> None:
-    lines = [line for line in as_markdown(MACHINE, Settings((1,)), ROWS[:2]).splitlines() if line[:1] == "|"]
+    lines = [line for line in as_markdown(MACHINE, Scope((1,)), ROWS[:2]).splitlines() if line[:1] == "|"]
     assert len({len(line) for line in lines}) == 1
 
 
 def test_json_has_the_samples_and_nothing_but_plain_values() -> None:
-    results = json.loads(json.dumps(as_json(MACHINE, Settings((1,), scene=Path("a/b.ply")), ROWS), allow_nan=False))
+    results = json.loads(json.dumps(as_json(MACHINE, Scope((1,), scene=Path("a/b.ply")), ROWS), allow_nan=False))
     assert results["machine"] == MACHINE
     assert results["settings"]["scene"] == "a/b.ply"
     assert results["settings"]["threads"] == [1]
@@ -125,7 +112,7 @@ def _size(path: Path) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("rows", [ROWS[:2], ROWS[:1], ROWS[1:2]], ids=["all", "only zero errors", "no zero error"])
-def test_picture_has_a_panel_for_each_operation_and_value(tmp_path: Path, rows: list[Row]) -> None:
+def test_picture_has_a_panel_for_each_operation_and_value(tmp_path: Path, rows: list[Measurement]) -> None:
     draw_suite(tmp_path / "one.png", rows, ERRORS)
     draw_suite(tmp_path / "three.png", [*rows, ROWS[2]], ERRORS)
     one, three = _size(tmp_path / "one.png"), _size(tmp_path / "three.png")
@@ -162,4 +149,4 @@ def test_shares_are_bars_as_long_as_they_are_large(tmp_path: Path) -> None:
 
 def test_picture_needs_something_to_draw(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no row has a value"):
-        draw_suite(tmp_path / "x.png", [Row("s", "w", "m", "o", 1, Timing((1.0,), (1.0,)))], ERRORS)
+        draw_suite(tmp_path / "x.png", [Measurement("s", "w", "m", "o", 1, Timing((1.0,), (1.0,)))], ERRORS)

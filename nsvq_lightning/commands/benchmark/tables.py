@@ -7,34 +7,22 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.commands.benchmark.row import Row
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.measurement import Measurement
+from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.report.figures import markdown_table
 
-__all__ = [
-    "as_json",
-    "as_markdown",
-    "between",
-    "fill_in",
-    "has_place",
-    "replace_between",
-    "results_line",
-    "suite_tables",
-]
+__all__ = ["as_json", "as_markdown", "number"]
 
 
-END = "<!-- end -->"
-
-
-def as_json(machine: Mapping[str, Any], settings: Settings, rows: Sequence[Row]) -> dict[str, Any]:
+def as_json(machine: Mapping[str, Any], scope: Scope, rows: Sequence[Measurement]) -> dict[str, Any]:
     """Everything that was measured, samples included, as JSON values.
 
     Args:
-        machine: From :func:`nsvq_lightning.commands.benchmark.machine.describe_machine`.
-        settings: How much was measured.
-        rows: Results.
+        machine: From :func:`nsvq_lightning.commands.benchmark.hardware.describe_machine`.
+        scope: What was measured, and how thoroughly.
+        rows: Measurements.
     """
-    chosen = {name: _plain(value) for name, value in asdict(settings).items()}
+    chosen = {name: _plain(value) for name, value in asdict(scope).items()}
     return {"machine": dict(machine), "settings": chosen, "rows": [row.as_json() for row in rows]}
 
 
@@ -44,78 +32,21 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def as_markdown(machine: Mapping[str, Any], settings: Settings, rows: Sequence[Row]) -> str:
+def as_markdown(machine: Mapping[str, Any], scope: Scope, rows: Sequence[Measurement]) -> str:
     """The machine, then one table for every operation of every suite."""
-    parts = ["# nsvq benchmark", *_machine_lines(machine, settings)]
+    parts = ["# nsvq benchmark", *_machine_lines(machine, scope)]
     for suite in dict.fromkeys(row.suite for row in rows):
-        parts += [f"## {suite}", *_operations([row for row in rows if row.suite == suite], "###")]
+        parts += [f"## {suite}", *_operations([row for row in rows if row.suite == suite])]
     return "\n\n".join(parts) + "\n"
 
 
-def suite_tables(machine: Mapping[str, Any], settings: Settings, rows: Sequence[Row]) -> str:
-    """The tables of one suite, for a document: first them, then what they were measured on."""
-    return "\n\n".join([*_operations(rows, "####"), *_machine_lines(machine, settings)])
-
-
-def fill_in(document: str, tables: Mapping[str, str]) -> str:
-    """Put tables between the lines ``<!-- results: SUITE -->`` and ``<!-- end -->`` of a document.
-
-    Args:
-        document: Markdown.
-        tables: Text by name of the suite; other places stay as they are.
-
-    Raises:
-        ValueError: There is no place for a suite.
-    """
-    for suite, text in tables.items():
-        document = replace_between(document, results_line(suite), text)
-    return document
-
-
-def results_line(suite: str) -> str:
-    """The line of a document after which the tables of a suite go."""
-    return f"<!-- results: {suite} -->"
-
-
-def has_place(document: str, start: str) -> bool:
-    """Whether a document has the line ``start``; a text may speak of it, too."""
-    return start in document.splitlines()
-
-
-def between(document: str, start: str) -> str:
-    """What stands between the line ``start`` and the next ``<!-- end -->``.
-
-    Raises:
-        ValueError: There is no such place.
-    """
-    return _split(document, start)[1].strip()
-
-
-def replace_between(document: str, start: str, text: str) -> str:
-    """Put ``text`` between the line ``start`` and the next ``<!-- end -->``.
-
-    Raises:
-        ValueError: There is no such place.
-    """
-    before, _, after = _split(document, start)
-    return f"{before}{start}\n\n{text}\n\n{END}{after}"
-
-
-def _split(document: str, start: str) -> tuple[str, str, str]:
-    before, found, rest = document.partition(f"{start}\n")
-    inside, closed, after = rest.partition(END)
-    if not found or not closed:
-        raise ValueError(f"no place for a table: it needs the lines {start!r} and {END!r}")
-    return before, inside, after
-
-
-def _operations(rows: Sequence[Row], heading: str) -> Iterator[str]:
+def _operations(rows: Sequence[Measurement]) -> Iterator[str]:
     for operation in dict.fromkeys(row.operation for row in rows):
         chosen = [row for row in rows if row.operation == operation]
         # What is the same in all rows is said once.
         common = [name for name in ("workload", "threads") if len({getattr(row, name) for row in chosen}) == 1]
         said = {"workload": chosen[0].workload, "threads": _counted(chosen[0].threads, "thread")}
-        yield f"{heading} {operation}" + "".join(f", {said[name]}" for name in common)
+        yield f"### {operation}" + "".join(f", {said[name]}" for name in common)
         yield markdown_table(*_columns(chosen, common), words=("workload", "method"))
         yield from _notes(chosen)
 
@@ -124,7 +55,7 @@ def _counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'s' * (number != 1)}"
 
 
-def _machine_lines(machine: Mapping[str, Any], settings: Settings) -> Iterator[str]:
+def _machine_lines(machine: Mapping[str, Any], scope: Scope) -> Iterator[str]:
     versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
     load = machine["load_average"]
     busy = "" if load is None else f", load average {load:.1f} at the start"
@@ -134,13 +65,13 @@ def _machine_lines(machine: Mapping[str, Any], settings: Settings) -> Iterator[s
     yield f"{machine['cpu']} ({machine['llvm_cpu']}), {cores}, {simd}{gpu}, {machine['system']}{busy}"
     yield versions
     yield (
-        f"Rounds: {settings.repeats}; threads: {', '.join(map(str, settings.threads))}{'; quick' * settings.quick}. "
+        f"Rounds: {scope.repeats}; threads: {', '.join(map(str, scope.threads))}{'; quick' * scope.quick}. "
         "ms: median of the calls; quartiles and n beside it. sgemm: the median as a multiple of a 2048³ float32 matrix "
         "product of torch that took turns with it."
     )
 
 
-def _columns(rows: Sequence[Row], common: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+def _columns(rows: Sequence[Measurement], common: Sequence[str]) -> tuple[list[str], list[list[str]]]:
     """Head and cells without those that are ``common``; values that no row of the table has get no column."""
     names = list(dict.fromkeys(name for row in rows for name in row.values))
     own = [name for name in ("workload", "method", "threads") if name not in common]
@@ -168,7 +99,7 @@ def number(value: float) -> str:
     return f"{value:.3g}"
 
 
-def _notes(rows: Sequence[Row]) -> list[str]:
+def _notes(rows: Sequence[Measurement]) -> list[str]:
     """Each different note once, with the workloads it is about where there are several."""
     by_note: dict[str, list[str]] = {}
     for row in rows:

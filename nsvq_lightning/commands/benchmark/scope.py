@@ -1,9 +1,8 @@
-"""How much is measured, and of what."""
+"""What is measured, and how thoroughly."""
 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,18 +11,13 @@ from typing import Any
 from nsvq_lightning.commands.benchmark.sizes import SIZES, STANDARD
 from nsvq_lightning.skips import SKIPS
 
-__all__ = ["Settings", "usable_cores"]
+__all__ = ["Scope"]
 
 QUICK_WORKLOADS = ("A20k",)
 
 
-def usable_cores() -> int:
-    """Cores this process may run on, which containers and ``taskset`` make fewer than the machine has."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 @dataclass(frozen=True)
-class Settings:
+class Scope:
     """What the command line says, with its defaults filled in.
 
     Attributes:
@@ -36,7 +30,7 @@ class Settings:
         init_from: Scene file whose splats are seen by the cameras of the COLMAP folder ``scene``, instead of its
             points.
         steps: Iterations of each run of ``train``, at least 4: a phase has one at least.
-        switches: Names of :data:`nsvq_lightning.skips.SKIPS` that ``train`` measures the other way round.
+        switches: Names of :data:`nsvq_lightning.skips.SKIPS` that ``train`` inverts one by one.
 
     Raises:
         ValueError: A number is out of range, a name is unknown, or there is nothing to measure.
@@ -70,9 +64,14 @@ class Settings:
         if self.init_from is not None and (self.scene is None or not self.scene.is_dir()):
             raise ValueError("init-from needs a COLMAP folder as scene, whose cameras look at its splats")
 
+    @property
+    def codebooks(self) -> str:
+        """The paper's codebook setting in the suites that quantize."""
+        return "1k" if self.quick else "16k"
+
     @classmethod
-    def of(cls, *, quick: bool, most_threads: int, **given: Any) -> Settings:
-        """Settings of a full or a quick run; what is None or not given gets the default of that kind of run.
+    def of(cls, *, quick: bool, most_threads: int, **given: Any) -> Scope:
+        """The scope of a full or a quick run; what is None or not given gets the default of that kind of run.
 
         Args:
             quick: Which kind.

@@ -6,8 +6,8 @@ import importlib
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple, cast
 
-from nsvq_lightning.commands.benchmark.row import Row
-from nsvq_lightning.commands.benchmark.settings import Settings
+from nsvq_lightning.commands.benchmark.measurement import Measurement
+from nsvq_lightning.commands.benchmark.scope import Scope
 
 __all__ = ["ALL", "SUITES", "Suite", "Unavailable", "load_suite", "suite_names"]
 
@@ -70,7 +70,7 @@ def suite_names(choice: str) -> tuple[str, ...]:
     return names
 
 
-def load_suite(name: str) -> Callable[[Settings], Sequence[Row]]:
-    """The function ``run(settings)`` of a suite."""
+def load_suite(name: str) -> Callable[[Scope], Sequence[Measurement]]:
+    """The function ``run(scope)`` of a suite."""
     module = importlib.import_module(f"nsvq_lightning.commands.benchmark.suites.{name}")
-    return cast(Callable[[Settings], Sequence[Row]], module.run)
+    return cast(Callable[[Scope], Sequence[Measurement]], module.run)

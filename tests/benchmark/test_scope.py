@@ -6,25 +6,25 @@ from typing import Any
 
 import pytest
 
-from nsvq_lightning.commands.benchmark.settings import Settings, usable_cores
+from nsvq_lightning.commands.benchmark.scope import Scope
 
 
 def test_full_and_quick_runs_have_their_own_defaults() -> None:
-    full, quick = (Settings.of(quick=quick, most_threads=4) for quick in (False, True))
+    full, quick = (Scope.of(quick=quick, most_threads=4) for quick in (False, True))
     assert (full.threads, full.repeats, full.workloads) == ((1, 4), 15, ("A20k", "B100k", "C500k"))
     assert (quick.threads, quick.repeats, quick.workloads) == ((4,), 3, ("A20k",))
     assert quick.seconds < full.seconds
     assert quick.steps < full.steps
-    assert Settings.of(quick=False, most_threads=1).threads == (1,)
+    assert Scope.of(quick=False, most_threads=1).threads == (1,)
 
 
 def test_what_is_given_wins() -> None:
-    settings = Settings.of(
+    scope = Scope.of(
         quick=True, most_threads=2, threads=(2, 1), repeats=9, workloads=("B100k",), scene=Path("x.ply"), steps=None
     )
-    assert (settings.threads, settings.repeats, settings.workloads) == ((2, 1), 9, ("B100k",))
-    assert settings.scene == Path("x.ply")
-    assert settings.steps == Settings.of(quick=True, most_threads=2).steps
+    assert (scope.threads, scope.repeats, scope.workloads) == ((2, 1), 9, ("B100k",))
+    assert scope.scene == Path("x.ply")
+    assert scope.steps == Scope.of(quick=True, most_threads=2).steps
 
 
 @pytest.mark.parametrize(
@@ -45,13 +45,9 @@ def test_what_is_given_wins() -> None:
 )
 def test_values_out_of_range_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Settings(**arguments)
+        Scope(**arguments)
 
 
 def test_more_threads_than_there_are_would_be_a_lie() -> None:
     with pytest.raises(ValueError, match="at most 2 threads can be measured here, got 3"):
-        Settings.of(quick=True, most_threads=2, threads=(1, 3))
-
-
-def test_at_least_one_core_is_usable() -> None:
-    assert usable_cores() >= 1
+        Scope.of(quick=True, most_threads=2, threads=(1, 3))

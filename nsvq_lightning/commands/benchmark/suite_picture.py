@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.commands.benchmark.registry import Suite
-from nsvq_lightning.commands.benchmark.row import Row
-from nsvq_lightning.report.figures import colours_of, draw_keys, markers_of, new_figure, write_figure
+from nsvq_lightning.commands.benchmark.measurement import Measurement
+from nsvq_lightning.commands.benchmark.suite_list import Suite
+from nsvq_lightning.commands.panels import panels
+from nsvq_lightning.report.figures import colours_of, draw_keys, markers_of, write_figure
 
 __all__ = ["draw_suite"]
 
-COLUMNS = 2
-PANEL = (6.4, 4.2)
-"""Inches across and down."""
-LEGEND_LINE = 0.19
-SHARE = "share %"
+PANEL_HEIGHT = 4.2
+"""Inches."""
 
 
-def draw_suite(path: Path, rows: Sequence[Row], suite: Suite) -> None:
+def draw_suite(path: Path, rows: Sequence[Measurement], suite: Suite) -> None:
     """Draw the rows of one suite.
 
     ``errors``: a panel for each operation and value, a colour for each method, a marker for each workload. The time is
@@ -31,7 +29,7 @@ def draw_suite(path: Path, rows: Sequence[Row], suite: Suite) -> None:
 
     Args:
         path: PNG file, replaced atomically.
-        rows: Rows of one suite, of which one has a value at least.
+        rows: Those of one suite; at least one has a value.
         suite: How it is drawn.
 
     Raises:
@@ -41,62 +39,46 @@ def draw_suite(path: Path, rows: Sequence[Row], suite: Suite) -> None:
     if not rows:
         raise ValueError(f"cannot draw {path}: no row has a value to draw against the time")
     if suite.picture == "shares":
-        figure = _figure([(rows, operation, SHARE) for operation in _distinct(rows, "operation")], _draw_bars)
+        operations = _distinct(rows, "operation")
+        figure, axes = panels(len(operations), PANEL_HEIGHT)
+        for axis, operation in zip(axes, operations, strict=True):
+            _draw_bars(axis, [row for row in rows if row.operation == operation])
     else:
-        panels = _values(rows, suite.drawn)
-        operations = {operation for _, operation, _ in panels}
-        rows = [row for row in rows if row.operation in operations]
-        figure = _figure([(rows, *panel[1:]) for panel in panels], _draw_values)
-        _draw_keys(figure, rows)
+        figure = _draw_values(rows, suite.drawn)
     write_figure(path, figure)
 
 
-Panel = tuple[Sequence[Row], str, str]
-"""All rows, the operation that is drawn, and the value."""
-
-
-def _values(rows: Sequence[Row], drawn: Sequence[str]) -> list[Panel]:
-    """The panels: what is to be drawn where the rows of an operation have it, else their first value."""
-    panels: list[Panel] = []
-    for operation in _distinct(rows, "operation"):
-        values = [row.values for row in rows if row.operation == operation]
-        wanted = [name for name in drawn if any(name in row for row in values)]
-        panels += [(rows, operation, name) for name in (wanted if drawn else [next(iter(values[0]))])]
-    return panels or [(rows, rows[0].operation, next(iter(rows[0].values)))]
-
-
-def _figure(panels: Sequence[Panel], draw: Callable[[Any, Sequence[Row], Panel], None]) -> Any:
-    across = min(COLUMNS, len(panels))
-    down = -(-len(panels) // across)
-    rows = panels[0][0]
-    keys = max(len(_distinct(rows, "method")), len(_distinct(rows, "workload"))) if draw is _draw_values else 0
-    figure = new_figure(PANEL[0] * across, PANEL[1] * down + LEGEND_LINE * keys)
-    axes = figure.subplots(down, across, squeeze=False).ravel()
-    for axis in axes[len(panels) :]:
-        axis.set_axis_off()
-    for axis, panel in zip(axes, panels, strict=False):
-        axis.set_title(f"{rows[0].suite}: {panel[1]}", fontsize="medium")
-        draw(axis, [row for row in rows if row.operation == panel[1]], panel)
+def _draw_values(rows: Sequence[Measurement], drawn: Sequence[str]) -> Any:
+    """A figure with a panel for each operation and value."""
+    shown = _values(rows, drawn)
+    rows = [row for row in rows if row.operation in dict(shown)]
+    styles = colours_of(_distinct(rows, "method")), markers_of(_distinct(rows, "workload"))
+    figure, axes = panels(len(shown), PANEL_HEIGHT, max(map(len, styles)))
+    for axis, (operation, value) in zip(axes, shown, strict=True):
+        chosen = [row for row in rows if row.operation == operation and value in row.values]
+        draw = _draw_courses if any(row.course for row in chosen) else _draw_points
+        draw(axis, chosen, value, styles)
+        axis.set_title(f"{rows[0].suite}: {operation}", fontsize="medium")
+        axis.grid(alpha=0.3, which="major")
+    threads = sorted({row.threads for row in rows})
+    hollow = f"hollow: {', '.join(map(str, threads[:-1]))} instead of {threads[-1]} threads"
+    draw_keys(figure, *styles, hollow if len(threads) > 1 else None)
     return figure
 
 
-def _styles(rows: Sequence[Row]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Colour of each method and marker of each workload, the same in all panels."""
-    return colours_of(_distinct(rows, "method")), markers_of(_distinct(rows, "workload"))
+def _values(rows: Sequence[Measurement], drawn: Sequence[str]) -> list[tuple[str, str]]:
+    """Operations and their values: those that are to be drawn where the rows have them, else the first one."""
+    shown: list[tuple[str, str]] = []
+    for operation in _distinct(rows, "operation"):
+        values = [row.values for row in rows if row.operation == operation]
+        wanted = [name for name in drawn if any(name in row for row in values)]
+        shown += [(operation, name) for name in (wanted if drawn else [next(iter(values[0]))])]
+    return shown or [(rows[0].operation, next(iter(rows[0].values)))]
 
 
-def _draw_values(axis: Any, rows: Sequence[Row], panel: Panel) -> None:
-    everything, _, value = panel
-    styles = _styles(everything)
-    rows = [row for row in rows if value in row.values]
-    if any(row.course for row in rows):
-        _draw_courses(axis, rows, value, styles)
-    else:
-        _draw_points(axis, rows, value, styles)
-    axis.grid(alpha=0.3, which="major")
-
-
-def _draw_courses(axis: Any, rows: Sequence[Row], value: str, styles: tuple[dict[str, Any], dict[str, str]]) -> None:
+def _draw_courses(
+    axis: Any, rows: Sequence[Measurement], value: str, styles: tuple[dict[str, Any], dict[str, str]]
+) -> None:
     colours, markers = styles
     for row in rows:
         seconds, values = zip(*row.course, strict=True)
@@ -106,7 +88,9 @@ def _draw_courses(axis: Any, rows: Sequence[Row], value: str, styles: tuple[dict
     axis.set(xlabel="seconds", ylabel=value)
 
 
-def _draw_points(axis: Any, rows: Sequence[Row], value: str, styles: tuple[dict[str, Any], dict[str, str]]) -> None:
+def _draw_points(
+    axis: Any, rows: Sequence[Measurement], value: str, styles: tuple[dict[str, Any], dict[str, str]]
+) -> None:
     colours, markers = styles
     most = max(row.threads for row in rows)
     for row in rows:
@@ -132,19 +116,12 @@ def _draw_points(axis: Any, rows: Sequence[Row], value: str, styles: tuple[dict[
     axis.set(xlabel="ms", ylabel=value)
 
 
-def _draw_keys(figure: Any, rows: Sequence[Row]) -> None:
-    """What colours, markers and hollow markers mean, below the panels."""
-    threads = sorted({row.threads for row in rows})
-    hollow = f"hollow: {', '.join(map(str, threads[:-1]))} instead of {threads[-1]} threads"
-    draw_keys(figure, *_styles(rows), hollow if len(threads) > 1 else None)
-
-
-def _draw_bars(axis: Any, rows: Sequence[Row], panel: Panel) -> None:
+def _draw_bars(axis: Any, rows: Sequence[Measurement]) -> None:
     """One bar a row below the first, which is the whole of them."""
     whole, *parts = rows
-    axis.set_title(f"{whole.suite}: {panel[1]}, {whole.timing.median:.3g} ms", fontsize="medium")
+    axis.set_title(f"{whole.suite}: {whole.operation}, {whole.timing.median:.3g} ms", fontsize="medium")
     names = [row.method for row in parts]
-    shares = [row.values[SHARE] for row in parts]
+    shares = [row.values["share %"] for row in parts]
     axis.barh(names, shares, color="C0")
     axis.invert_yaxis()
     for place, (share, row) in enumerate(zip(shares, parts, strict=True)):
@@ -161,5 +138,5 @@ def _decades(values: Sequence[float]) -> tuple[float, float]:
     return 10.0**bottom, 10.0 ** max(math.ceil(high + 0.05), bottom + 1)
 
 
-def _distinct(rows: Sequence[Row], field: str) -> list[str]:
+def _distinct(rows: Sequence[Measurement], field: str) -> list[str]:
     return list(dict.fromkeys(str(getattr(row, field)) for row in rows))
