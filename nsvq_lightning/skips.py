@@ -1,7 +1,6 @@
 """Work that a scene, a view or a phase may not need, and the switches that skip it.
 
-Most switches are on and leave every bit of the result as it is; those that change a result say how in ``changes`` and
-are off. They exist to be measured and tested one by one:
+All switches are on and leave every bit of the result as it is. They exist to be measured and tested one by one:
 
 * in Python: ``with switched(blocks=False): ...``
 * on the command line: ``nsvq fit --skips.blocks=false``, in a config ``skips: {blocks: false}``
@@ -32,25 +31,16 @@ class Skip:
         name: Its name.
         work: What is not done while it is on.
         when: In which case it is not needed.
-        changes: What a result loses by it; None when all bits stay the same.
-        default: Whether it is on.
     """
 
     name: str
     work: str
     when: str
-    changes: str | None = None
-    default: bool = True
-
-    @property
-    def exact(self) -> bool:
-        """Whether all results are the same bits with and without."""
-        return self.changes is None
 
     @property
     def summary(self) -> str:
         """One line for the help of a command."""
-        return f"skip {self.work}: {self.when} ({self.changes or 'same bits'})"
+        return f"skip {self.work}: {self.when}"
 
 
 SKIPS = {
@@ -66,16 +56,6 @@ SKIPS = {
         Skip("frozen_search", "the nearest code of a splat", "its codes are frozen"),
         Skip("distance_bounds", "the nearest code of a splat", "bounds prove that it is the last one"),
         # training step
-        Skip("adam_bands", "SH bands in the optimiser", "they never had a gradient"),
-        Skip(
-            "adam_rows",
-            "splats in the optimiser",
-            "they have no gradient in this step",
-            # 1500 iterations of nsvq_4k on 43 photos that each see 3 of 4 splats: 28.12 dB without, 27.43 dB with, in
-            # the same time. It would pay where a view sees few splats and memory is slow.
-            changes="momentum no longer moves them on, which costs 0.7 dB in a short run",
-            default=False,
-        ),
         Skip("metrics", "the PSNR of a training view", "it is not logged in this step"),
         # photos
         Skip("undistortion", "resampling a photo", "its camera is a pinhole"),
@@ -84,7 +64,7 @@ SKIPS = {
 }
 """All switches by name."""
 
-_ON = {name: skip.default for name, skip in SKIPS.items()}
+_ON = dict.fromkeys(SKIPS, True)
 
 
 def is_on(name: str) -> bool:

@@ -102,7 +102,7 @@ class SplatCLI(LightningCLI):
 
     The callbacks of a run are options of their own: ``--callbacks.density.max_splats=200000`` changes one number
     without repeating a list; ``trainer.callbacks`` takes further ones. So are the switches of
-    :mod:`nsvq_lightning.skips`: ``--skips.adam_rows=true``.
+    :mod:`nsvq_lightning.skips`: ``--skips.blocks=false``.
     """
 
     def __init__(self, args: list[str]) -> None:
@@ -135,7 +135,7 @@ class SplatCLI(LightningCLI):
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """Add the callbacks and the switches."""
         for skip in SKIPS.values():
-            parser.add_argument(f"--skips.{skip.name}", type=bool, default=skip.default, help=skip.summary)
+            parser.add_argument(f"--skips.{skip.name}", type=bool, default=True, help=skip.summary)
         for name, kind in STANDARD.items():
             key = f"callbacks.{name}"
             path = f"{kind.__module__}.{kind.__qualname__}"

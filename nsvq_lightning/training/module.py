@@ -29,7 +29,6 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, render, visible
 from nsvq_lightning.skips import is_on
-from nsvq_lightning.splats.sh_degree import sh_coefficients
 from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, sh_degree_of
 from nsvq_lightning.training.branch import (
     QUANTIZER_SETTINGS,
@@ -46,7 +45,6 @@ from nsvq_lightning.training.optim import (
     build_adam,
     param_groups,
     position_lr,
-    set_columns,
     set_lr,
 )
 from nsvq_lightning.training.schedule import Phase, Schedule, log_interval
@@ -353,16 +351,12 @@ class SplatModule(LightningModule):
         self.stopwatch.start()
 
     def on_train_batch_start(self, batch: View, batch_idx: int) -> None:
-        """Set the position's learning rate of this iteration, and how many SH coefficients it can change."""
+        """Set the position's learning rate of this iteration."""
         self._micro_batch = batch_idx % self.trainer.accumulate_grad_batches
         if self._micro_batch == 0:
             self._updates = True
-        optimizer = self.trainer.optimizers[0]
         rate = position_lr(self.global_step + 1, self.extent, self._step_rates, self.schedule.position_decay_end)
-        set_lr(optimizer, "means", rate)
-        # Noise substitution scales a whole row, so from there on every coefficient has a gradient.
-        degree = self.active_sh_degree if self.phase < Phase.QUANTIZE else self.splats.sh_degree
-        set_columns(optimizer, "shN", 3 * sh_coefficients(degree))
+        set_lr(self.trainer.optimizers[0], "means", rate)
 
     def training_step(self, batch: View, batch_idx: int) -> dict[str, Any] | None:
         """Loss of one view: (1 - w)·L1 + w·(1 - SSIM) + λ·Σ opacity (paper, section 3.3).

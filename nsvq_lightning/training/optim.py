@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import importlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
 from lightning.pytorch import Trainer
 from torch import Tensor, nn
-from torch.autograd.graph import increment_version
 
-from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.splats import ATTRIBUTES, Splats
 
 __all__ = [
     "LearningRates",
-    "SplatAdam",
     "apply_rates",
     "build_adam",
     "codebook_group",
@@ -28,7 +23,6 @@ __all__ = [
     "param_groups",
     "position_lr",
     "raw_optimizer",
-    "set_columns",
     "set_lr",
 ]
 
@@ -165,103 +159,11 @@ def apply_rates(optimizer: torch.optim.Optimizer, rates: LearningRates, extent: 
         group["betas"], group["eps"] = betas, EPS / math.sqrt(scale)
 
 
-class SplatAdam(torch.optim.Adam):
-    """:class:`torch.optim.Adam` for contiguous float32 parameters, in one pass over the memory.
-
-    On the CPU and on CUDA devices, where nothing waits for the device. The same bits for any number of threads; the
-    state is that of torch's, the count of steps on the CPU, so checkpoints fit both. A group may name
-    ``columns`` (:func:`set_columns`): the leading numbers of a row that can have a gradient or ever had one; Adam
-    leaves the others as they are, so they are not looked at (switch ``adam_bands``). With the switch ``adam_rows``
-    splats without a gradient keep weights and moments; the count of steps, which corrects the bias, goes on for all.
-
-    Args:
-        groups: Parameter groups with their learning rates.
-        eps: Added to the root of the second moment.
-    """
-
-    def __init__(self, groups: list[dict[str, Any]], eps: float = EPS) -> None:
-        super().__init__(groups, eps=eps)
-
-    @torch.no_grad()
-    def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """Call ``closure``, if any, and update what has a gradient then.
-
-        Returns:
-            What ``closure`` returned.
-        """
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
-        # All are prepared before the first is done, see `adam_update`.
-        due = [(group, p) for group in self.param_groups for p in group["params"] if p.grad is not None]
-        updates = [self._update_of(group, parameter, parameter.grad) for group, parameter in due]
-        for update in updates:
-            update()
-        for _, parameter in due:  # autograd does not see kernels write
-            increment_version([parameter, *(self.state[parameter][name] for name in ("exp_avg", "exp_avg_sq"))])
-        return loss
-
-    def _update_of(self, group: dict[str, Any], parameter: Tensor, gradient: Tensor) -> Callable[[], None]:
-        """Count one more step of a parameter; the function that does it."""
-        state = self.state[parameter]
-        if not state:
-            state["step"] = torch.zeros(())
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        # A checkpoint of torch's fused Adam has it on the device, where reading it would wait.
-        state["step"] = state["step"].cpu() + 1
-        return _adam_of(parameter)(
-            parameter,
-            gradient.contiguous(),
-            state["exp_avg"],
-            state["exp_avg_sq"],
-            step=int(state["step"]),
-            lr=group["lr"],
-            betas=group["betas"],
-            eps=group["eps"],
-            columns=group.get("columns") if is_on("adam_bands") else None,
-            rows_with_gradient=is_on("adam_rows") and not group.get("name", "").startswith(CODEBOOK_PREFIX),
-        )
-
-
-def _adam_of(parameter: Tensor) -> Callable[..., Callable[[], None]]:
-    """The function that prepares Adam on the device of a parameter, whose kernels' compiler is imported only now."""
-    adam = importlib.import_module(f"nsvq_lightning.training.adam_{kernels_for(parameter)}")
-    prepare: Callable[..., Callable[[], None]] = adam.adam_update
-    return prepare
-
-
 def build_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
-    """Adam of the paper over ``groups``: default betas, epsilon 1e-15, no weight decay.
-
-    Returns:
-        :class:`SplatAdam` where it can take the parameters, else torch's, fused where there is such.
-
-    Raises:
-        ValueError: ``adam_rows`` is on, and only torch's can take the parameters.
-    """
+    """Adam of the paper over ``groups``: default betas, epsilon 1e-15, no weight decay; fused where torch can."""
     parameters: list[Tensor] = [parameter for group in groups for parameter in group["params"]]
-    if all(kernels_for(p) is not None and p.is_contiguous() for p in parameters):
-        return SplatAdam(groups)
-    if is_on("adam_rows"):
-        raise ValueError(
-            "the switch adam_rows needs float32 parameters on the CPU, or on a CUDA device with Triton (pip install "
-            "triton); train there, or leave it off"
-        )
     fused = all(p.device.type in FUSED_DEVICES and p.is_floating_point() for p in parameters)
     return torch.optim.Adam(groups, eps=EPS, fused=True if fused else None)
-
-
-def set_columns(optimizer: torch.optim.Optimizer, name: str, columns: int) -> None:
-    """Say that from now on the leading ``columns`` numbers of a row of the group ``name`` can have a gradient.
-
-    Groups start without a limit. The first call at the start of a training sets one, later ones only raise it: moments
-    that were set once need their decay. The optimiser's state carries it.
-    """
-    group = find_group(optimizer, name)
-    fresh = not optimizer.state.get(group["params"][0])
-    if fresh or "columns" in group:
-        group["columns"] = max(columns, group.get("columns", 0))
 
 
 def set_lr(optimizer: torch.optim.Optimizer, name: str, rate: float) -> None:

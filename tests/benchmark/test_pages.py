@@ -21,6 +21,5 @@ def test_every_suite_has_a_page_that_says_how_it_was_made() -> None:
 def test_every_switch_is_described_as_it_is() -> None:
     explained, measured = (DOCS / "skips.md").read_text(), (DOCS / "measured" / "train.md").read_text()
     for name, skip in SKIPS.items():
-        result = (skip.changes or "same bits") + "; off by default" * (not skip.default)
-        assert f"| `{name}` | {skip.work} | {skip.when} | {result} |" in explained
+        assert f"| `{name}` | {skip.work} | {skip.when} |\n" in explained
         assert f"| `{name}` " in measured

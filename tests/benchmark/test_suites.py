@@ -209,7 +209,7 @@ def test_distortion_is_a_share_of_the_variance() -> None:
 
 
 def test_runs_with_and_without_a_switch(scene: Path) -> None:
-    switched = dataclasses.replace(TINY, scene=scene, switches=("sh_bands", "adam_rows"))
+    switched = dataclasses.replace(TINY, scene=scene, switches=("sh_bands", "metrics"))
     rows = {row.method: row for row in train.run(switched)}
     shipped, exact = rows["as shipped"], rows["no skip of sh_bands"]
     assert shipped.values["other numbers"] == exact.values["other numbers"] == 0
@@ -218,8 +218,6 @@ def test_runs_with_and_without_a_switch(scene: Path) -> None:
     assert "saves %" not in shipped.values
     ratio = exact.values["times as shipped"]
     assert exact.values["saves %"] == pytest.approx(100 * (1 - 1 / ratio))  # on: what its absence costs
-    ratio = rows["skip adam_rows"].values["times as shipped"]
-    assert rows["skip adam_rows"].values["saves %"] == pytest.approx(100 * (1 - ratio))  # off: what it would save
     assert {"warmup ms", "prune ms", "quantize ms", "finetune ms"} < shipped.values.keys()
     assert [point[0] for point in shipped.course] == sorted(point[0] for point in shipped.course)
     assert shipped.course[-1][1] == shipped.values["PSNR dB"]
@@ -230,8 +228,8 @@ def test_runs_with_and_without_a_switch(scene: Path) -> None:
 
 
 def test_variants_of_runs() -> None:
-    names = [variant.name for variant in train.variants(Scope((1, 2), switches=("sh_bands", "adam_rows")))]
-    assert names == ["as shipped", "1 thread", "no skip of sh_bands", "skip adam_rows"]
+    names = [variant.name for variant in train.variants(Scope((1, 2), switches=("sh_bands", "metrics")))]
+    assert names == ["as shipped", "1 thread", "no skip of sh_bands", "no skip of metrics"]
     plain = train.variants(Scope((2,)))
     assert [variant.options["codebooks"] for variant in plain] == ["1k", None]
 
@@ -325,18 +323,8 @@ def test_wrong_optimizer_is_found() -> None:
     def wrong(groups: list[dict[str, object]]) -> torch.optim.Optimizer:
         return torch.optim.Adam(groups, eps=1e-8)
 
-    everything = optimizer.SCENARIOS[0]
-    assert optimizer.errors_after(3, optimizer.AdamVariant(wrong), everything)["update error"] > 1e-3
-    assert optimizer.errors_after(3, optimizer.METHODS["build_adam"], everything)["update error"] < 1e-3
-
-
-def test_rows_and_bands_that_are_skipped(scene: Path) -> None:
-    rows = {(row.operation, row.method): row.values["update error"] for row in _run("optimizer", scene)}
-    every, hidden, first_band = (scenario.operation for scenario in optimizer.SCENARIOS)
-    assert max(rows[operation, "build_adam"] for operation in (every, hidden, first_band)) < 1e-3
-    assert rows[first_band, "build_adam, no skip of adam_bands"] == rows[first_band, "build_adam"]
-    # What the switch changes is stated, not hidden.
-    assert rows[hidden, "build_adam, skip adam_rows"] > 0.01
+    assert optimizer.errors_after(3, wrong)["update error"] > 1e-3
+    assert optimizer.errors_after(3, optimizer.METHODS["build_adam"])["update error"] < 1e-3
 
 
 def test_wrong_quantize_step_is_found() -> None:

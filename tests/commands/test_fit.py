@@ -66,12 +66,12 @@ def test_switches_are_options_that_hold_for_one_command(
     seen: list[tuple[bool, bool]] = []
 
     def look(module: SplatModule) -> None:
-        seen.append((is_on("adam_rows"), is_on("metrics")))
+        seen.append((is_on("blocks"), is_on("metrics")))
 
     monkeypatch.setattr(SplatModule, "on_train_end", look)
-    assert main(fit(demo_scene, tmp_path, "--model.codebooks=null", "--skips.adam_rows=true", steps=2)) == 0
-    assert seen == [(True, True)]
-    assert not is_on("adam_rows")
+    assert main(fit(demo_scene, tmp_path, "--model.codebooks=null", "--skips.blocks=false", steps=2)) == 0
+    assert seen == [(False, True)]
+    assert is_on("blocks")
 
 
 def test_a_second_run_gets_its_own_folder_and_prints_its_summary(

@@ -21,7 +21,7 @@ RUNTIME = {"NRT_incref", "NRT_decref", "memset"}
 LONGEST = 20_000
 """Instructions; a kernel that takes its vectors apart, lane by lane, has several times as many."""
 
-MAIN = ("blend.blend", "blend.blend_backward")
+MAIN = ("rendering.cpu.blend.blend", "rendering.cpu.blend.blend_backward")
 
 
 def _compiled(processor: str, *kernels: str) -> dict[str, Any]:

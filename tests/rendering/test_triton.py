@@ -24,7 +24,7 @@ def test_against_the_oracle(cases: str) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-BLEND, PROJECTION, LOSS, ADAM = (f"rendering.cuda.{name}" for name in ("blend", "projection", "dssim", "adam"))
+BLEND, PROJECTION, LOSS = "rendering.cuda.blend", "rendering.cuda.projection", "quality.ssim_cuda"
 NEAREST, NOISE, SUMS, SUBSTITUTION = (f"quantize.cuda.{name}" for name in ("nearest", "noise", "sums", "substitution"))
 
 
@@ -36,10 +36,10 @@ NEAREST, NOISE, SUMS, SUBSTITUTION = (f"quantize.cuda.{name}" for name in ("near
         pytest.param([f"{PROJECTION}:project_kernel"], marks=pytest.mark.slow),
         pytest.param([f"{PROJECTION}:project_backward_kernel"], marks=pytest.mark.slow),
         # Some with an argument that is 1, of which Triton makes a constant.
-        [f"{LOSS}:similarity_kernel:height=1", f"{LOSS}:loss_kernel:programs=1", f"{ADAM}:update_rows_kernel:stride=1"],
+        [f"{LOSS}:similarity_kernel:height=1", f"{LOSS}:loss_kernel:programs=1"],
         [f"{NEAREST}:nearest_kernel:num_codes=1", f"{SUBSTITUTION}:substitute_kernel", f"{SUMS}:sum_kernel:sums=*fp64"],
         pytest.param([f"{LOSS}:moments_kernel:height=1", f"{LOSS}:spread_kernel:height=1"], marks=pytest.mark.slow),
-        pytest.param([f"{LOSS}:gradient_kernel:height=1", f"{ADAM}:update_columns_kernel"], marks=pytest.mark.slow),
+        pytest.param([f"{LOSS}:gradient_kernel:height=1"], marks=pytest.mark.slow),
         pytest.param([f"{SUBSTITUTION}:radial_kernel:count=1", f"{NOISE}:normal_kernel"], marks=pytest.mark.slow),
     ],
 )

@@ -15,16 +15,21 @@ from typing import Any
 import llvmlite.binding as llvm
 
 SIGNATURES = {
-    "blend.blend": "void(i8, f4[::1], i4[::1], i8[::1], i8, i8, i8, f4[::1], f4[::1], u2[::1], i8[::1], f4[::1], "
+    "rendering.cpu.blend.blend": "void("
+    "i8, f4[::1], i4[::1], i8[::1], i8, i8, i8, f4[::1], f4[::1], u2[::1], i8[::1], f4[::1], "
     "f4[::1], f4[::1], f4[:, ::1], b1, b1, i8[::1])",
-    "blend.blend_backward": "void(i8, f4[::1], i4[::1], i4[::1], i8[::1], i8[::1], i8, i8, i8, f4[::1], u2[::1], "
+    "rendering.cpu.blend.blend_backward": "void("
+    "i8, f4[::1], i4[::1], i4[::1], i8[::1], i8[::1], i8, i8, i8, f4[::1], u2[::1], "
     "f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], b1, b1, f4[::1], i8, f4[:, ::1], i8[::1])",
-    "projection.project_splats": "void(i8, f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], i4[::1], i4[::1], "
+    "rendering.cpu.projection.project_splats": "void("
+    "i8, f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], i4[::1], i4[::1], "
     "i8[::1], i8[::1], f4[:, ::1])",
-    "projection.project_backward": "void(i8, f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], i8, i8, "
+    "rendering.cpu.projection_backward.project_backward": "void("
+    "i8, f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], i8, i8, "
     "i8, i4[::1], i8, f4[::1], i4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], "
     "f4[:, ::1])",
-    "dssim.sweep_image": "void(i8, f4[::1], u1[::1], f4, f4[::1], i8, i8, i8, f4, f4, f4[:, ::1], f4[:, ::1], "
+    "quality.ssim_cpu.sweep_image": "void("
+    "i8, f4[::1], u1[::1], f4, f4[::1], i8, i8, i8, f4, f4, f4[:, ::1], f4[:, ::1], "
     "f4[:, ::1], f4[:, ::1], f4[::1], f8[::1])",
 }
 
@@ -44,8 +49,8 @@ def assembly(name: str) -> str:
     from numba.core import compiler, compiler_lock, sigutils
     from numba.core.registry import cpu_target
 
-    module, _, function = name.partition(".")
-    kernel: Any = getattr(importlib.import_module(f"nsvq_lightning.rendering.cpu.{module}"), function)
+    module, _, function = name.rpartition(".")
+    kernel: Any = getattr(importlib.import_module(f"nsvq_lightning.{module}"), function)
     flags = compiler.Flags()
     cpu_target.options.parse_as_flags(flags, {**kernel.targetoptions, "parallel": False})
     flags.no_compile = True

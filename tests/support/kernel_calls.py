@@ -71,18 +71,6 @@ def _splats() -> RawSplats:
     return RawSplats(*(0.5 * _tensor(*shape, seed=seed) for seed, shape in enumerate(shapes)))
 
 
-def _adam(function: Callable[..., Callable[[], None]], **arguments: Any) -> None:
-    function(**arguments, step=3, lr=0.1, betas=(0.9, 0.99), eps=1e-8)()
-
-
-def _adam_case(**options: Any) -> Case:
-    def arguments() -> dict[str, Any]:
-        names = ("weights", "gradients", "first", "second")
-        return {name: _tensor(70, 2, 12, seed=seed).abs() for seed, name in enumerate(names)} | options
-
-    return Case(arguments, call=_adam)
-
-
 def _rows(count: int = 40) -> Any:
     return np.sort(np.random.default_rng(1).permutation(70)[:count])
 
@@ -189,13 +177,13 @@ def _tensors(arrays: dict[str, Any]) -> dict[str, Any]:
 
 
 _Q, _IO, _CPU = "nsvq_lightning.quantize", "nsvq_lightning.io", "nsvq_lightning.rendering.cpu"
+_ROWS, _SSIM = "nsvq_lightning.compute.rows", "nsvq_lightning.quality.ssim"
 
 NUMBA: dict[str, list[Case]] = {
-    f"{_CPU}.adam.adam_update": [_adam_case(), _adam_case(columns=14), _adam_case(rows_with_gradient=True)],
-    f"{_CPU}.dssim.l1_dssim": [Case(_pictures), Case(lambda: _pictures(torch.uint8))],
+    f"{_SSIM}_cpu.l1_dssim": [Case(_pictures), Case(lambda: _pictures(torch.uint8))],
     f"{_CPU}.rasterizer.render_cpu": [Case(_render, call=_render_and_back)],
     f"{_CPU}.rasterizer.visible_cpu": [Case(lambda: {"splats": _splats(), "camera": _camera()})],
-    f"{_CPU}.rows.gather_rows": [
+    f"{_ROWS}.gather_rows": [
         Case(
             lambda: {"table": _tensor(70, 5), "rows": torch.from_numpy(_rows())},
             rows=("table", "rows"),
@@ -203,7 +191,7 @@ NUMBA: dict[str, list[Case]] = {
             numbers=("rows",),
         )
     ],
-    f"{_CPU}.rows.spread_rows": [
+    f"{_ROWS}.spread_rows": [
         Case(
             lambda: {"values": _tensor(40, 5), "rows": torch.from_numpy(_rows()), "count": 70},
             columns=("values",),
@@ -251,17 +239,17 @@ NUMBA: dict[str, list[Case]] = {
         Case(lambda dim=dim: _tracked(dim), rows=("x", "codebook", "rows"), numbers=("rows",), call=_search)
         for dim in (3, 20)
     ],
-    f"{_IO}.codebook_order.tree_order": [
+    f"{_IO}.nsvq.codebook_order.tree_order": [
         Case(lambda: {"codebook": _normal(50, 3)}, rows=("codebook",), columns=("codebook",))
     ],
-    f"{_IO}.entropy.encode_paths": [Case(_paths, numbers=("neighbours",))],
-    f"{_IO}.entropy.decode_paths": [Case(_stored_paths, rows=("neighbours",), numbers=("neighbours",))],
-    f"{_IO}.entropy.encode_keys": [Case(_keys, numbers=("depths",))],
-    f"{_IO}.entropy.decode_keys": [Case(_stored_keys, rows=("depths",), numbers=("depths",))],
-    f"{_IO}.entropy.encode_integers": [
+    f"{_IO}.nsvq.entropy.encode_paths": [Case(_paths, numbers=("neighbours",))],
+    f"{_IO}.nsvq.entropy.decode_paths": [Case(_stored_paths, rows=("neighbours",), numbers=("neighbours",))],
+    f"{_IO}.nsvq.entropy.encode_keys": [Case(_keys, numbers=("depths",))],
+    f"{_IO}.nsvq.entropy.decode_keys": [Case(_stored_keys, rows=("depths",), numbers=("depths",))],
+    f"{_IO}.nsvq.entropy.encode_integers": [
         Case(lambda: {"values": _codes().reshape(20, 2)}, rows=("values",), columns=("values",))
     ],
-    f"{_IO}.entropy.decode_integers": [Case(_stored_integers)],
+    f"{_IO}.nsvq.entropy.decode_integers": [Case(_stored_integers)],
     f"{_IO}.palette.find_palette": [
         Case(
             lambda: {"rows": _normal(60, 5), "weight": np.ones(60), "count": 7}, columns=("rows",), types=("weight",)
@@ -356,11 +344,10 @@ def _pictures_backward() -> dict[str, Any]:
 _CUDA = "nsvq_lightning.rendering.cuda"
 
 TRITON: dict[str, list[Case]] = {
-    f"{_CUDA}.adam.adam_update": [_adam_case(), _adam_case(columns=14), _adam_case(rows_with_gradient=True)],
     f"{_CUDA}.blend.blend": [Case(_blending)],
     f"{_CUDA}.blend.blend_backward": [Case(_blending_backward)],
-    f"{_CUDA}.dssim.l1_dssim": [Case(_pictures), Case(lambda: _pictures(torch.uint8))],
-    f"{_CUDA}.dssim.l1_dssim_backward": [Case(_pictures_backward)],
+    f"{_SSIM}_cuda.l1_dssim": [Case(_pictures), Case(lambda: _pictures(torch.uint8))],
+    f"{_SSIM}_cuda.l1_dssim_backward": [Case(_pictures_backward)],
     f"{_CUDA}.projection.project": [
         Case(lambda: {"lens": _lens(), "splats": _splats(), "degree": 1}, call=_by_attribute)
     ],

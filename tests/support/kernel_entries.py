@@ -39,7 +39,7 @@ def entry_points() -> dict[str, str]:
 
 def _modules() -> Iterator[ModuleType]:
     for info in pkgutil.walk_packages(nsvq_lightning.__path__, "nsvq_lightning."):
-        if info.name.endswith(("__main__", ".rendering.cpu.jit")):
+        if info.name.endswith(("__main__", ".compute.jit")):
             continue
         try:
             yield importlib.import_module(info.name)

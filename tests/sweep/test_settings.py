@@ -91,7 +91,7 @@ def test_a_trunk_does_not_depend_on_what_starts_after_it(standard: Settings, pat
         ("model.sh_degree", 2),
         ("model.rates.codebook_factor", 0.5),
         ("model.init_from", "scene.ply"),
-        ("skips.adam_rows", True),
+        ("skips.blocks", False),
         ("trainer.max_steps", 61),
         ("trainer.accumulate_grad_batches", 2),
         ("trainer.precision", "64-true"),

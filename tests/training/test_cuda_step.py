@@ -24,10 +24,15 @@ from nsvq_lightning.quantize.nsvq import NSVQ
 from nsvq_lightning.quantize.straight_through import StraightThrough, TrainedStraightThrough
 from nsvq_lightning.quantize.sums import lookup, sum_by_code
 from nsvq_lightning.random import generator
-from nsvq_lightning.skips import switched
-from nsvq_lightning.training.optim import SplatAdam, build_adam, set_columns
 
-USERS = ("losses", "optim", "subset", "quantize.nearest", "quantize.nsvq", "quantize.sums", "callbacks.density_rules")
+USERS = (
+    "quality.loss",
+    "compute.rows",
+    "quantize.nearest",
+    "quantize.nsvq",
+    "quantize.sums",
+    "callbacks.density_rules",
+)
 """The modules that choose kernels by device."""
 
 
@@ -85,21 +90,6 @@ def test_loss(launches: list[str], dtype: torch.dtype) -> None:
     with torch.no_grad():
         ssim(image, photo.float())
     assert launches[5:] == ["moments_kernel", "similarity_kernel", "loss_kernel"]
-
-
-@pytest.mark.parametrize("rows_only", [False, True])
-def test_optimiser(launches: list[str], rows_only: bool) -> None:
-    sizes = {"shN": (1000, 15, 3), "means": (1000, 3), "opacities": (1000,), "empty": (0, 3)}
-    parameters = {name: torch.nn.Parameter(on_device(*size)) for name, size in sizes.items()}
-    optimizer = build_adam([{"params": [p], "lr": 1e-3, "name": name} for name, p in parameters.items()])
-    assert isinstance(optimizer, SplatAdam)
-    set_columns(optimizer, "shN", 9)
-    for parameter in parameters.values():
-        parameter.grad = torch.empty_like(parameter)
-    with switched(adam_rows=rows_only):
-        optimizer.step()
-        optimizer.step()
-    assert launches == 2 * 3 * ["update_rows_kernel" if rows_only else "update_columns_kernel"]
 
 
 @pytest.mark.parametrize("dim", [3, 4, 45])

@@ -28,7 +28,7 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.nsvq.file import write_nsvq
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.report.evaluation import evaluate
-from nsvq_lightning.skips import SKIPS, switched
+from nsvq_lightning.skips import switched
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
@@ -94,8 +94,7 @@ def variants(scope: Scope) -> list[Variant]:
     if not scope.switches:
         chosen.append(Variant("without codebooks", {"codebooks": None}, {}, most))
     for name in scope.switches:
-        inverted = f"{'no skip of' if SKIPS[name].default else 'skip'} {name}"
-        chosen.append(Variant(inverted, codebooks, {name: not SKIPS[name].default}, most))
+        chosen.append(Variant(f"no skip of {name}", codebooks, {name: False}, most))
     return chosen
 
 
@@ -182,22 +181,12 @@ def _run_row(workload: str, variant: Variant, runs: Sequence[Trained], shipped: 
         "file bytes": float(first.file_bytes),
         "other numbers": float(different_numbers(first.numbers, shipped[0].numbers)),
     }
-    for name in variant.switches:
-        values["saves %"] = 100 * _saved(ratio, SKIPS[name].default)
+    if variant.switches:
+        values["saves %"] = 100 * (1 - 1 / ratio)
     note = "times are of whole steps, those that start a phase included; PSNR is that of the test views"
     return Measurement(
         "train", workload, variant.name, "run", variant.threads, timing, values, note, tuple(first.course)
     )
-
-
-def _saved(ratio: float, default: bool) -> float:
-    """Share of the time that a switch saves; negative where it costs.
-
-    Args:
-        ratio: Time of the run with the switch inverted, as a multiple of the time as shipped.
-        default: Whether the switch is on as shipped.
-    """
-    return 1 - 1 / ratio if default else 1 - ratio
 
 
 def _timing(runs: Sequence[Trained]) -> Timing:
