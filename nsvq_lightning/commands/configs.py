@@ -7,7 +7,7 @@ from pathlib import Path, PurePath
 
 from nsvq_lightning.top_level import folder_of
 
-__all__ = ["check_config", "configs_among", "find_config", "resolve_configs"]
+__all__ = ["check_config", "configs_among", "find_config", "resolve_configs", "written_by_run"]
 
 CONFIG_OPTIONS = ("--config", "-c")
 
@@ -54,6 +54,11 @@ def check_config(path: str) -> None:
     if not isinstance(settings, dict):
         found = "nothing" if settings is None else type(settings).__name__
         raise ValueError(f"config {path} holds {found}: give settings by name, as 'trainer: {{max_steps: 1000}}'")
+
+
+def written_by_run(path: str) -> bool:
+    """Whether a file is the ``config.yaml`` that a run leaves; Lightning writes its version on the first line."""
+    return Path(path).is_file() and Path(path).read_text(encoding="utf-8").startswith("# lightning")
 
 
 def find_config(name: str) -> str:

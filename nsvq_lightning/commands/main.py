@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import TextIO
 
-from nsvq_lightning.commands.configs import check_config, configs_among, resolve_configs
+from nsvq_lightning.commands.configs import check_config, configs_among, resolve_configs, written_by_run
 from nsvq_lightning.commands.registry import COMMANDS, overview
 from nsvq_lightning.version import __version__
 
@@ -86,6 +86,11 @@ def _run_lightning(arguments: list[str]) -> int:
     except SystemExit as end:
         if end.code == 2 and configs:  # the parser's messages name the option, not the file it came from
             sys.stderr.write(f"Settings came from {', '.join(configs)} and the command line\n")
+            if old := [config for config in configs if written_by_run(config)]:
+                sys.stderr.write(
+                    f"A run has written {', '.join(old)}: if that was an earlier version of this package, what the "
+                    "error names may have another name now; remove it from that file\n"
+                )
         raise
     except Exception as error:
         names_file = isinstance(error, FileNotFoundError) or (isinstance(error, OSError) and error.filename is not None)

@@ -394,15 +394,19 @@ def test_what_cannot_be_a_config(tmp_path: Path, content: bytes, message: str) -
     check_config(str(tmp_path / "none.yaml"))  # the parser's to complain about
 
 
-def test_wrong_settings_name_the_file_they_came_from(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("head", ["", "# lightning.pytorch==2.6.6\n"])
+def test_wrong_settings_name_the_file_they_came_from(
+    tmp_path: Path, head: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "mine.yaml"
-    path.write_text("model: {nonsense: 3}")
+    path.write_text(head + "model: {nonsense: 3}")
     with pytest.raises(SystemExit) as stop:
         main(["fit", "--config", str(path), "--data.root=x"])
     assert stop.value.code == 2
     message = capsys.readouterr().err
     assert "nonsense" in message
     assert f"Settings came from {path} and the command line" in message
+    assert (f"A run has written {path}: if that was an earlier version" in message) == bool(head)
 
 
 @pytest.mark.parametrize(

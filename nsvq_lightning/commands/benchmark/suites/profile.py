@@ -42,11 +42,11 @@ PARTS = {
     "bin": (f"{CPU}.binning.count_tiles", f"{CPU}.binning.fill_tiles"),
     "blend": (f"{CPU}.blend.blend",),
     "blend backward": (f"{CPU}.blend.blend_backward", f"{CPU}.blend.total_slots"),
-    "projection backward": (f"{CPU}.projection.project_backward",),
+    "projection backward": (f"{CPU}.projection_backward.project_backward",),
     "density statistics": (f"{CPU}.statistics.*", "nsvq_lightning.callbacks.density.*"),
     "rasterizer, its Python": ("nsvq_lightning.rendering.*",),
     "loss": ("nsvq_lightning.quality.*",),
-    "Adam": ("nsvq_lightning.training.optim.*", "nsvq_lightning.training.adam_cpu.*", "torch.optim.*"),
+    "Adam": ("nsvq_lightning.training.optim.*", "torch.optim.*"),
     "rows of visible splats": ("nsvq_lightning.compute.rows.*",),
     "buffers, checks and thread counts": ("nsvq_lightning.compute.*", "numba.*"),
     "quantizer: noise backward": (
