@@ -49,6 +49,12 @@ class CanonicalCovariance(LatchedCallback):
 
     Raises:
         ValueError: Another mode, or a negative floor.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import CanonicalCovariance, standard
+        >>> canonical = CanonicalCovariance(mode="auto", floor=0.25)  # --callbacks.canonical.mode=auto
+        >>> [callback.floor for callback in standard(canonical=canonical) if isinstance(callback, CanonicalCovariance)]
+        [0.25]
     """
 
     def __init__(self, mode: Mode = "none", floor: float = 0.0) -> None:

@@ -46,6 +46,14 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
 
     Raises:
         ValueError: ``every`` is negative.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import RunCheckpoint
+        >>> from nsvq_lightning.training.schedule import Schedule
+        >>> checkpoint = RunCheckpoint(every=1000)  # --callbacks.checkpoint.every=1000
+        >>> schedule = Schedule(total=4500)
+        >>> [iteration for iteration in range(1, 4501) if checkpoint.is_due(schedule, iteration)]
+        [1000, 1500, 2000, 3000, 4000, 4200, 4500]
     """
 
     def __init__(self, every: int | None = None, keep: bool = False, folder: str | None = None) -> None:

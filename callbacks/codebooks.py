@@ -51,6 +51,14 @@ class CodebookInit(LatchedCallback):
 
     Raises:
         ValueError: Other weights, or an unknown attribute.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import CodebookInit
+        >>> CodebookInit(weights="contribution").weighted  # --callbacks.codebook_init.weights=contribution
+        ('quats', 'sh0', 'shN')
+        >>> CodebookInit(weights="contribution", weighted=["means"])
+        Traceback (most recent call last):
+        ValueError: weighted must be among scales, quats, sh0, shN, got means
     """
 
     def __init__(
@@ -107,6 +115,17 @@ class CodebookReplacement(LatchedCallback):
 
     Raises:
         ValueError: The iterations are not ascending, an interval is below 1, or the jitter is not in (0, 1].
+
+    Example:
+        >>> from nsvq_lightning import SplatModule
+        >>> from nsvq_lightning.callbacks import CodebookReplacement
+        >>> from nsvq_lightning.training.schedule import Schedule
+        >>> replacement = CodebookReplacement(end=40_000, jitter=0.5)  # --callbacks.codebook_replacement.end=40000
+        >>> module = SplatModule(codebooks="4k")
+        >>> module.schedule = Schedule(total=4500)
+        >>> due = [iteration for iteration in range(1, 4501) if replacement.is_due(module, iteration)]
+        >>> due[0], due[1], due[-1]  # the quantize phase is 2001 to 4200
+        (2050, 2100, 3900)
     """
 
     def __init__(

@@ -38,6 +38,13 @@ class ContributionPruning(LatchedCallback):
 
     Raises:
         ValueError: ``share`` is not in [0, 1), or ``at`` is below 1.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import ContributionPruning
+        >>> from nsvq_lightning.training.schedule import Schedule
+        >>> pruning = ContributionPruning(share=0.002, at=18_000)  # --callbacks.contribution.share=0.002
+        >>> Schedule(total=4500).iteration(pruning.at)
+        1800
     """
 
     def __init__(self, share: float = 0.0, at: int = 18_500) -> None:

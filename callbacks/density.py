@@ -62,6 +62,12 @@ class DensityControl(LatchedCallback):
 
     Raises:
         ValueError: ``max_splats`` is below ``rules.min_splats``, or ``finite_every`` below 1.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import DensityControl, standard
+        >>> callbacks = standard(density=DensityControl(max_splats=200_000))  # --callbacks.density.max_splats=200000
+        >>> [callback.max_splats for callback in callbacks if isinstance(callback, DensityControl)]
+        [200000]
     """
 
     def __init__(

@@ -55,6 +55,13 @@ class DensityRules:
 
     Raises:
         ValueError: A number is out of its range.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import DensityControl, DensityRules
+        >>> from nsvq_lightning.training.schedule import Schedule
+        >>> rules = DensityControl(DensityRules(every=200)).rules  # --callbacks.density.rules.every=200
+        >>> Schedule(total=22_500).density_times(rules.start, rules.last, rules.every)[:3]
+        (300, 400, 500)
     """
 
     start: int = 600

@@ -34,6 +34,15 @@ class FiniteCodes(LatchedCallback):
 
     Raises:
         ValueError: ``every`` is below 1.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import FiniteCodes, standard
+        >>> callbacks = standard(codebook_finite=FiniteCodes(every=50))  # --callbacks.codebook_finite.every=50
+        >>> [type(callback).__name__ for callback in callbacks].count("FiniteCodes")
+        1
+        >>> FiniteCodes(every=0)
+        Traceback (most recent call last):
+        ValueError: every must be at least 1, got 0
     """
 
     def __init__(self, every: int = 100) -> None:

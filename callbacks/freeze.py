@@ -28,6 +28,14 @@ class FreezeCodes(LatchedCallback):
 
     Where another callback removes or adds splats in fine-tuning without their codes, the codes are searched once more,
     with a warning: those that were frozen belong to other rows.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import FreezeCodes, standard
+        >>> from nsvq_lightning.training.schedule import Phase, Schedule
+        >>> any(isinstance(callback, FreezeCodes) for callback in standard())
+        True
+        >>> Schedule(total=4500).first_of(Phase.FINETUNE)  # the iteration at which codes freeze
+        4201
     """
 
     def __init__(self) -> None:

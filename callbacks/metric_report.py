@@ -57,6 +57,14 @@ class MetricReport(WritingCallback):
 
     Raises:
         ValueError: ``every`` is negative.
+
+    Example:
+        >>> from nsvq_lightning import SplatModule
+        >>> from nsvq_lightning.callbacks import MetricReport
+        >>> report = MetricReport(every=20_000, pictures=False)  # --callbacks.report.every=20000
+        >>> module = SplatModule(codebooks="4k")
+        >>> [iteration for iteration in range(1, 45_001) if report.is_due(module, iteration)]
+        [15000, 20000, 40000, 43000, 45000]
     """
 
     stages = ("fit", "test")

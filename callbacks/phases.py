@@ -36,6 +36,13 @@ class PhaseSchedule(HostedCallback):
 
     Raises:
         ValueError: See :class:`~nsvq_lightning.training.schedule.Schedule`.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import PhaseSchedule
+        >>> PhaseSchedule().schedule(4500).ends  # --trainer.max_steps=4500
+        (1500, 2000, 4200, 4500)
+        >>> PhaseSchedule(quantize_end=30_000).schedule(4500).ends  # --callbacks.phases.quantize_end=30000
+        (1500, 2000, 3000, 4500)
     """
 
     def __init__(

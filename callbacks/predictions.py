@@ -21,6 +21,12 @@ class RenderWriter(Callback):
 
     Args:
         folder: Where; None is ``predictions`` in the folder of the run.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import RenderWriter, standard
+        >>> writer = RenderWriter(folder="views")  # --callbacks.predictions.folder=views
+        >>> [callback.folder for callback in standard(predictions=writer) if isinstance(callback, RenderWriter)]
+        ['views']
     """
 
     def __init__(self, folder: str | None = None) -> None:

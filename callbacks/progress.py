@@ -33,6 +33,13 @@ class SplatProgressBar(TQDMProgressBar):
 
     Raises:
         ValueError: ``smoothing`` is out of range.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import SplatProgressBar
+        >>> SplatProgressBar(refresh_rate=100).is_disabled  # --callbacks.progress.refresh_rate=100
+        False
+        >>> SplatProgressBar(refresh_rate=0).is_disabled
+        True
     """
 
     BAR_FORMAT = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} {elapsed}<{remaining}{postfix}"

@@ -36,6 +36,15 @@ class CodebookRefit(HostedCallback):
 
     Raises:
         ValueError: ``every`` or ``steps`` is below 1.
+
+    Example:
+        >>> from nsvq_lightning import SplatModule
+        >>> from nsvq_lightning.callbacks import CodebookRefit
+        >>> from nsvq_lightning.quantize import StraightThrough
+        >>> refit = CodebookRefit(every=5000)  # --callbacks.codebook_refit.every=5000
+        >>> module = SplatModule(codebooks="4k", quantizer=StraightThrough)
+        >>> [iteration for iteration in range(1, 45_001) if refit.is_due(module, iteration)]
+        [25000, 30000, 35000, 40000]
     """
 
     def __init__(self, every: int = 100, steps: int = 10) -> None:

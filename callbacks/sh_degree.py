@@ -22,6 +22,13 @@ class ShDegreeSchedule(HostedCallback):
 
     Raises:
         ValueError: ``every`` is below 1.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import ShDegreeSchedule
+        >>> from nsvq_lightning.training.schedule import Schedule
+        >>> degrees = ShDegreeSchedule(every=2000)  # --callbacks.sh_degree.every=2000
+        >>> [Schedule(total=4500).sh_degree_at(iteration, degrees.every, 3) for iteration in (1, 200, 400, 600, 800)]
+        [0, 1, 2, 3, 3]
     """
 
     def __init__(self, every: int = 1000) -> None:

@@ -55,6 +55,7 @@ def standard(**replaced: Callback | None) -> list[Callback]:
         ValueError: There is no callback of that name.
 
     Example:
+        >>> from nsvq_lightning.callbacks import STANDARD, DensityControl, standard
         >>> len(standard()) == len(STANDARD)
         True
         >>> few = standard(density=DensityControl(max_splats=200_000), report=None, progress=None)
