@@ -76,7 +76,7 @@ def test_quantizing_renders_the_visible_splats_with_noise_of_the_right_length(
         seen.append(splats)
         return render(splats, view, **settings)
 
-    monkeypatch.setattr("nsvq_lightning.training.model.render", spy)
+    monkeypatch.setattr("nsvq_lightning.training.module.render", spy)
     module.phase = Phase.QUANTIZE
     module(camera())
     rows = visible(module.splats.raw(), camera())
