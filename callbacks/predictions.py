@@ -43,7 +43,7 @@ class RenderWriter(Callback):
             run_folder(trainer)
 
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Make the folder, while all processes are together: some have fewer views than others."""
+        """Make the folder in a hook that all processes call: some have fewer views than others."""
         self._target = run_folder(trainer) / "predictions" if self.folder is None else Path(self.folder)
         if not is_trial(trainer):
             self._target.mkdir(parents=True, exist_ok=True)
