@@ -1,7 +1,7 @@
-"""Lightning callbacks: everything of a run that happens at certain steps.
+"""Lightning callbacks: everything in a run that happens at certain steps.
 
-Each takes its decisions from the module's schedule and the trainer's step alone, through
-:class:`nsvq_lightning.training.host.SplatHost`; none knows another. :func:`standard` makes those of ``nsvq fit``.
+Each decides from the module's schedule and the trainer's step alone, through
+:class:`nsvq_lightning.training.host.SplatHost`; none depends on another. :func:`standard` makes those of ``nsvq fit``.
 """
 
 from .canonical import CanonicalCovariance

@@ -1,4 +1,4 @@
-"""The state after the last complete iteration: whether it is still there, and what puts it back."""
+"""The state after the last complete iteration: whether it still exists, and how to restore it."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class _Count(NamedTuple):
 
 
 class StepBoundary:
-    """Remembers what an iteration changes before its update, so that a broken one can be undone.
+    """Remembers what an iteration changes before its update, so that an incomplete one can be undone.
 
     Until its update an iteration may change the phase, the SH degree, the usage counts of the codes, the trainer's
-    counters and the state of callbacks: of these a copy is kept, which is small. All else (splats, codebooks, frozen
-    codes, side tables, Adam's moments) must not have changed, by identity, address and version of every tensor. Once
-    the update begins, or a view of the next iteration is in the statistics, there is no way back: call :meth:`drop`.
+    counters and the state of callbacks: a copy of these, which is small, is kept. All else (splats, codebooks, frozen
+    codes, side tables, Adam's moments) must be unchanged, judged by identity, address and version of every tensor. Once
+    the update begins, or a view of the next iteration is in the statistics, the state is lost: call :meth:`drop`.
     """
 
     def __init__(self) -> None:
@@ -69,11 +69,11 @@ class StepBoundary:
         ]
 
     def drop(self) -> None:
-        """Forget the state: it can no longer be put back."""
+        """Forget the state: it can no longer be restored."""
         self._kept = None
 
     def restore(self, trainer: Trainer, module: LightningModule) -> bool:
-        """Put module and trainer back into the state; returns whether that was possible."""
+        """Restore the state of module and trainer; returns whether that was possible."""
         host = as_host(module)
         if self._kept is None or self._kept != _fingerprint(trainer, module):
             return False
@@ -85,12 +85,12 @@ class StepBoundary:
         return True
 
     def amend(self, checkpoint: dict[str, Any]) -> None:
-        """Put the states of callbacks back in a checkpoint that is about to be written."""
+        """Restore the states of callbacks in a checkpoint that is about to be written."""
         checkpoint["callbacks"] = self._callbacks
 
 
 def _fingerprint(trainer: Trainer, module: LightningModule) -> Fingerprint:
-    """Identity, address and version of every tensor that an iteration leaves alone until its update."""
+    """Identity, address and version of every tensor that an iteration must not change before its update."""
     changing = list(_counters(as_host(module)))
     for part in module.modules():
         if isinstance(part, RunState):
@@ -110,7 +110,7 @@ def _counters(host: SplatHost) -> Iterator[Tensor]:
 
 
 def _places(loop: object) -> Iterator[dict[str, Any]]:
-    """The attributes of one of Lightning's loops and of all that it counts with, as the dictionaries they live in."""
+    """The attribute dictionaries of one of Lightning's loops, of its inner loops and of their counters."""
     yield vars(loop)
     for value in vars(loop).values():
         if isinstance(value, _Loop) or is_dataclass(value):

@@ -29,26 +29,32 @@ Mode = Literal["none", "sign", "full", "auto"]
 
 
 class CanonicalCovariance(LatchedCallback):
-    """After the last iteration before the quantize phase, brings together covariances that look the same.
+    """After the last iteration before the quantize phase, gives like covariances like scales and rotations.
 
-    ``mode`` gives each one scale and rotation out of the 48 that mean the same (:mod:`nsvq_lightning.splats.forms`), so
-    that k-means finds them together; nothing that is rendered changes. Rows are not kept so afterwards: they move
-    continuously and take their codes along, while a row that jumped to another representative would lose its code.
+    ``mode`` gives each one of its 48 equivalent pairs of scale and rotation (:mod:`nsvq_lightning.splats.forms`), so
+    that k-means groups them; renderings do not change. The form is not enforced afterwards: rows move continuously and
+    keep their codes, while a row that jumped to another equivalent pair would lose its code.
 
-    ``floor`` raises scales that are too small to show to one value, there and throughout the quantize phase, so that
-    codes are not spent on telling them apart (:func:`nsvq_lightning.compression.pixel_size.scale_floor`).
+    ``floor`` raises scales too small to be visible to one value, then and throughout the quantize phase, so that no
+    codes are spent on distinguishing them (:func:`nsvq_lightning.compression.pixel_size.scale_floor`).
 
     With 4k codes on 187 k splats, right after k-means for scales and rotations, test PSNR was 30.47 dB with ``none``,
-    30.61 dB with ``sign`` and 31.17 dB with ``full``, of 31.64 dB unquantized; ``auto`` took the last.
+    30.61 dB with ``sign`` and 31.17 dB with ``full``, against 31.64 dB unquantized; ``auto`` chose the last.
 
     Args:
         mode: ``none`` leaves everything as it is, as in the paper; ``sign`` gives quaternions length 1 and w ≥ 0;
-            ``full`` also sorts the axes and takes the smallest rotation; ``auto`` takes the form whose covariances
-            k-means on a sample of the scene's splats keeps best.
-        floor: Least scale, in pixels of the train views where those see splats close; 0 is none, as in the paper.
+            ``full`` also sorts the axes and takes the smallest rotation; ``auto`` takes the form with the smallest
+            covariance error after k-means on a sample of the scene's splats.
+        floor: Smallest scale, in pixels of the train views where those see splats close; 0 is none, as in the paper.
 
     Raises:
-        ValueError: Another mode, or a negative floor.
+        ValueError: An unknown mode, or a negative floor.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import CanonicalCovariance, standard
+        >>> canonical = CanonicalCovariance(mode="auto", floor=0.25)  # --callbacks.canonical.mode=auto
+        >>> [callback.floor for callback in standard(canonical=canonical) if isinstance(callback, CanonicalCovariance)]
+        [0.25]
     """
 
     def __init__(self, mode: Mode = "none", floor: float = 0.0) -> None:
@@ -72,7 +78,7 @@ class CanonicalCovariance(LatchedCallback):
         return super().state_dict() | {"log_floor": self._log_floor}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on with the floor that was in use."""
+        """Continue with the floor that was in use."""
         super().load_state_dict(state_dict)
         self._log_floor = state_dict.get("log_floor")
 
@@ -84,10 +90,10 @@ class CanonicalCovariance(LatchedCallback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Act after the last iteration before the quantize phase, so before anything looks at its first one.
+        """Act after the last iteration before the quantize phase, so before any callback handles its first one.
 
-        After those of the phase, keep scales from falling below the floor: Adam moves what has hardly a gradient as far
-        as all else.
+        After each iteration of the phase, keep scales from falling below the floor: Adam moves parameters with tiny
+        gradients as far as all others.
         """
         host = as_host(pl_module)
         self._act_if_due(trainer, host)
@@ -108,7 +114,7 @@ class CanonicalCovariance(LatchedCallback):
                 self._apply(trainer, host, form)
 
     def _chosen(self, trainer: Trainer, host: SplatHost) -> Form:
-        """The form with the smallest error over the finite splats; of equals the one that changes least."""
+        """The form with the smallest error over the finite splats; in a tie, the one that changes least."""
         finite, _ = trainable_rows(host.splats)
         scales, quats = host.splats.scales.detach()[finite], host.splats.quats.detach()[finite]
         codes = {name: len(q.codebook) for name, q in host.quantizers.items() if name in ("scales", "quats")}
@@ -120,7 +126,7 @@ class CanonicalCovariance(LatchedCallback):
     def _raise(self, trainer: Trainer, host: SplatHost) -> None:
         self._log_floor = scale_floor(host.splats.means.detach(), train_cameras(trainer, host), self.floor)
         if self._log_floor is None:
-            log.warning("iteration %d: no splat is seen by any train view; no scale is raised", trainer.global_step)
+            log.warning("iteration %d: no train view sees a splat; no scale is raised", trainer.global_step)
             return
         share = float((host.splats.scales < self._log_floor).float().mean())
         raise_scales(host.splats, self._log_floor)

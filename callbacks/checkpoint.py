@@ -29,23 +29,31 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
     """Saves the whole state of the run in ``checkpoints/last.ckpt``: regularly, at ends of phases, and when it stops.
 
     ``fit --ckpt_path …/last.ckpt`` continues exactly where it was saved. Lightning calls checkpoint callbacks after all
-    others, so a checkpoint holds the finished step. The time of saving is not training time. A file appears whole or
-    not at all, and the one before stays until then.
+    others, so a checkpoint holds the finished step. Saving does not count as training time. Files are written
+    atomically: the previous one stays until the new one is complete.
 
-    Ctrl-C and SIGTERM stop the run after the iteration they come in, with a checkpoint of it; a second one stops it at
-    once. An exception leaves a checkpoint of the last complete iteration if it comes before the update of the next one
-    begins. After that the state is of no iteration, and the last checkpoint is the one to continue from.
+    Ctrl-C and SIGTERM stop the run after the current iteration, with a checkpoint of it; a second one stops it at once.
+    An exception leaves a checkpoint of the last complete iteration if it comes before the update of the next one
+    begins. During an update the state belongs to no iteration, and the last checkpoint is the one to continue from.
 
-    Several processes stop together after the iteration in which a signal has come to any of them. After an exception
-    in one they cannot agree on an iteration any more, and the last periodic checkpoint is the one to continue from.
+    Several processes stop together after the iteration in which any of them receives a signal. After an exception in
+    one they can no longer agree on an iteration, and the last periodic checkpoint is the one to continue from.
 
     Args:
-        every: Iterations between two checkpoints; None is a tenth of the schedule, 0 saves at the end of the run only.
-        keep: Keep each checkpoint as ``step-<iteration>.ckpt`` too, instead of only the last.
+        every: Iterations between two checkpoints; None is a tenth of the schedule, 0 saves only at the end of the run.
+        keep: Also keep each checkpoint as ``step-<iteration>.ckpt``, instead of only the last.
         folder: Where; None is ``checkpoints`` in the folder of the run.
 
     Raises:
         ValueError: ``every`` is negative.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import RunCheckpoint
+        >>> from nsvq_lightning.training.schedule import Schedule
+        >>> checkpoint = RunCheckpoint(every=1000)  # --callbacks.checkpoint.every=1000
+        >>> schedule = Schedule(total=4500)
+        >>> [iteration for iteration in range(1, 4501) if checkpoint.is_due(schedule, iteration)]
+        [1000, 1500, 2000, 3000, 4000, 4200, 4500]
     """
 
     def __init__(self, every: int | None = None, keep: bool = False, folder: str | None = None) -> None:
@@ -56,7 +64,7 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
         self.keep = keep
         self.folder = folder
         self.last_path: Path | None = None
-        """Checkpoint to continue from: the last one written, at first the one this run was continued from."""
+        """Checkpoint to continue from: the last one written, or at first the one this run was continued from."""
         self._boundary = StepBoundary()
         self._signals = HeldSignals()
         self._saved = -1
@@ -64,9 +72,9 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
         self._amending = False
 
     def is_due(self, schedule: Schedule, iteration: int) -> bool:
-        """Whether to save after this iteration; the end of the run is saved by itself.
+        """Whether to save after this iteration; the end of the run is saved separately.
 
-        Ends of phases are, as what comes next (placing codebooks, freezing codes) takes longest and cannot be undone.
+        Ends of phases are due, as the next step (placing codebooks, freezing codes) takes longest and cannot be undone.
         """
         every = max(1, schedule.total // 10) if self.every is None else self.every
         return every > 0 and (iteration % every == 0 or iteration in schedule.ends)
@@ -79,7 +87,7 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
             self._boundary.drop()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Begin to hold back signals."""
+        """Start to hold back signals."""
         super().on_train_start(trainer, pl_module)
         if trainer.ckpt_path is not None:
             self.last_path, self._saved = Path(trainer.ckpt_path), trainer.global_step
@@ -101,9 +109,9 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
         if trainer.world_size == 1:
             self._boundary.take(trainer, pl_module)
         if iteration == trainer.max_steps:
-            return  # what comes at the end belongs to the checkpoint, too: it is saved then, and signals wait
+            return  # the end of training belongs to the checkpoint, too: it is saved then, and signals wait
         received = self._signals.received(trainer)
-        # One process writes its checkpoint when it has stopped; several are together now, but not any more then.
+        # One process writes its checkpoint when it has stopped; several can do so together only now.
         if self.is_due(as_host(pl_module).schedule, iteration) or (received and trainer.world_size > 1):
             self._save(trainer, pl_module)
         self._signals.deliver(received)
@@ -117,7 +125,7 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
         self._signals.release()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Save the last complete iteration if it is still there; say from where to continue."""
+        """Save the last complete iteration if it still exists; say where to continue from."""
         self._signals.release()
         if not self._training or is_trial(trainer):
             return
@@ -126,7 +134,7 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
             self._amending = True
             try:
                 self._save(trainer, pl_module)
-            except Exception as error:  # what stopped the run must be what the user sees
+            except Exception as error:  # the user must see what stopped the run
                 log.warning("the checkpoint of iteration %d could not be written: %s", self._boundary.iteration, error)
             finally:
                 self._amending = False
@@ -136,12 +144,12 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
             log.warning("stopped before the first checkpoint")
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Of a broken iteration, store the counters and callbacks as they were before it."""
+        """After an incomplete iteration, store counters and callbacks as they were before it."""
         if self._amending:
             self._boundary.amend(checkpoint)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Give the signals back, whatever happened."""
+        """Restore the signal handlers in any case."""
         self._signals.release()
 
     def _save(self, trainer: Trainer, pl_module: LightningModule) -> None:

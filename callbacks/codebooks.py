@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 def perplexity(usage: Tensor) -> float:
-    """Number of codes in even use that would have the entropy of ``usage [K]``: exp(-Σ p·log p); 0 without any use."""
+    """Number of equally used codes with the entropy of ``usage [K]``: exp(-Σ p·log p); 0 if none is used."""
     p = usage.double() / usage.sum().clamp(min=1)
     entropy = torch.special.entr(p).sum()
     return float(entropy.exp()) if bool(usage.any()) else 0.0
@@ -39,18 +39,25 @@ def perplexity(usage: Tensor) -> float:
 class CodebookInit(LatchedCallback):
     """At the first iteration of the quantize phase, fit every codebook to the rows of all splats (k-means).
 
-    Splats that are not finite are dropped first, whenever the last search for them was.
+    NaN and infinite splats are dropped first, whenever they were last searched for.
 
     Args:
-        weights: What a splat counts in k-means: ``none`` counts all alike, as in the paper; ``contribution`` counts
-            each by its blending weight in the train views, so that codes go to what is seen.
-        weighted: The attributes this holds for. Scales are left out: a splat hardly contributes because it is small,
-            and what shows is a small one that gets the code of larger ones. Weighing all four, right after k-means
-            with 4k codes on 187 k splats, changed test PSNR by -0.37 dB for scales, +0.07 for rotations, +0.04 for
-            colours and +0.15 for SH.
+        weights: Weight of a splat in k-means: ``none`` weights all equally, as in the paper; ``contribution`` weights
+            each by its blending weight in the train views, so that codes go to visible splats.
+        weighted: The weighted attributes. Scales are left out: small splats contribute little, but a small splat with
+            the code of larger ones is visible. Weighting all four, right after k-means with 4k codes on 187 k splats,
+            changed test PSNR by -0.37 dB for scales, +0.07 for rotations, +0.04 for colours and +0.15 for SH.
 
     Raises:
-        ValueError: Other weights, or an unknown attribute.
+        ValueError: Unknown weights or an unknown attribute.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import CodebookInit
+        >>> CodebookInit(weights="contribution").weighted  # --callbacks.codebook_init.weights=contribution
+        ('quats', 'sh0', 'shN')
+        >>> CodebookInit(weights="contribution", weighted=["means"])
+        Traceback (most recent call last):
+        ValueError: weighted must be among scales, quats, sh0, shN, got means
     """
 
     def __init__(
@@ -77,7 +84,7 @@ class CodebookInit(LatchedCallback):
             if trainer.is_global_zero:
                 weight = weights if name in self.weighted else None
                 quantizer.fit(host.rows(name), weight, generator=generator(host.seed, iteration, "kmeans", name))
-            if trainer.world_size > 1:  # a fit may leave fewer codes, so counters and all else must follow
+            if trainer.world_size > 1:  # a fit may leave fewer codes, so counters and all other buffers must follow
                 follow_first(trainer.strategy, cast(nn.Module, quantizer))
         sizes = ", ".join(f"{name} {q.codebook.shape[0]}" for name, q in host.quantizers.items())
         if sizes:
@@ -85,14 +92,14 @@ class CodebookInit(LatchedCallback):
 
 
 class CodebookReplacement(LatchedCallback):
-    """Replaces inactive codes by copies of active ones, at first often, then less so (paper, section 3.2).
+    """Replaces inactive codes with copies of active ones, at first often, then less often (paper, section 3.2).
 
     All numbers are iterations of the reference run; the paper's are every 100 from 20 100 to 22 000, then every 500 up
-    to 43 000. What counts as inactive is the quantizer's rule.
+    to 43 000. The quantizer decides which codes are inactive.
 
-    By the paper's rule the last replacement falls right before the codes freeze, so that the new codes never train; a
-    smaller ``end`` leaves them time. Its copies are equal to the codes they are copied from, which take all the rows.
-    Few codes are concerned: after k-means on 182 k splats, 0 to 5 of 16 384 codes were inactive in a window.
+    By the paper's rule the last replacement comes right before the codes freeze, so its new codes are never trained; a
+    smaller ``end`` leaves them time. Untrained copies equal their originals, which keep all the rows. Few codes are
+    affected: after k-means on 182 k splats, 0 to 5 of 16 384 codes were inactive in a window.
 
     Args:
         start: First replacement.
@@ -101,12 +108,23 @@ class CodebookReplacement(LatchedCallback):
         end: Last one of the late series.
         late_every: Interval of the late series.
         jitter: None copies random active codes, as in the paper. A number in (0, 1] splits the codes that distort most:
-            a row of the scene is drawn, with the chance of its squared distance to its code, and the new code is put
-            this share of the way from that code to the row.
-        reset_moments: Set Adam's moments of replaced codes to zero, instead of leaving those of the codes before.
+            a row of the scene is drawn with probability proportional to its squared distance to its code, and the new
+            code is put this share of the way from that code to the row.
+        reset_moments: Set Adam's moments of replaced codes to zero, instead of keeping those of the previous codes.
 
     Raises:
-        ValueError: The iterations are not ascending, an interval is below 1, or the jitter is not in (0, 1].
+        ValueError: The iterations are not in ascending order, an interval is below 1, or the jitter is not in (0, 1].
+
+    Example:
+        >>> from nsvq_lightning import SplatModule
+        >>> from nsvq_lightning.callbacks import CodebookReplacement
+        >>> from nsvq_lightning.training.schedule import Schedule
+        >>> replacement = CodebookReplacement(end=40_000, jitter=0.5)  # --callbacks.codebook_replacement.end=40000
+        >>> module = SplatModule(codebooks="4k")
+        >>> module.schedule = Schedule(total=4500)
+        >>> due = [iteration for iteration in range(1, 4501) if replacement.is_due(module, iteration)]
+        >>> due[0], due[1], due[-1]  # the quantize phase is 2001 to 4200
+        (2050, 2100, 3900)
     """
 
     def __init__(
@@ -163,19 +181,19 @@ class CodebookReplacement(LatchedCallback):
         pl_module.log_dict(dict(values), batch_size=1)
 
     def _replace(self, quantizer: Quantizer, rows: Tensor, draws: torch.Generator) -> Tensor:
-        """Replace in one codebook, by the rule asked for; returns the replaced codes."""
+        """Replace inactive codes in one codebook by the chosen rule; returns the replaced codes."""
         if self.jitter is None:
             return quantizer.replace_unused(draws)
         return quantizer.replace_unused(draws, rows=rows, jitter=self.jitter)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Leave what a checkpoint has counted to the first process: it is the count of all."""
+        """Keep a checkpoint's counts on the first process only: they are the sum of all."""
         super().on_train_start(trainer, pl_module)
         if not trainer.is_global_zero:
             _forget_usage(as_host(pl_module))
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Collect what all processes have counted in the buffers of the first one, which the checkpoint holds."""
+        """Sum the counts of all processes in the buffers of the first one, which the checkpoint holds."""
         if trainer.world_size == 1:
             return
         host = as_host(pl_module)
@@ -186,7 +204,7 @@ class CodebookReplacement(LatchedCallback):
 
 
 def _sum_usage(trainer: Trainer, quantizer: Quantizer) -> None:
-    """Add up what the processes have counted, in the buffers of each."""
+    """Sum the counts of all processes in the buffers of each."""
     for counter in (quantizer.usage, quantizer.window):
         counter.copy_(sum_over_processes(trainer, counter))
 

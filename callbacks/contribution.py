@@ -1,4 +1,4 @@
-"""Remove the splats that hardly show in any photo."""
+"""Remove the splats that are hardly visible in any photo."""
 
 from __future__ import annotations
 
@@ -24,20 +24,27 @@ log = logging.getLogger(__name__)
 class ContributionPruning(LatchedCallback):
     """Once before the quantize phase, removes the splats that contribute least to the train views.
 
-    A splat contributes its blending weight, summed over all pixels
-    (:func:`nsvq_lightning.compression.importance.contributions`): unlike opacity this also finds splats that are hidden
-    behind others, or small. The paper prunes by opacity alone.
+    The contribution of a splat is its blending weight, summed over all pixels
+    (:func:`nsvq_lightning.compression.importance.contributions`): unlike opacity, this also finds splats that are small
+    or hidden behind others. The paper prunes by opacity alone.
 
-    Of 187 k splats at iteration 18 000, before any further training: share 0.001 took 11 % of them and 0.03 dB of test
-    PSNR, 0.003 18 % and 0.11 dB, 0.01 30 % and 0.38 dB.
+    Of 187 k splats at iteration 18 000, before any further training: share 0.001 removed 11 % and cost 0.03 dB of test
+    PSNR; 0.003, 18 % and 0.11 dB; 0.01, 30 % and 0.38 dB.
 
     Args:
-        share: Share of the light that may go: the least contributing splats that together send at most this much of
-            it. 0 removes nothing, as in the paper.
-        at: Iteration of the reference run, before the quantize phase; some should be left to close the gaps.
+        share: Share of the total contribution to remove: that of the least contributing splats together is at most
+            this. 0 removes nothing, as in the paper.
+        at: Iteration of the reference run, before the quantize phase; leave some iterations to close the gaps.
 
     Raises:
         ValueError: ``share`` is not in [0, 1), or ``at`` is below 1.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import ContributionPruning
+        >>> from nsvq_lightning.training.schedule import Schedule
+        >>> pruning = ContributionPruning(share=0.002, at=18_000)  # --callbacks.contribution.share=0.002
+        >>> Schedule(total=4500).iteration(pruning.at)
+        1800
     """
 
     def __init__(self, share: float = 0.0, at: int = 18_500) -> None:
@@ -64,7 +71,7 @@ class ContributionPruning(LatchedCallback):
             )
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Prune after iteration ``at``, now that every callback has finished with it."""
+        """Prune after iteration ``at``, now that all callbacks have finished with it."""
         host = as_host(pl_module)
         iteration = next_iteration(trainer) - 1
         if self.share and iteration == host.schedule.iteration(self.at) and self._latch.first_time(iteration):
@@ -74,11 +81,11 @@ class ContributionPruning(LatchedCallback):
         before = len(host.splats)
         contribution = train_contributions(trainer, host)
         if not bool(contribution.any()):
-            log.warning("iteration %d: no splat is seen by any train view; none is pruned", trainer.global_step)
+            log.warning("iteration %d: no train view sees a splat; none is pruned", trainer.global_step)
             return
         keep_rows(host.splats, raw_optimizer(trainer), ~least_contributing(contribution, self.share))
         log.info(
-            "iteration %d: pruned %d of %d splats, which sent at most %g of the light",
+            "iteration %d: pruned %d of %d splats, at most %g of the total contribution",
             trainer.global_step,
             before - len(host.splats),
             before,

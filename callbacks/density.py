@@ -1,4 +1,4 @@
-"""Adaptive density control of warm-up and prune phase; the search for splats that turn non-finite."""
+"""Adaptive density control in the warm-up and prune phases; the search for non-finite splats."""
 
 from __future__ import annotations
 
@@ -44,24 +44,31 @@ GRADIENTS, VIEWS = "gradient_sum", "view_count"
 
 
 class DensityControl(LatchedCallback):
-    """Clones, splits and prunes splats (Kerbl et al. 2023, section 5), and drops those that turn non-finite.
+    """Clones, splits and prunes splats (Kerbl et al. 2023, section 5), and drops those that become NaN or infinite.
 
     During warm-up the norm of the screen-space gradient is averaged over the views that see a splat; at the scheduled
     iterations splats above the threshold are cloned or split, transparent and huge ones pruned, and opacities reset. In
-    the prune phase transparent splats are pruned and none are added. Non-finite splats are searched in every phase.
+    the prune phase transparent splats are pruned and none are added. Non-finite splats are dropped in every phase.
 
-    Callbacks that remove or add splats may stand before or after it. A view whose splats were changed before its end is
-    left out of the statistics, with a warning: the norms belong to rows that are others now.
+    Callbacks that remove or add splats may come before or after it. A view whose splats were changed before its step
+    ended is left out of the statistics, with a warning: its norms no longer match the rows.
 
     Args:
-        rules: All numbers.
-        max_splats: Never more than this many. Where the scene starts with more, those that contribute most to the train
-            views stay; while it grows, those with the largest statistic go first. None for no limit, as in the paper.
+        rules: All thresholds, intervals and limits.
+        max_splats: Upper limit on the number of splats. If the scene starts with more, those that contribute most to
+            the train views are kept; during growth, those with the largest statistic come first. None for no limit, as
+            in the paper.
         finite_every: Iterations between two searches for non-finite splats; a step whose loss is not finite always
             causes one.
 
     Raises:
         ValueError: ``max_splats`` is below ``rules.min_splats``, or ``finite_every`` below 1.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import DensityControl, standard
+        >>> callbacks = standard(density=DensityControl(max_splats=200_000))  # --callbacks.density.max_splats=200000
+        >>> [callback.max_splats for callback in callbacks if isinstance(callback, DensityControl)]
+        [200000]
     """
 
     def __init__(
@@ -79,7 +86,7 @@ class DensityControl(LatchedCallback):
         self._warned = False
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Refuse strategies that would lose the replaced parameters.
+        """Reject strategies that would lose the replaced parameters.
 
         Raises:
             ValueError: The strategy wraps the module in ``DistributedDataParallel``.
@@ -87,7 +94,7 @@ class DensityControl(LatchedCallback):
         super().setup(trainer, pl_module, stage)
         if stage == "fit":
             self._warned = False
-        # A strategy that follows parameters when they are replaced says so with this attribute.
+        # A strategy that follows replaced parameters has this attribute.
         follows = getattr(trainer.strategy, "follows_replaced_parameters", False)
         if stage == "fit" and isinstance(trainer.strategy, DDPStrategy) and not follows:
             raise ValueError(
@@ -97,10 +104,10 @@ class DensityControl(LatchedCallback):
             )
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Remove splats where there are more than ``max_splats`` already.
+        """Remove splats if there are already more than ``max_splats``.
 
         Raises:
-            ValueError: There are, and the trainer has no data module whose views could tell which ones matter.
+            ValueError: There are more, and the trainer has no data module whose views show which ones matter.
         """
         super().on_train_start(trainer, pl_module)
         host = as_host(pl_module)
@@ -108,7 +115,9 @@ class DensityControl(LatchedCallback):
         if self.max_splats is None or count <= self.max_splats:
             return
         if host.phase > Phase.PRUNE:
-            log.warning("max_splats=%d comes too late for %d splats with codebooks; all stay", self.max_splats, count)
+            log.warning(
+                "max_splats=%d comes too late for %d splats with codebooks; all are kept", self.max_splats, count
+            )
             return
         kept = most_contributing(train_contributions(trainer, host), self.max_splats)
         keep_rows(host.splats, raw_optimizer(trainer), kept)
@@ -141,7 +150,7 @@ class DensityControl(LatchedCallback):
             self._prune_step(trainer, host, iteration)
 
     def _view(self, trainer: Trainer, host: SplatHost, outputs: Mapping[str, Any]) -> Render | None:
-        """What the step has rendered; None without it, and where other splats are there now."""
+        """The step's rendering; None if there is none, or if the splats have changed since."""
         splats, render = host.splats, outputs.get("render")
         if render is None or (len(render.radii) == len(splats) and outputs.get("edits", splats.edits) == splats.edits):
             return render
@@ -149,8 +158,8 @@ class DensityControl(LatchedCallback):
             self._warned = True
             log.warning(
                 "iteration %d: another callback has removed or added splats (%d were rendered, now %d) before density "
-                "control took the statistics of the view; they are left out, here and from now on. List that callback "
-                "after DensityControl to have all views counted",
+                "control took the statistics of the view; such views are left out from now on. List that callback "
+                "after DensityControl to count all views",
                 trainer.global_step,
                 len(render.radii),
                 len(splats),
@@ -158,14 +167,14 @@ class DensityControl(LatchedCallback):
         return None
 
     def _observe(self, trainer: Trainer, host: SplatHost, render: Render | None) -> None:
-        """Add one view (of each process) to the statistics; None, a view without a loss, adds nothing."""
+        """Add one view (of each process) to the statistics; None, for a view without a loss, adds nothing."""
         sums, views = host.splats.add_table(GRADIENTS), host.splats.add_table(VIEWS)
         if trainer.world_size == 1:
             _add(sums, views, render, trainer.accumulate_grad_batches)
             return
         observed = sums.new_zeros(2, len(sums))
         _add(observed[0], observed[1], render, trainer.accumulate_grad_batches)
-        # What one process has to add or not, all must come by here.
+        # A collective: every process must call it, even with nothing to add.
         norms, seen = sum_over_processes(trainer, observed)
         sums.add_(norms)
         views.add_(seen)
@@ -195,7 +204,7 @@ class DensityControl(LatchedCallback):
 
     @torch.no_grad()
     def _grow(self, trainer: Trainer, host: SplatHost, iteration: int) -> int:
-        """Clone and split; returns how many splats were added. The statistics start anew."""
+        """Clone and split; returns how many splats were added. Resets the statistics."""
         splats, rules, optimizer = host.splats, self.rules, raw_optimizer(trainer)
         gradient_sum, views = splats.add_table(GRADIENTS), splats.add_table(VIEWS)
         statistic = gradient_sum / views.clamp(min=1)
@@ -217,7 +226,7 @@ class DensityControl(LatchedCallback):
 
     @torch.no_grad()
     def _prune(self, trainer: Trainer, host: SplatHost, iteration: int, huge: bool) -> int:
-        """Prune; returns how many splats went."""
+        """Prune; returns how many splats were removed."""
         splats, rules = host.splats, self.rules
         prune = prune_mask(splats.opacities, splats.scales, host.extent, rules, huge)
         count = int(prune.sum())
@@ -243,11 +252,11 @@ class DensityControl(LatchedCallback):
 
 
 def _add(sums: Tensor, views: Tensor, render: Render | None, micro_batches: int) -> None:
-    """Add a view to statistics, as :func:`~nsvq_lightning.callbacks.density_rules.add_view`; nothing without one."""
+    """Add a view to the statistics with :func:`~nsvq_lightning.callbacks.density_rules.add_view`, if there is one."""
     if render is None or render.means2d.grad is None:
         return
     height, width = render.alpha.shape
-    # Gradient accumulation divides the loss by the number of micro-batches; each is a view of its own here.
+    # Gradient accumulation divides the loss by the number of micro-batches; each is a separate view here.
     add_view(sums, views, render.means2d.grad, render.radii, width * micro_batches, height * micro_batches)
 
 

@@ -1,4 +1,4 @@
-"""Density control: the paper's numbers, and its decisions as functions of parameters and statistics."""
+"""Density control: the paper's settings, and its decisions as functions of parameters and statistics."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class DensityRules:
-    """Numbers of adaptive density control (Kerbl et al. 2023, section 5) and of the prune phase (paper, section 3.4).
+    """Settings of adaptive density control (Kerbl et al. 2023, section 5) and the prune phase (paper, section 3.4).
 
     Iterations are those of the reference run of 45 000; :class:`~nsvq_lightning.training.schedule.Schedule` scales
     them.
@@ -41,20 +41,27 @@ class DensityRules:
         dense_fraction: Splats up to this share of the extent are cloned, larger ones split.
         children: Splats that a split leaves in place of its parent.
         shrink: Children are smaller than their parent by this factor.
-        min_opacity: Splats below are pruned.
+        min_opacity: Splats with a lower opacity are pruned.
         huge_fraction: Splats larger than this share of the extent are pruned.
-        huge_after: They are pruned only after this iteration.
+        huge_after: Huge splats are pruned only after this iteration.
         reset_every: Interval of opacity resets.
         reset_last: Last opacity reset.
         reset_opacity: Opacities are reset to at most this.
         white_reset: Iteration of one more reset on a white background; 0 for none.
         prune_start: First pruning of the prune phase.
         prune_last: Last pruning of the prune phase.
-        prune_every: Interval of pruning in the prune phase; 0 prunes never.
+        prune_every: Interval of pruning in the prune phase; 0 never prunes.
         min_splats: A pruning that would leave fewer splats is skipped with a warning.
 
     Raises:
-        ValueError: A number is out of its range.
+        ValueError: A setting is out of range.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import DensityControl, DensityRules
+        >>> from nsvq_lightning.training.schedule import Schedule
+        >>> rules = DensityControl(DensityRules(every=200)).rules  # --callbacks.density.rules.every=200
+        >>> Schedule(total=22_500).density_times(rules.start, rules.last, rules.every)[:3]
+        (300, 400, 500)
     """
 
     start: int = 600
@@ -94,7 +101,7 @@ class DensityRules:
 def screen_gradient(grad: Tensor, width: int, height: int) -> Tensor:
     """Norm ``[N]`` of the gradient of projected centres in normalised device coordinates.
 
-    An image is 2 wide and 2 high in these coordinates, so a pixel gradient counts 0.5·width and 0.5·height times.
+    An image is 2 wide and 2 high in these coordinates, so pixel gradients are scaled by 0.5·width and 0.5·height.
 
     Args:
         grad: Gradient of the loss ``[N, 2]`` by the centre in pixels.
@@ -131,7 +138,7 @@ def largest_scale(scales: Tensor) -> Tensor:
 
 
 def clone_mask(statistic: Tensor, scales: Tensor, extent: float, rules: DensityRules) -> Tensor:
-    """Which splats ``[N]`` to clone: moved a lot on the screen, and small.
+    """Which splats ``[N]`` to clone: those with a large screen-space gradient that are small.
 
     Args:
         statistic: Mean screen-space gradient ``[N]``.
@@ -143,19 +150,19 @@ def clone_mask(statistic: Tensor, scales: Tensor, extent: float, rules: DensityR
 
 
 def split_mask(statistic: Tensor, scales: Tensor, extent: float, rules: DensityRules) -> Tensor:
-    """Which splats ``[N]`` to split: moved a lot on the screen, and large; arguments as in :func:`clone_mask`."""
+    """Which splats ``[N]`` to split: those with a large gradient that are large; arguments as in :func:`clone_mask`."""
     return (statistic >= rules.grad_threshold) & (largest_scale(scales) > rules.dense_fraction * extent)
 
 
 def prune_mask(opacities: Tensor, scales: Tensor, extent: float, rules: DensityRules, huge: bool) -> Tensor:
-    """Which splats ``[N]`` to prune: nearly transparent ones, and huge ones where ``huge`` is set.
+    """Which splats ``[N]`` to prune: nearly transparent ones, and with ``huge`` also huge ones.
 
     Args:
         opacities: Opacity logits ``[N]``.
         scales: Log-scales ``[N, 3]``.
         extent: Extent of the scene, scene units.
         rules: Thresholds.
-        huge: Whether size counts already.
+        huge: Whether to prune huge splats, too.
     """
     prune = opacities.sigmoid() < rules.min_opacity
     if huge:
@@ -164,7 +171,7 @@ def prune_mask(opacities: Tensor, scales: Tensor, extent: float, rules: DensityR
 
 
 def limit_growth(mask: Tensor, statistic: Tensor, added: Tensor, budget: int) -> Tensor:
-    """The splats of ``mask [N]`` with the largest statistic that add at most ``budget`` together; of equals the first.
+    """The splats of ``mask [N]`` with the largest statistic that together add at most ``budget``; in ties, the first.
 
     Args:
         mask: Splats that want to grow.
@@ -188,7 +195,7 @@ def split(parents: RawSplats, rules: DensityRules, generator: torch.Generator) -
     Args:
         parents: Raw attributes of the parents; all first children come before all second ones.
         rules: Number of children and shrinking factor.
-        generator: Where the draws come from, on the CPU.
+        generator: Source of the draws, on the CPU.
     """
     count = parents.means.shape[0] * rules.children
     repeated = RawSplats(*(t.repeat(rules.children, *([1] * (t.dim() - 1))) for t in parents))
@@ -198,5 +205,5 @@ def split(parents: RawSplats, rules: DensityRules, generator: torch.Generator) -
 
 
 def lower_opacities(opacities: Tensor, ceiling: float) -> Tensor:
-    """Opacity logits ``[N]`` of opacities that are at most ``ceiling``."""
+    """Opacity logits ``[N]``, limited to opacity ``ceiling``."""
     return opacities.clamp(max=math.log(ceiling / (1.0 - ceiling)))

@@ -34,6 +34,14 @@ class ExportScene(WritingCallback):
 
     Raises:
         ValueError: An unknown format.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import ExportScene
+        >>> ExportScene(["nsvq", "sog"]).formats  # --callbacks.export.formats=[nsvq,sog]
+        ('nsvq', 'sog')
+        >>> ExportScene(["obj"])
+        Traceback (most recent call last):
+        ValueError: unknown export formats obj; choose from ply, nsvq, sog, spz, splat
     """
 
     def __init__(self, formats: Sequence[str] = DEFAULT_EXPORT, folder: str | None = None) -> None:

@@ -1,4 +1,4 @@
-"""What happens to numbers that are not finite: codes are put back among the others, splats leave the scene."""
+"""How NaN and infinite values are handled: codes are mended, splats are dropped."""
 
 from __future__ import annotations
 
@@ -23,17 +23,26 @@ log = logging.getLogger(__name__)
 
 
 class FiniteCodes(LatchedCallback):
-    """Searches codebooks for NaN and infinite numbers, from the quantize phase on, and mends such codes with a warning.
+    """Searches codebooks for NaN and infinite values, from the quantize phase on, and mends such codes with a warning.
 
-    As with splats that turn non-finite (:class:`~nsvq_lightning.callbacks.DensityControl`), the run goes on. A code
-    cannot be dropped, as the others would change their numbers: the quantizer puts it back
-    (:class:`nsvq_lightning.quantize.base.Mendable`), and its Adam moments start anew.
+    As with non-finite splats (:class:`~nsvq_lightning.callbacks.DensityControl`), the run continues. A code cannot be
+    dropped, as that would renumber the others: the quantizer gives it a new value
+    (:class:`nsvq_lightning.quantize.base.Mendable`), and its Adam moments are reset.
 
     Args:
         every: Iterations between two searches; a step whose loss is not finite always causes one.
 
     Raises:
         ValueError: ``every`` is below 1.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import FiniteCodes, standard
+        >>> callbacks = standard(codebook_finite=FiniteCodes(every=50))  # --callbacks.codebook_finite.every=50
+        >>> [type(callback).__name__ for callback in callbacks].count("FiniteCodes")
+        1
+        >>> FiniteCodes(every=0)
+        Traceback (most recent call last):
+        ValueError: every must be at least 1, got 0
     """
 
     def __init__(self, every: int = 100) -> None:
@@ -43,7 +52,7 @@ class FiniteCodes(LatchedCallback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Search when it is time.
+        """Search when due.
 
         Raises:
             FloatingPointError: All codes of an attribute are non-finite, or its quantizer cannot mend them.
@@ -73,15 +82,15 @@ def _numbers(rows: list[int]) -> str:
 
 
 class FiniteSearch:
-    """Says after which iterations to search for NaN and infinite numbers: every so many, and when nothing was updated.
+    """Decides when to search for NaN and infinite values: at intervals, and after a step without an update.
 
-    A step with a loss that is not finite leaves no parameter a gradient, on any process
+    After a step with a non-finite loss no parameter has a gradient, on any process
     (:class:`nsvq_lightning.SplatModule`, :class:`nsvq_lightning.training.strategies.ViewParallelStrategy`). So all
-    processes get the same answer without asking each other.
+    processes decide alike without communication.
 
     Args:
         every: Iterations between two searches.
-        name: What the number is called, for the error.
+        name: Name of the argument, for the error.
 
     Raises:
         ValueError: ``every`` is below 1.
@@ -103,10 +112,10 @@ def _was_updated(trainer: Trainer) -> bool:
 
 
 def keep_finite_splats(trainer: Trainer, host: SplatHost) -> None:
-    """Drop splats that are not finite, with their frozen codes (:func:`nsvq_lightning.training.edit.drop_non_finite`).
+    """Drop non-finite splats, with their frozen codes (:func:`nsvq_lightning.training.edit.drop_non_finite`).
 
-    The replicas of several processes are equal, so all drop the same without asking each other. Gradients are lost
-    where splats are dropped: call it between an update and the next backward pass.
+    The replicas of several processes are equal, so all drop the same splats without communication. Dropping splats
+    loses gradients: call it between an update and the next backward pass.
 
     Raises:
         FloatingPointError: No finite splat is left.

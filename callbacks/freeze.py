@@ -22,12 +22,20 @@ log = logging.getLogger(__name__)
 
 
 class FreezeCodes(LatchedCallback):
-    """At the first iteration of fine-tuning, search the nearest code of every splat once and keep it from then on.
+    """At the first iteration of fine-tuning, finds the nearest code of every splat and freezes it.
 
-    A quantizer that says whether its codebook has been placed, by an attribute ``fitted``, must have one by then.
+    If a quantizer has an attribute ``fitted`` (whether its codebook has been placed), it must be true by then.
 
-    Where another callback removes or adds splats in fine-tuning without their codes, the codes are searched once more,
-    with a warning: those that were frozen belong to other rows.
+    If another callback removes or adds splats in fine-tuning without their codes, the nearest codes are searched again,
+    with a warning: the frozen ones belong to other rows.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import FreezeCodes, standard
+        >>> from nsvq_lightning.training.schedule import Phase, Schedule
+        >>> any(isinstance(callback, FreezeCodes) for callback in standard())
+        True
+        >>> Schedule(total=4500).first_of(Phase.FINETUNE)  # the iteration at which codes freeze
+        4201
     """
 
     def __init__(self) -> None:
@@ -46,7 +54,7 @@ class FreezeCodes(LatchedCallback):
         self._warned = False
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Freeze when fine-tuning starts, and where splats have changed since.
+        """Freeze when fine-tuning starts, and again where splats have changed.
 
         Raises:
             RuntimeError: A codebook has never been placed.
@@ -64,7 +72,7 @@ class FreezeCodes(LatchedCallback):
         self._codes = {name: quantizer.codes for name, quantizer in host.quantizers.items()}
 
     def _stale(self, host: SplatHost) -> list[str]:
-        """Attributes with frozen codes of other rows; who edits rows and freezes their codes leaves other tensors."""
+        """Attributes whose frozen codes belong to other rows; freezing anew would have replaced their tensor."""
         edited = self._edits not in (None, host.splats.edits)
         return [
             name
@@ -78,7 +86,7 @@ class FreezeCodes(LatchedCallback):
             self._warned = True
             log.warning(
                 "iteration %d: another callback has removed or added splats after codes were frozen; the nearest codes "
-                "of %s are searched again, here and from now on. Let that callback act before the fine-tune phase",
+                "of %s are searched again after every such edit. Let that callback act before the fine-tune phase",
                 iteration,
                 ", ".join(stale),
             )
@@ -88,11 +96,11 @@ class FreezeCodes(LatchedCallback):
         for name in names:
             quantizer = host.quantizers[name]
             codes = quantizer.encode(host.rows(name))
-            # Only now: some place their codebooks where rows are encoded.
+            # Only now: some quantizers place their codebooks when rows are encoded.
             if not getattr(quantizer, "fitted", True):
                 raise RuntimeError(
-                    f"iteration {next_iteration(trainer)}: the codebook of {name} has never been placed, its codes "
-                    "cannot be frozen; fit with CodebookInit among the callbacks"
+                    f"iteration {next_iteration(trainer)}: the codebook of {name} has never been placed, so its codes "
+                    "cannot be frozen; add CodebookInit to the callbacks"
                 )
             quantizer.freeze(from_first_process(trainer, codes))
         check_replicas(trainer, "freezing the codes")

@@ -1,4 +1,4 @@
-"""Work with any module that hosts splats, say at once what one lacks, and write into the folder of the run."""
+"""Base classes: check that a module can host the callbacks, and take the folder of the run."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ __all__ = ["HostedCallback", "WritingCallback"]
 
 
 class HostedCallback(Callback):
-    """Callback of any module that follows :class:`nsvq_lightning.training.host.SplatHost`; every callback here is one.
+    """Callback of any module that follows :class:`nsvq_lightning.training.host.SplatHost`; those here that act on the
+    training are such.
 
-    What the module must have is checked before anything starts, what its optimiser must have as soon as there is one.
-    A subclass that has these hooks itself calls them here first.
+    The module is checked before anything starts, its optimiser as soon as there is one. A subclass that overrides these
+    hooks calls them here first.
     """
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -32,7 +33,7 @@ class HostedCallback(Callback):
         """Check the optimiser.
 
         Raises:
-            ValueError: There is not one with the parameter groups of a host.
+            ValueError: It lacks the parameter groups of a host, or there are several.
         """
         check_optimizer(trainer, pl_module)
 
@@ -40,13 +41,13 @@ class HostedCallback(Callback):
 class WritingCallback(HostedCallback):
     """Callback that writes files: it takes the folder of the run when the run starts, not when the first file is due.
 
-    A subclass that has these hooks itself calls them here first.
+    A subclass that overrides these hooks calls them here first.
     """
 
     stages: ClassVar[tuple[str, ...]] = ("fit",)
-    """What it writes in: ``fit``, ``test`` or both."""
+    """Stages in which it writes: ``fit``, ``test`` or both."""
     folder: str | Path | None = None
-    """Where it writes instead, if it was told to."""
+    """Where it writes instead of the folder of the run, if set."""
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Check the module, and for a test take the folder.
@@ -59,7 +60,7 @@ class WritingCallback(HostedCallback):
             self._take_folder(trainer, stage)
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Take the folder, now that the trainer knows what checkpoint it goes on from.
+        """Take the folder, now that the trainer knows which checkpoint it continues from.
 
         Raises:
             FileExistsError: It holds another run.

@@ -1,4 +1,4 @@
-"""Act at most once an iteration."""
+"""Act at most once per iteration."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ __all__ = ["LatchedCallback", "StepLatch"]
 
 
 class StepLatch:
-    """Remembers the last iteration something was done at.
+    """Remembers the last iteration acted on.
 
     With gradient accumulation ``on_train_batch_start`` and ``on_train_batch_end`` are called several times at one
-    ``global_step``; what must happen once an iteration asks the latch first. Its state belongs into ``state_dict``: a
+    ``global_step``; code that must run once per iteration asks the latch first. Its state belongs in ``state_dict``: a
     run resumed right after the step must not act again.
     """
 
     def __init__(self) -> None:
-        # No iteration: they are 1-based, and 0 is what `global_step` says before the first step.
+        # No iteration: they are 1-based, and `global_step` is 0 before the first step.
         self.last = -1
 
     def first_time(self, iteration: int) -> bool:
@@ -32,7 +32,7 @@ class StepLatch:
 
 
 class LatchedCallback(HostedCallback):
-    """Callback that acts at most once an iteration of a fit, also when the fit is resumed."""
+    """Callback that acts at most once per iteration of a fit, also when the fit is resumed."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -36,27 +36,36 @@ log = logging.getLogger(__name__)
 
 
 class MetricReport(WritingCallback):
-    """Writes what a run achieved into its folder.
+    """Writes the results of a run to its folder.
 
-    While training: test PSNR and SSIM, number of splats and training seconds at the end of each phase and every
+    During training: test PSNR and SSIM, number of splats and training seconds at the end of each phase and every
     ``every`` iterations, in ``curve.csv`` and ``curve.png``. An evaluation renders what a file written at that moment
-    would decode to. Its time is not training time.
+    would decode to. It does not count as training time.
 
-    To Lightning an evaluation is what a validation is: ``report/psnr``, ``report/ssim`` and ``report/splats`` go to the
-    loggers and into ``trainer.callback_metrics``, and ``EarlyStopping(monitor="report/psnr", mode="max")`` or a
-    ``ModelCheckpoint`` that monitors one of them looks at it right away.
+    Evaluations take the place of Lightning's validation: ``report/psnr``, ``report/ssim`` and ``report/splats`` go to
+    the loggers and to ``trainer.callback_metrics``, and ``EarlyStopping(monitor="report/psnr", mode="max")`` or a
+    ``ModelCheckpoint`` that monitors one of them is called right away.
 
-    In ``test``: writes ``scene.nsvq``, reads it back, and lets the module render the **decoded file**; then
+    In ``test``: writes ``scene.nsvq``, reads it back, and lets the module render the **decoded file**; then writes
     ``metrics.json``, ``views.csv`` and a picture (photo, render, error) of each view in ``renders/``. TensorBoard and
-    Weights & Biases show the pictures, too, when they are among the loggers.
+    Weights & Biases loggers show the pictures, too.
 
     Args:
-        every: Iterations of this run between two evaluations; None is a twentieth of the run, 0 only the phase ends.
-        lpips: Measure LPIPS in ``test`` where torchvision and its weights are installed.
+        every: Iterations of this run between two evaluations; None is a twentieth of the run, 0 means only the ends of
+            phases.
+        lpips: Measure LPIPS in ``test`` if torchvision and its weights are installed.
         pictures: Write a picture of each test view.
 
     Raises:
         ValueError: ``every`` is negative.
+
+    Example:
+        >>> from nsvq_lightning import SplatModule
+        >>> from nsvq_lightning.callbacks import MetricReport
+        >>> report = MetricReport(every=20_000, pictures=False)  # --callbacks.report.every=20000
+        >>> module = SplatModule(codebooks="4k")
+        >>> [iteration for iteration in range(1, 45_001) if report.is_due(module, iteration)]
+        [15000, 20000, 40000, 43000, 45000]
     """
 
     stages = ("fit", "test")
@@ -74,27 +83,27 @@ class MetricReport(WritingCallback):
         self._lpips: Metric | None = None
         self._lpips_reason: str | None = None
 
-    # While training
+    # During training
 
     def is_due(self, host: SplatHost, iteration: int) -> bool:
         """Whether the scene is evaluated after this iteration."""
         every = max(1, host.schedule.total // 20) if self.every is None else self.every
-        # By default between the round numbers: opacities are reset at those, and just then a picture says nothing.
+        # By default between the round numbers: opacities are reset at those, and evaluating right then is misleading.
         offset = every // 2 if self.every is None else 0
         return iteration > 0 and (iteration in host.schedule.ends or bool(every and iteration % every == offset))
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Evaluate the last iteration, now that every callback has finished with it."""
+        """Evaluate the last iteration, now that all callbacks have finished with it."""
         iteration = next_iteration(trainer) - 1
         if self.is_due(as_host(pl_module), iteration):
             self._evaluate_once(trainer, pl_module, iteration)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Evaluate the end of the run, before what Lightning does at the end of its only epoch."""
+        """Evaluate the end of the run, before Lightning's own work at the end of its only epoch."""
         self._evaluate_once(trainer, pl_module, trainer.global_step)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Evaluate the end of the run where no epoch has ended, and draw the curve."""
+        """Evaluate the end of the run if no epoch has ended, and draw the curve."""
         host = as_host(pl_module)
         self._evaluate_once(trainer, pl_module, trainer.global_step)
         folder = run_folder(trainer)
@@ -104,12 +113,12 @@ class MetricReport(WritingCallback):
                 write_curve(folder / "curve.png", host.history, host.schedule)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Make up for what a run that was stopped after its last iteration has missed: continued, it trains no more."""
+        """Catch up for a run that was stopped after its last iteration: when continued, it trains no further."""
         if trainer.global_step and not (run_folder(trainer) / "curve.png").exists():
             self.on_train_end(trainer, pl_module)
 
     def _evaluate_once(self, trainer: Trainer, module: LightningModule, iteration: int) -> None:
-        """Evaluate an iteration that was not evaluated yet, and let those who wait for it know."""
+        """Evaluate an iteration that was not evaluated yet, and notify the callbacks that monitor it."""
         host = as_host(module)
         done = host.history[-1]["iteration"] if host.history else 0
         if iteration <= done or is_trial(trainer):
@@ -150,12 +159,12 @@ class MetricReport(WritingCallback):
     # In test
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write the file, read it back, and let the module test what was read; a trial tests what is in memory."""
+        """Write the file, read it back, and let the module test the decoded scene; a trial tests the one in memory."""
         self._scene, self._scores = None, []
         if is_trial(trainer):
             return
         host = as_host(pl_module)
-        # Here all processes are together; some have fewer views than others.
+        # All processes call this hook; later ones differ, as some have fewer views than others.
         self._folder = run_folder(trainer)
         path = self._folder / "scene.nsvq"
         if trainer.is_global_zero:
@@ -164,7 +173,7 @@ class MetricReport(WritingCallback):
             self._paper_level = paper_level(scene)
         trainer.strategy.barrier("scene.nsvq")
         self._scene = read_nsvq(path)
-        # Detached tensors, not the module: as a submodule it would enter checkpoints.
+        # Detached tensors, not the module: a submodule would enter checkpoints.
         decoded = self._scene.decode().to(host.device).raw()
         host.evaluation_splats = RawSplats(*(tensor.detach() for tensor in decoded))
         self._lpips, self._lpips_reason = build_lpips() if self.lpips else (None, "switched off")
@@ -197,7 +206,7 @@ class MetricReport(WritingCallback):
         return float(self._lpips(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]))
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write the numbers."""
+        """Write the figures."""
         if self._scene is None:
             return
         host = as_host(pl_module)

@@ -1,4 +1,4 @@
-"""Phase of the run from the trainer's step."""
+"""The phase of the run, from the trainer's step."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class PhaseSchedule(HostedCallback):
     """Gives the module its schedule, and writes the phase of each iteration into its buffer.
 
     The ends of the phases are iterations of a reference run, the paper's of 45 000 iterations by default; a run of any
-    other length is that run, scaled (:mod:`nsvq_lightning.training.schedule` says what scales how).
+    other length is that run, scaled (:mod:`nsvq_lightning.training.schedule` says how).
 
     Args:
         total: Iterations of the run; None takes ``trainer.max_steps``.
-        reference_total: Iterations of the run the ends are written for; None means ``total``: nothing scales.
+        reference_total: Iterations of the run that the ends are given for; None means ``total``: nothing scales.
         warmup_end: Last iteration of the warm-up phase in the reference run.
         prune_end: Last iteration of the prune phase in the reference run.
         quantize_end: Last iteration of the quantize phase in the reference run.
@@ -36,6 +36,13 @@ class PhaseSchedule(HostedCallback):
 
     Raises:
         ValueError: See :class:`~nsvq_lightning.training.schedule.Schedule`.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import PhaseSchedule
+        >>> PhaseSchedule().schedule(4500).ends  # --trainer.max_steps=4500
+        (1500, 2000, 4200, 4500)
+        >>> PhaseSchedule(quantize_end=30_000).schedule(4500).ends  # --callbacks.phases.quantize_end=30000
+        (1500, 2000, 3000, 4500)
     """
 
     def __init__(
@@ -62,7 +69,7 @@ class PhaseSchedule(HostedCallback):
             "min_finetune": min_finetune,
         }
         if total is not None or reference_total is not None:
-            # Says at once what is wrong with the numbers, not after the scene is loaded.
+            # Report wrong settings at once, not after the scene is loaded.
             self.schedule(total or reference_total or 1)
 
     def schedule(self, total: int) -> Schedule:
@@ -96,28 +103,28 @@ class PhaseSchedule(HostedCallback):
             )
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Check that a resumed run goes on in the phase it was in.
+        """Check that a resumed run continues in the phase it was in.
 
         Raises:
-            ValueError: This schedule has the last trained iteration in another phase.
+            ValueError: In this schedule, the last trained iteration is in another phase.
         """
         super().on_train_start(trainer, pl_module)
         host = as_host(pl_module)
         step = trainer.global_step
         expected = host.schedule.phase_at(step) if step else Phase.WARMUP
-        # A checkpoint may have been written when the next iteration had just begun.
+        # A checkpoint may have been written just after the next iteration began.
         if host.phase is expected or (step and host.phase is host.schedule.phase_at(step + 1)):
             return
         if step == 0:
             raise ValueError(
                 f"this module was already trained into its {host.phase.name.lower()} phase; make a new one, or pass "
-                "ckpt_path to go on"
+                "ckpt_path to continue"
             )
         raise ValueError(
             f"the checkpoint is at iteration {step} in its {host.phase.name.lower()} phase, but in a run of "
             f"{host.schedule.total} iterations that is in the {expected.name.lower()} phase; pass "
             "the trainer.max_steps it was started with, or that number as PhaseSchedule.total "
-            "(--callbacks.phases.total) and a larger trainer.max_steps to train on in its last phase"
+            "(--callbacks.phases.total) and a larger trainer.max_steps to continue its last phase"
         )
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:

@@ -21,6 +21,12 @@ class RenderWriter(Callback):
 
     Args:
         folder: Where; None is ``predictions`` in the folder of the run.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import RenderWriter, standard
+        >>> writer = RenderWriter(folder="views")  # --callbacks.predictions.folder=views
+        >>> [callback.folder for callback in standard(predictions=writer) if isinstance(callback, RenderWriter)]
+        ['views']
     """
 
     def __init__(self, folder: str | None = None) -> None:
@@ -37,7 +43,7 @@ class RenderWriter(Callback):
             run_folder(trainer)
 
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Make the folder, while all processes are together: some have fewer views than others."""
+        """Make the folder in a hook that all processes call: some have fewer views than others."""
         self._target = run_folder(trainer) / "predictions" if self.folder is None else Path(self.folder)
         if not is_trial(trainer):
             self._target.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The progress of a run as a whole: a bar on a terminal, plain lines in a file."""
+"""The progress of a whole run: a bar on a terminal, plain lines in a file."""
 
 from __future__ import annotations
 
@@ -17,22 +17,28 @@ from nsvq_lightning.training.host import as_host, splat_host
 __all__ = ["SplatProgressBar"]
 
 LINES = 50
-"""Lines of a run where the output is no terminal."""
+"""Lines of a run if the output is not a terminal."""
 
 
 class SplatProgressBar(TQDMProgressBar):
-    """One bar over the iterations of the run, also of a resumed one; where the output is no terminal, plain lines.
+    """One bar for all iterations of a run, also a resumed one; plain lines if the output is not a terminal.
 
-    Behind count and time it shows the phase, the number of splats, the training PSNR of recent steps (exponential mean)
-    and the latest test PSNR. It fits 80 columns. The time that kernels are compiled for is left out of the estimate of
-    what remains.
+    After count and time it shows the phase, the number of splats, the training PSNR of recent steps (exponential mean)
+    and the latest test PSNR. It fits 80 columns. The estimate of the remaining time excludes kernel compilation.
 
     Args:
-        refresh_rate: Iterations between two refreshes on a terminal; 0 switches the bar off.
+        refresh_rate: Iterations between two refreshes on a terminal; 0 turns the bar off.
         smoothing: Weight of the past in the exponential mean, in [0, 1).
 
     Raises:
         ValueError: ``smoothing`` is out of range.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import SplatProgressBar
+        >>> SplatProgressBar(refresh_rate=100).is_disabled  # --callbacks.progress.refresh_rate=100
+        False
+        >>> SplatProgressBar(refresh_rate=0).is_disabled
+        True
     """
 
     BAR_FORMAT = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} {elapsed}<{remaining}{postfix}"
@@ -58,7 +64,7 @@ class SplatProgressBar(TQDMProgressBar):
         return super().is_disabled or self._is_plain
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """See what the output is; lines in a file are few."""
+        """Find out whether the output shows bars; write only a few lines to a file."""
         super().setup(trainer, pl_module, stage)
         splat_host(pl_module)
         self._psnr = None
@@ -67,22 +73,22 @@ class SplatProgressBar(TQDMProgressBar):
             self._refresh_rate = max(self._refresh_rate, trainer.max_steps // LINES)
 
     def on_train_start(self, trainer: Trainer, *args: Any) -> None:
-        """Start the bar where the run is."""
+        """Start the bar at the current iteration."""
         super().on_train_start(trainer, *args)
         done = trainer.global_step * trainer.accumulate_grad_batches
         self.train_progress_bar.reset(total=self.total_train_batches)
-        self.train_progress_bar.initial = self.train_progress_bar.n = done  # n - initial, over the time, is the speed
+        self.train_progress_bar.initial = self.train_progress_bar.n = done  # (n - initial) / time is the speed
         self._started, self._compiled_before = time.time(), compile_seconds()
         self._watching.enter_context(compile_watcher(self._show_compilation))
 
     def on_train_epoch_start(self, trainer: Trainer, *args: Any) -> None:
-        """Leave the bar as it is: there is only one epoch, and a resumed run is in the middle of it."""
+        """Leave the bar unchanged: there is only one epoch, and a resumed run is in the middle of it."""
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Refresh the bar, or write a line."""
-        # A resumed run starts to count batches anew; its bar does not.
+        # A resumed run counts batches from zero; its bar does not.
         done = trainer.global_step * trainer.accumulate_grad_batches
         if not self._should_update(done, int(self.total_train_batches)):
             return
@@ -97,7 +103,7 @@ class SplatProgressBar(TQDMProgressBar):
         bar.set_postfix_str(text)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Leave the bar as it is; the end of the run is the end of its only epoch."""
+        """Leave the bar unchanged; the end of the run is the end of its only epoch."""
 
     def on_train_end(self, *args: Any) -> None:
         """Close the bar."""
@@ -105,7 +111,7 @@ class SplatProgressBar(TQDMProgressBar):
         self._watching.close()
 
     def on_exception(self, *args: Any) -> None:
-        """Close the bar, so that what went wrong starts on a line of its own."""
+        """Close the bar, so that the error starts on a new line."""
         self._watching.close()
         if self._train_progress_bar is not None:
             self._train_progress_bar.close()
@@ -121,8 +127,8 @@ class SplatProgressBar(TQDMProgressBar):
         seconds = time.time() - self._start_without_compilation()
         done = self.train_progress_bar.initial / trainer.accumulate_grad_batches
         left = seconds * (total - step) / max(1.0, step - done)
-        passed, remaining = Tqdm.format_interval(seconds), Tqdm.format_interval(left)
-        return f"iteration {step} of {total} ({100 * step // total} %), {passed} passed, {remaining} left"
+        elapsed, remaining = Tqdm.format_interval(seconds), Tqdm.format_interval(left)
+        return f"iteration {step} of {total} ({100 * step // total} %), {elapsed} elapsed, {remaining} left"
 
     def _start_without_compilation(self) -> float:
         return self._started + compile_seconds() - self._compiled_before
@@ -142,7 +148,7 @@ class SplatProgressBar(TQDMProgressBar):
     def _show_compilation(self, compiling: bool) -> None:
         bar = self._train_progress_bar
         if compiling and bar is not None and not bar.disable:
-            bar.set_postfix_str("compiling kernels")  # the next refresh takes it away
+            bar.set_postfix_str("compiling kernels")  # the next refresh removes it
 
 
 def _shows_bars() -> bool:

@@ -1,4 +1,4 @@
-"""Move codebooks that no gradient trains to the rows as they are now."""
+"""Refit codebooks that get no gradient to the current rows."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ log = logging.getLogger(__name__)
 class CodebookRefit(HostedCallback):
     """Refits codebooks to the rows of all splats in the quantize phase, as CompGS does (Navaneet et al. 2024).
 
-    Only quantizers that offer it (:class:`nsvq_lightning.quantize.base.Refittable`, such as ``StraightThrough``) are
-    refitted; for others it does nothing. CompGS runs up to 10 steps of k-means every 100 iterations.
+    Only quantizers that support it (:class:`nsvq_lightning.quantize.base.Refittable`, such as ``StraightThrough``) are
+    refitted. CompGS runs up to 10 steps of k-means every 100 iterations.
 
-    A refit comes between backward pass and update: once a step, also with gradient accumulation, and before the other
-    callbacks replace codes or evaluate, so that the order of their list does not matter.
+    A refit comes between backward pass and update: once a step, also with gradient accumulation, and before other
+    callbacks replace codes or evaluate, so the order of the callbacks does not matter.
 
     Args:
         every: Iterations of the reference run between two refits.
@@ -36,6 +36,15 @@ class CodebookRefit(HostedCallback):
 
     Raises:
         ValueError: ``every`` or ``steps`` is below 1.
+
+    Example:
+        >>> from nsvq_lightning import SplatModule
+        >>> from nsvq_lightning.callbacks import CodebookRefit
+        >>> from nsvq_lightning.quantize import StraightThrough
+        >>> refit = CodebookRefit(every=5000)  # --callbacks.codebook_refit.every=5000
+        >>> module = SplatModule(codebooks="4k", quantizer=StraightThrough)
+        >>> [iteration for iteration in range(1, 45_001) if refit.is_due(module, iteration)]
+        [25000, 30000, 35000, 40000]
     """
 
     def __init__(self, every: int = 100, steps: int = 10) -> None:
@@ -52,13 +61,13 @@ class CodebookRefit(HostedCallback):
         return iteration in schedule.refit_times(self.every)
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Drop non-finite splats before a refit to all rows: after the backward pass it would take the gradients."""
+        """Drop non-finite splats before a refit to all rows: after the backward pass this would lose the gradients."""
         host = as_host(pl_module)
         if self.is_due(host, next_iteration(trainer)) and _refittable(host):
             keep_finite_splats(trainer, host)
 
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
-        """Refit when it is time, on the first process."""
+        """Refit when due, on the first process."""
         host = as_host(pl_module)
         iteration = next_iteration(trainer)
         if not self.is_due(host, iteration):
@@ -71,5 +80,5 @@ class CodebookRefit(HostedCallback):
 
 
 def _refittable(host: SplatHost) -> dict[str, Refittable]:
-    """The quantizers that offer it, by attribute."""
+    """The quantizers that support it, by attribute."""
     return {name: quantizer for name, quantizer in host.quantizers.items() if is_refittable(quantizer)}

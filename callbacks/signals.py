@@ -23,12 +23,11 @@ HELD = (signal.SIGINT, signal.SIGTERM)
 class HeldSignals:
     """Holds back the first SIGINT and the first SIGTERM until :meth:`deliver`; a second one acts at once.
 
-    With several processes a second one does nothing: launchers pass on what a process has received already, and a
-    process that stopped in the middle of an iteration would leave the others waiting.
+    With several processes a second one does nothing: launchers forward signals that a process has already received, and
+    a process that stopped in the middle of an iteration would leave the others waiting.
 
-    Delivering calls the handler that was there before, so what a signal means stays with the trainer and the
-    interpreter. Signals that were ignored stay so; outside the main thread, where Python allows no handlers, nothing
-    is held back.
+    Delivering calls the previous handler, so the trainer and the interpreter still decide what a signal does. Ignored
+    signals stay ignored; outside the main thread, where Python allows no handlers, nothing is held back.
     """
 
     def __init__(self) -> None:
@@ -37,7 +36,7 @@ class HeldSignals:
         self._several = False
 
     def hold(self, trainer: Trainer) -> None:
-        """Begin to hold signals back."""
+        """Start to hold signals back."""
         self._several = trainer.world_size > 1
         if self._handlers or threading.current_thread() is not threading.main_thread():
             return
@@ -48,7 +47,7 @@ class HeldSignals:
                 signal.signal(number, self._receive)
 
     def received(self, trainer: Trainer) -> list[int]:
-        """Signals that came meanwhile, to whichever process: a collective, which every process must call."""
+        """Signals received by any process in the meantime: a collective, which every process must call."""
         if trainer.world_size == 1:
             return list(self._pending)
         own = torch.tensor([number in self._pending for number in HELD], dtype=torch.float32)
@@ -56,7 +55,7 @@ class HeldSignals:
         return [number for number, count in zip(HELD, counts, strict=True) if count]
 
     def deliver(self, received: list[int]) -> None:
-        """Let signals do what they do."""
+        """Call the previous handlers of the signals."""
         for number in received:
             if number in self._pending:
                 self._pending.remove(number)
@@ -64,7 +63,7 @@ class HeldSignals:
                 self._handlers[number](number, None)
 
     def release(self) -> None:
-        """Give the signals back to the handlers from before."""
+        """Restore the previous handlers."""
         for number, handler in self._handlers.items():
             if signal.getsignal(number) == self._receive:
                 signal.signal(number, handler)
@@ -73,7 +72,7 @@ class HeldSignals:
     def _receive(self, number: int, frame: FrameType | None) -> None:
         if number not in self._pending:
             self._pending.append(number)
-            more = "" if self._several else "; once more stops at once, without a checkpoint"
+            more = "" if self._several else "; a second one stops at once, without a checkpoint"
             log.warning("%s: stopping after this iteration%s", signal.Signals(number).name, more)
         elif not self._several:
             self._pending.remove(number)

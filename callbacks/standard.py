@@ -1,4 +1,4 @@
-"""The callbacks of a run, one of each, in their order: those of ``nsvq fit``."""
+"""The callbacks of ``nsvq fit``, one of each, in order."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ STANDARD: dict[str, type[Callback]] = {
     "progress": SplatProgressBar,
 }
 """Callback by name. The order matters in two places: density control comes before the canonical form, which may act
-after the same iteration, and contribution pruning before the report, whose figures are then those of the splats left.
+after the same iteration, and contribution pruning before the report, which then measures the remaining splats.
 """
 
 
@@ -49,12 +49,13 @@ def standard(**replaced: Callback | None) -> list[Callback]:
     """The callbacks of ``nsvq fit``, with their defaults.
 
     Args:
-        replaced: Callbacks to have in the place of those of the same name in :data:`STANDARD`; None leaves one out.
+        replaced: Callbacks that replace those of the same name in :data:`STANDARD`; None leaves one out.
 
     Raises:
         ValueError: There is no callback of that name.
 
     Example:
+        >>> from nsvq_lightning.callbacks import STANDARD, DensityControl, standard
         >>> len(standard()) == len(STANDARD)
         True
         >>> few = standard(density=DensityControl(max_splats=200_000), report=None, progress=None)

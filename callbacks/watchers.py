@@ -1,4 +1,4 @@
-"""Callbacks of Lightning that wait for a metric, told when there is a new one."""
+"""Notify Lightning's callbacks that monitor a metric when there is a new value."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ __all__ = ["tell_watchers"]
 
 
 def tell_watchers(trainer: Trainer, module: LightningModule) -> None:
-    """Let early stopping and checkpoints that monitor ``report/…`` look at it now.
+    """Let early stopping and checkpoints that monitor ``report/…`` act now.
 
-    They wait for the end of an epoch or of a validation, whichever their settings and the trainer's ask for, and act in
-    one of these hooks. Here the sampler is endless and no validation runs, so neither ever comes.
+    They wait for the end of an epoch or a validation, depending on their settings and the trainer's, and act in one of
+    these hooks. Here the sampler is endless and no validation runs, so neither ever comes.
     """
     watchers: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
     for watcher in watchers:

@@ -117,7 +117,7 @@ def test_the_lines_of_a_resumed_run_count_the_whole_run(
     assert main(fit(demo_scene, tmp_path, *CODES, *more, *shown, steps=22)) == 0
     out = capsys.readouterr().out
     counts = re.findall(
-        r"^iteration (\d+) of 22 \(\d+ %\), \S+ passed, \S+ left: finetune \d+ splats", out, re.MULTILINE
+        r"^iteration (\d+) of 22 \(\d+ %\), \S+ elapsed, \S+ left: finetune \d+ splats", out, re.MULTILINE
     )
     assert counts == ["21", "22"]
     assert "\r" not in out

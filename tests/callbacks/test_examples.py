@@ -1,0 +1,35 @@
+"""The examples in the docstrings of the callbacks, run as a user would who copies them."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import pkgutil
+
+import pytest
+
+from nsvq_lightning import callbacks
+
+PUBLIC = [name for name in callbacks.__all__ if callable(getattr(callbacks, name))]
+MODULES = [
+    importlib.import_module(f"{callbacks.__name__}.{found.name}") for found in pkgutil.iter_modules(callbacks.__path__)
+]
+EXAMPLES = {
+    test.name: test
+    for module in MODULES
+    for test in doctest.DocTestFinder().find(module, globs={})  # each imports what it needs
+    if test.examples
+}
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_a_public_callback_has_an_example(name: str) -> None:
+    public = getattr(callbacks, name)
+    assert f"{public.__module__}.{public.__qualname__}" in EXAMPLES
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_an_example_does_what_it_shows(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    failed, attempted = doctest.DocTestRunner().run(EXAMPLES[name])
+    assert failed == 0, capsys.readouterr().out
+    assert attempted == len(EXAMPLES[name].examples)
