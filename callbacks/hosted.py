@@ -14,8 +14,7 @@ __all__ = ["HostedCallback", "WritingCallback"]
 
 
 class HostedCallback(Callback):
-    """Callback of any module that follows :class:`nsvq_lightning.training.host.SplatHost`; those here that act on the
-    training are such.
+    """Base of the callbacks that train: works with any :class:`nsvq_lightning.training.host.SplatHost`.
 
     The module is checked before anything starts, its optimiser as soon as there is one. A subclass that overrides these
     hooks calls them here first.
