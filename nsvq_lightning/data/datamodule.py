@@ -34,7 +34,7 @@ class ColmapDataModule(LightningDataModule):
     of that one sequence, and every R-th of the test views.
 
     Args:
-        root: Scene folder: ``images/``, and a COLMAP model (``.bin`` or ``.txt``) in ``sparse/0``, ``sparse`` or itself.
+        root: Scene folder: ``images/`` and a COLMAP model (``.bin`` or ``.txt``) in ``sparse/0``, ``sparse`` or itself.
         factor: Divide the image size by 1, 2, 4 or 8 (from ``images_2`` … where it exists); None: see ``max_width``.
         max_width: If ``factor`` is None, images wider than this many pixels are scaled down to it; None for no limit.
         test_every: Every ``test_every``-th view is a test view, at least 2.
@@ -84,7 +84,7 @@ class ColmapDataModule(LightningDataModule):
 
         Raises:
             SceneError: The folder cannot be used, or there are fewer test views than processes, which would otherwise
-                    fail only at the first evaluation.
+                fail only at the first evaluation.
         """
         count = len(self.scene.test)
         if stage != "predict":

@@ -27,7 +27,7 @@ class DiVeQ(CodebookQuantizer):
         num_codes: Codes K, at least 1.
         dim: Dimension D of a row.
         sigma: σ, in units of the attribute's raw space; keep it small compared with the quantization errors, which are
-                    a few hundredths there.
+            a few hundredths there.
         **settings: Those of :class:`CodebookQuantizer`.
 
     Raises:

@@ -13,7 +13,7 @@ minimum radius and no anti-aliasing. Different, because gsplat has no argument f
 * The box of a splat is rounded up to whole pixels, so ``radii`` and :func:`visible_gsplat` count a few splats that
   reach no pixel centre; they change no pixel.
 * A splat with a zero quaternion is not drawn; this package takes it as the identity. Quaternions whose squares
-    overflow, and splats of thousands of pixels, lose the precision that the package's own kernels keep.
+  overflow, and splats of thousands of pixels, lose the precision that the package's own kernels keep.
 * The gradients of a splat with a non-finite attribute may be NaN; those of the others are not affected.
 * Gradients are summed in the order in which threads arrive: two runs with one seed differ in their last bits.
 """
