@@ -1,7 +1,7 @@
-"""One step of Adam over a table of rows, in one pass over the memory.
+"""One step of Adam over a table of rows, in a single pass over memory.
 
-The step is bound by memory: seven streams (weight, gradient and two moments in, all but the gradient out). So what
-helps is to touch less of it: only the leading columns, or only the rows that have a gradient.
+The step is memory-bound: seven streams (weight, gradient and two moments in, all but the gradient out). So what
+helps is touching less memory: only the leading columns, or only the rows that have a gradient.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ __all__ = ["adam_update"]
 
 WIDTH = 16
 AHEAD = 256
-"""Numbers ahead of the work at which memory is asked for: a tenth faster than the processor's own guess."""
+"""Prefetch distance in floats: a tenth faster than hardware prefetching alone."""
 BLOCK = 16
-"""Rows that are looked at together: as many whole vectors as a row has columns."""
+"""Rows that are checked together: as many whole vectors as a row has columns."""
 
 
 @inline
@@ -35,7 +35,7 @@ def unpack(factors):
 
 @inline
 def update(weights, gradients, firsts, seconds, o, factors, chosen):
-    """Adam on the sixteen numbers from ``o`` on, as far as they are chosen."""
+    """Adam on those of the sixteen elements from ``o`` on that are chosen."""
     for table in (weights, gradients, firsts, seconds):
         prefetch(table, o + AHEAD)
     step, gain, decay, fresh, root, eps = factors
@@ -50,7 +50,7 @@ def update(weights, gradients, firsts, seconds, o, factors, chosen):
 
 @inline
 def update_one(weights, gradients, firsts, seconds, o, factors):
-    """Adam on one number."""
+    """Adam on one element."""
     step, gain, decay, fresh, root, eps = factors
     gradient, first = get(gradients, o), get(firsts, o)
     mean = gain * (gradient - first) + first
@@ -62,7 +62,7 @@ def update_one(weights, gradients, firsts, seconds, o, factors):
 
 @kernel
 def update_all(threads, weights, gradients, firsts, seconds, packed):
-    """Every number of the table."""
+    """Update every element of the table."""
     vectors = weights.shape[0] // WIDTH
     for thread in prange(threads):
         factors = unpack(packed)
@@ -76,7 +76,7 @@ def update_all(threads, weights, gradients, firsts, seconds, packed):
 
 @kernel
 def update_columns(threads, rows, stride, columns, weights, gradients, firsts, seconds, packed):
-    """The leading ``columns`` of each row, and what shares a vector with them; at most ``stride`` in all."""
+    """Update the leading ``columns`` of each row, and what shares a vector with them; at most ``stride`` in all."""
     for thread in prange(threads):
         factors = unpack(packed)
         every = broadcast(F(1)) > broadcast(F(0))
@@ -87,11 +87,11 @@ def update_columns(threads, rows, stride, columns, weights, gradients, firsts, s
 
 @inline
 def has_gradient(gradients, o, columns):
-    """Whether any of some numbers is not 0; what is not a number counts too."""
+    """Whether any of ``columns`` elements is not 0; NaN counts too."""
     zero = broadcast(F(0))
     if columns >= WIDTH:
         for k in range(0, columns, WIDTH):
-            # The last vector overlaps the one before.
+            # The last vector overlaps the one before it.
             x = load(gradients, o + min(k, columns - WIDTH))
             if any_lane(~((x >= zero) & (x <= zero))):
                 return True
@@ -104,7 +104,7 @@ def has_gradient(gradients, o, columns):
 
 @inline
 def mark_rows(gradients, o, rows, columns, marks):
-    """Mark each number of some rows: 1 where its row has a gradient, else 0."""
+    """Mark each element of some rows: 1 where its row has a gradient, else 0."""
     for row in range(rows):
         start = row * columns
         mark = F(1) if has_gradient(gradients, o + start, columns) else F(0)
@@ -118,7 +118,7 @@ def mark_rows(gradients, o, rows, columns, marks):
 
 @kernel
 def update_rows(threads, rows, stride, weights, gradients, firsts, seconds, packed, scratch):
-    """The rows that have a gradient."""
+    """Update the rows that have a gradient."""
     blocks = (rows + BLOCK - 1) // BLOCK
     for thread in prange(threads):
         factors = unpack(packed)
@@ -150,25 +150,25 @@ def adam_update(
     columns: int | None = None,
     rows_with_gradient: bool = False,
 ) -> Callable[[], None]:
-    """Prepare Adam in place on ``[N, ...]``, all contiguous float32 on the CPU; what is returned does the step.
+    """Prepare an in-place Adam step on contiguous float32 tensors ``[N, ...]`` on the CPU; call the result to run it.
 
-    Several steps are best prepared together and then done: each empties the caches, and Python is slow to come back.
+    Prepare several steps first, then run them: each one flushes the caches, which slows down Python code in between.
 
     Args:
-        weights: What is trained.
+        weights: The parameter.
         gradients: Its gradient.
-        first: Mean of the gradients.
-        second: Mean of their squares.
-        step: 1-based number of the step, for the correction of the bias.
+        first: First moment, the mean of the gradients.
+        second: Second moment, the mean of their squares.
+        step: 1-based number of the step, for bias correction.
         lr: Learning rate.
-        betas: Decay of the two means.
-        eps: Added to the root of the second.
-        columns: Only so many leading numbers of each row; the caller knows that gradient and moments of the others
-            are 0, which Adam leaves as they are.
-        rows_with_gradient: Leave rows whose gradient is 0 as they are, moments included.
+        betas: Decay rates of the two moments.
+        eps: Added to the root of the second moment.
+        columns: Update only this many leading columns of each row; the caller guarantees that gradient and moments of
+            the others are 0, so that Adam would not change them.
+        rows_with_gradient: Leave rows whose gradient is 0 unchanged, moments included.
 
     Raises:
-        ValueError: The tensors differ in shape, or one has gaps.
+        ValueError: The tensors differ in shape, or one is not contiguous.
         TypeError: One is not float32.
     """
     packed = _factors(step, lr, betas, eps)
@@ -190,6 +190,6 @@ def _update_rows(threads: int, rows: int, stride: int, *tables: Array) -> None:
 
 
 def _factors(step: int, lr: float, betas: tuple[float, float], eps: float) -> Array:
-    """Step, share of the gradient in the first moment, decay and share in the second, 1 / root of its bias, eps."""
+    """Step size, gradient's share in the first moment, decay and share in the second, 1 / root of its bias, eps."""
     first, second = (1 - beta**step for beta in betas)
     return np.array([lr / first, 1 - betas[0], betas[1], 1 - betas[1], 1 / math.sqrt(second), eps], np.float32)

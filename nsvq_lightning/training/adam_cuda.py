@@ -1,7 +1,7 @@
-"""One step of Adam over a table of rows, in one pass over the memory.
+"""One step of Adam over a table of rows, in a single pass over memory.
 
-The step is bound by memory, so what helps is to touch less of it: only the leading columns, or only the rows that have
-a gradient. Rounding is that of the CPU's kernel, operation by operation.
+The step is memory-bound, so what helps is touching less memory: only the leading columns, or only the rows that have a
+gradient. Rounding matches the CPU kernel, operation by operation.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from nsvq_lightning.compute.memory import check_tensor
 __all__ = ["adam_update"]
 
 BLOCK = 1024
-"""Numbers a program updates."""
+"""Elements per program."""
 
 
 @triton.jit
 def update(weights, gradients, firsts, seconds, at, chosen, step, gain, decay, fresh, root, eps):
-    """Adam on the chosen ones of some numbers."""
+    """Adam on the chosen elements."""
     weight = tl.load(weights + at, mask=chosen, other=0.0)
     gradient = tl.load(gradients + at, mask=chosen, other=0.0)
     first = tl.load(firsts + at, mask=chosen, other=0.0)
@@ -43,7 +43,7 @@ def update_columns_kernel(
     weights, gradients, firsts, seconds, count, stride, step, gain, decay, fresh, root, eps, COLUMNS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The leading ``COLUMNS`` of each row of ``stride`` numbers, ``count`` numbers in all; 0 stands for whole rows."""
+    """Update the leading ``COLUMNS`` (0: all) of each row of ``stride`` elements, ``count`` elements in all."""
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     chosen = at < count
     if COLUMNS > 0:
@@ -56,7 +56,7 @@ def update_rows_kernel(
     weights, gradients, firsts, seconds, count, stride, step, gain, decay, fresh, root, eps, ROWS: tl.constexpr,
     WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Those of ``count`` rows that have a gradient; what is not a number counts as one."""
+    """Update those of ``count`` rows that have a gradient; NaN counts as one."""
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)[:, None]
     column = tl.arange(0, WIDTH)[None, :]
     inside = (row < count) & (column < stride)
@@ -79,24 +79,24 @@ def adam_update(
     columns: int | None = None,
     rows_with_gradient: bool = False,
 ) -> Callable[[], None]:
-    """Prepare Adam in place on ``[N, ...]``, all contiguous float32 on one CUDA device; what is returned does the step.
+    """Prepare an in-place Adam step on contiguous float32 tensors ``[N, ...]`` on a GPU; call the result to run it.
 
     Args:
-        weights: What is trained.
+        weights: The parameter.
         gradients: Its gradient.
-        first: Mean of the gradients.
-        second: Mean of their squares.
-        step: 1-based number of the step, for the correction of the bias.
+        first: First moment, the mean of the gradients.
+        second: Second moment, the mean of their squares.
+        step: 1-based number of the step, for bias correction.
         lr: Learning rate.
-        betas: Decay of the two means.
-        eps: Added to the root of the second.
-        columns: Only so many leading numbers of each row; the caller knows that gradient and moments of the others
-            are 0, which Adam leaves as they are.
-        rows_with_gradient: Leave rows whose gradient is 0 as they are, moments included.
+        betas: Decay rates of the two moments.
+        eps: Added to the root of the second moment.
+        columns: Update only this many leading columns of each row; the caller guarantees that gradient and moments of
+            the others are 0, so that Adam would not change them.
+        rows_with_gradient: Leave rows whose gradient is 0 unchanged, moments included.
 
     Raises:
-        ValueError: The tensors differ in shape or device, or one has gaps.
-        TypeError: A type differs.
+        ValueError: The tensors differ in shape or device, or one is not contiguous.
+        TypeError: A dtype is wrong.
     """
     given = {"weights": weights, "gradients": gradients, "first": first, "second": second}
     for name, tensor in given.items():
@@ -126,6 +126,6 @@ def adam_update(
 
 
 def _factors(step: int, lr: float, betas: tuple[float, float], eps: float) -> tuple[float, ...]:
-    """Step, share of the gradient in the first moment, decay and share in the second, 1 / root of its bias, eps."""
+    """Step size, gradient's share in the first moment, decay and share in the second, 1 / root of its bias, eps."""
     first, second = (1 - beta**step for beta in betas)
     return lr / first, 1 - betas[0], betas[1], 1 - betas[1], 1 / math.sqrt(second), eps

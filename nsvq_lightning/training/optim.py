@@ -1,4 +1,4 @@
-"""One Adam with a named parameter group for every attribute and every codebook, and the position's learning rate."""
+"""One Adam with a named parameter group per attribute and codebook, and the position's learning rate."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ BETAS = 0.9, 0.999
 """Adam's defaults."""
 
 EPS = 1e-15
-"""Adam's epsilon of 3D Gaussian splatting: gradients of a splat are far below PyTorch's default of 1e-8."""
+"""Adam's epsilon in 3D Gaussian splatting: gradients of a splat are far below PyTorch's default of 1e-8."""
 
 FUSED_DEVICES = frozenset({"cpu", "cuda"})
-"""Device types on which torch has a fused Adam."""
+"""Device types for which torch has a fused Adam."""
 
 CODEBOOK_PREFIX = "codebook_"
-"""A codebook's parameter group is named after its attribute with this in front."""
+"""Prefix of a codebook's parameter group, before the name of its attribute."""
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Learning rates of 3D Gaussian splatting, which the paper keeps.
+    """Learning rates of 3D Gaussian splatting, which the paper also uses.
 
     Attributes:
         means: Position at the start, times the extent of the scene.
@@ -57,9 +57,9 @@ class LearningRates:
         opacities: Opacity logit.
         sh0: Constant colour coefficient.
         shN: Higher colour coefficients.
-        codebook_factor: A codebook learns with the rate of its attribute times this.
-        scale_with_views: With B views in a step take √B times these rates, and Adam's other numbers to match
-            (:func:`apply_rates`); else those of one view.
+        codebook_factor: Factor from the rate of an attribute to that of its codebook.
+        scale_with_views: For B views in a step, multiply these rates by √B and adapt Adam's other settings
+            (:func:`apply_rates`); otherwise use the rates for one view.
 
     Raises:
         ValueError: A rate is negative or not finite, or a rate of the position is 0.
@@ -85,7 +85,7 @@ class LearningRates:
                 )
 
     def of_step(self, views: int) -> LearningRates:
-        """The rates of a step of ``views`` views, none left to scale."""
+        """The rates for a step of ``views`` views, with nothing left to scale."""
         factor = math.sqrt(views) if self.scale_with_views else 1.0
         scaled = {name: factor * getattr(self, name) for name in (*ATTRIBUTES, "means_final")}
         return replace(self, **scaled, scale_with_views=False)
@@ -108,16 +108,16 @@ def codebook_group(attribute: str) -> str:
 def param_groups(
     splats: Splats, quantizers: Mapping[str, nn.Module], rates: LearningRates, extent: float
 ) -> list[dict[str, Any]]:
-    """One group a parameter, named after its attribute (``means``) or its codebook (``codebook_scales``).
+    """One group per parameter, named after its attribute (``means``) or its codebook (``codebook_scales``).
 
-    Codebooks are there from the start: without a gradient Adam skips them, and a checkpoint of any phase has the same
-    groups.
+    Codebooks are included from the start: Adam skips them while they have no gradient, and a checkpoint of any phase
+    has the same groups.
 
     Args:
         splats: The splats.
         quantizers: Quantizer by attribute, each with a parameter ``codebook``.
         rates: Learning rates.
-        extent: Extent of the scene, scene units; the position's rate is in its unit.
+        extent: Extent of the scene, scene units; the position's rate is relative to it.
     """
     parameters: dict[str, Any] = dict(splats.attributes())
     parameters |= {codebook_group(name): quantizer.codebook for name, quantizer in quantizers.items()}
@@ -128,7 +128,7 @@ def param_groups(
 
 
 def group_lr(name: str, rates: LearningRates, extent: float) -> float:
-    """Learning rate at the start of the parameter group ``name``."""
+    """Initial learning rate of the parameter group ``name``."""
     attribute = name.removeprefix(CODEBOOK_PREFIX)
     rate: float = getattr(rates, attribute)
     if attribute != name:
@@ -137,17 +137,17 @@ def group_lr(name: str, rates: LearningRates, extent: float) -> float:
 
 
 def apply_rates(optimizer: torch.optim.Optimizer, rates: LearningRates, extent: float, views: int = 1) -> None:
-    """Set learning rates, betas and epsilon of all groups, for example after a checkpoint has brought others.
+    """Set learning rates, betas and epsilon of all groups, for example after a checkpoint has replaced them.
 
-    With ``rates.scale_with_views``, of a step of B views, whose gradients are averaged: √B·lr, 1 - B·(1 - β), ε / √B.
-    B views in one step then move parameters as B steps of a view each, in mean and in variance (Malladi et al. 2022,
+    With ``rates.scale_with_views``, for a step of B views with averaged gradients: √B·lr, 1 - B·(1 - β), ε / √B.
+    B views in one step then move parameters like B steps of a view each, in mean and in variance (Malladi et al. 2022,
     "On the SDEs and Scaling Rules for Adaptive Gradient Algorithms").
 
     Args:
         optimizer: Adam with named groups.
-        rates: Learning rates of a step of one view.
+        rates: Learning rates for a step of one view.
         extent: Extent of the scene, scene units.
-        views: Views in a step, of all processes and micro-batches.
+        views: Views in a step, over all processes and micro-batches.
 
     Raises:
         ValueError: So many views that a beta would not be positive.
@@ -166,13 +166,13 @@ def apply_rates(optimizer: torch.optim.Optimizer, rates: LearningRates, extent: 
 
 
 class SplatAdam(torch.optim.Adam):
-    """:class:`torch.optim.Adam` for contiguous float32 parameters, in one pass over the memory.
+    """:class:`torch.optim.Adam` for contiguous float32 parameters, in a single pass over memory.
 
-    On the CPU and on CUDA devices, where nothing waits for the device. The same bits for any number of threads; the
-    state is that of torch's, the count of steps on the CPU, so checkpoints fit both. A group may name
-    ``columns`` (:func:`set_columns`): the leading numbers of a row that can have a gradient or ever had one; Adam
-    leaves the others as they are, so they are not looked at (switch ``adam_bands``). With the switch ``adam_rows``
-    splats without a gradient keep weights and moments; the count of steps, which corrects the bias, goes on for all.
+    It runs on the CPU and on CUDA devices, where nothing waits for the device, and gives the same bits for any number
+    of threads. The state is that of torch's Adam, with the step count on the CPU, so checkpoints fit both. A group may
+    set ``columns`` (:func:`set_columns`): the leading columns of a row that can have a gradient or ever had one; Adam
+    would not change the others, so they are skipped (switch ``adam_bands``). With the switch ``adam_rows``, splats
+    without a gradient keep weights and moments; the step count, which corrects the bias, advances for all.
 
     Args:
         groups: Parameter groups with their learning rates.
@@ -184,7 +184,7 @@ class SplatAdam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """Call ``closure``, if any, and update what has a gradient then.
+        """Call ``closure``, if any, then update what has a gradient.
 
         Returns:
             What ``closure`` returned.
@@ -193,22 +193,22 @@ class SplatAdam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        # All are prepared before the first is done, see `adam_update`.
+        # All updates are prepared before the first one runs, see `adam_update`.
         due = [(group, p) for group in self.param_groups for p in group["params"] if p.grad is not None]
         updates = [self._update_of(group, parameter, parameter.grad) for group, parameter in due]
         for update in updates:
             update()
-        for _, parameter in due:  # autograd does not see kernels write
+        for _, parameter in due:  # autograd does not notice writes by kernels
             increment_version([parameter, *(self.state[parameter][name] for name in ("exp_avg", "exp_avg_sq"))])
         return loss
 
     def _update_of(self, group: dict[str, Any], parameter: Tensor, gradient: Tensor) -> Callable[[], None]:
-        """Count one more step of a parameter; the function that does it."""
+        """Count one more step of a parameter; returns the function that runs it."""
         state = self.state[parameter]
         if not state:
             state["step"] = torch.zeros(())
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        # A checkpoint of torch's fused Adam has it on the device, where reading it would wait.
+        # A checkpoint of torch's fused Adam has it on the device, and reading it there would block.
         state["step"] = state["step"].cpu() + 1
         return _adam_of(parameter)(
             parameter,
@@ -225,20 +225,20 @@ class SplatAdam(torch.optim.Adam):
 
 
 def _adam_of(parameter: Tensor) -> Callable[..., Callable[[], None]]:
-    """The function that prepares Adam on the device of a parameter, whose kernels' compiler is imported only now."""
+    """The ``adam_update`` for a parameter's device, imported only now because that imports the kernels' compiler."""
     adam = importlib.import_module(f"nsvq_lightning.training.adam_{kernels_for(parameter)}")
     prepare: Callable[..., Callable[[], None]] = adam.adam_update
     return prepare
 
 
 def build_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
-    """Adam of the paper over ``groups``: default betas, epsilon 1e-15, no weight decay.
+    """The paper's Adam over ``groups``: default betas, epsilon 1e-15, no weight decay.
 
     Returns:
-        :class:`SplatAdam` where it can take the parameters, else torch's, fused where there is such.
+        :class:`SplatAdam` where it supports the parameters, otherwise torch's, fused where available.
 
     Raises:
-        ValueError: ``adam_rows`` is on, and only torch's can take the parameters.
+        ValueError: ``adam_rows`` is on, and only torch's supports the parameters.
     """
     parameters: list[Tensor] = [parameter for group in groups for parameter in group["params"]]
     if all(kernels_for(p) is not None and p.is_contiguous() for p in parameters):
@@ -253,10 +253,10 @@ def build_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
 
 
 def set_columns(optimizer: torch.optim.Optimizer, name: str, columns: int) -> None:
-    """Say that from now on the leading ``columns`` numbers of a row of the group ``name`` can have a gradient.
+    """Declare that from now on the leading ``columns`` columns of the group ``name`` can have a gradient.
 
-    Groups start without a limit. The first call at the start of a training sets one, later ones only raise it: moments
-    that were set once need their decay. The optimiser's state carries it.
+    Groups start without a limit. The first call at the start of training sets one, later calls only raise it: moments
+    that were ever set must keep decaying. The optimiser's state stores the limit.
     """
     group = find_group(optimizer, name)
     fresh = not optimizer.state.get(group["params"][0])
@@ -283,5 +283,5 @@ def find_group(optimizer: torch.optim.Optimizer, name: str) -> dict[str, Any]:
 
 
 def raw_optimizer(trainer: Trainer) -> torch.optim.Optimizer:
-    """The one optimiser, unwrapped."""
+    """The trainer's only optimiser, unwrapped."""
     return trainer.optimizers[0]

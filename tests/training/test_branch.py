@@ -199,5 +199,5 @@ def test_a_fit_from_a_quantized_checkpoint_keeps_its_codebooks(run: RunFactory, 
     loaded = SplatModule.load_from_checkpoint(path)
     assert loaded.quantizer_settings == module.quantizer_settings
     for other in ({"codebooks": {"scales": 23, "quats": 24, "sh0": 16, "shN": 16}}, {"quantizer": StraightThrough}):
-        with pytest.raises(ValueError, match="that can change before the quantize phase only"):
+        with pytest.raises(ValueError, match="that can change only before the quantize phase"):
             run(recipe().values(), ckpt_path=path, module=other, max_steps=12)
