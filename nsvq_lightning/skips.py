@@ -1,18 +1,18 @@
 """Work that a scene, a view or a phase may not need, and the switches that skip it.
 
-Most switches are on and leave every bit of the result as it is; those that change a result say how in ``changes`` and
-are off. They exist to be measured and tested one by one:
+Most switches are on and do not change a bit of the result; those that change it say how in ``changes`` and are off.
+They exist so that each can be measured and tested separately:
 
 * in Python: ``with switched(blocks=False): ...``
 * on the command line: ``nsvq fit --skips.blocks=false``, in a config ``skips: {blocks: false}``
 
 Switches hold for the whole process, so set them before work starts, not while another thread renders.
 
-Things that look alike and have no switch, because switching them off would only call a function that returns its
-argument: the sum over processes where there is one process, and gradients of what nothing depends on.
+Similar cases have no switch, because switching them off would only call a function that returns its argument: the sum
+over processes where there is one process, and gradients of outputs on which nothing depends.
 
-Nor has an attribute with no more distinct rows than codes: its codebook starts as these rows, but from the first step
-on training moves rows and codes apart, so that they must be searched like any others.
+An attribute with no more distinct rows than codes has no switch either: its codebook starts as these rows, but from the
+first step on, training moves rows and codes apart, so that they must be searched like any others.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class Skip:
 
     Attributes:
         name: Its name.
-        work: What is not done while it is on.
-        when: In which case it is not needed.
-        changes: What a result loses by it; None when all bits stay the same.
+        work: The work that is skipped while it is on.
+        when: In which case that work is not needed.
+        changes: What the result loses; None if all bits stay the same.
         default: Whether it is on.
     """
 
@@ -44,7 +44,7 @@ class Skip:
 
     @property
     def exact(self) -> bool:
-        """Whether all results are the same bits with and without."""
+        """Whether all results have the same bits with and without the switch."""
         return self.changes is None
 
     @property
@@ -72,7 +72,7 @@ SKIPS = {
             "splats in the optimiser",
             "they have no gradient in this step",
             # 1500 iterations of nsvq_4k on 43 photos that each see 3 of 4 splats: 28.12 dB without, 27.43 dB with, in
-            # the same time. It would pay where a view sees few splats and memory is slow.
+            # the same time. It would pay off where a view sees few splats and memory is slow.
             changes="momentum no longer moves them on, which costs 0.7 dB in a short run",
             default=False,
         ),
@@ -106,7 +106,7 @@ def switch(**switches: bool) -> None:
 
 @contextmanager
 def switched(**switches: bool) -> Iterator[None]:
-    """Set switches by name for the body of a ``with`` statement; afterwards all are as before.
+    """Set switches by name for the body of a ``with`` statement, and restore them afterwards.
 
     Raises:
         ValueError: There is no such switch.
