@@ -143,7 +143,7 @@ class _TakeRows(torch.autograd.Function):
 
 
 def take_rows(tensor: Tensor, rows: Tensor) -> Tensor:
-    """The rows ``rows [V]`` (int64, ascending, all different) of ``tensor [N, ...]``: ``[V, ...]``.
+    """The rows ``rows [V]`` (int64, ascending, distinct) of ``tensor [N, ...]``: ``[V, ...]``.
 
     The backward pass takes half the time of ``index_select``'s, and its result depends on no order of additions.
     """

@@ -91,14 +91,14 @@ def as_quantizer(module: object) -> Quantizer:
     lacks = missing_members(module, Quantizer)
     if lacks:
         raise TypeError(
-            f"{type(module).__name__} is no quantizer; it lacks: {', '.join(lacks)}; derive it from "
+            f"{type(module).__name__} is not a quantizer; it lacks: {', '.join(lacks)}; derive it from "
             "nsvq_lightning.quantize.CodebookQuantizer, or offer the members of nsvq_lightning.quantize.Quantizer"
         )
     quantizer = cast(Quantizer, module)
     if not isinstance(module, nn.Module) or not isinstance(quantizer.codebook, nn.Parameter):
         raise TypeError(
-            f"{type(module).__name__} is no quantizer: it must be an nn.Module whose codebook is an nn.Parameter, so "
-            "that checkpoints carry it and the optimiser trains it"
+            f"{type(module).__name__} is not a quantizer: it must be an nn.Module whose codebook is an nn.Parameter, "
+            "so that checkpoints carry it and the optimiser trains it"
         )
     return quantizer
 

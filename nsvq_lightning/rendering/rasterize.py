@@ -107,7 +107,7 @@ def visible(splats: SplatTensors, camera: Camera, *, backend: str = "auto") -> T
         backend: One of :data:`BACKENDS`.
 
     Raises:
-        ValueError: As of :func:`render`.
+        ValueError: As for :func:`render`.
     """
     _check_alike(splats)
     name = resolve_backend(backend, splats.means)

@@ -53,6 +53,6 @@ def evaluate(render_image: Callable[[Camera], Tensor], views: Iterable[View], de
         values = metrics(render_image(on_device.camera), on_device.image)
         scores.append(ViewScore(view.name, float(values["psnr"]), float(values["ssim"])))
     if not scores:
-        raise ValueError("there is no view to evaluate; the scene needs at least one test view")
+        raise ValueError("there are no views to evaluate; the scene needs at least one test view")
     mean = metrics.compute()
     return Quality(float(mean["psnr"]), float(mean["ssim"]), scores)

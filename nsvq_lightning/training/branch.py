@@ -103,7 +103,7 @@ def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str |
         return None
     return (
         f"the checkpoint is of a run with {', '.join(f'{name} = {value}' for name, value in changed.items())}, this "
-        f"one goes on with {', '.join(f'{name} = {own[name]}' for name in changed)}; pass "
+        f"one continues with {', '.join(f'{name} = {own[name]}' for name in changed)}; pass "
         f"{' '.join(f'--callbacks.phases.{name}={value}' for name, value in changed.items())} to continue that run as "
         "it was"
     )

@@ -82,5 +82,5 @@ class ViewParallelStrategy(DDPStrategy):
 
 
 StrategyRegistry.register(
-    "view_parallel", ViewParallelStrategy, description="A replica on each device, one view each a step", override=True
+    "view_parallel", ViewParallelStrategy, description="A replica on each device, one view each per step", override=True
 )

@@ -97,7 +97,7 @@ def test_a_branch_tells_which_rules_of_its_trunk_have_changed(
         assert messages == []
         return
     assert messages == [
-        f"the checkpoint is of a run with {named[0]}, this one goes on with {named[1]}; pass "
+        f"the checkpoint is of a run with {named[0]}, this one continues with {named[1]}; pass "
         "--callbacks.phases.min_reset_interval=11 to continue that run as it was"
     ]
 

@@ -162,7 +162,7 @@ def test_the_module_is_a_host_and_others_are_told_what_they_lack(module: SplatMo
 
 
 def test_what_is_not_a_quantizer_is_refused() -> None:
-    with pytest.raises(TypeError, match="Linear is no quantizer"):
+    with pytest.raises(TypeError, match="Linear is not a quantizer"):
         SplatModule(quantizer=nn.Linear)
     with pytest.raises(ValueError, match="unknown attributes albedo"):
         SplatModule(codebooks={"albedo": 4})

@@ -75,7 +75,7 @@ class _Stored(NamedTuple):
 
     Attributes:
         entry: Its line in the header.
-        values: Codes ``[N]`` (row of the codebook, or level) or integers ``[N, D]``, one row a splat.
+        values: Codes ``[N]`` (row of the codebook, or level) or integers ``[N, D]``, one row per splat.
         codebook: Integers ``[K, D]`` of the codebook; None if there is none.
     """
 

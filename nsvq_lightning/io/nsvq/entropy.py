@@ -185,7 +185,7 @@ def _bytes(words: NDArray[np.uint32], used: int) -> bytes:
 
 def _words(data: bytes | memoryview) -> NDArray[np.uint32]:
     if len(data) % 4:
-        raise FormatError(f"damaged: an entropy-coded stream of {len(data)} bytes, which is no multiple of 4")
+        raise FormatError(f"damaged: an entropy-coded stream of {len(data)} bytes, not a multiple of 4")
     return np.frombuffer(data, "<u4").astype(np.uint32, copy=False)
 
 

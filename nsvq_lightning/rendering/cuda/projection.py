@@ -75,7 +75,7 @@ def cross(a, b):
 
 @triton.jit
 def positive(x):
-    """max(x, 0) that keeps NaN, so that the loss shows it; ``tl.maximum`` drops it on a GPU."""
+    """max(x, 0) that keeps NaN, so that the loss shows it; ``tl.maximum`` drops NaN on a GPU."""
     return tl.where(x < 0, 0.0, x)
 
 
