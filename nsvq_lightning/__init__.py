@@ -1,6 +1,6 @@
 """Train 3D Gaussian splatting scenes and store them small (NSVQ-GS) with PyTorch Lightning.
 
-The public names are loaded on first use, so that light commands such as ``nsvq info`` start without torch.
+Public names are imported on first use, so that light commands such as ``nsvq info`` start without torch.
 """
 
 from __future__ import annotations

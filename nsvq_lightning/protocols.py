@@ -1,7 +1,7 @@
-"""What an object lacks of a protocol.
+"""Which members of a protocol an object lacks.
 
-``isinstance`` with a protocol is used nowhere in this package: since Python 3.12 it looks members up without running
-``__getattr__``, where an ``nn.Module`` keeps its parameters and buffers, and finds none of them.
+``isinstance`` with a protocol is used nowhere in this package: since Python 3.12 it looks up members without calling
+``__getattr__``, through which an ``nn.Module`` gives its parameters and buffers, and so finds none of them.
 """
 
 from __future__ import annotations

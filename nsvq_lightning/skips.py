@@ -1,17 +1,17 @@
 """Work that a scene, a view or a phase may not need, and the switches that skip it.
 
-All switches are on and leave every bit of the result as it is. They exist to be measured and tested one by one:
+All switches are on and do not change a bit of the result. They exist so that each can be measured and tested:
 
 * in Python: ``with switched(blocks=False): ...``
 * on the command line: ``nsvq fit --skips.blocks=false``, in a config ``skips: {blocks: false}``
 
 Switches hold for the whole process, so set them before work starts, not while another thread renders.
 
-Things that look alike and have no switch, because switching them off would only call a function that returns its
-argument: the sum over processes where there is one process, and gradients of what nothing depends on.
+Similar cases have no switch, because switching them off would only call a function that returns its argument: the sum
+over processes where there is one process, and gradients of outputs on which nothing depends.
 
-Nor has an attribute with no more distinct rows than codes: its codebook starts as these rows, but from the first step
-on training moves rows and codes apart, so that they must be searched like any others.
+An attribute with no more distinct rows than codes has no switch either: its codebook starts as these rows, but from the
+first step on, training moves rows and codes apart, so that they must be searched like any others.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class Skip:
 
     Attributes:
         name: Its name.
-        work: What is not done while it is on.
-        when: In which case it is not needed.
+        work: The work that is skipped while it is on.
+        when: In which case that work is not needed.
     """
 
     name: str
@@ -86,7 +86,7 @@ def switch(**switches: bool) -> None:
 
 @contextmanager
 def switched(**switches: bool) -> Iterator[None]:
-    """Set switches by name for the body of a ``with`` statement; afterwards all are as before.
+    """Set switches by name for the body of a ``with`` statement, and restore them afterwards.
 
     Raises:
         ValueError: There is no such switch.

@@ -1,7 +1,7 @@
 """Folders of the package that stand at the top level of the repository.
 
-An installed package holds them itself, and in a checkout links lead to them. Where git cannot make links, as on
-Windows, it writes small text files in their place; the folders are then found at the top level, by what is here.
+An installed package contains them, and in a checkout, symbolic links lead to them. Where git cannot create links, as on
+Windows, it writes small text files instead; this module then finds the folders at the top level.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ _PACKAGE = Path(__file__).parent
 
 
 def folder_of(name: str) -> Path:
-    """Where ``callbacks`` or ``configs`` is: in the package, or else beside it."""
+    """Where ``callbacks`` or ``configs`` is: in the package, or otherwise next to it."""
     inside = _PACKAGE / name
     return inside if inside.is_dir() else _PACKAGE.parent / name
 
 
 def find_callbacks() -> None:
-    """Let ``nsvq_lightning.callbacks`` be imported from where it is; nothing to do where that is the package."""
+    """Make ``nsvq_lightning.callbacks`` importable from where it is; does nothing if that is the package."""
     folder = folder_of("callbacks")
     if folder.parent != _PACKAGE:
         sys.meta_path.append(_Finder(f"{_PACKAGE.name}.callbacks", folder))
 
 
 class _Finder(MetaPathFinder):
-    """Finds one package in a folder; the modules in it are found as usual."""
+    """Finds one package in a folder; its modules are found as usual."""
 
     def __init__(self, name: str, folder: Path) -> None:
         self._name, self._folder = name, folder

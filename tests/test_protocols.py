@@ -40,7 +40,7 @@ def test_what_a_quantizer_lacks_is_named() -> None:
         freeze = property()  # type: ignore[assignment]  # reading it raises AttributeError
 
     assert as_quantizer(quantizer := NSVQ(4, 3)) is quantizer
-    with pytest.raises(TypeError, match=r"NearlyOne is no quantizer, it lacks: freeze; derive it from"):
+    with pytest.raises(TypeError, match=r"NearlyOne is not a quantizer; it lacks: freeze; derive it from"):
         as_quantizer(NearlyOne(4, 3))
     with pytest.raises(TypeError, match=r"lacks: codebook, codes, decode, encode, fit, forward, freeze"):
         as_quantizer(object())

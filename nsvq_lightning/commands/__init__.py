@@ -1,1 +1,1 @@
-"""One entry for each word after ``nsvq``."""
+"""One entry for each command of ``nsvq``."""

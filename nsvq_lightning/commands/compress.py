@@ -1,4 +1,4 @@
-"""``nsvq compress``: an existing splat file made small, without photos or fine-tuned with them."""
+"""``nsvq compress``: make an existing splat file small, without photos or fine-tuned with them."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ log = logging.getLogger("nsvq_lightning.compress")
 DEFAULT_CODEBOOKS = "16k"
 
 EPILOG = """\
-The error is the root mean square difference between pictures of the scene before and after, of channels in [0, 1]:
-0.01 is 40 dB, 0.003 is 50 dB. Pictures are the train views of --data.root, or taken from around the scene.
-Photos keep to the aim: if training leads past it, OUT is the file without training, and the trained one stays beside.
+The error is the root mean square difference between pictures of the scene before and after, for channels in [0, 1]:
+0.01 is 40 dB, 0.003 is 50 dB. Pictures are the train views of --data.root, or views from around the scene.
+Training with photos keeps to the limit: if the trained file misses it, OUT is the untrained file, and the trained one
+stays in the folder of the run.
 
 examples:
   nsvq compress scene.ply scene.nsvq
@@ -44,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments after ``nsvq compress``; those of the process if None.
 
     Returns:
-        0, or 1 after an error in the user's files or an aim that cannot be reached. Wrong arguments end the process
+        0, or 1 after an error in the user's files or a limit that cannot be met. Wrong arguments end the process
         with status 2.
     """
     parser = _parser()
@@ -73,7 +74,7 @@ class Result:
     Attributes:
         settings: How it was made, for the user.
         data: Its bytes.
-        error: Root mean square difference of its pictures to those of the original, of channels in [0, 1].
+        error: Root mean square difference between its pictures and those of the original, for channels in [0, 1].
     """
 
     settings: str
@@ -92,7 +93,7 @@ def _compress(options: argparse.Namespace) -> int:
     scene = read_scene(source)
     arrays = scene.finite().arrays()
     if len(arrays) == 0:
-        raise ValueError(f"{source} holds no splat with finite numbers; there is nothing to compress")
+        raise ValueError(f"{source} holds no finite splat; there is nothing to compress")
     cameras = measuring_cameras(options.root, arrays.means)
     candidate = _candidate(options, arrays, cameras, scene.origin)
     options.output.parent.mkdir(parents=True, exist_ok=True)
@@ -107,7 +108,7 @@ def _compress(options: argparse.Namespace) -> int:
                 return status
             path = folder / "scene.nsvq"
             data = with_origin(path.read_bytes(), scene.origin)
-            # Made anew: the pictures of the original would fill the memory while training.
+            # A new one: keeping the pictures of the original would fill the memory during training.
             error = Compressor(arrays, cameras, candidate.storage).error(data)
             result = _within_aim(options, result, Result(f"{result.settings}, trained with photos", data, error), path)
     with atomic_write(options.output) as file:
@@ -122,7 +123,7 @@ def _compress(options: argparse.Namespace) -> int:
 
 
 def _within_aim(options: argparse.Namespace, untrained: Result, trained: Result, path: Path) -> Result:
-    """The trained file, read from ``path``, unless it misses the aim that the untrained one meets."""
+    """The trained file, read from ``path``, unless it misses the limit that the untrained one meets."""
     if options.target_bytes is not None and len(trained.data) > options.target_bytes:
         missed = f"has {len(trained.data):,} bytes, more than --target-bytes={options.target_bytes}"
     elif options.max_error is not None and trained.error > options.max_error:
@@ -130,7 +131,7 @@ def _within_aim(options: argparse.Namespace, untrained: Result, trained: Result,
     else:
         return trained
     log.warning(
-        "the trained file %s %s: %s is the one without training; allow more for a trained one",
+        "the trained file %s %s: %s is the untrained one; raise the limit for a trained one",
         *(path, missed, options.output),
     )
     return replace(untrained, settings=f"{untrained.settings}, without training")
@@ -151,7 +152,7 @@ def _candidate(
 
 
 def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> int:
-    """Train the candidate's codebooks with photos: quantize and fine-tune phase only, from the splats as they are.
+    """Train the candidate's codebooks with photos: only the quantize and fine-tune phases, from the given splats.
 
     Returns:
         Exit status of ``nsvq fit``, which writes a run into ``folder``.
@@ -171,7 +172,7 @@ def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> i
             f"--model.codebooks={{{codebooks}}}",
             "--model.quantizer=TrainedStraightThrough",
             "--model.quantizer.start=spread",
-            "--model.rates.means=1.6e-6",  # a trained scene is past the decay of this rate
+            "--model.rates.means=1.6e-6",  # the rate of a trained scene has already decayed
             f"--model.seed={options.seed}",
             f"--model.storage.level={candidate.storage.level}",
             *(f"--model.storage.precision.{name}={value}" for name, value in precision.items()),
@@ -202,9 +203,9 @@ def _parser() -> argparse.ArgumentParser:
         "--codebooks", choices=names, default=DEFAULT_CODEBOOKS, help=f"codebook sizes; {DEFAULT_CODEBOOKS} by default"
     )
     aim.add_argument(
-        "--max-error", type=_positive(float), metavar="E", help="the smallest file with this error at most"
+        "--max-error", type=_positive(float), metavar="E", help="the smallest file with an error of at most E"
     )
-    aim.add_argument("--target-bytes", type=_positive(int), metavar="B", help="the best file of at most so many bytes")
+    aim.add_argument("--target-bytes", type=_positive(int), metavar="B", help="the best file of at most B bytes")
     parser.add_argument("--level", choices=LEVELS, default=DEFAULT_LEVEL, help=f"{DEFAULT_LEVEL} by default")
     parser.add_argument("--seed", type=int, default=0, help="seed of k-means")
     parser.add_argument(
@@ -215,7 +216,7 @@ def _parser() -> argparse.ArgumentParser:
         help="COLMAP folder with the photos: errors are those in its views, and its photos train the codebooks",
     )
     parser.add_argument(
-        "--max-steps", type=int, metavar="N", help="iterations of that training: 3000 by default; 0 only measures"
+        "--max-steps", type=int, metavar="N", help="training iterations: 3000 by default; 0 only measures"
     )
     return parser
 

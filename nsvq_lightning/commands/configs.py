@@ -1,4 +1,4 @@
-"""Configs: which arguments name one, where the shipped ones are, and whether a file is one at all."""
+"""Configs: which arguments name one, where the shipped ones are, and whether a file is one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CONFIG_OPTIONS = ("--config", "-c")
 
 
 def resolve_configs(arguments: Sequence[str]) -> list[str]:
-    """The arguments with every ``--config NAME`` that is no file replaced by the shipped one of that name."""
+    """The arguments, with every ``--config NAME`` that is not a file replaced by the shipped config of that name."""
     resolved = list(arguments)
     for place, name in _configs(arguments):
         resolved[place] = resolved[place].removesuffix(name) + find_config(name)
@@ -26,7 +26,7 @@ def configs_among(arguments: Sequence[str]) -> list[str]:
 
 
 def _configs(arguments: Sequence[str]) -> Iterator[tuple[int, str]]:
-    """Place of each argument that ends with the name of a config, and that name."""
+    """Position of each argument that ends with the name of a config, and that name."""
     expects_config = False
     for place, argument in enumerate(arguments):
         option, equals, value = argument.partition("=")
@@ -38,7 +38,7 @@ def _configs(arguments: Sequence[str]) -> Iterator[tuple[int, str]]:
 
 
 def check_config(path: str) -> None:
-    """Refuse a file that cannot be a config at all; a name that is no file is for the parser to complain about.
+    """Refuse a file that cannot be a config; the parser reports a name that is not a file.
 
     Raises:
         ValueError: It is not text, not YAML, or not a table of settings.
@@ -53,7 +53,7 @@ def check_config(path: str) -> None:
         raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error
     if not isinstance(settings, dict):
         found = "nothing" if settings is None else type(settings).__name__
-        raise ValueError(f"config {path} holds {found}: give settings by name, as 'trainer: {{max_steps: 1000}}'")
+        raise ValueError(f"config {path} holds {found}: give settings by name, like 'trainer: {{max_steps: 1000}}'")
 
 
 def written_by_run(path: str) -> bool:
@@ -62,9 +62,9 @@ def written_by_run(path: str) -> bool:
 
 
 def find_config(name: str) -> str:
-    """Path of a config: a file as given, else one shipped with the package (``nsvq_4k``, ``configs/nsvq_4k.yaml``).
+    """Path of a config: a given file, otherwise one shipped with the package (``nsvq_4k``, ``configs/nsvq_4k.yaml``).
 
-    A name that is neither is returned as it is, for the parser to complain about.
+    A name that is neither is returned unchanged, for the parser to report.
     """
     if Path(name).exists():
         return name

@@ -1,4 +1,4 @@
-"""``nsvq convert``: a scene file in another format, for the viewer at hand."""
+"""``nsvq convert``: write a scene file in another format, for viewers."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from nsvq_lightning.io.spz_frame import SPZ_VERSIONS
 __all__ = ["main"]
 
 _OPTIONS = {"level": ("--level", ".nsvq"), "palette": ("--palette", ".sog"), "version": ("--spz-version", ".spz")}
-"""Options of a writer: what they are called here, and its format."""
+"""Options of writers: their flag here, and their format."""
 
 EPILOG = """\
-The codebooks of a .nsvq file are used: as the palette of .sog, and to make .spz smaller. To make a .ply small, with
-codebooks found for it, use 'nsvq compress'.
+The codebooks of a .nsvq file are used as the palette of .sog, and to make .spz smaller. To make a .ply small, with
+codebooks fitted to it, use 'nsvq compress'.
 
 examples:
   nsvq convert scene.nsvq scene.sog
@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     chosen = {name: getattr(options, name) for name in _OPTIONS if getattr(options, name) is not None}
     for flag, suffix in (_OPTIONS[name] for name in chosen):
         if options.output.suffix.lower() != suffix:
-            parser.error(f"{flag} is an option of {suffix} files, and the output is {options.output}")
+            parser.error(f"{flag} is an option of {suffix} files, but the output is {options.output}")
     if options.root is not None and not options.measure:
         parser.error("--data.root says where to measure: add --measure")
     logging.basicConfig(format="%(message)s")
@@ -68,12 +68,12 @@ def _convert(source: Path, output: Path, options: dict[str, Any]) -> None:
     scene = read_scene(source).finite()
     output.parent.mkdir(parents=True, exist_ok=True)
     size = save(scene, output, **options)
-    each = f", {size / len(scene):.1f} a splat" if len(scene) else ""
+    each = f", {size / len(scene):.1f} per splat" if len(scene) else ""
     sys.stdout.write(f"{output}: {len(scene):,} splats in {size:,} bytes{each}\n{_errors(scene, output)}")
 
 
 def _errors(scene: CompressedScene, output: Path) -> str:
-    """A line that says how far the numbers of the file are from those of the scene; nothing where none are lost."""
+    """A line with the errors of the values in the file; empty if the format is exact."""
     in_order = FORMATS[output.suffix.lower()].in_order
     if in_order is None:
         return ""
@@ -87,7 +87,7 @@ def _measure(source: Path, output: Path, root: Path | None) -> None:
 
     original = read_scene(source).finite()
     if len(original) == 0:
-        raise ValueError(f"{source} holds no splat with finite numbers; there is nothing to measure")
+        raise ValueError(f"{source} holds no finite splat; there is nothing to measure")
     cameras = measuring_cameras(root, original.means)
     error = picture_error(read_scene(output).decode(), cameras, pictures(original.decode(), cameras))
     sys.stdout.write(
@@ -102,7 +102,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser = argparse.ArgumentParser(
         prog="nsvq convert",
-        description="Write a scene file in another format; the suffixes name the formats.",
+        description="Write a scene file in another format; the suffixes select the formats.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -112,7 +112,7 @@ def _parser() -> argparse.ArgumentParser:
         "--palette",
         type=int,
         metavar="ROWS",
-        help="most rows of the .sog palette of a scene without an SH codebook; "
+        help="largest number of rows of the .sog palette for a scene without an SH codebook; "
         f"{PALETTE_LIMIT} by default, 4096 to 16384 make a smaller file",
     )
     parser.add_argument(
@@ -120,7 +120,7 @@ def _parser() -> argparse.ArgumentParser:
         dest="version",
         type=int,
         choices=SPZ_VERSIONS,
-        help=f"version of .spz; {DEFAULT_VERSION} by default, which more viewers open",
+        help=f"version of .spz; {DEFAULT_VERSION} by default, which more viewers support",
     )
     parser.add_argument("--level", choices=LEVELS, help="level of .nsvq")
     parser.add_argument("--measure", action="store_true", help="render both files and say how they differ")

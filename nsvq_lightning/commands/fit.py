@@ -37,14 +37,14 @@ TRAINER_DEFAULTS: dict[str, Any] = {
     "max_epochs": -1,  # the sampler is endless: steps end the run
     "limit_val_batches": 0,  # MetricReport evaluates, outside the training time
     "num_sanity_val_steps": 0,
-    "devices": 1,  # more are asked for, as what a step is changes with them
+    "devices": 1,  # more must be requested, because they change what a step is
     "use_distributed_sampler": False,  # the sampler knows its rank
     "enable_model_summary": False,
     "default_root_dir": "runs",
 }
 
 NAMED_CHECKPOINTS = frozenset({"hpc", "registry"})
-"""What Lightning takes in place of the path of a checkpoint; ``last`` and ``best`` are those of its own callback."""
+"""Words that Lightning accepts instead of a checkpoint's path; ``last`` and ``best`` refer to its own callback."""
 
 PARSER_TEXTS: dict[str, Any] = {
     "prog": "nsvq",
@@ -53,7 +53,7 @@ PARSER_TEXTS: dict[str, Any] = {
 
 
 class QuietParser(LightningArgumentParser):
-    """Says what is wrong without the usage, which has some hundred lines, and lists options without their classes."""
+    """Reports errors without the usage, which has about a hundred lines, and lists options without their classes."""
 
     def format_help(self, *args: Any) -> str:
         """Help of a command, see :mod:`nsvq_lightning.commands.option_help`."""
@@ -78,18 +78,18 @@ class QuietParser(LightningArgumentParser):
 
 
 class RunStart(SaveConfigCallback):
-    """Opens the run: its folder, the default loggers in it, and the settings in ``config.yaml``, written atomically."""
+    """Opens the run: makes its folder and default loggers, and writes the settings to ``config.yaml`` atomically."""
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Open it as soon as the scene has been loaded, before anything is logged."""
-        folder = run_folder(trainer)  # asks all processes
+        folder = run_folder(trainer)  # a collective of all processes
         if self.already_saved or is_trial(trainer):
             return
         self.already_saved = True
         if self.config.trainer.logger in (None, True):
             trainer.loggers = default_loggers(folder)
             for logger in trainer.loggers:
-                _ = logger.experiment  # type: ignore[attr-defined]  # now, as the CSV logger warns of a folder with files
+                _ = logger.experiment  # type: ignore[attr-defined]  # now, because the CSV logger warns about a folder with files
         for callback in trainer.checkpoint_callbacks:
             if isinstance(callback, ModelCheckpoint) and callback.dirpath is None:
                 callback.dirpath = str(folder / "checkpoints")
@@ -100,8 +100,8 @@ class RunStart(SaveConfigCallback):
 class SplatCLI(LightningCLI):
     """``nsvq fit | validate | test | predict | export``.
 
-    The callbacks of a run are options of their own: ``--callbacks.density.max_splats=200000`` changes one number
-    without repeating a list; ``trainer.callbacks`` takes further ones. So are the switches of
+    The callbacks of a run have options of their own: ``--callbacks.density.max_splats=200000`` changes one number
+    without repeating a list; ``trainer.callbacks`` takes further callbacks. So do the switches of
     :mod:`nsvq_lightning.skips`: ``--skips.blocks=false``.
     """
 
@@ -129,7 +129,7 @@ class SplatCLI(LightningCLI):
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
-        """Lightning's subcommands and ours, each with the arguments that are no options."""
+        """Lightning's subcommands and ours, each with the arguments that are not options."""
         return {**LightningCLI.subcommands(), "export": {"model"}}
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
@@ -146,11 +146,11 @@ class SplatCLI(LightningCLI):
 
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
         parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
-        # Export reads no scene: any data module that can be built without options will do.
+        # Export reads no photos: any data module that can be built without options will do.
         data = DemoDataModule if subcommand == "export" else ColmapDataModule
         parser.set_defaults({"data": {"class_path": f"{data.__module__}.{data.__qualname__}"}})
         if subcommand == "predict":
-            # RenderWriter has them on disk; a list of all pictures would only fill the memory.
+            # RenderWriter writes them to disk; a list of all pictures would only fill the memory.
             parser.set_defaults({"return_predictions": False})
         return parser
 
@@ -159,11 +159,11 @@ class SplatCLI(LightningCLI):
         switch(**self._get(self.config, "skips").as_dict())
 
     def _parse_ckpt_path(self) -> None:
-        """Take the model's settings from the checkpoint, but for those on the command line; in ``fit`` none of them.
+        """Take the model's settings from the checkpoint, except those on the command line; in ``fit``, take none.
 
         Raises:
-            FormatError: The checkpoint cannot be used; better said now than after the scene has been loaded.
-            FileNotFoundError: There is none.
+            FormatError: The checkpoint cannot be used; it is better to fail now than after the scene has been loaded.
+            FileNotFoundError: There is no such checkpoint.
         """
         path = self.config[self.config.subcommand].get("ckpt_path")
         if path is not None and path.partition(":")[0] not in NAMED_CHECKPOINTS and "://" not in path:
@@ -183,21 +183,21 @@ class SplatCLI(LightningCLI):
         """Make trainer, module and data.
 
         Raises:
-            ValueError: One of them cannot be made of these settings; the message is that of the cause.
+            ValueError: One of them cannot be made from these settings; the message is that of the cause.
         """
         try:
             super().instantiate_classes()
         except Exception as error:
             cause: BaseException = error
-            while cause.__cause__ is not None:  # the parser adds what it tried besides
+            while cause.__cause__ is not None:  # the parser wraps the cause in what else it tried
                 cause = cause.__cause__
             raise ValueError(" ".join(str(cause).split())) from error
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """The trainer without the callbacks that are null, or switched off with the bar or with checkpoints."""
+        """The trainer without the callbacks that are null, or disabled with the progress bar or checkpoints."""
         parser = self._parser(self.subcommand)
         settings = self._get(self.config_init, "trainer")
-        # Lightning refuses a callback beside the flag, and the default callbacks hold one of each kind.
+        # Lightning refuses such a callback if the flag disables it, and the default callbacks include one of each.
         unwanted: list[type] = [NoneType]
         unwanted += [ProgressBar] if settings.enable_progress_bar is False else []
         unwanted += [Checkpoint] if settings.enable_checkpointing is False else []
@@ -207,11 +207,11 @@ class SplatCLI(LightningCLI):
         if settings.logger in (None, True):
             kwargs["logger"] = False  # until the run has a folder: see RunStart
         if self.subcommand == "validate" and settings.limit_val_batches == 0:
-            kwargs["limit_val_batches"] = 1.0  # 0 is of a config that `fit` has written
+            kwargs["limit_val_batches"] = 1.0  # 0 comes from a config that `fit` has written
         return super().instantiate_trainer(**kwargs)
 
     def _run_subcommand(self, subcommand: str) -> None:
-        """Run it; say how to continue a training that was stopped by whatever it was."""
+        """Run a subcommand; say how to continue if training was stopped, for whatever reason."""
         if subcommand != "export":
             reserve(self.trainer, self.config[subcommand].get("ckpt_path") if subcommand == "fit" else None)
         try:
@@ -229,14 +229,14 @@ class SplatCLI(LightningCLI):
         return next((path for path in paths if path is not None), None)
 
     def after_fit(self) -> None:
-        """Test the decoded file, and say what came out."""
+        """Test the decoded file, and print a summary."""
         if is_trial(self.trainer) or self.trainer.interrupted:
             return
         self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
         self._print_summary()
 
     def after_test(self) -> None:
-        """Say what came out."""
+        """Print a summary."""
         self._print_summary()
 
     def _print_summary(self) -> None:
@@ -246,7 +246,7 @@ class SplatCLI(LightningCLI):
 
 
 def _options_of(group: str, arguments: Sequence[str]) -> list[str]:
-    """The options of a group among arguments, each with its value."""
+    """The options of a group among the arguments, each with its value."""
     found, takes_value = [], False
     for argument in arguments:
         starts = argument.startswith((f"--{group}.", f"--{group}="))
@@ -257,7 +257,7 @@ def _options_of(group: str, arguments: Sequence[str]) -> list[str]:
 
 
 def continuation(arguments: Sequence[str], checkpoint: Path) -> str:
-    """The command that goes on from a checkpoint with the arguments of the run that wrote it, for a shell."""
+    """The shell command that continues from a checkpoint with the arguments of the run that wrote it."""
     as_module = Path(sys.argv[0]).parts[-2:] == ("nsvq_lightning", "__main__.py")
     program = ["python", "-m", "nsvq_lightning"] if as_module else ["nsvq"]
     kept, skip = [], False
@@ -269,7 +269,7 @@ def continuation(arguments: Sequence[str], checkpoint: Path) -> str:
 
 
 def summary(folder: Path, metrics: dict[str, Any]) -> str:
-    """What a run achieved, in a few lines."""
+    """The results of a run, in a few lines."""
     before = metrics["before_quantization"]
     lines = [
         f"{folder}",
@@ -285,7 +285,7 @@ def summary(folder: Path, metrics: dict[str, Any]) -> str:
 
 
 def default_loggers(folder: Path) -> list[Logger]:
-    """A CSV logger that writes into ``folder``, and a TensorBoard logger where that is installed."""
+    """A CSV logger that writes into ``folder``, and a TensorBoard logger if that is installed."""
     place: dict[str, Any] = {"save_dir": folder.parent, "name": "", "version": folder.name}
     loggers: list[Logger] = [CSVLogger(**place)]
     if find_spec("tensorboard") is not None:

@@ -1,4 +1,4 @@
-"""``nsvq info FILE``: what a scene file holds, said without importing torch."""
+"""``nsvq info FILE``: describe a scene file without importing torch."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         0, or 1 after a one-line error if the file cannot be read.
     """
     parser = argparse.ArgumentParser(
-        prog="nsvq info", description="Say what a scene file holds: .nsvq, .ply, .sog, .spz or .splat."
+        prog="nsvq info", description="Describe a scene file: .nsvq, .ply, .sog, .spz or .splat."
     )
     parser.add_argument("file", type=Path, metavar="FILE", help="scene file")
     parser.add_argument("--json", action="store_true", help="print the description as JSON")
@@ -68,13 +68,13 @@ def _text(facts: dict[str, Any]) -> str:
         (s["name"], s["encoding"], s["bytes"], f"{8 * s['bytes'] / splats:.2f}", f"{100 * s['bytes'] / whole:.1f} %")
         for s in facts["streams"]
     )
-    parts.append(_table(("stream", "encoding", "bytes", "bits a splat", "share"), shares))
+    parts.append(_table(("stream", "encoding", "bytes", "bits per splat", "share"), shares))
     parts += [f"{key}\n{_indented(facts[key])}" for key in ("metrics", "config") if facts.get(key)]
     return "\n\n".join(parts)
 
 
 def _table(head: tuple[str, ...], rows: Iterable[tuple[str | int, ...]]) -> str:
-    """Two columns of words, then columns of numbers; 0 is shown as a dash."""
+    """A table of two columns of words, then columns of numbers; 0 is shown as a dash."""
     lines = [head, *(tuple(_cell(value) for value in row) for row in rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
@@ -92,5 +92,5 @@ def _cell(value: str | int) -> str:
 
 def _indented(value: object) -> str:
     text = json.dumps(value, indent=2, ensure_ascii=False)
-    # The outer braces carry nothing; the lines between them are indented by two already.
+    # Drop the outer braces; the lines between them are already indented by two.
     return "\n".join(text.splitlines()[1:-1])

@@ -1,7 +1,7 @@
-"""The ``lightning`` command: our subcommands, and a way through to other distributions that install the same name.
+"""The ``lightning`` command: our subcommands, and a passthrough to other distributions that install the same name.
 
 Lightning itself has shipped no ``lightning`` script since 2.5.1, but lightning-sdk and litserve do, and pip lets the
-distribution installed last own the name. This one runs ``lightning fit`` and hands on what it does not know.
+distribution installed last own the name. This one runs ``lightning fit`` and passes on what it does not know.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run ``lightning ARGUMENTS``.
 
     Args:
-        argv: Arguments; those of the process if None. No word, or an option first, is ours too.
+        argv: Arguments; those of the process if None. No arguments, or an option first, is ours too.
 
     Returns:
-        Exit status: that of our command or of the other distribution's; 2 if nobody knows the word.
+        Exit status: that of our command or of the other distribution's; 2 if none knows the command.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0].startswith("-") or arguments[0] in COMMANDS:

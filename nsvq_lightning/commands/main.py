@@ -1,4 +1,4 @@
-"""The ``nsvq`` command. Kept light: ``nsvq info`` must answer before torch would be imported."""
+"""The ``nsvq`` command. Kept light: ``nsvq info`` must answer without importing torch."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ TRACEBACK = "NSVQ_TRACEBACK"
 """Environment variable that makes errors show their traceback."""
 
 NOT_ACTIONABLE = (
-    "does not have many workers",  # views come from a cache in memory; workers would each hold a copy
-    "args parameter is intended",  # we pass the arguments after looking configs up
+    "does not have many workers",  # views come from a cache in memory; each worker would hold a copy
+    "args parameter is intended",  # we pass the arguments after looking up configs
     "dataloader.*no length",
     "LeafSpec",
     "Checkpoint directory .* exists and is not empty",
     "`tensorboardX` has been removed",
 )
-"""Parts of warnings of Lightning and torch that a user of this command can do nothing about."""
+"""Fragments of Lightning's and torch's warnings that a user of this command can do nothing about."""
 
 NOT_OURS = ("Tip:", "TPU available", "HPU available", "litlogger", "litmodels", "`Trainer.fit` stopped")
-"""Parts of what Lightning says that advertise, or say what the bar has said already, in the middle of its line."""
+"""Fragments of Lightning's messages that advertise, or repeat the progress bar in the middle of its line."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments[0] == "--version":
         sys.stdout.write(f"nsvq {__version__}\n")
         return 0
-    if isinstance(sys.stdout, io.TextIOWrapper):  # a pipe on Windows, say, can take only the letters of the locale
+    if isinstance(sys.stdout, io.TextIOWrapper):  # for example, a pipe on Windows accepts only the locale's characters
         sys.stdout.reconfigure(errors="replace")
     try:
         if arguments[0] in COMMANDS and (module := COMMANDS[arguments[0]].module) is not None:
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if error.name != "cv2":
             raise
-        sys.stderr.write("error: there is no OpenCV (cv2): pip install opencv-contrib-python-headless, or any other\n")
+        sys.stderr.write("error: OpenCV (cv2) is missing: pip install opencv-contrib-python-headless, or any other\n")
         return 1
 
 
@@ -74,7 +74,7 @@ def _run_lightning(arguments: list[str]) -> int:
     from nsvq_lightning.commands.fit import SplatCLI
 
     _quiet_lightning()
-    if os.getcwd() not in sys.path:  # last, unlike `python -m`: for quantizers and callbacks of one's own
+    if os.getcwd() not in sys.path:  # last, unlike `python -m`: for the user's own quantizers and callbacks
         sys.path.append(os.getcwd())
     configs = configs_among(arguments)
     try:
@@ -82,7 +82,7 @@ def _run_lightning(arguments: list[str]) -> int:
             check_config(config)
         SplatCLI(arguments)
     except SIGTERMException:  # a kind of SystemExit
-        return 128 + signal.SIGTERM  # Lightning's own exit status is that of success
+        return 128 + signal.SIGTERM  # Lightning itself would exit with the status of success
     except SystemExit as end:
         if end.code == 2 and configs:  # the parser's messages name the option, not the file it came from
             sys.stderr.write(f"Settings came from {', '.join(configs)} and the command line\n")
@@ -103,9 +103,9 @@ def _run_lightning(arguments: list[str]) -> int:
 
 
 def _is_ours(error: BaseException) -> bool:
-    """Whether this package raised the error: its message then says what to do, and a traceback would only hide it.
+    """Whether this package raised the error: its message then says what to do, and a traceback would only obscure it.
 
-    Errors of other kinds than these are mistakes of ours, whose place matters.
+    Errors of other kinds are bugs of ours, for which the traceback matters.
     """
     if not isinstance(error, ValueError | TypeError | OSError | RuntimeError | ArithmeticError | ImportError):
         return False
@@ -116,7 +116,7 @@ def _is_ours(error: BaseException) -> bool:
 
 
 class BarHandler(logging.StreamHandler[TextIO]):
-    """Writes to stderr, above a progress bar where there is one."""
+    """Writes to stderr, above a progress bar if there is one."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a record."""
@@ -129,13 +129,13 @@ class BarHandler(logging.StreamHandler[TextIO]):
 
 
 def _quiet_lightning() -> None:
-    """Show our log messages, once; of Lightning's only those that are not advertisements."""
+    """Show our log messages, once; of Lightning's, only those that are not advertisements."""
     from lightning.pytorch.utilities import rank_zero_only
 
     logging.basicConfig(format="%(message)s", handlers=[BarHandler()])
     logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
     for handler in logging.getLogger().handlers:
-        # Of several processes the first one speaks; what goes wrong on another is said there.
+        # With several processes, only the first logs below warnings; each logs its own warnings and errors.
         handler.addFilter(lambda record: record.levelno >= logging.WARNING or getattr(rank_zero_only, "rank", 0) == 0)
 
     def keep(record: logging.LogRecord) -> bool:

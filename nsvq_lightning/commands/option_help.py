@@ -1,7 +1,7 @@
-"""What ``nsvq fit --help`` prints: every option once, with its default and a sentence on it.
+"""What ``nsvq fit --help`` prints: every option once, with its default and a one-sentence description.
 
-The parser's own help lists all classes that any option might take, those of torch included, and none of the options
-that the default callbacks have.
+The parser's own help lists all classes that any option might take, even those of torch, but none of the options of the
+default callbacks.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import docstring_parser
 __all__ = ["class_help", "command_help", "first_sentence"]
 
 WIDEST = 100
-"""Columns that text is wrapped to on a wider terminal."""
+"""Largest width in columns to which text is wrapped, even on a wider terminal."""
 
 
 class Option(NamedTuple):
@@ -32,12 +32,12 @@ class Option(NamedTuple):
 
 
 def command_help(parser: ArgumentParser, command: str, classes: Mapping[str, type]) -> str:
-    """Help of a command.
+    """Help text of a command.
 
     Args:
         parser: Its parser, with options named ``group.name``.
         command: Its name.
-        classes: Class whose constructor's arguments are options, too, by their prefix.
+        classes: Classes, by prefix, whose constructor arguments are also options.
     """
     groups: dict[str, list[Option]] = {"run": [], "model": [], "skips": [], "trainer": []}
     for action in parser._actions:
@@ -61,7 +61,7 @@ def command_help(parser: ArgumentParser, command: str, classes: Mapping[str, typ
 
 
 def class_help(prefix: str, kind: type) -> str:
-    """Help of the options of a class, all named ``prefix.…``."""
+    """Help text for the options of a class, all named ``prefix.…``."""
     return _section(prefix, _class_options(prefix, kind), f"{first_sentence(kind.__doc__)}.")
 
 
@@ -73,7 +73,7 @@ def first_sentence(text: str | None) -> str:
 
 
 def _class_options(prefix: str, kind: type) -> Iterator[Option]:
-    """The options of a class from its constructor and its docstring, those of dataclasses among them in their place.
+    """The options of a class from its constructor and docstring, with dataclass arguments expanded in place.
 
     Args:
         prefix: Name in front, such as ``callbacks.density``.
@@ -91,7 +91,7 @@ def _class_options(prefix: str, kind: type) -> Iterator[Option]:
 
 
 def _section(title: str, options: Iterable[Option], introduction: str = "") -> str:
-    """A section of the help: the title, and for each option a line with its default and its text below."""
+    """A section of the help: the title, and for each option a line with its default, and its text below."""
     lines = [f"{title}:", *_wrapped(introduction, "  ")]
     for option in options:
         lines.append(f"  --{option.name}{_default(option.default)}")
@@ -100,7 +100,7 @@ def _section(title: str, options: Iterable[Option], introduction: str = "") -> s
 
 
 def _texts(kind: type) -> Mapping[str, str]:
-    """First sentence on each argument or attribute by name, from the docstring."""
+    """First sentence for each argument or attribute by name, from the docstring."""
     found = docstring_parser.parse(inspect.getdoc(kind) or "", docstring_parser.DocstringStyle.GOOGLE).params
     return {each.arg_name.lstrip("*"): first_sentence(each.description) for each in found}
 
@@ -111,7 +111,7 @@ def _wrapped(text: str, indent: str) -> list[str]:
 
 
 def _default(value: Any) -> str:
-    """``=default`` as one would type it; nothing where there is none."""
+    """``=default`` as one would type it; empty if there is no default."""
     if value is inspect.Parameter.empty:
         return ""
     if value is None or isinstance(value, bool):

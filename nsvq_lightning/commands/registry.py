@@ -1,4 +1,4 @@
-"""The words that may follow ``nsvq``. Light: nothing is imported here."""
+"""The commands that may follow ``nsvq``. Light: it imports no heavy modules."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class Command(NamedTuple):
 
     summary: str
     module: str | None = None
-    """Where its ``main(argv)`` is; None for those that Lightning's command line runs, whose start takes seconds."""
+    """Module of its ``main(argv)``; None for those that Lightning's command line runs, which takes seconds to start."""
 
 
 COMMANDS = {
@@ -25,7 +25,7 @@ COMMANDS = {
     "convert": Command("write a scene file in another format", "nsvq_lightning.commands.convert"),
     "compress": Command("make an existing splat file small", "nsvq_lightning.commands.compress"),
     "sweep": Command("train many runs and compare them", "nsvq_lightning.commands.sweep.cli"),
-    "doctor": Command("say whether this machine and a scene folder are fit", "nsvq_lightning.commands.doctor.cli"),
+    "doctor": Command("check whether this machine and a scene folder are fit", "nsvq_lightning.commands.doctor.cli"),
     "benchmark": Command("measure run time against error on this machine", "nsvq_lightning.commands.benchmark.cli"),
 }
 """All commands by name."""

@@ -1,4 +1,4 @@
-"""What quantization does to the covariances of splats, and the canonical form that it hurts least."""
+"""The error that quantization makes in the covariances of splats, by canonical form."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nsvq_lightning.splats.forms import FORMS, Form, canonical
 __all__ = ["covariance_error", "covariances", "form_errors"]
 
 SAMPLE = 1 << 15
-"""Splats that are enough to tell the forms apart."""
+"""Size of a sample of splats that is enough to rank the forms."""
 
 
 def covariances(scales: Tensor, quats: Tensor) -> Tensor:
@@ -27,7 +27,7 @@ def covariances(scales: Tensor, quats: Tensor) -> Tensor:
 
 
 def covariance_error(found: Tensor, exact: Tensor) -> float:
-    """Mean of ‖Σ̂ − Σ‖ / ‖Σ‖ in the Frobenius norm over ``[N, 3, 3]``: the same for splats of every size."""
+    """Mean of ‖Σ̂ − Σ‖ / ‖Σ‖ in the Frobenius norm over ``[N, 3, 3]``: independent of the size of the splats."""
     norm = torch.linalg.matrix_norm
     return float((norm(found - exact) / norm(exact).clamp_min(torch.finfo(exact.dtype).tiny)).mean())
 
@@ -38,7 +38,7 @@ def form_errors(
 ) -> dict[Form, float]:
     """:func:`covariance_error` of k-means on a sample of the splats, for every canonical form.
 
-    A sample gets codes in proportion, so that a code stands for as many splats as it will.
+    A sample gets proportionally fewer codes, so that a code represents as many splats as it will in the whole scene.
 
     Args:
         scales: Log-scales ``[N, 3]``, N > 0.

@@ -1,4 +1,4 @@
-"""How much each splat matters for the photos: the light it sends into them."""
+"""How much each splat matters for the photos: its total blending weight in them."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ def contributions(
 ) -> Tensor:
     """Blending weight T·α of each splat, summed over all pixels of all cameras: ``[N]``, in pixels.
 
-    An image is linear in the colours of its splats, so the weight is the derivative of the sum of the pixels by the
-    splat's colour: one backward pass a view gives it for all splats, with everything the rasterizer leaves out left
-    out here too.
+    An image is linear in the colours of its splats, so the weight is the derivative of the sum of the pixels with
+    respect to the splat's colour: one backward pass per view gives it for all splats, and what the rasterizer skips is
+    skipped here too.
 
     Args:
         splats: Raw attributes.
-        cameras: The views; those of several processes may be shared out and their results added.
+        cameras: The views; they may be divided among processes, and the results added.
         render: The rasterizer.
     """
     base = RawSplats(*(getattr(splats, name).detach() for name in RawSplats._fields))
-    # Any colour above 0 will do, where it is not clamped: sh0 = 0 is grey.
+    # Any colour above 0, where it is not clamped, will do: sh0 = 0 is grey.
     sh0 = torch.zeros_like(base.sh0).requires_grad_()
     grey = base._replace(sh0=sh0, shN=base.shN[:, :0])
     total = torch.zeros_like(base.opacities)
@@ -43,7 +43,7 @@ def contributions(
 
 
 def least_contributing(contribution: Tensor, share: float) -> Tensor:
-    """Mask ``[N]`` of the splats that contribute least, as many as together have at most ``share`` of the sum.
+    """Mask ``[N]`` of the least contributing splats: as many as together have at most ``share`` of the sum.
 
     Args:
         contribution: Contribution ``[N]``, not negative.
@@ -56,11 +56,11 @@ def least_contributing(contribution: Tensor, share: float) -> Tensor:
 
 
 def most_contributing(contribution: Tensor, count: int) -> Tensor:
-    """Mask ``[N]`` of the ``count`` splats that contribute most; of equals the first.
+    """Mask ``[N]`` of the ``count`` splats that contribute most; ties go to the first.
 
     Args:
         contribution: Contribution ``[N]``.
-        count: How many, at most N.
+        count: Number of splats, at most N.
     """
     mask = torch.zeros_like(contribution, dtype=torch.bool)
     mask[contribution.argsort(descending=True, stable=True)[:count]] = True
@@ -68,8 +68,8 @@ def most_contributing(contribution: Tensor, count: int) -> Tensor:
 
 
 def row_weights(contribution: Tensor) -> Tensor:
-    """Weights ``[N]`` in k-means of splats with ``contribution [N]``: never 0, as test views may see what no photo saw.
+    """k-means weights ``[N]`` of splats with ``contribution [N]``: never 0, as test views may see what no photo saw.
 
-    The least weight is a hundredth of the mean.
+    The smallest weight is a hundredth of the mean.
     """
     return contribution + (0.01 * contribution.mean()).clamp_min(torch.finfo(contribution.dtype).tiny)

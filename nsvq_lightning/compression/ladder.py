@@ -1,4 +1,4 @@
-"""Compress a scene that is trained already: k-means, and the smallest of several settings that is good enough."""
+"""Compress a scene that is already trained: k-means, and the smallest of several settings that is good enough."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Rung:
-    """One setting between large and exact, and small.
+    """One compression setting, between large and exact, and small.
 
     Attributes:
         name: What messages call it.
-        codebooks: Codes by attribute; empty without codebooks.
+        codebooks: Number of codes by attribute; empty for no codebooks.
         coarseness: Factor on the errors of :class:`~nsvq_lightning.io.nsvq.precision.Precision`.
     """
 
@@ -55,7 +55,7 @@ def _sizes(codes: int) -> dict[str, int]:
 
 PLAIN = Rung("no codebooks", {})
 PLAINS: tuple[Rung, ...] = (Rung("no codebooks, a quarter of the errors", {}, 0.25), PLAIN)
-"""Settings without codebooks. They need no k-means, and are the smaller ones where splats are few."""
+"""Settings without codebooks. They need no k-means, and give smaller files where splats are few."""
 
 LADDER: tuple[Rung, ...] = (
     *(Rung(f"{codes // 1024}k", _sizes(codes), 0.5) for codes in (1 << 17, 1 << 16, 1 << 15)),
@@ -73,9 +73,9 @@ class Candidate:
     Attributes:
         rung: The setting.
         scene: What is stored.
-        storage: How.
-        data: The file.
-        error: Root mean square difference of its pictures to those of the original, of channels in [0, 1].
+        storage: How it is stored.
+        data: The file's bytes.
+        error: Root mean square difference between its pictures and those of the original, for channels in [0, 1].
     """
 
     rung: Rung
@@ -93,15 +93,15 @@ class Candidate:
 class Compressor:
     """Compresses one scene at any rung, each at most once.
 
-    Before k-means, scales too small to show are raised, scales and rotations take the canonical form that suits the
-    scene, and codes of rotations and colours are placed by how much each splat contributes to the pictures.
+    Before k-means, scales too small to be visible are raised, and scales and rotations take the canonical form that
+    suits the scene; k-means weights rotations and colours by how much each splat contributes to the pictures.
 
     Args:
         splats: The scene, finite.
-        cameras: Views that errors and contributions are measured in.
-        storage: Level and precision, which rungs make coarser or finer.
+        cameras: Views in which errors and contributions are measured.
+        storage: Level, and the precision, which rungs make coarser or finer.
         seed: Seed of k-means.
-        origin: World coordinates of the point (0, 0, 0) of the positions; files keep it.
+        origin: World coordinates of the point (0, 0, 0) of the positions, stored in files.
 
     Raises:
         ValueError: There are no splats, or no camera shows any of them.
@@ -129,12 +129,12 @@ class Compressor:
 
     @cached_property
     def _weights(self) -> Tensor:
-        """Weight of each splat ``[N]`` in k-means; only codebooks need it."""
+        """k-means weight of each splat ``[N]``; only codebooks need it."""
         return row_weights(contributions(self._splats, self._cameras, render))
 
     @cached_property
     def _log_floor(self) -> float | None:
-        """Log-scale below which a splat's extent does not show."""
+        """Log-scale below which a splat's extent is not visible."""
         return scale_floor(self._splats.means, self._cameras)
 
     def at(self, rung: Rung) -> Candidate:
@@ -146,7 +146,7 @@ class Compressor:
         return self._done[rung.name]
 
     def error(self, data: bytes) -> float:
-        """Root mean square difference of the pictures of a ``.nsvq`` file to those of the scene."""
+        """Root mean square difference between the pictures of a ``.nsvq`` file and those of the scene."""
         splats = RawSplats(*(tensor.detach() for tensor in decode(*unframe(data)).decode().raw()))
         return picture_error(splats, self._cameras, self._pictures)
 
@@ -167,7 +167,7 @@ class Compressor:
             rows = attribute_rows(splats, name)
             if rows.shape[1] == 0:
                 continue
-            # Scales spread over many sizes, of which each counts; a weight would leave the small ones none.
+            # Scales cover many sizes, all of which count; weights would leave no codes for the small ones.
             scales = name == "scales"
             quantizer = NSVQ(codes, rows.shape[1], start="spread" if scales else "sample")
             weight = None if scales else self._weights
@@ -232,7 +232,7 @@ def _error_first(candidate: Candidate) -> tuple[float, int]:
 
 
 def _last(holds: Callable[[Rung], bool]) -> Rung | None:
-    """The last rung of the ladder for which something holds that holds up to some rung and not after it, or None."""
+    """The last rung for which a condition holds, or None; it must hold up to some rung and not after it."""
     low, high = -1, len(LADDER)
     while high - low > 1:
         middle = (low + high) // 2

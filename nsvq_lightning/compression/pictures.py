@@ -1,4 +1,4 @@
-"""Cameras for a scene that came without any: around it, looking at where most of its splats are."""
+"""Cameras for a scene without any: around it, looking at where most of its splats are."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ __all__ = ["cameras_around", "decibels", "look_at", "measuring_cameras", "middle
 
 SYNTHETIC_CAMERAS = 8
 MOST_CAMERAS = 24
-"""Train views that errors are measured in, spread evenly over the folder's."""
+"""Number of train views in which errors are measured, spread evenly over those of the folder."""
 
 ELEVATIONS = (0.1, 0.5)
-"""Radians above the horizon, y down, in turns."""
+"""Elevations above the horizon in radians, y down, used in turn."""
 
 
 def look_at(target: NDArray[np.float64], eye: NDArray[np.float64], width: int, height: int, angle: float) -> Camera:
@@ -50,7 +50,7 @@ def look_at(target: NDArray[np.float64], eye: NDArray[np.float64], width: int, h
 
 
 def middle_of(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
-    """The median ``[3]`` of positions ``[N, 3]``, N > 0, and the distance from it that holds four fifths of them."""
+    """The median ``[3]`` of positions ``[N, 3]``, N > 0, and the distance from it within which four fifths lie."""
     points = means.astype(np.float64)
     middle = np.median(points, axis=0)
     return middle, max(float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.8)), 1e-3)
@@ -59,7 +59,7 @@ def middle_of(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
 def cameras_around(means: NDArray[np.float32], count: int, width: int = 800, height: int = 533) -> list[Camera]:
     """Cameras on a ring around a scene, alternately low and high, twice as far as four fifths of its splats reach.
 
-    They stand farther off, with a narrower view of the same, where the scene is so small that it would be too near.
+    If the scene is so small that this would be too near, they are farther away, with a narrower field of view.
 
     Args:
         means: Positions ``[N, 3]``, N > 0.
@@ -80,14 +80,14 @@ def cameras_around(means: NDArray[np.float32], count: int, width: int = 800, hei
 
 
 def measuring_cameras(root: Path | None, means: NDArray[np.float32]) -> list[Camera]:
-    """Views that errors are measured in.
+    """Views in which errors are measured.
 
     Args:
-        root: COLMAP folder whose train views they are; None for views from around the scene.
+        root: COLMAP folder whose train views are used; None for views from around the scene.
         means: Positions ``[N, 3]``, N > 0.
 
     Raises:
-        SceneError: The folder is no COLMAP scene.
+        SceneError: The folder is not a COLMAP scene.
     """
     if root is None:
         return cameras_around(means, SYNTHETIC_CAMERAS)
@@ -105,11 +105,11 @@ def pictures(splats: SplatTensors, cameras: Sequence[Camera]) -> list[Tensor]:
 
 
 def picture_error(splats: SplatTensors, cameras: Sequence[Camera], expected: Sequence[Tensor]) -> float:
-    """Root mean square difference between the pictures of a scene and expected ones, of channels in [0, 1]."""
+    """Root mean square difference between the pictures of a scene and expected ones, for channels in [0, 1]."""
     found = zip(pictures(splats, cameras), expected, strict=True)
     return math.sqrt(float(np.mean([float((a - b).double().square().mean()) for a, b in found])))
 
 
 def decibels(error: float) -> float:
-    """An error as PSNR."""
+    """A root mean square error as PSNR in dB."""
     return math.inf if error == 0 else -20 * math.log10(error)

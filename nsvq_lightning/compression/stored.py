@@ -31,7 +31,7 @@ def compress(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> Compress
         splats: Raw attributes.
         quantizers: Quantizer by attribute; empty stores everything as it is.
     """
-    # Before they are quantized: the code of a row with NaN would be finite.
+    # Check before quantizing: the code of a row with NaN would be finite.
     finite, culprits = finite_rows(splats._asdict())
     scene = CompressedScene(
         means=_numpy(splats.means),
@@ -48,9 +48,9 @@ def compress(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> Compress
 
 
 def formula_bytes(scene: CompressedScene, header_bytes: int) -> int:
-    """Bytes the paper's count gives: 16·N + ⌈N·Σ bits / 8⌉ + Σ 4·K·D + header, plus 4·N·D of what is not quantized.
+    """Bytes the paper's count gives: 16·N + ⌈N·Σ bits / 8⌉ + Σ 4·K·D + header, plus 4·N·D for what is not quantized.
 
-    Counted here from the numbers of the scene alone, independently of the code that writes the file.
+    It is computed from the scene's counts alone, independently of the code that writes the file.
     """
     n = len(scene)
     bits = sum((len(codebook) - 1).bit_length() for codebook in scene.codebooks.values())

@@ -1,7 +1,7 @@
-"""How long kernels have been compiled for in this process, and a word when that begins.
+"""How long this process has spent compiling kernels, and a log line when compilation begins.
 
-A kernel is compiled once on a machine, at its first call, and then found on the disk. That is neither training nor a
-reason to worry, so clocks leave it out and progress says what is going on.
+A kernel is compiled at its first call on a machine and read from the disk cache from then on. Compiling is not
+training, so clocks leave it out, and it can look like a hang, so the progress display says what is going on.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Watcher = Callable[[bool], None]
 
 
 class _Clock(event.Listener):
-    """Adds up Numba's compilations; one that a kernel needs of its helpers happens within its own."""
+    """Adds up the time of Numba's compilations; compiling a kernel includes compiling its helpers."""
 
     def __init__(self) -> None:
         self.watchers: list[Watcher] = []
@@ -34,7 +34,7 @@ class _Clock(event.Listener):
 
     @property
     def seconds(self) -> float:
-        """Seconds so far, up to this moment."""
+        """Seconds so far, including the compilation in progress."""
         return self._seconds + (time.perf_counter() - self._since if self._depth else 0.0)
 
     def on_start(self, _: Any) -> None:
@@ -44,7 +44,7 @@ class _Clock(event.Listener):
         self._since = time.perf_counter()
         if not self._announced:
             self._announced = True
-            log.info("compiling kernels, once on this machine: one to three minutes in all, as they are needed")
+            log.info("compiling kernels as they are needed, once on this machine: one to three minutes in all")
         for watcher in self.watchers:
             watcher(True)
 
@@ -62,13 +62,13 @@ event.register("numba:compile", _clock)
 
 
 def compile_seconds() -> float:
-    """Seconds spent compiling CPU kernels in this process so far; those found on the disk take none."""
+    """Seconds spent compiling CPU kernels in this process so far; cached kernels take none."""
     return _clock.seconds
 
 
 @contextmanager
 def compile_watcher(watcher: Watcher) -> Iterator[None]:
-    """Tell ``watcher`` within the block whenever a compilation begins or ends."""
+    """Call ``watcher`` whenever a compilation begins or ends within the block."""
     _clock.watchers.append(watcher)
     try:
         yield

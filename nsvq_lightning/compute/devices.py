@@ -1,4 +1,4 @@
-"""Which compiled kernels take a tensor. All fast paths ask here; a kind of tensor gets one answer for the whole run."""
+"""Which compiled kernels take a tensor. All fast paths ask here; the answer for a dtype and device never changes."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ __all__ = ["kernels_for", "not_on_cuda", "triton_obstacle"]
 
 
 def kernels_for(like: Tensor) -> Literal["cpu", "cuda"] | None:
-    """``cpu`` (Numba) or ``cuda`` (Triton) for float32 tensors there; None where plain torch must do.
+    """``cpu`` (Numba) or ``cuda`` (Triton) for float32 tensors on that device; None where only plain torch works.
 
-    None is any other dtype or device, and a CUDA device without Triton. Under Triton's interpreter tensors on the CPU
-    still go to Numba: it is for tests, which call the kernels by name.
+    None is for any other dtype or device, and for CUDA without Triton. Under Triton's interpreter, tensors on the CPU
+    still go to Numba: the interpreter is for tests, which call the Triton kernels directly.
     """
     return _kernels_for(like.dtype, like.device.type)
 
@@ -32,20 +32,20 @@ def _kernels_for(dtype: torch.dtype, device: str) -> Literal["cpu", "cuda"] | No
 
 
 def triton_obstacle(like: Tensor) -> str | None:
-    """Why Triton's kernels cannot take tensors such as ``like``, with a way out; None where they can."""
+    """Why Triton's kernels cannot take tensors such as ``like``, with a remedy; None where they can."""
     problem = None if _interpreted() and like.dtype == torch.float32 else not_on_cuda(like)
     if problem is None and not _has_triton():
-        return "it needs Triton, which a CUDA build of PyTorch for Linux brings along (pip install triton)"
+        return "it needs Triton, which comes with CUDA builds of PyTorch for Linux (pip install triton)"
     return problem
 
 
 def not_on_cuda(like: Tensor) -> str | None:
-    """Why kernels of a GPU cannot take tensors such as ``like``, with a way out; None for float32 on a CUDA device."""
+    """Why GPU kernels cannot take tensors such as ``like``, with a remedy; None for float32 on a CUDA device."""
     if like.is_cuda and like.dtype == torch.float32:
         return None
     help_ = "move the splats (nsvq fit --trainer.accelerator=cuda)"
     if not torch.cuda.is_available():
-        help_ = "torch finds no CUDA device here, nsvq doctor says why"
+        help_ = "torch finds no CUDA device here (nsvq doctor says why)"
     return f"it renders float32 tensors on a CUDA device, got {like.dtype} on {like.device}; {help_}"
 
 

@@ -14,10 +14,10 @@ from nsvq_lightning.compute.stamp import KernelStore
 __all__ = ["F", "inline", "kernel", "thread_count"]
 
 F = np.float32
-"""Numbers written in kernels have its type: Python's own would widen what they meet to float64."""
+"""Type of the numeric literals in kernels; Python floats would promote their operands to float64."""
 
 _OPTIONS: dict[str, Any] = {
-    # Products and sums may fuse; NaN and infinity keep their meaning because the guards of this package rely on them.
+    # Products and sums may fuse; NaN and infinity keep their meaning because this package's guards rely on them.
     "fastmath": {"contract", "nsz"},
     "error_model": "numpy",
     "boundscheck": False,
@@ -31,12 +31,13 @@ def inline(function: Callable[..., Any]) -> Any:
 
 
 def kernel(function: Callable[..., Any], parallel: bool = True, allocates: bool = True) -> Any:
-    """Compile a kernel once a machine and keep it on disk. To wake the threads costs more than some need in all.
+    """Compile a kernel once per machine and cache it on disk.
 
-    One that makes no arrays of its own may say so: arrays that it passes to inlined helpers are then not counted up and
-    down, by atomic operations, at every call. A loop of few instructions becomes seven times as fast.
+    Small kernels pass ``parallel=False``: waking the threads costs more than they take. A kernel that allocates no
+    arrays may pass ``allocates=False``: the arrays that it passes to inlined helpers are then not reference-counted,
+    with atomic operations, at every call, and a loop of few instructions becomes seven times as fast.
 
-    A stored one is compiled again when what it is made of has changed (:mod:`nsvq_lightning.compute.stamp`).
+    A cached kernel is compiled again when anything it is built from has changed (:mod:`nsvq_lightning.compute.stamp`).
     """
     dispatcher = numba.njit(parallel=parallel, _nrt=allocates, **_OPTIONS)(function)
     dispatcher._cache = KernelStore(function)
@@ -44,7 +45,7 @@ def kernel(function: Callable[..., Any], parallel: bool = True, allocates: bool 
 
 
 def thread_count() -> int:
-    """Threads that kernels use: torch's setting, so that one knob rules both."""
+    """Number of threads that kernels use: torch's setting, so that one setting controls both."""
     count = max(1, min(torch.get_num_threads(), int(numba.config.NUMBA_NUM_THREADS)))
     numba.set_num_threads(count)
     return count

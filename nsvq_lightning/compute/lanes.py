@@ -1,12 +1,12 @@
 """A vector of 16 floats for Numba kernels.
 
-Numba vectorizes plain loops only when LLVM feels like it; the kernels of this package say what they want instead.
+Whether Numba vectorizes a plain loop is up to LLVM; the kernels of this package vectorize explicitly instead.
 ``Lanes`` and ``Mask`` are Numba types that hold one LLVM ``<16 x float>`` and ``<16 x i1>``. LLVM turns them into one
 AVX-512, two AVX2 or four NEON/SSE registers, so one source serves every CPU. Operators work between two vectors;
 scalars enter through :func:`broadcast`. All functions here are intrinsics: they only exist inside ``@njit`` code.
 
 Conventions: a memory argument is a pair (one-dimensional contiguous array, element offset); nothing is
-bounds-checked. Floating-point code may be contracted (a·b + c in one rounding), never reassociated, so NaN and
+bounds-checked. Floating-point code may be contracted (a·b + c with one rounding) but never reassociated, so NaN and
 infinity keep their meaning.
 """
 
@@ -50,7 +50,7 @@ class _VectorModel(models.PrimitiveModel):
 
 
 def _operator(symbol: Callable[..., Any], result: types.Type, arguments: tuple[types.Type, ...], emit: Any) -> None:
-    """Give ``symbol`` a meaning for vector arguments; ``emit(builder, *values)`` builds the instructions."""
+    """Define the operator ``symbol`` for vector arguments; ``emit(builder, *values)`` builds the instructions."""
     name = f"_{symbol.__name__}_{'_'.join(argument.name for argument in arguments)}"
     infer_global(symbol)(type(name, (ConcreteTemplate,), {"cases": [signature(result, *arguments)]}))
     lower_builtin(symbol, *arguments)(lambda context, builder, sig, values: emit(builder, *values))
@@ -107,8 +107,8 @@ def _llvm(builder: Any, name: str, result: Any, values: Sequence[Any]) -> Any:
 
 
 def _fused(builder: Any, x: Any, y: Any, z: Any) -> Any:
-    # Not llvm.fma: where the processor that is compiled for has no such instruction, that calls a library function for
-    # every lane. This one then multiplies and adds.
+    # Not llvm.fma: where the target processor lacks that instruction, llvm.fma calls a library function for every lane,
+    # while llvm.fmuladd multiplies and adds.
     return _llvm(builder, "llvm.fmuladd.v16f32", _VF, [x, y, z])
 
 
@@ -204,13 +204,13 @@ def fetch_add(context, builder, sig, values):
 
 @_function(Lanes, 3)
 def fma(context, builder, sig, values):
-    """``x * y + z`` in one rounding, where the processor has that."""
+    """``x * y + z``, with one rounding where the processor supports it."""
     return _fused(builder, *values)
 
 
 @_function(Lanes, 3)
 def fnma(context, builder, sig, values):
-    """``z - x * y`` in one rounding, where the processor has that."""
+    """``z - x * y``, with one rounding where the processor supports it."""
     return _fused(builder, builder.fneg(values[0]), values[1], values[2])
 
 
@@ -261,7 +261,7 @@ def exp2_clamped(context, builder, sig, values):
 
 
 def _exp2(builder: Any, x: Any) -> Any:
-    # Adding 1.5·2^23 rounds to an integer that stands in the low bits of the sum, ready to become an exponent.
+    # Adding 1.5·2^23 rounds to an integer in the low bits of the sum, ready to become an exponent.
     magic = _constant(12582912.0)
     shifted = builder.fadd(x, magic)
     fraction = builder.fsub(x, builder.fsub(shifted, magic))
@@ -355,7 +355,7 @@ def lane_sums(context, builder, sig, values):
     vectors += [None] * (WIDTH - len(vectors))
     zero = _constant(0.0)
     for step in (1, 2, 4, 8):
-        # Lanes with this bit belong to the second of two vectors from now on; each takes in its neighbour's half.
+        # Lanes with this bit now belong to the second of two vectors; each lane adds its partner's half sum.
         second_half = [bool(lane & step) for lane in range(WIDTH)]
         kept = ir.Constant(_VM, second_half)
         moved = [(lane ^ step) + WIDTH * of_second for lane, of_second in enumerate(second_half)]
@@ -457,7 +457,7 @@ scatter_rows1, scatter_rows3, scatter_rows4 = (_scatterer(columns) for columns i
 
 
 def _split_columns(builder: Any, parts: Sequence[Any], columns: int) -> list[Any]:
-    """From vectors of consecutive memory, element (row, column) at row·columns + column, to one vector a column."""
+    """Turn vectors of consecutive memory, element (row, column) at row·columns + column, into one vector per column."""
     flat = [(part, lane) for part in range(columns) for lane in range(WIDTH)]
     result = []
     for column in range(columns):
@@ -496,7 +496,7 @@ load_rows4 = _row_loader(4)
 def load_rgb_block(context, builder, sig, values):
     """``load_rgb_block(image, offset, stride)``: a 4x4 block of an interleaved RGB image as three vectors.
 
-    ``offset`` is the element of the block's first pixel, ``stride`` the floats from one image row to the next.
+    ``offset`` is the element of the block's first pixel, ``stride`` the floats between the starts of two image rows.
     """
     image, offset, stride = values
     rows = []

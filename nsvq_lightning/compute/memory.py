@@ -1,4 +1,4 @@
-"""Tensors and arrays as kernels take them: a kernel looks at no length, so whoever calls one checks here first."""
+"""Tensors and arrays as kernels take them: a kernel checks no lengths, so whoever calls one checks here first."""
 
 from __future__ import annotations
 
@@ -38,37 +38,37 @@ FLOAT32, FLOAT64, INT32, INT64, UINT8, UINT64 = (
 
 
 def flat(tensor: Tensor) -> Array:
-    """The numbers of a tensor on the CPU, row by row: its own memory, or a copy where that is not contiguous."""
+    """The elements of a CPU tensor in row-major order: its own memory, or a copy where that is not contiguous."""
     return tensor.detach().contiguous().numpy().reshape(-1)
 
 
 def check_array(name: str, array: Array, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-    """Refuse memory that a kernel would take for something else, or pass the end of.
+    """Refuse memory that a kernel would misread or run past the end of.
 
     Args:
-        name: What the caller calls it, for the error.
+        name: What the error calls it.
         array: What a kernel is to read or write.
         shape: The shape it must have.
-        dtype: The type that its numbers must have.
+        dtype: The dtype it must have.
 
     Raises:
-        TypeError: It is no array, or its numbers have another type.
-        ValueError: It has another shape, or its numbers do not lie one behind the other.
+        TypeError: It is not an array, or has another dtype.
+        ValueError: It has another shape, or is not contiguous.
     """
     if not isinstance(array, np.ndarray) or array.dtype != dtype:
         raise TypeError(f"{name} must be {dtype}, got {getattr(array, 'dtype', type(array).__name__)}; convert it")
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {list(shape)}, got {list(array.shape)}")
     if not array.flags.c_contiguous:
-        raise ValueError(f"{name} must lie in memory without gaps, got strides {array.strides}; pass a copy")
+        raise ValueError(f"{name} must be contiguous, got strides {array.strides}; pass a copy")
 
 
 def check_table(name: str, table: Array) -> None:
-    """Refuse what is no float32 table ``[N, D]`` with D above 0 (:func:`check_array`).
+    """Refuse anything but a float32 table ``[N, D]`` with D > 0 (:func:`check_array`).
 
     Raises:
-        TypeError: Its numbers are not float32.
-        ValueError: It has another shape, or gaps.
+        TypeError: It is not float32.
+        ValueError: It has another shape, or is not contiguous.
     """
     check_array(name, table, table.shape, FLOAT32)
     if table.ndim != 2 or table.shape[1] == 0:
@@ -83,7 +83,7 @@ def flat_checked(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: np.dt
 
 
 def outside(name: str, numbers: Array, count: int) -> ValueError:
-    """The error for row numbers of which a kernel has found some outside a table of ``count`` rows."""
+    """The error for row numbers some of which a kernel found outside a table of ``count`` rows."""
     return ValueError(f"{name} must be in [0, {count}), got {numbers.min()} to {numbers.max()}")
 
 
@@ -130,20 +130,20 @@ class Workspace:
 _BUFFERS: list[Array] = []
 _LOCK = threading.Lock()
 _SLACK = 4
-"""A buffer up to this many times as large as asked for is good enough."""
+"""A buffer of up to this many times the requested size is reused."""
 _PAGE = 1024
-"""Elements of a memory page."""
+"""Floats in a memory page."""
 
 
 def _is_idle(index: int) -> bool:
-    """Whether nobody but the list and this question refers to a buffer."""
+    """Whether only the list and this check refer to a buffer."""
     return sys.getrefcount(_BUFFERS[index]) == 2
 
 
 def recycled(shape: tuple[int, ...]) -> Tensor:
-    """A float32 tensor with unspecified content, in memory whose former tensor is gone.
+    """A float32 tensor with unspecified content, in memory whose previous tensor is gone.
 
-    Images and the gradients of large scenes come and go at every step; taking them from the system each time would cost
+    Images and the gradients of large scenes come and go at every step; allocating them afresh each time would cost
     more in page faults than computing them.
     """
     size = math.prod(shape)
@@ -153,7 +153,7 @@ def recycled(shape: tuple[int, ...]) -> Tensor:
             if size <= _BUFFERS[i].size <= _SLACK * size + _PAGE and _is_idle(i):
                 best = i if best < 0 or _BUFFERS[i].size < _BUFFERS[best].size else best
         if best < 0:
-            # The number of splats grows: what is a little too small now will not be asked for again.
+            # The number of splats grows: a buffer that is a little too small now will not be requested again.
             outgrown = [i for i in range(len(_BUFFERS)) if size / 2 <= _BUFFERS[i].size < size and _is_idle(i)]
             for i in reversed(outgrown):
                 del _BUFFERS[i]
@@ -165,18 +165,18 @@ def recycled(shape: tuple[int, ...]) -> Tensor:
 def check_tensor(
     name: str, tensor: Tensor, shape: tuple[int, ...], device: torch.device, dtype: torch.dtype = torch.float32
 ) -> None:
-    """Refuse memory that a kernel would take for something else, or pass the end of; asks nothing of the device.
+    """Refuse memory that a kernel would misread or run past the end of; asks nothing of the device.
 
     Args:
-        name: What the caller calls it, for the error.
+        name: What the error calls it.
         tensor: What a kernel is to read or write.
         shape: The shape it must have.
         device: Where it must be.
-        dtype: The type that its numbers must have.
+        dtype: The dtype it must have.
 
     Raises:
-        TypeError: Its numbers have another type.
-        ValueError: It has another shape, is elsewhere, or its numbers do not lie one behind the other.
+        TypeError: It has another dtype.
+        ValueError: It has another shape, is on another device, or is not contiguous.
     """
     if tensor.dtype != dtype:
         raise TypeError(f"{name} must be {dtype}, got {tensor.dtype}; convert it")
@@ -185,11 +185,11 @@ def check_tensor(
             f"{name} must have shape {list(shape)} on {device}, got {list(tensor.shape)} on {tensor.device}"
         )
     if not tensor.is_contiguous():
-        raise ValueError(f"{name} must lie in memory without gaps, got strides {tensor.stride()}; pass a copy")
+        raise ValueError(f"{name} must be contiguous, got strides {tensor.stride()}; pass a copy")
 
 
 def aligned_empty(shape: tuple[int, ...]) -> Array:
-    """An uninitialised float32 array that starts on a cache line, so that no vector of it lies on two."""
+    """An uninitialised float32 array that starts on a cache line, so that no vector in it straddles two."""
     size = math.prod(shape)
     memory = np.empty(size + 16, np.float32)
     start = -(memory.ctypes.data // 4) % 16

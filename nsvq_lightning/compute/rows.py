@@ -1,4 +1,4 @@
-"""Distinct rows out of a table and back into one."""
+"""Copy distinct rows out of a table, and back into one."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def clear_between(rows, i, columns, table):
 
 @inline
 def count_outside(rows, first, last, count):
-    """How many of ``rows[first:last]`` are no row of a table of ``count`` rows; ``first`` may be -1."""
+    """How many of ``rows[first:last]`` are not rows of a table of ``count`` rows; ``first`` may be -1."""
     found = 0
     for i in range(max(first, 0), last):
         found += get(rows, i) < 0 or get(rows, i) >= count
@@ -49,7 +49,7 @@ def _copy(source, start, target, place, count):
 
 @kernel
 def _gather(threads, height, columns, source, rows, target):
-    """Copy rows of a table of ``height`` rows; returns how many it does not have, and then has not copied all."""
+    """Copy rows of a table of ``height`` rows; returns how many are outside it (if any, not all rows are copied)."""
     count = rows.shape[0]
     missing = 0
     for thread in prange(threads):
@@ -69,7 +69,7 @@ def _spread(threads, height, columns, source, rows, target):
     missing = 0
     for thread in prange(threads):
         first, last = count * thread // threads, count * (thread + 1) // threads
-        # The row before the first one says where to begin to clear.
+        # The row before the first one says where clearing begins.
         found = count_outside(rows, first - 1, last, height)
         missing += found
         if found == 0:
@@ -85,7 +85,7 @@ def gather_rows(table: Tensor, rows: Tensor) -> Tensor:
     """The rows ``rows [V]`` of a float32 table ``[N, ...]`` on the CPU: ``[V, ...]``.
 
     Raises:
-        ValueError: ``rows`` is not ``[V]``, or the table does not have one of them.
+        ValueError: ``rows`` is not ``[V]``, or one of them is outside the table.
         TypeError: The table is not float32, or the rows are not int64.
     """
     values = flat_checked("table", table.contiguous(), tuple(table.shape))
@@ -97,10 +97,10 @@ def gather_rows(table: Tensor, rows: Tensor) -> Tensor:
 
 
 def spread_rows(values: Tensor, rows: Tensor, count: int) -> Tensor:
-    """A table ``[count, ...]`` of zeros but for ``values [V, ...]`` at the ascending ``rows [V]``.
+    """A table ``[count, ...]`` of zeros except for ``values [V, ...]`` at the ascending ``rows [V]``.
 
     Raises:
-        ValueError: ``rows`` is not ``[V]``, or the table does not have one of them.
+        ValueError: ``rows`` is not ``[V]``, or one of them is outside the table.
         TypeError: The values are not float32, or the rows are not int64.
     """
     numbers = _numbers(rows)
@@ -120,14 +120,14 @@ def _columns(table: Tensor) -> int:
 
 
 def put_rows(values: Tensor, rows: Tensor, count: int) -> Tensor:
-    """A table ``[count, ...]`` of zeros but for ``values [V, ...]`` at ``rows [V]``, int64, ascending, distinct."""
+    """A table ``[count, ...]`` of zeros except for ``values [V, ...]`` at ``rows [V]``, int64, ascending, distinct."""
     if kernels_for(values) == "cpu":
         return spread_rows(values, rows, count)
     return values.new_zeros(count, *values.shape[1:]).index_copy_(0, rows, values)
 
 
 class _TakeRows(torch.autograd.Function):
-    """``index_select`` whose backward copies rows instead of adding them: distinct rows never meet."""
+    """``index_select`` whose backward copies rows instead of adding them, since they are distinct."""
 
     @staticmethod
     def forward(ctx: Any, tensor: Tensor, rows: Tensor) -> Tensor:
@@ -143,8 +143,8 @@ class _TakeRows(torch.autograd.Function):
 
 
 def take_rows(tensor: Tensor, rows: Tensor) -> Tensor:
-    """The rows ``rows [V]`` (int64, ascending, all different) of ``tensor [N, ...]``: ``[V, ...]``.
+    """The rows ``rows [V]`` (int64, ascending, distinct) of ``tensor [N, ...]``: ``[V, ...]``.
 
-    The backward pass takes half the time of ``index_select``'s, and no order of additions enters its result.
+    The backward pass takes half the time of ``index_select``'s, and its result depends on no order of additions.
     """
     return cast(Tensor, _TakeRows.apply(tensor, rows))

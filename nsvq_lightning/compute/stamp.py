@@ -1,8 +1,8 @@
-"""Whether a stored kernel is still the one that its source says.
+"""Whether a cached kernel still matches its source.
 
-Numba keeps a compiled kernel until the file with its source changes. That is too late, since a kernel contains the code
-of its helpers and the constants of other modules, and too early, since a comment changes nothing. The digest covers
-what a kernel is compiled from: its code, and whatever that names, through any number of modules.
+Numba keeps a compiled kernel until its source file changes. That is too late, since a kernel contains the code of its
+helpers and the constants of other modules, and too early, since a comment changes nothing. The digest covers everything
+that a kernel is compiled from: its code and whatever that code refers to, across any number of modules.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from numba.extending import lower_builtin
 __all__ = ["KernelStore", "digest"]
 
 LIBRARIES = frozenset({"llvmlite", "numba", "numpy", "torch", *sys.stdlib_module_names})
-"""Not looked into: what a kernel depends on there is Numba's version, which its own stamp has."""
+"""Not looked into: a kernel depends on these only through Numba's version, which Numba's own stamp holds."""
 
 
 class _Layout(CompileResultCacheImpl):
-    """Names files after the kernel alone; Numba's own names move with its line number."""
+    """Names files after the kernel alone; Numba's own names contain its line number."""
 
     def get_filename_base(self, fullname: str, abiflags: str) -> str:
         kept = fullname.replace("<", "").replace(">", "")
@@ -38,17 +38,17 @@ class _Layout(CompileResultCacheImpl):
 
 
 class KernelStore(FunctionCache):
-    """Numba's store of one kernel on the disk, stale when :func:`digest` says so."""
+    """Numba's disk cache of one kernel, stale when its :func:`digest` has changed."""
 
     _impl_class = _Layout
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
-        # Not earlier: a kernel may name helpers that its module defines after it.
+        # Not earlier: a kernel may refer to helpers that its module defines after it.
         self._cache_file._source_stamp = digest(_Template(self._py_func))
         return super()._load_overload(sig, target_context)
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
-        # Kernels that a function makes differ in what they close over, and share a file.
+        # Kernels made by one function differ only in what they close over, and share a file.
         return sig, codegen.magic_tuple(), digest(_cells(self._py_func))
 
 
@@ -60,12 +60,12 @@ class _Template:
 
 
 def digest(thing: Any) -> str:
-    """SHA-256 of what a kernel, a helper or a value that they name consists of: code, constants and options.
+    """SHA-256 of all that makes up a kernel, a helper or a value that they refer to: code, constants and options.
 
-    Not of what does not enter the compiled code: names of arguments, line numbers, comments, docstrings, annotations.
+    It leaves out what is not in the compiled code: argument names, line numbers, comments, docstrings and annotations.
 
     Raises:
-        TypeError: The thing, or one that it leads to, is of a kind that no kernel can name.
+        TypeError: The object, or one that it refers to, is of a kind that no kernel can use.
     """
     found = hashlib.sha256()
     _Walk(found).add(thing)
@@ -73,12 +73,12 @@ def digest(thing: Any) -> str:
 
 
 class _Walk:
-    """Feeds a digest with everything that a thing leads to, each once."""
+    """Feeds a digest with everything reachable from an object, each once."""
 
     def __init__(self, found: Any) -> None:
         self._found = found
         self._seen: dict[int, int] = {}
-        self._kept: list[Any] = []  # so that no number in the former is given to another thing
+        self._kept: list[Any] = []  # keeps the objects alive, so that no id in `_seen` is reused
 
     def add(self, thing: Any) -> None:
         if isinstance(thing, type(None) | type(...) | bool | int | float | complex | str | bytes):
@@ -112,7 +112,7 @@ class _Walk:
         elif isinstance(thing, types.Type | ir.Type | ir.Value | np.dtype):
             self._say(type(thing).__name__, thing)
         elif isinstance(thing, ModuleType) or _is_foreign(thing):
-            # What is used of a module of our own is added where the code that names it is.
+            # What a kernel uses of our own modules is added with the code that refers to it.
             self._say(getattr(thing, "__module__", ""), getattr(thing, "__qualname__", getattr(thing, "__name__", "")))
         elif isinstance(thing, FunctionType):
             self._function(thing)
@@ -128,7 +128,7 @@ class _Walk:
         elif isinstance(thing, property | staticmethod | classmethod | functools.partial):
             self._each(getattr(thing, part, None) for part in ("fget", "__func__", "func", "args", "keywords"))
         else:
-            raise TypeError(f"a kernel names {thing!r}; of a {type(thing).__name__} it cannot be told when it changes")
+            raise TypeError(f"a kernel refers to {thing!r}; changes to a {type(thing).__name__} cannot be detected")
 
     def _function(self, function: FunctionType) -> None:
         self._say("function", function.__qualname__)
@@ -142,7 +142,7 @@ class _Walk:
             if isinstance(value, ModuleType) and not _is_library(value.__name__):
                 self._each(vars(value)[part] for part in sorted(names & vars(value).keys()))
         if any(value is lower_builtin for value in function.__globals__.values()):
-            # It says what operators mean, and no code that uses them names it.
+            # It defines the operators, and no code that uses them refers to it by name.
             self._say("operators", _source(function.__module__))
 
     def _code(self, code: CodeType, doc: str | None) -> None:
@@ -165,7 +165,7 @@ def _cells(function: FunctionType) -> tuple[Any, ...]:
 
 
 def _names(code: CodeType) -> set[str]:
-    """All names in a function's code and in those that it holds."""
+    """All names in a function's code and in the code objects nested in it."""
     held = (_names(constant) for constant in code.co_consts if isinstance(constant, CodeType))
     return set(code.co_names).union(*held)
 
@@ -175,7 +175,7 @@ def _is_library(module: str) -> bool:
 
 
 def _is_foreign(thing: Any) -> bool:
-    """Whether a thing is a library's, or Python's own."""
+    """Whether an object comes from a library or from Python itself."""
     module = getattr(thing, "__module__", None)
     if isinstance(thing, BuiltinFunctionType | MethodDescriptorType | np.ufunc):
         return True

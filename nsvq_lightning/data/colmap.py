@@ -24,9 +24,9 @@ from nsvq_lightning.data.model_files import (
 __all__ = ["ColmapImage", "ColmapModel", "import_pycolmap", "read_model"]
 
 _LARGEST = 1e18
-"""What poses and intrinsics may reach: their squares, which rendering takes in float32, stay finite."""
+"""Upper bound on poses and intrinsics: their squares, which rendering computes in float32, stay finite."""
 
-# What pycolmap throws at a file it cannot read: its own checks arrive as ValueError, those of the C++ library as these.
+# What pycolmap raises for a file it cannot read: its own checks give ValueError, the C++ library the others.
 _READ_ERRORS = (ValueError, RuntimeError, IndexError, KeyError, OSError, MemoryError)
 
 
@@ -54,7 +54,7 @@ class ColmapModel:
         cameras: ``pycolmap.Camera`` by id.
         points: Sparse points ``[P, 3]`` float64, scene units, sorted by COLMAP's point id.
         colors: Their colours ``[P, 3]`` uint8 RGB.
-        observations: Row of the point and row of the image of each sighting ``[O, 2]`` int64; None unless asked for.
+        observations: Row of the point and row of the image of each sighting ``[O, 2]`` int64; None unless requested.
     """
 
     images: tuple[ColmapImage, ...]
@@ -67,8 +67,8 @@ class ColmapModel:
 def import_pycolmap() -> Any:
     """Import pycolmap, late and after OpenCV and Pillow.
 
-    The wheels carry different copies of libpng and zlib. With pycolmap's loaded first, writing any PNG with OpenCV or
-    Pillow aborts the process; the imports at the head of this module keep the order right.
+    The wheels bundle different copies of libpng and zlib. If pycolmap's are loaded first, writing a PNG with OpenCV or
+    Pillow aborts the process; the imports at the top of this module ensure the right order.
     """
     PIL.Image.preinit()  # loads Pillow's own image libraries, which a bare import leaves for later
     import pycolmap
@@ -77,11 +77,11 @@ def import_pycolmap() -> Any:
 
 
 def read_model(root: Path, observations: bool = False) -> ColmapModel:
-    """Read the model of a scene folder, see :func:`nsvq_lightning.data.model_files.find_model` for where it may stand.
+    """Read the model of a scene folder, see :func:`nsvq_lightning.data.model_files.find_model` for where it may be.
 
     Args:
         root: Scene folder.
-        observations: Say which image saw which point, too; training does not need it.
+        observations: Also read which image saw which point; training does not need it.
 
     Raises:
         SceneError: There is no model, a file is damaged, or the model has no registered image or no point.
@@ -114,7 +114,7 @@ def _parameter_counts(pycolmap: Any) -> dict[int, int]:
 
 
 def _check_rows(files: ModelFiles, reconstruction: Any) -> None:
-    """A text table cut between two lines reads without complaint; its head still tells how long it was."""
+    """A text table cut off between two lines reads without error, but its head comment still gives the row count."""
     for table in ("cameras", "images", "points3D"):
         path, rows = files.path(table), len(getattr(reconstruction, table))
         announced = announced_rows(path)
@@ -158,7 +158,7 @@ def _plain_model(files: ModelFiles, reconstruction: Any, observations: bool) -> 
 
 
 def _check_cameras(files: ModelFiles, cameras: Mapping[int, Any]) -> None:
-    """Text tables, which nothing has walked before, may hold any number."""
+    """Check sizes and parameters: text tables, which no check has seen before, may hold any number."""
     for number, camera in cameras.items():
         size = camera.width, camera.height
         if not 0 < min(size) <= max(size) <= LARGEST_SIDE or not (np.abs(camera.params) <= _LARGEST).all():
@@ -170,7 +170,7 @@ def _check_cameras(files: ModelFiles, cameras: Mapping[int, Any]) -> None:
 
 
 def _observations(registered: list[Any], points: list[tuple[int, Any]]) -> NDArray[np.int64]:
-    """Pairs of a point's and an image's row, each once: a track may have two features of one image."""
+    """Pairs of point row and image row, each once: a track may have two features in one image."""
     row_of = {image.image_id: row for row, image in enumerate(registered)}
     pairs = [
         (row, row_of[element.image_id])

@@ -26,20 +26,20 @@ def _identity(batch: T) -> T:
 
 
 class ColmapDataModule(LightningDataModule):
-    """Views of a COLMAP scene, one a batch.
+    """Views of a COLMAP scene, one per batch.
 
     Every 8th of the sorted image names is a test view (validated and tested on, never trained on). The train views come
     in the endless order of :class:`~nsvq_lightning.data.sampler.ViewSampler`, which starts at the trainer's step: a
-    resumed run sees the views that the uninterrupted run would have seen. With several processes each takes its own
-    draws of that one sequence, and every R-th of the test views.
+    resumed run sees the views that the uninterrupted run would have seen. With R processes, each takes its own draws
+    of that one sequence, and every R-th of the test views.
 
     Args:
         root: Scene folder: ``images/`` and a COLMAP model (``.bin`` or ``.txt``) in ``sparse/0``, ``sparse`` or itself.
         factor: Divide the image size by 1, 2, 4 or 8 (from ``images_2`` … where it exists); None: see ``max_width``.
-        max_width: Images wider than this many pixels are scaled to it where ``factor`` is None; None for no limit.
+        max_width: If ``factor`` is None, images wider than this many pixels are scaled down to it; None for no limit.
         test_every: Every ``test_every``-th view is a test view, at least 2.
         seed: Seed of the order of the train views.
-        cache_bytes: Memory for decoded images in bytes; what does not fit is decoded anew, in the background.
+        cache_bytes: Memory for decoded images in bytes; what does not fit is decoded each time, in the background.
         images_folder: Name of the image folder.
     """
 
@@ -72,19 +72,19 @@ class ColmapDataModule(LightningDataModule):
         return scene
 
     def prepare_data(self) -> None:
-        """Load the scene where this is the only process: a folder that cannot be used leaves none of a run behind.
+        """Load the scene if this is the only process, so that an unusable folder fails before a run folder is made.
 
-        Lightning calls this before its loggers make theirs; of several processes only one would fail here.
+        Lightning calls this before its loggers create folders; with several processes, only one would fail here.
         """
         if self.process == (0, 1):
             _ = self.scene
 
     def setup(self, stage: str | None = None) -> None:
-        """Load the scene; a second call does nothing.
+        """Load the scene; further calls do nothing.
 
         Raises:
-            SceneError: The folder cannot be used, or there are fewer test views than processes, which a run would
-                notice at its first evaluation.
+            SceneError: The folder cannot be used, or there are fewer test views than processes, which would otherwise
+                fail only at the first evaluation.
         """
         count = len(self.scene.test)
         if stage != "predict":
@@ -95,15 +95,15 @@ class ColmapDataModule(LightningDataModule):
         return DataLoader(_TrainViews(self), batch_size=None, collate_fn=_identity)
 
     def val_dataloader(self) -> DataLoader[View]:
-        """Test views in the order of their names, this process's share."""
+        """This process's share of the test views, in the order of their names."""
         return self._ordered(self.scene.test)
 
     def test_dataloader(self) -> DataLoader[View]:
-        """Test views in the order of their names, this process's share."""
+        """This process's share of the test views, in the order of their names."""
         return self._ordered(self.scene.test)
 
     def predict_dataloader(self) -> DataLoader[View]:
-        """All views in the order of their names, this process's share."""
+        """This process's share of all views, in the order of their names."""
         return self._ordered(range(len(self.scene)))
 
     @property
@@ -113,7 +113,7 @@ class ColmapDataModule(LightningDataModule):
 
     @property
     def draw(self) -> int:
-        """Number of train views each process has drawn before the trainer's current step."""
+        """Number of train views that each process had drawn before the trainer's current step."""
         return self.trainer.global_step * self.trainer.accumulate_grad_batches if self.trainer is not None else 0
 
     def _check_share(self, count: int, views: str) -> None:
@@ -133,7 +133,7 @@ class DemoDataModule(ColmapDataModule):
     """The embedded demo scene: a ray-traced room, written as a COLMAP folder when it is first needed.
 
     Args:
-        root: Folder of the scene; built by ``prepare_data`` where there is none.
+        root: Folder of the scene; ``prepare_data`` builds it if it does not exist.
         views: Number of views, at least 2.
         width: Image width in pixels.
         height: Image height in pixels.
@@ -156,13 +156,13 @@ class DemoDataModule(ColmapDataModule):
         self.views, self.width, self.height = views, width, height
 
     def prepare_data(self) -> None:
-        """Build the scene unless it is there, and load it."""
+        """Build the scene if it does not exist, and load it."""
         if not self.root.exists():
-            rank_zero_info(f"rendering the demo scene into {self.root} (once, some seconds)")
+            rank_zero_info(f"rendering the demo scene into {self.root} (once, takes some seconds)")
             try:
                 write_synthetic_scene(self.root, views=self.views, width=self.width, height=self.height)
             except OSError:
-                if not self.root.exists():  # else another node has built it meanwhile
+                if not self.root.exists():  # otherwise another node has built it in the meantime
                     raise
         super().prepare_data()
 
@@ -178,8 +178,8 @@ class DemoDataModule(ColmapDataModule):
         if found != wanted:
             raise SceneError(
                 f"{self.root} holds {found[0]} views of {found[1]}x{found[2]}, not the demo scene of {wanted[0]} views "
-                f"of {wanted[1]}x{wanted[2]}: train photos of your own with --config nsvq_4k.yaml, or give --data.root "
-                "a folder for the demo scene"
+                f"of {wanted[1]}x{wanted[2]}: train on your own photos with --config nsvq_4k.yaml, or give --data.root "
+                "another folder for the demo scene"
             )
 
 
@@ -202,7 +202,7 @@ class _TrainViews(IterableDataset[View]):
 
 
 class _OrderedViews(Dataset[View]):
-    """Given views of a scene; each access starts to decode the one ``stride`` further."""
+    """Given views of a scene; each access starts decoding the one ``stride`` further on."""
 
     def __init__(self, scene: Scene, indices: Sequence[int], stride: int) -> None:
         self._scene, self._indices, self._stride = scene, indices, stride

@@ -1,7 +1,7 @@
 """The furniture of the demo scene: a textured room with boxes, balls and pictures, its lamp and its cameras.
 
-Textures are photographs that ship inside the scikit-image wheel, so nothing is downloaded. World axes as COLMAP's
-pictures have them: y points down, the floor is y = 0, one unit is a metre.
+Textures are photographs that ship inside the scikit-image wheel, so nothing is downloaded. World axes follow
+COLMAP's camera axes: y points down, the floor is y = 0, one unit is a metre.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __all__ = ["demo_poses", "demo_room", "to_srgb"]
 HALF, HEIGHT = 3.0, 2.7
 """Half the side of the room and its height."""
 TEXELS = 140
-"""Texture resolution, texels a metre: about one sample of a 320-pixel picture across the room."""
+"""Texture resolution, texels per metre: about one per sample of a 320-pixel picture across the room."""
 
 
 def to_srgb(linear: Array) -> NDArray[np.uint8]:
@@ -61,7 +61,7 @@ def _vector(*xyz: float) -> Array:
 
 
 def _linear(image: NDArray[np.uint8], tint: tuple[float, float, float] = (1, 1, 1)) -> Array:
-    """8-bit sRGB (or grey) picture to linear albedo ``[h, w, 3]``, darkened as real paint is."""
+    """8-bit sRGB (or grey) picture to linear albedo ``[h, w, 3]``, darkened to the range of real paint."""
     rgb = np.repeat(image[..., None], 3, axis=-1) if image.ndim == 2 else image[..., :3]
     encoded = rgb.astype(np.float32) / 255
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
@@ -86,7 +86,7 @@ def _tiled(texture: Array, width: float, height: float, tile: float) -> Array:
 
 
 def _chequered(light: Array, dark: Array, squares_x: int, squares_y: int) -> Array:
-    """Two textures ``[h, w, 3]`` of one size in alternating fields."""
+    """Two textures ``[h, w, 3]`` of the same size in alternating squares."""
     y = np.arange(light.shape[0]) * squares_y // light.shape[0]
     x = np.arange(light.shape[1]) * squares_x // light.shape[1]
     return np.where(((y[:, None] + x) % 2 == 0)[..., None], light, dark)
@@ -191,7 +191,7 @@ def _balls() -> list[Surface]:
 
 
 def _panel(lamp: Lamp) -> Surface:
-    """The lamp as it is seen."""
+    """The visible panel of the lamp."""
     s = lamp.side
     corner = lamp.centre + _vector(-s / 2, -0.01, -s / 2)
     return Quad(corner, _vector(s, 0, 0), _vector(0, 0, s), np.ones((2, 2, 3), np.float32), glow=1.0)

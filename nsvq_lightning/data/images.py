@@ -25,20 +25,20 @@ from nsvq_lightning.skips import is_on
 
 __all__ = ["ImageSource", "ImageStore", "encode_png", "image_size", "read_image"]
 
-# COLMAP works on the pixels as stored, so the EXIF orientation must not turn them.
+# COLMAP works on the pixels as stored, so the EXIF orientation must not be applied.
 _READ = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 _MOST_A_BYTE = 10_000
-"""Pixels a byte of the file; no photo comes near, an empty PNG of one bit a pixel has 8000."""
+"""Pixels per byte of the file; no photo comes near, and an empty PNG of one bit per pixel has 8000."""
 
 _DAMAGED = (OSError, ValueError, SyntaxError, KeyError)
-"""What Pillow raises for a file that is damaged or no picture."""
+"""What Pillow raises for a file that is damaged or not a picture."""
 
 _TIFF_SIZE, _TIFF_ORIENTATION = (256, 257), 274
 _LIMIT = threading.Lock()
 
 _MIRRORED = {2: (1,), 3: (0, 1), 4: (0,), 6: (0,), 7: (0, 1), 8: (1,)}
-"""By orientation, the axes to mirror; from 5 on rows and columns change places first."""
+"""By orientation, the axes to mirror; from 5 on, rows and columns are swapped first."""
 
 
 def _undecodable(path: Path, reason: str) -> SceneError:
@@ -49,23 +49,23 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels as stored, read from the head of the file.
 
     Raises:
-        SceneError: The file is not an image, or its head announces more pixels than there can be.
+        SceneError: The file is not an image, or its head declares more pixels than it can hold.
     """
     try:
         with _opened(path) as image:
             width, height = image.size
-            if image.format == "TIFF":  # Pillow turns their size
+            if image.format == "TIFF":  # Pillow applies the orientation to their size
                 width, height = (int(image.getexif()[tag]) for tag in _TIFF_SIZE)
     except _DAMAGED as error:
         raise _undecodable(path, str(error)) from error
     if width * height > _MOST_A_BYTE * path.stat().st_size:
-        raise _undecodable(path, f"its head announces {width}x{height} pixels in {path.stat().st_size} bytes")
+        raise _undecodable(path, f"its head declares {width}x{height} pixels in {path.stat().st_size} bytes")
     return width, height
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[PIL.Image.Image]:
-    """The head of a picture of any size: nothing is decoded, and phones take more pixels than Pillow's limit."""
+    """Open the head of a picture of any size, past Pillow's pixel limit, which phones exceed; nothing is decoded."""
     with _LIMIT:
         usual, PIL.Image.MAX_IMAGE_PIXELS = PIL.Image.MAX_IMAGE_PIXELS, None
         try:
@@ -82,7 +82,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     Raises:
         SceneError: The file is damaged or has floating-point pixels.
     """
-    data = path.read_bytes()  # imread itself fails on names outside the locale's character set
+    data = path.read_bytes()  # imread fails on names outside the locale's character set
     try:
         orientation = _orientation(data)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), _READ)
@@ -95,7 +95,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     if image.dtype == np.uint16:
         image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if image.dtype != np.uint8:
-        raise _undecodable(path, f"its pixels are {image.dtype}, accepted are 8 and 16 bit integers")
+        raise _undecodable(path, f"its pixels are {image.dtype}; accepted are 8 and 16 bit integers")
     return _turned_back(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), orientation)
 
 
@@ -113,18 +113,18 @@ def encode_png(rgb: NDArray[np.uint8]) -> bytes:
 
 
 def _orientation(data: bytes) -> int:
-    """How OpenCV turns the picture; also refuses what it would not notice to be missing.
+    """The orientation that OpenCV applies to the picture; also refuses truncation that OpenCV would not notice.
 
     Raises:
-        OSError: The file is not whole; so do the other errors of ``_DAMAGED``.
+        OSError: The file is incomplete; the other errors of ``_DAMAGED`` mean the same.
     """
     file = io.BytesIO(data)
     if data.startswith(b"\x89PNG"):
-        PngImageFile(file).verify()  # OpenCV allocates the lengths of chunks, up to 2 GB, before it looks for them
+        PngImageFile(file).verify()  # OpenCV allocates chunks of any declared length, up to 2 GB, before it reads them
     elif data.startswith(b"\xff\xd8"):
         JpegImageFile(file)  # up to the first scan
         if b"\xff\xd9" not in data[file.tell() :]:
-            raise OSError("there is no end marker")  # OpenCV 4 would fill what is missing with grey
+            raise OSError("there is no end marker")  # OpenCV 4 would fill the missing part with grey
     elif data.startswith((b"II", b"MM")):
         tags = PIL.Image.Exif()  # the tags of a TIFF, whatever its pixels are
         tags.load(data)
@@ -133,20 +133,20 @@ def _orientation(data: bytes) -> int:
 
 
 def _turned_back(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
-    """A TIFF as it is stored: OpenCV turns it, whatever it is told."""
+    """A TIFF's pixels as stored: OpenCV applies the orientation to TIFFs even when told not to."""
     stored = pixels.transpose(1, 0, 2) if orientation >= 5 else pixels
     return np.ascontiguousarray(np.flip(stored, _MIRRORED.get(orientation, ())))
 
 
 @dataclass(frozen=True, eq=False)
 class ImageSource:
-    """How the picture of one view comes from its file.
+    """How the picture of one view is made from its file.
 
     Attributes:
         path: Image file.
         size: Its width and height in pixels.
-        undistortion: Applied first, None for a pinhole camera.
-        pinhole: Camera of the picture that comes out; the picture is resized to its size.
+        undistortion: Applied first; None for a pinhole camera.
+        pinhole: Camera of the resulting picture, which is resized to its size.
     """
 
     path: Path
@@ -177,14 +177,14 @@ class ImageSource:
 
 
 class ImageStore:
-    """Pictures by number, decoded at first use and kept while the byte budget lasts.
+    """Pictures by index, decoded at first use and kept while the byte budget lasts.
 
-    What is kept stays: under a random order without replacement, an LRU cache smaller than the scene throws out what
+    A kept picture stays: under a random order without replacement, an LRU cache smaller than the scene would evict what
     the next epoch needs first. Pictures beyond the budget are decoded anew each time; :meth:`prefetch` does that in the
-    background, one thread a picture, so that nothing lives on in a forked process.
+    background, with one thread per picture, so that no thread pool has to survive a fork.
 
     Args:
-        sources: One entry a view.
+        sources: One entry per view.
         cache_bytes: Budget for the kept pictures in bytes; 0 keeps none.
 
     Raises:
@@ -218,10 +218,10 @@ class ImageStore:
         return image
 
     def prefetch(self, index: int) -> None:
-        """Start to decode picture ``index`` in the background; errors surface when it is asked for."""
+        """Start decoding picture ``index`` in the background; errors are raised when it is requested."""
         if index in self._kept or index in self._coming:
             return
-        while len(self._coming) > 1:  # what was announced and never asked for
+        while len(self._coming) > 1:  # prefetched and never requested
             self._coming.pop(next(iter(self._coming)))
         future: Future[Tensor] = Future()
         self._coming[index] = future
@@ -234,5 +234,5 @@ class ImageStore:
 def _load_into(future: Future[Tensor], source: ImageSource) -> None:
     try:
         future.set_result(source.load())
-    except Exception as error:  # handed on to whoever asks for the picture
+    except Exception as error:  # passed on to whoever requests the picture
         future.set_exception(error)

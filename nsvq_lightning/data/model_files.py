@@ -1,4 +1,4 @@
-"""Finds the files of a COLMAP model and proves them whole before a reader allocates anything from them."""
+"""Finds the files of a COLMAP model and checks that they are complete before a reader allocates memory for them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from pathlib import Path
 __all__ = ["ModelFiles", "SceneError", "check_binary_files", "find_model", "larger_models"]
 
 FOLDERS = ("sparse/0", "sparse", ".")
-"""Where a model may stand inside a scene folder, in the order of preference."""
+"""Where a model may be inside a scene folder, in order of preference."""
 TABLES = ("cameras", "images", "points3D")
 """The three tables every COLMAP model has."""
 
 LARGEST_SIDE = (1 << 20) - 1
-"""Pixels; a camera with more is a damaged one."""
+"""Pixels; a camera with a larger side is damaged."""
 
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height
@@ -78,7 +78,7 @@ def find_model(root: Path) -> ModelFiles:
 def larger_models(root: Path) -> str | None:
     """Which models of a scene folder have more images than :func:`find_model`'s ``sparse/0``, and what to do; or None.
 
-    COLMAP numbers the parts of a scene that it could not join, not always by their size.
+    COLMAP numbers the parts of a scene that it could not join, not always in the order of their size.
     """
     counts = {}
     for path in sorted((root / "sparse").glob("*/images.bin")):
@@ -88,16 +88,16 @@ def larger_models(root: Path) -> str | None:
     if not larger:
         return None
     return (
-        f"sparse/0 has {counts['0']} images, {', '.join(larger)}: COLMAP could not join them; to use another, let the "
-        "folders change their names"
+        f"sparse/0 has {counts['0']} images, {', '.join(larger)}: COLMAP could not join them; to use another, swap "
+        "the names of the folders"
     )
 
 
 def check_binary_files(files: ModelFiles, params_of_model: Mapping[int, int]) -> None:
-    """Walk every record of a binary model, so that a damaged file is an error and not an endless allocation.
+    """Walk every record of a binary model, so that a damaged file gives an error instead of an endless allocation.
 
-    COLMAP's reader trusts the counts in the files: an empty ``points3D.bin`` makes it allocate without end, a truncated
-    ``cameras.bin`` loads as garbage.
+    COLMAP's reader trusts the counts in the files: an empty ``points3D.bin`` makes it allocate without end, and a
+    truncated ``cameras.bin`` loads as garbage.
 
     Args:
         files: The model; ``rigs.bin`` and ``frames.bin`` (COLMAP 4) are checked too where they exist.
@@ -130,14 +130,14 @@ def _check_table(path: Path, record_end: RecordEnd) -> None:
             try:
                 end = record_end(data, end)
                 if end > size:
-                    raise struct.error("it ends behind the file")
+                    raise struct.error("it ends beyond the file")
             except struct.error as error:
                 raise SceneError(
-                    f"{path} is truncated or garbled: of {count} announced records, record {row} cannot be read "
+                    f"{path} is truncated or garbled: of {count} declared records, record {row} cannot be read "
                     f"({error}; the file has {size} bytes); {_REMEDY}"
                 ) from error
         if end != size:
-            raise SceneError(f"{path} is garbled: its {count} announced records end at byte {end} of {size}; {_REMEDY}")
+            raise SceneError(f"{path} is garbled: its {count} declared records end at byte {end} of {size}; {_REMEDY}")
 
 
 def _camera_end(params_of_model: Mapping[int, int], data: Buffer, start: int) -> int:
@@ -154,7 +154,7 @@ def _image_end(data: Buffer, start: int) -> int:
     name = start + 64  # u32 id, 7 doubles of pose, u32 camera id
     terminator = data.find(b"\0", name)
     if terminator < 0:
-        raise struct.error("name without end")
+        raise struct.error("unterminated name")
     (points,) = _U64.unpack_from(data, terminator + 1)
     return terminator + 1 + _U64.size + 24 * int(points)
 
@@ -180,7 +180,7 @@ def _frame_end(data: Buffer, start: int) -> int:
 
 
 def announced_rows(path: Path) -> int | None:
-    """Number of rows that the comment at the head of a text table announces, None where it has no such comment."""
+    """Number of rows that the comment at the head of a text table declares; None where it has no such comment."""
     with path.open(encoding="utf-8", errors="replace") as file:
         for line in file:
             if not line.startswith("#"):

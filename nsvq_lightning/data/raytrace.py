@@ -1,7 +1,7 @@
 """A small ray tracer in NumPy: baked soft light and one Phong highlight.
 
 Light that does not depend on the viewer (a rectangular lamp with soft shadows, and ambient light with occlusion) is
-baked once into a light map a surface; a picture then costs one ray a sample.
+baked once into a light map per surface; a picture then costs one ray per sample.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class Lamp:
 
     Attributes:
         centre: ``[3]``.
-        side: Its side length.
+        side: Side length.
         power: Irradiance at distance 1 straight below it.
-        ambient: Irradiance from everywhere else where nothing is near.
+        ambient: Irradiance from all other directions where nothing is near.
     """
 
     centre: Array
@@ -42,7 +42,7 @@ class Hit:
 
     Attributes:
         t: Ray parameters ``[M]``, infinite where nothing was hit.
-        surface: Numbers of the surfaces ``[M]``.
+        surface: Indices of the surfaces ``[M]``.
     """
 
     t: Array
@@ -54,9 +54,9 @@ class Room:
     """Surfaces, a lamp and the baked light maps.
 
     Attributes:
-        surfaces: What there is.
-        lamp: What lights it.
-        texels: Light map resolution, texels a scene unit.
+        surfaces: All surfaces of the room.
+        lamp: The lamp that lights it.
+        texels: Light map resolution, texels per scene unit.
     """
 
     surfaces: Sequence[Surface]

@@ -29,18 +29,18 @@ Factor = Literal[1, 2, 4, 8]
 
 _FACTORS = (1, 2, 4, 8)
 _CAMERAS_WITH_KEPT_MAPS = 8
-"""With more distorted cameras than this (each photo its own, say) the undistortion maps would outweigh the images."""
+"""With more distorted cameras than this (say, one per photo), the undistortion maps would take more than the images."""
 _FARTHEST = 1e4
-"""Distance of the cameras from the origin, in extents, beyond which rounding moves splats by a good part of a pixel."""
+"""Distance of the cameras from the origin, in extents, beyond which rounding moves splats by much of a pixel."""
 _ROUNDED = 0.01
 """Relative difference of aspect ratios that rounding explains."""
 OTHER_SHAPE = (
-    "have another aspect ratio than their camera: they were cropped, turned or mixed up after COLMAP ran; copy the "
+    "have another aspect ratio than their camera: they were cropped, rotated or mixed up after COLMAP ran; copy the "
     "photos it ran on"
 )
 ONE_PLACE = "are taken from one place: without parallax there is no depth; move while taking photos"
 _AT_CAMERA = 1e-6
-"""Distance from a camera's centre, in extents, within which a point is no surface but a failed triangulation."""
+"""Distance from a camera's centre, in extents, within which a point is a failed triangulation, not a surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class View:
     image: Tensor
 
     def to(self, device: torch.device | str, **kwargs: object) -> View:
-        """The view on another device, itself where it is there; Lightning calls it to move a batch."""
+        """The view on another device, or itself if it is there already; Lightning calls this to move a batch."""
         camera, image = self.camera.to(device), self.image.to(device)
         if camera is self.camera and image is self.image:
             return self
@@ -76,7 +76,7 @@ class Scene:
         names: Names of the views, sorted.
         cameras: Pinhole camera of each view, float32.
         images: Pictures of the views, decoded at first use.
-        points: Sparse points ``[P, 3]`` float32, scene units, without those at the centre of a camera.
+        points: Sparse points ``[P, 3]`` float32, scene units, except those at the centre of a camera.
         colors: Their colours ``[P, 3]`` float32, RGB in [0, 1].
         train: Indices of the train views, ascending.
         test: Indices of the test views, ascending.
@@ -115,13 +115,13 @@ def load_scene(
 ) -> Scene:
     """Load a COLMAP scene: ``images/`` and a model (binary or text) in ``sparse/0``, ``sparse`` or the folder itself.
 
-    Pinhole images pass straight through; those of any other camera model are undistorted when they are decoded, as by
-    COLMAP's ``image_undistorter``.
+    Pinhole images are used as they are; those of any other camera model are undistorted when they are decoded, like
+    COLMAP's ``image_undistorter`` does.
 
     Args:
         root: Scene folder.
         factor: Divide the image size by 1, 2, 4 or 8, from the folder ``images_2`` (4, 8) where there is one. None
-            scales images wider than ``max_width`` to that width and leaves the others alone.
+            scales images wider than ``max_width`` down to that width and leaves the others unchanged.
         max_width: Largest width in pixels where ``factor`` is None; None for no limit.
         test_every: Every ``test_every``-th of the sorted image names is a test view, starting with the first.
         cache_bytes: Memory for decoded images in bytes, see :class:`~nsvq_lightning.data.images.ImageStore`.
@@ -168,7 +168,7 @@ def split_views(names: Sequence[str], test_every: int) -> tuple[tuple[int, ...],
     if not train or not test:
         raise SceneError(
             f"{len(names)} registered image(s) split with test_every={test_every} leave {len(train)} train and "
-            f"{len(test)} test views, needed is at least 1 of each: register more photos"
+            f"{len(test)} test views; at least 1 of each is needed: register more photos"
         )
     return train, test
 
@@ -183,7 +183,7 @@ def _check_arguments(factor: int | None, max_width: int | None, test_every: int)
 
 
 def _image_folder(root: Path, name: str, factor: int | None) -> tuple[Path, int]:
-    """Folder to read from and the divisor that is left to do on load."""
+    """Folder to read from, and the divisor still to be applied on load."""
     scaled = root / f"{name}_{factor}"
     if factor is not None and factor > 1 and scaled.is_dir():
         return scaled, 1
@@ -202,7 +202,7 @@ def _image_folder(root: Path, name: str, factor: int | None) -> tuple[Path, int]
 
 
 def _locate(images: Sequence[ColmapImage], folder: Path) -> list[Path]:
-    """Path of each image; in a downscaled copy of the folder the suffix may differ."""
+    """Path of each image; in a downscaled copy of the folder, the suffix may differ."""
     found = [folder / image.name for image in images]
     absent = [i for i, path in enumerate(found) if not path.is_file()]
     if absent:
@@ -221,12 +221,12 @@ def _locate(images: Sequence[ColmapImage], folder: Path) -> list[Path]:
 
 
 def same_shape(camera: Any, width: int, height: int) -> bool:
-    """Whether a picture has the aspect ratio of its ``pycolmap.Camera``, but for what rounding of its size explains."""
+    """Whether a picture has the aspect ratio of its ``pycolmap.Camera``, up to rounding of its size."""
     return bool(abs(width * camera.height / (height * camera.width) - 1) < _ROUNDED)
 
 
 def _image_sources(model: ColmapModel, paths: list[Path], divisor: int, max_width: int | None) -> list[ImageSource]:
-    """One source a view; views with one camera and one file size share their undistortion."""
+    """One source per view; views with the same camera and file size share their undistortion."""
     sizes = [image_size(path) for path in paths]
     kinds = [(image.camera_id, size) for image, size in zip(model.images, sizes, strict=True)]
     others = sum(not same_shape(model.cameras[camera_id], *size) for camera_id, size in kinds)
@@ -266,15 +266,15 @@ def _extent(centres: NDArray[np.float64]) -> float:
 
 
 def _away_from(centres: NDArray[np.float64], points: NDArray[np.float64], radius: float) -> NDArray[np.bool_]:
-    """Which points ``[P, 3]`` are more than ``radius`` from all ``centres [V, 3]``, or not finite; warns of the others.
+    """Which points ``[P, 3]`` are more than ``radius`` from all ``centres [V, 3]``, or not finite; warns of the rest.
 
-    At a camera's centre a point has no direction; splats there are in nobody's view, or cover that camera's whole view.
+    At a camera's centre a point has no direction; splats there are in no view, or cover that camera's whole view.
     """
     away = np.ones(len(points), bool)
     finite = np.isfinite(points).all(1)
     away[finite] = cKDTree(centres).query(points[finite])[0] > radius
     if not away.all():
-        log.warning("left out %d of %d points, which are at the centre of a camera", len(away) - away.sum(), len(away))
+        log.warning("left out %d of %d points: they are at the centre of a camera", len(away) - away.sum(), len(away))
     return away
 
 

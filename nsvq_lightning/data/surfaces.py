@@ -1,4 +1,4 @@
-"""Surfaces of the demo room: textured quads and spheres that rays can hit and that have coordinates."""
+"""Surfaces of the demo room: textured quads and spheres with texture coordinates that rays can hit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["NEAR", "Array", "Quad", "Sphere", "Surface", "sample"]
 Array = NDArray[np.float32]
 
 NEAR = 1e-3
-"""Hits nearer than this ray parameter are the ray's own start."""
+"""Hits nearer than this ray parameter are on the surface where the ray starts, and ignored."""
 
 
 class Surface(Protocol):
@@ -26,7 +26,7 @@ class Surface(Protocol):
     gloss: float
     """Strength of the Phong highlight, 0 for a matt surface."""
     glow: float
-    """Light given off, 0 for all but the lamp's panel."""
+    """Emitted light, 0 for all but the lamp's panel."""
 
     @property
     def size(self) -> tuple[float, float]:

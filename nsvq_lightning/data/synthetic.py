@@ -1,4 +1,4 @@
-"""Writes the demo scene as a true COLMAP folder: pictures, cameras, poses, points with tracks."""
+"""Writes the demo scene as a real COLMAP folder: pictures, cameras, poses, points with tracks."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ __all__ = ["render_view", "write_synthetic_scene"]
 
 _SUPERSAMPLING = 2
 _POINT_NOISE = 0.002  # metres; about the error of a triangulated point at this size
-_VIEWS_A_POINT = 3  # COLMAP's mapper keeps no point with a shorter track for long
+_VIEWS_A_POINT = 3  # COLMAP's mapper does not keep points with shorter tracks
 
 
 @dataclass(frozen=True)
 class _Lens:
-    """Pinhole camera of all views, its principal point off the centre as a real one's."""
+    """Pinhole camera of all views; its principal point is off-centre, as in a real camera."""
 
     width: int
     height: int
@@ -73,8 +73,8 @@ def write_synthetic_scene(
 ) -> Path:
     """Render the demo room and write it as a COLMAP scene (``images/*.png``, ``sparse/0/*.bin``).
 
-    The folder is built beside its place and renamed when it is complete, so an interrupted run leaves none behind. Same
-    arguments, same bytes.
+    The folder is built next to ``root`` and renamed when complete, so an interrupted run leaves no partial scene. The
+    same arguments give the same bytes.
 
     Args:
         root: Folder to create.
@@ -93,7 +93,7 @@ def write_synthetic_scene(
     """
     if views < 2 or width < 8 or height < 8 or points < 1:
         raise ValueError(
-            f"needed are views >= 2, width and height >= 8, points >= 1; got {views}, {width}x{height}, {points}"
+            f"needs views >= 2, width and height >= 8, points >= 1; got {views}, {width}x{height}, {points}"
         )
     root = Path(root)
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
@@ -123,7 +123,7 @@ def _centre(pose: NDArray[np.float64]) -> Array:
 
 
 def _surface_points(room: Room, lens: _Lens, poses: NDArray[np.float64], count: int, seed: int) -> _Points:
-    """Random points on the surfaces, those in the pictures of at least three views (or all views, if fewer)."""
+    """Random surface points that at least three views see (or all views, if there are fewer)."""
     rng = generator(seed, 0, "demo points")
     candidates = 3 * count
     areas = torch.tensor([s.size[0] * s.size[1] * (0.0 if s.glow else 1.0) for s in room.surfaces])
@@ -145,7 +145,7 @@ def _surface_points(room: Room, lens: _Lens, poses: NDArray[np.float64], count: 
 def _sight(
     room: Room, lens: _Lens, pose: NDArray[np.float64], xyz: Array
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Pixels ``[P, 2]`` of points ``[P, 3]`` and whether the view sees them, nothing being in the way."""
+    """Pixels ``[P, 2]`` of points ``[P, 3]``, and whether the view sees them unoccluded."""
     pixels, inside = lens.project(pose, xyz)
     centre = _centre(pose)
     inside[inside] = room.trace(centre, xyz[inside] - centre).t > 0.995

@@ -26,9 +26,9 @@ _ROWS_AT_ONCE = 256
 
 
 class Maps(NamedTuple):
-    """Source column and row of each pixel, ``[H, W]``, OpenCV's pixels (centres at integers).
+    """Source column and row of each pixel, ``[H, W]``, in OpenCV's pixels (centres at integers).
 
-    ``blank [H, W]`` tells the pixels that the camera never saw, None where it saw all.
+    ``blank [H, W]`` marks the pixels that the camera never saw; None if it saw all.
     """
 
     x: NDArray[np.float32]
@@ -57,19 +57,19 @@ class Pinhole:
 
 
 class Undistortion:
-    """Mapping from the images of a distorted camera to those of a pinhole camera, cropped to have no blank pixel.
+    """Mapping from the images of a distorted camera to those of a pinhole camera, cropped so that no pixel is blank.
 
     The pinhole camera is the one of COLMAP's ``image_undistorter`` with its default options. Distortion is evaluated in
-    the model's pixels, so the image file may have another size than the model says, even with another aspect ratio.
+    the model's pixels, so the image file may have another size than the model says, even another aspect ratio.
 
     Args:
         camera: Distorted ``pycolmap.Camera``.
         width: Width of the image files in pixels.
         height: Height of the image files in pixels.
-        keep_maps: Keep the map, 8 bytes a pixel, for the next image of this camera.
+        keep_maps: Keep the map, 8 bytes per pixel, for the next image of this camera.
 
     Raises:
-        SceneError: The camera has no pinhole counterpart, as a spherical one.
+        SceneError: The camera has no pinhole counterpart, for example a spherical one.
     """
 
     def __init__(self, camera: Any, width: int, height: int, keep_maps: bool = True) -> None:
@@ -94,7 +94,7 @@ class Undistortion:
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Undistort an image ``[H, W, 3]`` of the file's size; pixels the camera never saw are black."""
         maps = self.maps()
-        # the border is repeated, so that the cubic kernel does not mix black into the edge of the crop
+        # replicate the border, so that the cubic kernel does not mix black into the edge of the crop
         result: NDArray[np.uint8] = cv2.remap(image, maps.x, maps.y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         if maps.blank is not None:
             result[maps.blank] = 0
@@ -105,7 +105,7 @@ class Undistortion:
         if self._maps is not None:
             return self._maps
         pixels = np.concatenate(list(self._source_pixels())).reshape(self.pinhole.height, self.pinhole.width, 2)
-        # more than a pixel outside, or not a number where the ray leaves the camera's model
+        # more than a pixel outside, or NaN where the ray leaves the domain of the camera model
         blank: NDArray[np.bool_] = np.any((pixels <= -1) | (pixels >= self._size) | np.isnan(pixels), axis=-1)
         columns, rows = (np.nan_to_num(pixels[..., i], nan=-1.0) for i in (0, 1))
         maps = Maps(columns, rows, blank if blank.any() else None)
@@ -129,7 +129,7 @@ class Undistortion:
         if not self._warned:
             self._warned = True
             _LOG.warning(
-                "camera %s (%s): %.1f %% of the pinhole image is black, its field of view is too wide for one",
+                "camera %s (%s): %.1f %% of the pinhole image is black: its field of view is too wide for a pinhole",
                 self._camera.camera_id,
                 self._camera.model_name,
                 100 * blank.mean(),
@@ -137,7 +137,7 @@ class Undistortion:
 
 
 def rectify(camera: Any, width: int, height: int, keep_maps: bool = True) -> tuple[Pinhole, Undistortion | None]:
-    """Pinhole camera of the undistorted images, and how to undistort them (None where nothing is to be done).
+    """Pinhole camera of the undistorted images, and how to undistort them (None if there is nothing to do).
 
     Args:
         camera: ``pycolmap.Camera`` of any model.
@@ -148,7 +148,7 @@ def rectify(camera: Any, width: int, height: int, keep_maps: bool = True) -> tup
     Raises:
         SceneError: The camera cannot be turned into a pinhole camera.
     """
-    # A polynomial of zeros is a pinhole too, but COLMAP's undistorter would crop its picture by a pixel.
+    # An all-zero polynomial is a pinhole too, but COLMAP's undistorter would crop its picture by a pixel.
     skip = camera.model_name in _POLYNOMIAL and camera.is_undistorted()
     if skip or (camera.model_name in _PINHOLE and is_on("undistortion")):
         pinhole = Pinhole(camera.calibration_matrix(), camera.width, camera.height)

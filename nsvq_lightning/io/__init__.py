@@ -1,4 +1,4 @@
-"""Scenes on disk: the compressed ``.nsvq`` file, what viewers open, and the registry of formats.
+"""Scenes on disk: the compressed ``.nsvq`` file, the formats of viewers, and the registry of formats.
 
 Nothing here imports torch before a scene is turned into :class:`nsvq_lightning.Splats`.
 """

@@ -1,4 +1,4 @@
-"""Files that are either complete or not there."""
+"""Files that are either complete or absent."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ __all__ = ["atomic_path", "atomic_write", "write_text"]
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Name of a temporary file to write, which takes the name ``path`` only when the block ends without an error.
+    """Path of a temporary file to write, which is renamed to ``path`` only when the block ends without an error.
 
-    The file lies in the same folder, reaches the disk (fsync), and is renamed over ``path`` in one step
-    (:func:`os.replace`). A block that raises, a full disk or a killed process leave the previous file as it was; an
+    The file is in the same folder, is flushed to disk (fsync), and is renamed over ``path`` in one step
+    (:func:`os.replace`). A block that raises, a full disk or a killed process leaves the previous file as it was; an
     exception also removes the temporary file. A symbolic link is followed: its target is replaced, the link stays.
 
     Args:
-        path: Final name; the folder must exist. A new file keeps the permissions it was written with, a replaced one
-            keeps its own.
+        path: Final name; the folder must exist. A new file keeps the permissions it was written with; a file that is
+            replaced passes its permissions on.
 
     Yields:
         The temporary name; the block must write a file there.
@@ -36,11 +36,11 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise IsADirectoryError(f"cannot write {path}: it is a folder; add a file name")
     if not target.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: the folder {target.parent} does not exist; create it first")
-    # Not mkstemp: it makes files that only their owner can read, and rename would keep that.
+    # Not mkstemp: it creates files that only their owner can read, and renaming would keep that.
     temporary = target.parent / f".{secrets.token_hex(8)}.tmp"
     try:
         yield temporary
-        _sync(temporary, os.O_RDWR)  # not read-only: Windows brings only what may be written to the disk
+        _sync(temporary, os.O_RDWR)  # not read-only: Windows flushes only files that are open for writing
         with suppress(FileNotFoundError):
             temporary.chmod(target.stat().st_mode & 0o7777)
         os.replace(temporary, target)
@@ -54,9 +54,9 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """Open a binary file for writing that takes the name ``path`` only when the block ends without an error.
+    """Open a binary file for writing that is renamed to ``path`` only when the block ends without an error.
 
-    Arguments and errors as of :func:`atomic_path`; a new file gets the permissions of any new file.
+    Arguments and errors are those of :func:`atomic_path`; a new file gets default permissions.
 
     Yields:
         The temporary file, opened for writing.
@@ -72,7 +72,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def _sync(path: Path, access: int) -> None:
-    """Bring a file or folder to the disk."""
+    """Flush a file or folder to disk."""
     descriptor = os.open(path, access)
     try:
         os.fsync(descriptor)

@@ -1,4 +1,4 @@
-"""How far the numbers of a file are from those of the scene that it was written from."""
+"""How far the values in a file are from those of the scene that it was written from."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ __all__ = ["attribute_errors"]
 
 
 def attribute_errors(read: SplatArrays, written: SplatArrays) -> dict[str, float]:
-    """Root mean square errors over the splats, by what they are errors of.
+    """Root mean square errors over the splats, by quantity.
 
     Args:
         read: What the file holds, N splats.
-        written: What it was written from, the same splats in the same order; coefficients of spherical harmonics that
+        written: What it was written from, the same splats in the same order; spherical-harmonic coefficients that
             the file does not hold count as 0.
 
     Returns:

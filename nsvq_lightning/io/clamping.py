@@ -1,4 +1,4 @@
-"""Rounding to the numbers that a format can hold, and a count of the splats that it cannot."""
+"""Rounding to the values that a format can hold, and a count of the splats out of its range."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ __all__ = ["Clamped"]
 logger = logging.getLogger(__name__)
 
 _ROUNDING = 1e-3
-"""What float32 may add to a distance of one half."""
+"""What float32 rounding may add to a distance of one half."""
 
 
 class Clamped:
-    """Rounds values to what lies between two ends; counts the splats that lie beyond, by attribute."""
+    """Rounds and clamps values to a range; counts the splats outside it, by attribute."""
 
     def __init__(self) -> None:
         self._counts: dict[str, int] = {}
@@ -34,9 +34,9 @@ class Clamped:
 
         Args:
             name: Attribute, for the message.
-            values: Numbers ``[K, ...]`` in units of the format.
+            values: Values ``[K, ...]`` in units of the format.
             ends: Smallest and largest integer of the format.
-            uses: How many splats have each row ``[K]``; one each if None. Rows that no splat uses may hold anything.
+            uses: How many splats have each row ``[K]``; one each if None. Rows that no splat uses are not counted.
 
         Returns:
             Integers ``[K, ...]``.
@@ -49,7 +49,7 @@ class Clamped:
     def within(
         self, name: str, values: NDArray[np.float32], low: float, high: float, uses: NDArray[np.integer] | None = None
     ) -> NDArray[np.float32]:
-        """Numbers ``[K, ...]`` within two ends; arguments as of :meth:`nearest`."""
+        """Values ``[K, ...]`` clamped to [``low``, ``high``]; the other arguments are those of :meth:`nearest`."""
         self._count(name, (values < low) | (values > high), uses)
         return np.clip(values, low, high)
 
@@ -58,11 +58,11 @@ class Clamped:
         self._counts[name] = self._counts.get(name, 0) + int(rows.sum() if uses is None else uses[rows].sum())
 
     def warn(self, path: str | os.PathLike[str], count: int) -> None:
-        """Say how many of ``count`` splats were changed because the format does not reach so far."""
+        """Warn how many of ``count`` splats were clamped to the format's range."""
         changed = ", ".join(f"{name} {splats}" for name, splats in self._counts.items() if splats)
         if changed:
             logger.warning(
-                "%s: out of the range of %s files, moved to its end: %s (of %d splats)",
+                "%s: out of the range of %s files and clamped to it: %s (of %d splats)",
                 os.fspath(path),
                 os.path.splitext(path)[1].lower(),
                 changed,

@@ -25,17 +25,17 @@ _T = TypeVar("_T", bound=np.generic)
 __all__ = ["QUANTIZABLE", "CompressedScene", "attribute_dims"]
 
 QUANTIZABLE = ("quats", "scales", "sh0", "shN")
-"""Attributes that may be codes into a codebook, in file order; positions and opacities never are (paper, section 3)."""
+"""Attributes that may be stored as codes, in file order; positions and opacities never are (paper, section 3)."""
 
 
 def attribute_dims(sh_degree: int) -> dict[str, int]:
-    """Numbers a splat, D, of each attribute in :data:`QUANTIZABLE`; ``shN`` is the flattened ``[coefficients, 3]``."""
+    """Values per splat, D, of each attribute in :data:`QUANTIZABLE`; ``shN`` is the flattened ``[coefficients, 3]``."""
     return {"quats": 4, "scales": 3, "sh0": 3, "shN": 3 * sh_coefficients(sh_degree)}
 
 
 @dataclass(frozen=True, eq=False)
 class CompressedScene:
-    """N splats whose attributes are partly codes into codebooks.
+    """N splats, some of whose attributes are codes into codebooks.
 
     Every attribute of :data:`QUANTIZABLE` is either in ``codes`` and ``codebooks`` or in ``raw``; spaces are those of
     :meth:`nsvq_lightning.Splats.from_tensors` (log-scales, quaternions wxyz, SH coefficients).
@@ -48,8 +48,8 @@ class CompressedScene:
         raw: Attributes that are not quantized, ``[N, D]`` float32.
         sh_degree: Degree of the spherical harmonics, 0 to 3.
         config: Settings of the run; JSON values only, keys are strings.
-        metrics: Quality measured on the decoded scene; not finite values are stored as None.
-        origin: World coordinates of the zero of ``means``, float64.
+        metrics: Quality measured on the decoded scene; non-finite values are stored as None.
+        origin: World coordinates of the point that is 0 in ``means``, float64.
         stored_bytes: Bytes of the file the scene was read from, None if it was not.
 
     Raises:
@@ -89,14 +89,14 @@ class CompressedScene:
 
     @classmethod
     def from_arrays(cls, arrays: SplatArrays, **header: Any) -> CompressedScene:
-        """A scene without any codebook: valid, and no smaller than its numbers.
+        """A scene without any codebook: valid, but not compressed.
 
         Args:
             arrays: The scene.
             header: ``config``, ``metrics`` and ``origin``.
         """
         dims = attribute_dims(arrays.sh_degree)
-        # Not -1, which cannot be inferred where an axis is empty.
+        # Not -1, which NumPy cannot infer where an axis is empty.
         raw = {name: getattr(arrays, name).reshape(len(arrays), dims[name]) for name in QUANTIZABLE}
         return cls(arrays.means, arrays.opacities, raw=raw, sh_degree=arrays.sh_degree, **header)
 
@@ -116,11 +116,11 @@ class CompressedScene:
     def spread(
         self, name: str, function: Callable[[NDArray[np.float32], NDArray[np.int64] | None], NDArray[_T]]
     ) -> NDArray[_T]:
-        """What a function makes of the rows of an attribute, for each splat: computed once a row of the codebook.
+        """A function of the rows of an attribute, for each splat: computed once per row of the codebook.
 
         Args:
             name: Attribute.
-            function: Of the rows ``[K, D]`` and of how many splats use each ``[K]`` (None: one each), to ``[K, ...]``.
+            function: Maps the rows ``[K, D]`` and how many splats use each ``[K]`` (None: one each) to ``[K, ...]``.
 
         Returns:
             ``[N, ...]``.
@@ -129,7 +129,7 @@ class CompressedScene:
         return values if name in self.raw else values[self.codes[name]]
 
     def take(self, splats: NDArray[np.integer] | NDArray[np.bool_]) -> CompressedScene:
-        """The scene of some of the splats, by number or by mask ``[N]``; codebooks stay as they are."""
+        """The scene of some of the splats, by index or by mask ``[N]``; codebooks stay as they are."""
         return replace(
             self,
             means=self.means[splats],
@@ -140,7 +140,7 @@ class CompressedScene:
         )
 
     def finite(self) -> CompressedScene:
-        """The splats without NaN or infinite numbers; a warning names the attributes of the others."""
+        """The splats without NaN or infinite values; a warning counts the others by attribute."""
         bad = {name: np.where(np.isfinite(rows).all(1), 0, np.nan) for name, rows in self.codebooks.items()}
         flags = {name: flags.astype(np.float32)[self.codes[name]] for name, flags in bad.items()}
         keep, culprits = finite_rows({"means": self.means, "opacities": self.opacities, **self.raw, **flags})
@@ -165,8 +165,8 @@ class CompressedScene:
     def decode(self) -> Splats:
         """The decoded scene as :class:`nsvq_lightning.Splats`.
 
-        Positions stay relative to ``origin``: adding a large origin in float32 would lose the detail that it was taken
-        off to keep.
+        Positions stay relative to ``origin``: adding a large origin in float32 would lose the detail that
+        subtracting it preserved.
         """
         return self.arrays().to_splats()
 

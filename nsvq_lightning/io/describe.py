@@ -25,7 +25,7 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Facts about a file, as JSON values; its first bytes name the format, except that ``.splat`` has none.
 
     Raises:
-        FormatError: The file is damaged, or of no format of :data:`~nsvq_lightning.io.formats.FORMATS`.
+        FormatError: The file is damaged, or not in a format of :data:`~nsvq_lightning.io.formats.FORMATS`.
         OSError: It cannot be read.
     """
     path = Path(path)
@@ -40,7 +40,7 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
             raise FormatError(f"{path}: not a {', '.join(FORMATS)} file", "give the file of a scene")
         facts = _describe_splat(path)
     facts["plain_bytes"] = plain_ply_bytes(facts["splats"], facts["sh_degree"])
-    facts["ratio"] = facts["plain_bytes"] / max(1, facts["bytes"])  # an empty .splat has no byte
+    facts["ratio"] = facts["plain_bytes"] / max(1, facts["bytes"])  # an empty .splat has no bytes
     return {"file": str(path), **facts}
 
 
@@ -67,7 +67,7 @@ def _describe_ply(path: Path) -> dict[str, Any]:
     for name in header.properties:
         attribute = attribute_of(name)
         sizes[attribute] = sizes.get(attribute, 0) + header.count * header.dtype[name].itemsize
-    # The lengths of ascii numbers differ, so only the whole is known.
+    # The lengths of ascii numbers vary, so only the total is known.
     streams = {"header": header.offset, **sizes} if header.encoding != "ascii" else {"text": total}
     return _facts(f"ply, {header.encoding}", header.count, header.sh_degree, total, streams, "ply")
 
@@ -107,7 +107,7 @@ def _facts(
 
 
 _OUTSIDE = {"header": "plain", META: "json", "zip": "zip"}
-"""What is around the streams, and how it is encoded."""
+"""The part of a file around the streams, and how it is encoded."""
 
 _DESCRIBERS: tuple[tuple[bytes | tuple[bytes, ...], Callable[[Path], dict[str, Any]]], ...] = (
     (MAGIC, _describe_nsvq),
@@ -115,4 +115,4 @@ _DESCRIBERS: tuple[tuple[bytes | tuple[bytes, ...], Callable[[Path], dict[str, A
     (ZIP_MAGIC, _describe_sog),
     (SPZ_MAGICS, _describe_spz),
 )
-"""First bytes of each format, and what describes it."""
+"""First bytes of each format, and the function that describes it."""

@@ -1,4 +1,4 @@
-"""The one error of all file formats."""
+"""The error that all file formats share."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class FormatError(ValueError):
 
 @contextmanager
 def naming_file(path: str | PathLike[str]) -> Iterator[None]:
-    """Put the file's name in front of every :class:`FormatError` of the block, so that parsers need not know it."""
+    """Prefix every :class:`FormatError` of the block with the file's name, so that parsers need not know it."""
     try:
         yield
     except FormatError as error:

@@ -1,4 +1,4 @@
-"""Load, save and convert scenes, the format chosen by the file's suffix."""
+"""Load, save and convert scenes; the file's suffix selects the format."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Format:
         read: Scene from a file; None if the format is only written. Codebooks are kept where the format has them.
         write: ``write(path, scene, **options) -> bytes written``; None if the format is only read.
         keeps_origin: Whether the file holds the origin that positions are relative to.
-        in_order: The splats of a scene that a file holds, in its order, to be compared with what is read from it; None
-            if the format loses nothing, or states its errors itself.
+        in_order: Gives the splats of a scene that a file holds, in file order, for comparison with what is read back;
+            None if the format loses nothing, or states its errors itself.
     """
 
     description: str
@@ -50,11 +50,11 @@ def load(path: str | os.PathLike[str]) -> Splats:
     """Load a scene of any supported format.
 
     Args:
-        path: File; its suffix, in any case, names the format, see :data:`FORMATS`.
+        path: File; its suffix, upper or lower case, selects the format, see :data:`FORMATS`.
 
     Raises:
         ValueError: Unknown suffix.
-        FormatError: The file is damaged or of another format than its suffix says.
+        FormatError: The file is damaged or not in the format of its suffix.
         FileNotFoundError: No such file.
     """
     scene = read_scene(path)
@@ -66,7 +66,7 @@ def load(path: str | os.PathLike[str]) -> Splats:
 
 
 def read_scene(path: str | os.PathLike[str]) -> CompressedScene:
-    """Read a scene of any supported format with the codebooks that it has; arguments and errors as of :func:`load`."""
+    """Read a scene of any supported format, keeping its codebooks; arguments and errors are those of :func:`load`."""
     path = Path(path)
     reader = _format_of(path, "read").read
     if reader is None:
@@ -80,15 +80,15 @@ def save(
     storage: Storage | None = None,
     **options: Any,
 ) -> int:
-    """Save a scene in any supported format; splats with NaN or infinite numbers are left out with a warning.
+    """Save a scene in any supported format; splats with NaN or infinite values are left out with a warning.
 
     Args:
         scene: For example :class:`nsvq_lightning.Splats`. A :class:`CompressedScene` keeps its codebooks where the
             format has them: all of them in ``.nsvq``, that of the spherical harmonics in ``.sog``.
-        path: File to write, replaced atomically; its suffix names the format.
-        storage: Level and precision of ``.nsvq``. Given for another format, the file holds what the ``.nsvq`` file
+        path: File to write, replaced atomically; its suffix selects the format.
+        storage: Level and precision of ``.nsvq``. For another format, the file then holds what the ``.nsvq`` file
             would decode to, so that all files of a run hold the same splats.
-        options: For ``.sog``: ``palette`` (most rows of the palette of spherical harmonics without a codebook, default
+        options: For ``.sog``: ``palette`` (most rows of the palette for spherical harmonics without a codebook, default
             65536). For ``.spz``: ``version`` (3 or 4, default 3).
 
     Returns:

@@ -1,4 +1,4 @@
-"""The few levels that stand for many numbers with the least square error (Max 1960, Lloyd 1982)."""
+"""The few levels that represent many values with the least squared error (Max 1960, Lloyd 1982)."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from numpy.typing import NDArray
 __all__ = ["best_levels", "nearest_level"]
 
 _STEPS = 500
-"""Most Lloyd steps; each costs one search of 256 borders, whatever the number of values."""
+"""Largest number of Lloyd steps; each costs one search of 256 borders, whatever the number of values."""
 
 
 def best_levels(
     values: NDArray[np.float32], weight: NDArray[np.integer] | None = None, count: int = 256
 ) -> NDArray[np.float32]:
-    """Levels ``[count]``, ascending, to the nearest of which values have nearly the least mean square distance.
+    """Levels ``[count]``, ascending, that nearly minimize the mean squared distance of values to their nearest level.
 
-    Where there are no more distinct values than levels, the levels are those values. Otherwise one cell of all values
-    is cut in two where that gains most, then whichever cell gains most, until there are enough; Lloyd's steps then move
-    each level into the mean of its values until none moves. On random numbers that ends within a tenth of the optimum.
+    If there are no more distinct values than levels, the levels are those values. Otherwise one cell of all values is
+    split where that gains most, then always the cell that gains most, until there are enough; Lloyd steps then move
+    each level to the mean of its values until none moves. On random numbers this ends within a tenth of the optimum.
 
     Args:
         values: Any shape, finite.
         weight: How often each value counts, broadcasts with ``values``; once if None.
-        count: Number of levels; the last one is repeated where fewer are enough.
+        count: Number of levels; the last one is repeated if fewer are enough.
     """
     distinct, inverse = np.unique(values, return_inverse=True)
     weights = None if weight is None else np.broadcast_to(weight, values.shape).ravel().astype(np.float64)
@@ -39,7 +39,7 @@ def best_levels(
 
 
 def nearest_level(values: NDArray[np.float32], levels: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Number of the level nearest to each value; ``levels`` ascending, 256 at most."""
+    """Index of the level nearest to each value; ``levels`` ascending, at most 256."""
     return np.searchsorted(_borders(levels.astype(np.float64)), values).astype(np.uint8)
 
 
@@ -51,17 +51,17 @@ class _Cells:
     """Sums over runs of sorted values, each a cell with one level: its mean."""
 
     def __init__(self, numbers: NDArray[np.float64], mass: NDArray[np.float64]) -> None:
-        self._middle = float(np.average(numbers, weights=mass))  # sums of differences to it lose no digits
+        self._middle = float(np.average(numbers, weights=mass))  # sums of differences from it lose no digits
         self._mass = np.concatenate([[0.0], np.cumsum(mass)])
         self._sum = np.concatenate([[0.0], np.cumsum(mass * (numbers - self._middle))])
 
     def means(self, ends: NDArray[np.intp], empty: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Means ``[C]`` of the cells between ``ends [C + 1]``; of a cell without values what ``empty [C]`` says."""
+        """Means ``[C]`` of the cells between ``ends [C + 1]``; for a cell without values, that of ``empty [C]``."""
         mass = np.diff(self._mass[ends])
         return np.where(mass > 0, np.diff(self._sum[ends]) / np.where(mass > 0, mass, 1) + self._middle, empty)
 
     def best_split(self, first: int, end: int) -> tuple[float, int]:
-        """By how much the sum of squares falls most if a cell is cut in two, and where; -1 for a cell of one value."""
+        """The largest reduction of the sum of squares by splitting a cell, and where; -1 for a cell of one value."""
         if end - first < 2:
             return -1.0, first
         cuts = slice(first + 1, end)
@@ -73,7 +73,7 @@ class _Cells:
 
 
 def _split(cells: _Cells, numbers: int, count: int) -> NDArray[np.intp]:
-    """Ends ``[count + 1]`` of cells: one cell of all values, of which always the one that gains most is cut in two."""
+    """Ends ``[count + 1]`` of cells: starting from one cell of all values, always split the one that gains most."""
     gain, cut = cells.best_split(0, numbers)
     heap = [(-gain, 0, cut, numbers)]
     while len(heap) < count:

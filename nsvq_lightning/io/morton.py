@@ -1,4 +1,4 @@
-"""Positions as integers on a grid, in Morton order, each only as fine as it must be."""
+"""Positions as integers on a grid, in Morton order, each only as fine as necessary."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from nsvq_lightning.compute.memory import INT64, check_array
 __all__ = ["AXIS_BITS", "Grid", "morton_keys", "nearest_before", "spatial_order", "unmorton"]
 
 AXIS_BITS = 21
-"""Bits of a coordinate: three of them make a key of 63."""
+"""Bits per coordinate: three coordinates make a key of 63 bits."""
 
 _WINDOW = 16
-"""Rows before a row that are searched for neighbours. Of 8 bits of codes, 64 instead of 16 save another 0.05."""
+"""Rows before a row that are searched for neighbours. 64 instead of 16 would save another 0.05 of 8 bits of codes."""
 
 _EXTENT_BITS = 20
-"""No step is finer than this part of the extent, in powers of a half."""
+"""No step is finer than the extent times ½ to this power."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A cube of 2^21 cells a side, of which position ``x`` is in cell ``floor(x / step) - base``.
+    """A cube with 2^21 cells per side, in which position ``x`` is in cell ``floor(x / step) - base``.
 
     Attributes:
         step: Side of the finest cell, scene units.
-        base: First cell along each axis, in cells from the zero of the scene.
+        base: First cell along each axis, in cells from the scene's origin.
     """
 
     step: float
@@ -37,10 +37,10 @@ class Grid:
 
     @classmethod
     def around(cls, means: NDArray[np.float32], widest: NDArray[np.float64]) -> Grid:
-        """The grid for positions ``[N, 3]`` whose cells may be ``widest [N]`` at most.
+        """The grid for positions ``[N, 3]`` whose cells may be at most ``widest [N]`` wide.
 
-        Its cells are small enough for all but the thousandth with the smallest splats, yet not below 2⁻²⁰ of the
-        extent of all but the thousandth at either end of each axis; so the cube holds all but a few far splats.
+        Its cells are small enough for all but the smallest thousandth of splats, yet not below 2⁻²⁰ of the extent of
+        all but the outermost thousandth at either end of each axis; so the cube holds all but a few far splats.
         """
         if len(means) == 0:
             return cls(1.0, (0, 0, 0))
@@ -57,7 +57,7 @@ class Grid:
         return np.where(inside[:, None], cells, 0).astype(np.int64), inside
 
     def depths(self, doublings: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Bits an axis ``[N]``, 0 to 21, of cells that are at most 2 to the power of ``doublings [N]`` steps wide."""
+        """Bits per axis ``[N]``, 0 to 21, of cells that are at most 2 to the power of ``doublings [N]`` steps wide."""
         return AXIS_BITS - np.clip(np.floor(doublings), 0, AXIS_BITS).astype(np.int64)
 
     def centers(self, cells: NDArray[np.int64], depths: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -69,7 +69,7 @@ class Grid:
 
 
 def morton_keys(cells: NDArray[np.int64], depths: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """Bits of the coordinates ``[N, 3]`` in turns, highest first, x before y before z; those below ``depths`` are 0."""
+    """Interleaved bits of coordinates ``[N, 3]``, highest first, x before y before z; those below ``depths`` are 0."""
     shift = AXIS_BITS - depths
     keys = np.zeros(len(cells), np.uint64)
     for axis in range(3):
@@ -88,20 +88,20 @@ _MASKS = tuple(
         (0x1249249249249249, 0x10C30C30C30C30C3, 0x100F00F00F00F00F, 0x1F0000FF0000FF, 0x1F00000000FFFF, 0x1FFFFF),
     )
 )
-"""Groups of 1, 2, 4, 8, 16 and 21 neighbouring bits with twice as many gaps between."""
+"""Masks of groups of 1, 2, 4, 8, 16 and 21 adjacent bits, with gaps of twice that length between."""
 
 _SHIFTS = tuple(map(np.uint64, (2, 4, 8, 16, 32)))
 
 
 def _spread(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Two zeros between every two of 21 bits."""
+    """Insert two zeros between adjacent bits of the 21."""
     for mask, shift in zip(_MASKS[4::-1], _SHIFTS[::-1], strict=True):
         values = (values | (values << shift)) & mask
     return values
 
 
 def _gather(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Every third bit, without the gaps."""
+    """Collect every third bit, the inverse of :func:`_spread`."""
     values = values & _MASKS[0]
     for mask, shift in zip(_MASKS[1:], _SHIFTS, strict=True):
         values = (values | (values >> shift)) & mask
@@ -111,10 +111,10 @@ def _gather(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
 def nearest_before(cells: NDArray[np.int64]) -> NDArray[np.int32]:
     """The two nearest ``[N, 2]`` of the 16 rows before each row of ``cells [N, 3]``, nearest first; -1 where none is.
 
-    Distances are integers, and of equal ones the earlier row counts: every machine finds the same rows.
+    Distances are integers, and the earlier of two equally near rows is taken: every machine finds the same rows.
 
     Raises:
-        ValueError: ``cells`` is not ``[N, 3]``, or has gaps.
+        ValueError: ``cells`` is not ``[N, 3]``, or not contiguous.
         TypeError: It is not int64.
     """
     check_array("cells", cells, (len(cells), 3), INT64)
@@ -142,6 +142,6 @@ def _search_before(cells, found):  # type: ignore[no-untyped-def]
 
 
 def spatial_order(means: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Numbers ``[N]`` of splats in Morton order of their positions ``[N, 3]``; equal ones stay as they are."""
+    """Indices ``[N]`` of splats in Morton order of their positions ``[N, 3]``; equal ones keep their order."""
     cells, _ = Grid.around(means, np.zeros(len(means))).cells(means)
     return morton_keys(cells, np.full(len(means), AXIS_BITS)).argsort(kind="stable")

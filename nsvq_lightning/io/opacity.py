@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 __all__ = ["finite_logits", "logits_of_bytes", "opacity_of"]
 
 _OPAQUE = 20.0
-"""Logit that stands for ±inf: its sigmoid is 1 in float32, and training can still move it."""
+"""Magnitude of the logit that replaces ±inf: its sigmoid is 1 in float32, and training can still move it."""
 
 
 def opacity_of(logits: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -18,12 +18,12 @@ def opacity_of(logits: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def finite_logits(logits: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The logits with ±20 for ±inf, which is what 0 and 255 become where opacities are bytes."""
+    """The logits with ±20 in place of ±inf, which 0 and 255 become where opacities are stored as bytes."""
     return np.where(np.isinf(logits), np.copysign(np.float32(_OPAQUE), logits), logits)
 
 
 def logits_of_bytes(levels: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Finite logits of opacities that are 255ths."""
+    """Finite logits of opacities given in 255ths."""
     shares = np.arange(256) / 255
     with np.errstate(divide="ignore"):
         table = np.log(shares) - np.log1p(-shares)

@@ -1,4 +1,4 @@
-"""A palette for many rows: cells of like rows, found by cutting the cell in two where that gains most."""
+"""A palette for many rows: cells of similar rows, found by always splitting the cell where that gains most."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from nsvq_lightning.compute.memory import check_array, check_table
 __all__ = ["find_palette", "in_order_of_use"]
 
 _ITERATIONS = 4
-"""Steps of the power iteration for the direction of a cut, which need not be exact."""
+"""Power-iteration steps for the direction of a cut, which need not be exact."""
 
 
 def find_palette(
     rows: NDArray[np.float32], weight: NDArray[np.number[Any]], count: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Few rows that stand for many with a small weighted square distance; rows as they are where they are few enough.
+    """Few rows that represent many with a small weighted squared distance; the rows themselves if they are few enough.
 
-    All rows are one cell, which is cut across the direction in which they differ most, where the sum of squares along
-    it falls most; then whichever cell gains most, until there are enough. A cell of equal rows is never cut. The time
-    hardly depends on the number of cells, and that of k-means grows with it: 65 536 cells of 100 000 rows take seconds,
-    not minutes.
+    All rows start as one cell, which is cut across the direction in which they differ most, where that reduces the sum
+    of squares most; then always the cell that gains most, until there are enough. A cell of equal rows is never cut.
+    The time hardly depends on the number of cells, while that of k-means grows with it: 65 536 cells of 100 000 rows
+    take seconds, not minutes.
 
     Args:
         rows: ``[N, D]``, finite.
@@ -38,7 +38,7 @@ def find_palette(
 
     Raises:
         TypeError: ``rows`` are not float32.
-        ValueError: They have another shape, or gaps, or there is another number of weights.
+        ValueError: They have another shape, are not contiguous, or the number of weights differs.
     """
     check_table("rows", rows)
     wide = weight.astype(np.float64)
@@ -52,9 +52,9 @@ def find_palette(
 def in_order_of_use(
     rows: NDArray[np.float32], labels: NDArray[np.integer]
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """The distinct rows in use, in the order of the splats that use them first, and the row of each splat.
+    """The distinct rows in use, in order of first use by the splats, and the row of each splat.
 
-    Neighbours then have like labels. Where each splat has its own row, labels count up and cost next to nothing.
+    Neighbours then have similar labels. If each splat has its own row, labels count up and cost next to nothing.
 
     Args:
         rows: ``[K, D]``.
@@ -62,7 +62,7 @@ def in_order_of_use(
     """
     used, labels = np.unique(labels, return_inverse=True)
     distinct, same = np.unique(rows[used], axis=0, return_inverse=True)
-    labels = same.reshape(-1)[labels]  # its shape was not the same in all releases of NumPy
+    labels = same.reshape(-1)[labels]  # its shape differs between releases of NumPy
     _, first = np.unique(labels, return_index=True)
     order = first.argsort()
     return distinct[order], order.argsort()[labels]
@@ -84,14 +84,14 @@ def _labels(rows: NDArray[np.float32], weight: NDArray[np.float64], count: int) 
 
 
 class _Cells:
-    """Runs of ``order [N]``, the numbers of the rows, each run a cell."""
+    """Runs of ``order [N]``, the indices of the rows; each run is a cell."""
 
     def __init__(self, rows: NDArray[np.float32], weight: NDArray[np.float64]) -> None:
         self._rows, self._weight = rows, weight
         self.order = np.arange(len(rows))
 
     def best_cut(self, start: int, end: int) -> tuple[float, int]:
-        """Sort a cell along its direction; how much the sum of squares falls if it is cut in two, and where."""
+        """Sort a cell along its direction; returns how much the sum of squares falls if it is cut in two, and where."""
         if end - start < 2:
             return 0.0, start
         numbers = self.order[start:end]
@@ -109,7 +109,7 @@ class _Cells:
 
 @partial(kernel, parallel=False)
 def _place_along(rows, weight, numbers, along):  # type: ignore[no-untyped-def]
-    """Where some rows lie along the direction in which they differ most; 0 if they are equal."""
+    """Positions of some rows along the direction in which they differ most; 0 if they are equal."""
     dim = rows.shape[1]
     along[:] = 0
     mean, product, direction = np.zeros(dim), np.zeros(dim), np.zeros(dim)
@@ -121,7 +121,7 @@ def _place_along(rows, weight, numbers, along):  # type: ignore[no-untyped-def]
             equal &= rows[i, j] == rows[numbers[0], j]
     if equal:
         return
-    # The column that varies most is where the search for the direction starts.
+    # The search for the direction starts from the column that varies most.
     widest = 0
     for j in range(dim):
         mean[j] /= mass

@@ -20,14 +20,14 @@ from nsvq_lightning.splats.sh_degree import sh_coefficients
 __all__ = ["plain_ply_bytes", "read_ply", "read_ply_size", "write_ply"]
 
 _ROWS = 1 << 12
-"""Rows converted at a time, about 1 MB: they stay in the cache, and memory at one copy of the scene."""
+"""Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene."""
 
 
 def read_ply(path: str | os.PathLike[str]) -> SplatArrays:
     """Read the splats of a ``.ply`` file.
 
-    Properties may come in any order and any number type, binary (either byte order) or ascii; with or without normals,
-    SH degree 0 to 3 by the number of ``f_rest`` properties, further properties and elements are skipped.
+    Properties may come in any order and any number type, binary (either byte order) or ascii; with or without normals.
+    The number of ``f_rest`` properties gives the SH degree, 0 to 3; other properties and elements are skipped.
 
     Raises:
         FormatError: The file is truncated, or not a ``.ply`` of Gaussian splats.
@@ -35,7 +35,7 @@ def read_ply(path: str | os.PathLike[str]) -> SplatArrays:
     header, _ = read_ply_size(path)
     splats = _empty(header.count, header.sh_degree)
     start = 0
-    # A double beyond float32 becomes inf, which is what a float file would hold.
+    # A double beyond float32's range becomes inf, which is what a float file would hold.
     with naming_file(path), open(path, "rb") as file, np.errstate(over="ignore"):
         file.seek(header.offset)
         for table in (_read_ascii if header.encoding == "ascii" else _read_binary)(file, header):
@@ -45,7 +45,7 @@ def read_ply(path: str | os.PathLike[str]) -> SplatArrays:
 
 
 def read_ply_size(path: str | os.PathLike[str]) -> tuple[PlyHeader, int]:
-    """Header and bytes of a ``.ply`` file that is long enough for its splats.
+    """Header and size in bytes of a ``.ply`` file that is long enough for its splats.
 
     Raises:
         FormatError: The file is truncated, or not a ``.ply`` of Gaussian splats.
@@ -57,11 +57,11 @@ def read_ply_size(path: str | os.PathLike[str]) -> tuple[PlyHeader, int]:
 
 
 def write_ply(path: str | os.PathLike[str], splats: SplatArrays) -> int:
-    """Write splats as little-endian ``.ply``, 62 float32 a splat at SH degree 3.
+    """Write splats as little-endian ``.ply``, 62 float32 per splat at SH degree 3.
 
     Args:
         path: File to write, replaced atomically.
-        splats: The scene; :func:`nsvq_lightning.save` leaves non-finite splats out, on which viewers fail.
+        splats: The scene; :func:`nsvq_lightning.save` leaves out non-finite splats, on which viewers fail.
 
     Returns:
         Bytes of the file.
@@ -75,7 +75,7 @@ def write_ply(path: str | os.PathLike[str], splats: SplatArrays) -> int:
 
 
 def plain_ply_bytes(splats: int, sh_degree: int) -> int:
-    """Bytes of the file :func:`write_ply` makes: what a compressed scene is compared with."""
+    """Size in bytes of the file that :func:`write_ply` makes: the reference for a compressed scene."""
     return len(_header_text(splats, sh_degree)) + 4 * splats * len(_property_names(sh_degree))
 
 
@@ -158,7 +158,7 @@ def _store(table: NDArray[np.float32], splats: SplatArrays, rows: slice) -> None
     means, sh0, opacities, scales, quats, rest = np.split(table, np.cumsum([3, 3, 1, 3, 4]), axis=1)
     splats.means[rows] = means
     splats.sh0[rows, 0] = sh0
-    # Writers that store opacity as a byte turn 0 and 255 into an infinite logit.
+    # Writers that store opacity as a byte make 0 and 255 infinite logits.
     splats.opacities[rows] = finite_logits(opacities[:, 0])
     splats.scales[rows] = scales
     splats.quats[rows] = quats

@@ -31,12 +31,12 @@ _REQUIRED = (
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """Where the splats of a ``.ply`` file lie and what they hold.
+    """Where the splats of a ``.ply`` file are and what they hold.
 
     Attributes:
         encoding: ``binary_little_endian``, ``binary_big_endian`` or ``ascii``.
         count: Number of splats N.
-        dtype: Structured type of one row (of numbers of that type, where the encoding is ascii).
+        dtype: Structured dtype of one row (for ascii, that of the parsed row).
         offset: Byte of the first row; for ascii, of the first line after the header.
         lines: Lines of other elements between ``offset`` and the first splat (ascii only).
         sh_degree: Degree of the spherical harmonics, 0 to 3.
@@ -76,7 +76,7 @@ class _Element:
 
 
 def read_ply_header(path: str | os.PathLike[str]) -> PlyHeader:
-    """Parse the header only; the size of the data is not looked at.
+    """Parse only the header; the size of the data is not checked.
 
     Raises:
         FormatError: The header is truncated, malformed, or not that of Gaussian splats.
@@ -94,7 +94,7 @@ def read_ply_header(path: str | os.PathLike[str]) -> PlyHeader:
 
 
 def attribute_of(name: str) -> str:
-    """Attribute that a property belongs to; the other properties are called ``other``."""
+    """Attribute that a property belongs to; ``other`` for all other properties."""
     families = {"f_dc": "sh0", "f_rest": "shN", "scale": "scales", "rot": "quats"}
     singles = {"x": "means", "y": "means", "z": "means", "opacity": "opacities"}
     return singles.get(name) or families.get(re.sub(r"_[0-9]+$", "", name), "other")

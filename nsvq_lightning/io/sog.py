@@ -1,19 +1,19 @@
-"""The ``.sog`` file of PlayCanvas, version 2: pictures of bytes that a web page can hand to its GPU as they are.
+"""The ``.sog`` file of PlayCanvas, version 2: byte images that a web page can pass to the GPU unchanged.
 
 ==================  ===========================================================================================
 picture             texel
 ==================  ===========================================================================================
-``means_l``         low bytes of the position: sign(x) ln(1 + |x|) in 65535ths between smallest and largest
+``means_l``         low bytes of the position: sign(x) ln(1 + |x|) in 65535ths from smallest to largest
 ``means_u``         high bytes
-``quats``           smallest three of wxyz, 127.5 (1 + √2 q); alpha is 252 plus the number of the largest
-``scales``          numbers of levels, shared by the axes; logarithms
-``sh0``             numbers of levels, shared by the colours; alpha is the opacity in 255ths
+``quats``           smallest three of wxyz, 127.5 (1 + √2 q); alpha is 252 plus the index of the largest
+``scales``          level indices, levels shared by the axes; logarithms
+``sh0``             level indices, levels shared by the colours; alpha is the opacity in 255ths
 ``shN_labels``      row of the palette, low byte and high byte
-``shN_centroids``   64 rows of the palette a line, a texel a coefficient: numbers of levels
+``shN_centroids``   64 rows of the palette per line, one texel per coefficient: level indices
 ==================  ===========================================================================================
 
-The palette is what an SH codebook is, so a scene with one needs no clustering: codes become labels. What is in the file
-follows from the decoded splats alone: a scene gives the same file with its codebooks and without them.
+The palette corresponds to an SH codebook, so a scene with one needs no clustering: codes become labels. The file
+depends only on the decoded splats: a scene gives the same file with its codebooks and without them.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from nsvq_lightning.splats.sh_degree import sh_coefficients
 __all__ = ["PALETTE_LIMIT", "in_sog_order", "read_sog", "read_sog_header", "write_sog"]
 
 PALETTE_LIMIT = 1 << 16
-"""Rows that a label of 16 bits can name."""
+"""Number of rows that a 16-bit label can address."""
 _ROWS_A_LINE = 64
 _LEVELS = 256
 _FARTHEST = math.log1p(float(np.finfo(np.float32).max))
@@ -46,7 +46,7 @@ _FARTHEST = math.log1p(float(np.finfo(np.float32).max))
 
 def in_sog_order(scene: CompressedScene) -> CompressedScene:
     """The splats that a file holds, in its order: Morton order of the positions."""
-    from nsvq_lightning.io.morton import spatial_order  # brings Numba, which readers do without
+    from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
 
     return scene.take(spatial_order(scene.means))
 
@@ -54,16 +54,16 @@ def in_sog_order(scene: CompressedScene) -> CompressedScene:
 def write_sog(path: str | os.PathLike[str], scene: CompressedScene, *, palette: int = PALETTE_LIMIT) -> int:
     """Write a scene as ``.sog``.
 
-    A codebook of the spherical harmonics becomes the palette and its codes the labels, renumbered in the order of their
-    first use. A scene without one, or with more rows in use than a label can name, gets a palette of means of like
-    rows, in which opaque and large splats count more; it is exact where there are no more distinct rows than it may
-    have. Splats with a non-finite value are left out with a warning.
+    A codebook of the spherical harmonics becomes the palette and its codes the labels, renumbered in order of first
+    use. A scene without one, or with more rows in use than a label can address, gets a palette of means of similar
+    rows, in which opaque and large splats count more; it is exact if there are no more distinct rows than it may have.
+    Splats with a non-finite value are left out with a warning.
 
     Args:
         path: File to write, replaced atomically.
         scene: The scene.
-        palette: Most rows of a palette that must be found: fewer make a smaller file, and colours that follow the view
-            less closely.
+        palette: Largest number of rows of a palette that must be found: fewer make a smaller file, with less exact
+            view-dependent colours.
 
     Returns:
         Bytes of the file.
@@ -103,7 +103,7 @@ def write_sog(path: str | os.PathLike[str], scene: CompressedScene, *, palette: 
 
 
 def _with_palette(scene: CompressedScene, most: int) -> CompressedScene:
-    """The scene with an SH codebook, all of whose rows are in use; of one row if there is no splat."""
+    """The scene with an SH codebook, all of whose rows are in use; one row if there are no splats."""
     if scene.sh_degree == 0:
         return scene
     if len(scene):
@@ -123,8 +123,8 @@ def _with_palette(scene: CompressedScene, most: int) -> CompressedScene:
 
 
 def _palette(scene: CompressedScene, most: int) -> tuple[NDArray[np.float32], NDArray[np.integer]]:
-    """Rows of spherical harmonics ``[K, D]``, and the row of each splat ``[N]``."""
-    from nsvq_lightning.io.palette import find_palette  # brings Numba, which readers do without
+    """Palette rows of spherical harmonics ``[K, D]``, and the row of each splat ``[N]``."""
+    from nsvq_lightning.io.palette import find_palette  # imports Numba, which readers do without
 
     rows, codes = scene.table("shN")
     if codes is None:
@@ -137,9 +137,9 @@ def _palette(scene: CompressedScene, most: int) -> tuple[NDArray[np.float32], ND
 
 
 def _visibility(scene: CompressedScene) -> NDArray[np.float64]:
-    """How much the colour of each splat matters ``[N]``, where no view is known: opacity times width.
+    """How much the colour of each splat matters ``[N]`` when no view is known: opacity times width.
 
-    Every splat counts a little, however small it is beside the largest.
+    Every splat counts a little, however small it is compared with the largest.
     """
     sizes = scene.spread("scales", lambda rows, _: np.sort(rows, axis=1)[:, 1:].mean(1)).astype(np.float64)
     weight: NDArray[np.float64] = opacity_of(scene.opacities) * np.exp(sizes - sizes.max())
@@ -170,7 +170,7 @@ def _packed_quats(rows: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def _leveled(scene: CompressedScene, name: str) -> tuple[NDArray[np.uint8], list[float]]:
-    """Numbers of levels ``[N, D]`` of an attribute, and the levels."""
+    """Level indices ``[N, D]`` of an attribute, and the levels."""
     levels = _levels(scene, name)
     return scene.spread(name, lambda rows, _: nearest_level(rows, levels)), _decimals(levels)
 
@@ -200,12 +200,12 @@ def _packed_sh(scene: CompressedScene) -> tuple[dict[str, Any], dict[str, NDArra
 
 
 def _decimals(levels: NDArray[np.float32]) -> list[float]:
-    """Levels as the shortest decimals that are the same float32."""
+    """Levels as the shortest decimals that give the same float32."""
     return [float(str(level)) for level in levels]
 
 
 def _picture(texels: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """Texels ``[N, C]`` as picture ``[H, W, 4]``; what is missing is black and opaque."""
+    """Texels ``[N, C]`` as a picture ``[H, W, 4]``; missing texels are black and opaque."""
     picture = np.zeros((shape[0] * shape[1], 4), np.uint8)
     picture[:, 3] = 255
     picture[: len(texels), : texels.shape[1]] = texels
@@ -216,7 +216,7 @@ def read_sog(path: str | os.PathLike[str]) -> CompressedScene:
     """Read a ``.sog`` file; its palette becomes the codebook of the spherical harmonics.
 
     Raises:
-        FormatError: The file is truncated, altered, of another version, or no ``.sog`` file.
+        FormatError: The file is truncated, altered, of another version, or not a ``.sog`` file.
     """
     with naming_file(path), SogArchive(path) as archive:
         meta = archive.meta()
@@ -238,10 +238,10 @@ def read_sog(path: str | os.PathLike[str]) -> CompressedScene:
 
 
 def read_sog_header(path: str | os.PathLike[str]) -> tuple[int, int, dict[str, int]]:
-    """Number of splats, SH degree, and bytes by name of what is in the archive of a ``.sog`` file.
+    """Number of splats, SH degree, and size in bytes of each entry of a ``.sog`` archive, by name.
 
     Raises:
-        FormatError: The file is truncated, of another version, or no ``.sog`` file.
+        FormatError: The file is truncated, of another version, or not a ``.sog`` file.
     """
     with naming_file(path), SogArchive(path) as archive:
         return *_checked(archive.meta(), archive), archive.sizes
@@ -301,7 +301,7 @@ def _unpacked_means(meta: Mapping[str, Any], low: NDArray[np.uint8], high: NDArr
     mins, maxs = (_numbers(entry, name, range(3, 4), _FARTHEST) for name in ("mins", "maxs"))
     numbers = low[:, :3] + 256.0 * high[:, :3]
     logs = mins + (maxs - mins) * (numbers / 65535)
-    # The logarithm of the largest float32 may round to one that it is not.
+    # The logarithm of the largest float32 may round up, beyond it.
     positions = np.clip(np.copysign(np.expm1(np.abs(logs)), logs), -3.4e38, 3.4e38)
     return positions.astype(np.float32)
 

@@ -1,4 +1,4 @@
-"""The outside of a ``.sog`` file: a zip archive of ``meta.json`` and lossless WebP pictures."""
+"""The container of a ``.sog`` file: a zip archive of ``meta.json`` and lossless WebP pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ZIP_MAGIC = b"PK\x03\x04"
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 _META_LIMIT = 1 << 20
 _MOST_A_BYTE = 1024
-"""Texels a byte of the file: pictures of one colour take almost no bytes, honest scenes several a splat."""
+"""Limit on texels per byte of the file: pictures of one colour take almost no bytes, real scenes several per splat."""
 
 
 def picture_shape(count: int) -> tuple[int, int]:
@@ -52,7 +52,7 @@ def write_archive(
         with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
             for name, data in {META: text, **{name: _webp(texels) for name, texels in pictures.items()}}.items():
                 entry = zipfile.ZipInfo(name, _EPOCH)
-                entry.create_system = 3  # else the machine's
+                entry.create_system = 3  # otherwise that of the machine
                 archive.writestr(entry, data)
         return file.tell()
 
@@ -61,7 +61,7 @@ def _webp(texels: NDArray[np.uint8]) -> bytes:
     from PIL import Image
 
     buffer = io.BytesIO()
-    # Exact: else colours under alpha 0 are changed.
+    # exact=True: otherwise colours under alpha 0 are changed.
     Image.fromarray(texels, "RGBA").save(buffer, "WEBP", lossless=True, exact=True, quality=75, method=3)
     return buffer.getvalue()
 
@@ -73,7 +73,7 @@ class SogArchive:
         path: File.
 
     Raises:
-        FormatError: It is truncated, altered, or no zip archive with a ``meta.json``.
+        FormatError: It is truncated, altered, or not a zip archive with a ``meta.json``.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -91,21 +91,21 @@ class SogArchive:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Bytes in the archive by name."""
+        """Compressed size in bytes of each entry, by name."""
         return {entry.filename: entry.compress_size for entry in self._zip.infolist()}
 
     def meta(self) -> dict[str, Any]:
         """Content of ``meta.json``.
 
         Raises:
-            FormatError: It is missing, damaged, or no JSON object.
+            FormatError: It is missing, damaged, or not a JSON object.
         """
         try:
             meta = json.loads(self._bytes(META, _META_LIMIT))
         except (ValueError, RecursionError) as error:
-            raise FormatError(f"damaged: {META} is no JSON ({error})") from None
+            raise FormatError(f"damaged: {META} is not JSON ({error})") from None
         if not isinstance(meta, dict):
-            raise FormatError(f"damaged: {META} is no JSON object")
+            raise FormatError(f"damaged: {META} is not a JSON object")
         return meta
 
     def check_count(self, texels: int) -> None:
@@ -136,8 +136,8 @@ class SogArchive:
                 return np.asarray(image.convert("RGBA")).reshape(-1, 4)[:count]
         except FormatError:
             raise
-        except Exception as error:  # Pillow's decoders raise whatever damage leads them to
-            raise FormatError(f"damaged: {name} is no picture ({error})") from None
+        except Exception as error:  # damage can make Pillow's decoders raise anything
+            raise FormatError(f"damaged: {name} is not a picture ({error})") from None
 
     def _bytes(self, name: str, most: int) -> bytes:
         try:

@@ -1,4 +1,4 @@
-"""The ``.splat`` file, which the first viewers on the web read: 32 bytes a splat, no spherical harmonics.
+"""The ``.splat`` file of the first web viewers: 32 bytes per splat, no spherical harmonics.
 
 =========  =====  ====================================================================
 offset     bytes  content
@@ -37,7 +37,7 @@ SPLAT_LAYOUT = {name: _RECORD[name].itemsize for name in _RECORD.names or ()}
 """Bytes of each part of a splat."""
 _SH_C0 = 0.5 / math.sqrt(math.pi)
 _SMALLEST, _LARGEST = -87.0, 88.0
-"""Logarithms of lengths between which float32 has all its digits."""
+"""Logarithms of the smallest and largest length that float32 holds with full precision."""
 
 
 def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:
@@ -72,7 +72,7 @@ def _lengths(scales: NDArray[np.float32], uses: NDArray[np.int64] | None, clampe
 
 def _packed_quats(quats: NDArray[np.float32]) -> NDArray[np.uint8]:
     units = unit(quats)
-    # Of q and -q the one whose largest component is negative: -1 is a byte, 1 is not.
+    # Of q and -q, the one whose largest component is negative: -1 fits a byte, 1 does not.
     largest = np.take_along_axis(units, np.abs(units).argmax(1)[:, None], 1)
     packed: NDArray[np.uint8] = np.rint(128 + 128 * np.where(largest > 0, -units, units)).astype(np.uint8)
     return packed
@@ -110,7 +110,7 @@ def count_splats(path: str | os.PathLike[str]) -> int:
     with naming_file(path):
         if size % _RECORD.itemsize:
             raise FormatError(
-                f"truncated, or not a .splat file: of {size} bytes the last {size % _RECORD.itemsize} are no "
-                f"whole splat of {_RECORD.itemsize}"
+                f"truncated, or not a .splat file: of {size} bytes the last {size % _RECORD.itemsize} are not "
+                f"a whole splat of {_RECORD.itemsize}"
             )
     return size // _RECORD.itemsize

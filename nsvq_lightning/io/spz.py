@@ -1,10 +1,10 @@
-"""The ``.spz`` file of Niantic: 65 bytes a splat, 12 to 25 compressed. Versions 3 and 4 are written, 1 to 4 read.
+"""The ``.spz`` file of Niantic: 65 bytes per splat, 12 to 25 compressed. Versions 3 and 4 are written, 1 to 4 read.
 
-Six arrays, each of all splats; :mod:`~nsvq_lightning.io.spz_frame` says what is around them. Integers are
+Six arrays, each over all splats; :mod:`~nsvq_lightning.io.spz_frame` describes the container. Integers are
 little-endian.
 
 ===========  =================  =============================================================================
-array        bytes a splat      content
+array        bytes per splat    content
 ===========  =================  =============================================================================
 positions    9                  3 fixed-point numbers of 24 bits; version 1: 3 float16
 opacities    1                  255ths
@@ -15,11 +15,11 @@ rotations    4                  smallest three: 2 bits say which component of xy
 SH           3 (d² + 2d)        128 + 128 x, coefficient by coefficient, three colours each
 ===========  =================  =============================================================================
 
-Niantic's writer rounds spherical harmonics to 5 and 4 bits before, for a smaller file; that took a trained scene down
-to 31 dB, so all 8 bits are used here.
+Niantic's writer first rounds spherical harmonics to 5 and 4 bits, for a smaller file; that reduced a trained scene to
+31 dB, so all 8 bits are used here.
 
-Axes are right, up, back; ours are right, down, forward, so y and z change their signs, and with them the coefficients
-of odd functions of either.
+Axes are right, up, back; ours are right, down, forward, so y and z change sign, and with them the coefficients of odd
+functions of either.
 """
 
 from __future__ import annotations
@@ -42,27 +42,27 @@ from nsvq_lightning.splats.sh_degree import sh_coefficients
 __all__ = ["DEFAULT_VERSION", "in_spz_order", "read_spz", "write_spz"]
 
 DEFAULT_VERSION = 3
-"""The version that every reader of the format opens."""
+"""The version that every reader of the format supports."""
 _POSITION = 24
 _USUAL_FRACTION = 12
 _POSITION_ERROR = 0.05
-"""Largest error of a coordinate as a share of the splat's size, of all but the thousandth with the smallest splats."""
+"""Largest error of a coordinate as a share of the splat's size, for all but the smallest thousandth of the splats."""
 _COLOR = 0.15
 _BLOCK = 1 << 16
 """Rows of spherical harmonics rounded at a time."""
 _ORDER = ("quats", "scales", "sh0", "shN")
-"""Attributes whose codes order the splats, the most important last."""
+"""Attributes by whose codes the splats are sorted, the most important last."""
 _FLIPPED_AXES = np.array([1.0, -1.0, -1.0])
 _FLIPPED_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)[:, None]
-"""Signs of the real spherical harmonics of degree 1 to 3 when y and z change theirs, ``[15, 1]``."""
+"""Signs of the real spherical harmonics of degree 1 to 3 when y and z change sign, ``[15, 1]``."""
 
 
 def in_spz_order(scene: CompressedScene) -> CompressedScene:
-    """The splats that a file holds, in its order: that of their codes, then of their place.
+    """The splats that a file holds, in its order: by their codes, then by position.
 
-    The codes of the spherical harmonics come first: equal rows compress best where they are near, in both versions.
+    The codes of the spherical harmonics come first: in both versions, equal rows compress best when close together.
     """
-    from nsvq_lightning.io.morton import spatial_order  # brings Numba, which readers do without
+    from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
 
     scene = scene.take(spatial_order(scene.means))
     codes = [scene.codes[name] for name in _ORDER if name in scene.codes]
@@ -72,13 +72,13 @@ def in_spz_order(scene: CompressedScene) -> CompressedScene:
 def write_spz(path: str | os.PathLike[str], scene: CompressedScene, *, version: int = DEFAULT_VERSION) -> int:
     """Write a scene as ``.spz``.
 
-    Positions get as many bits after the point as the smallest splats need. Splats with a non-finite value are left out
+    Positions get as many fractional bits as the smallest splats need. Splats with a non-finite value are left out
     and values out of the format's range are clamped, each with a warning.
 
     Args:
         path: File to write, replaced atomically.
         scene: The scene.
-        version: 3, or 4, which is compressed with Zstandard.
+        version: 3, or 4, which uses Zstandard.
 
     Returns:
         Bytes of the file.
@@ -105,9 +105,9 @@ def write_spz(path: str | os.PathLike[str], scene: CompressedScene, *, version: 
 
 
 def _fraction_bits(scene: CompressedScene) -> int:
-    """Bits after the point: what the smallest splats need, unless the farthest then lie out of range.
+    """Fractional bits: what the smallest splats need, unless that puts the farthest out of range.
 
-    A few splats far away do not make positions coarser than the format's usual 12 bits; they are moved to its end.
+    A few distant splats do not make positions coarser than the format's usual 12 bits; they are clamped.
     """
     if len(scene) == 0:
         return _USUAL_FRACTION
@@ -153,10 +153,10 @@ def _packed_sh(
 
 
 def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
-    """Read a ``.spz`` file of version 1 to 4; its extensions are left out.
+    """Read a ``.spz`` file of version 1 to 4; its extensions are ignored.
 
     Raises:
-        FormatError: The file is truncated, altered, of another version, or no ``.spz`` file; or version 4 needs
+        FormatError: The file is truncated, altered, of another version, or not a ``.spz`` file; or version 4 needs
             Zstandard, and it is not installed.
     """
     return CompressedScene.from_arrays(_unpacked(*read_frame(path)))
@@ -178,7 +178,7 @@ def _unpacked(header: SpzHeader, arrays: dict[str, NDArray[np.uint8]]) -> SplatA
 def _unpacked_means(header: SpzHeader, data: NDArray[np.uint8]) -> NDArray[np.floating[Any]]:
     if header.version == 1:
         return np.ascontiguousarray(data).view("<f2").astype(np.float64)
-    # Three bytes at the top of four, shifted down with their sign.
+    # Put three bytes at the top of four, then shift down with the sign.
     wide = np.zeros((header.count, 3, 4), np.uint8)
     wide[:, :, 1:] = data.reshape(header.count, 3, 3)
     fixed = wide.view("<i4")[:, :, 0] >> 8

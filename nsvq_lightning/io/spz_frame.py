@@ -1,4 +1,4 @@
-"""The outside of a ``.spz`` file: one gzip stream up to version 3, a Zstandard stream an array in version 4.
+"""The container of a ``.spz`` file: one gzip stream up to version 3, one Zstandard stream per array in version 4.
 
 Integers are little-endian. Up to version 3 the gzip stream holds the first 16 bytes below, the arrays, and perhaps
 extensions. Version 4:
@@ -6,7 +6,7 @@ extensions. Version 4:
 ============  ==================  ==================================================================================
 offset        bytes               content
 ============  ==================  ==================================================================================
-0             16                  header: ``NGSP``, version (4), N (4), SH degree, bits after the point, flags, and S:
+0             16                  header: ``NGSP``, version (4), N (4), SH degree, fractional bits, flags, and S:
                                   number of streams (0 up to version 3)
 16            4                   offset T of the table
 20            12                  0
@@ -39,34 +39,34 @@ __all__ = ["MOST_FRACTION", "SPZ_MAGICS", "SPZ_VERSIONS", "SpzHeader", "read_fra
 
 _MAGIC = b"NGSP"
 SPZ_MAGICS = (b"\x1f\x8b", _MAGIC)
-"""First bytes: of gzip up to version 3, of the plain header from version 4 on."""
+"""First bytes: those of gzip up to version 3, those of the plain header from version 4 on."""
 SPZ_VERSIONS = (3, 4)
 """Versions that are written."""
 MOST_FRACTION = 30
-"""Bits after the point that a position may have."""
+"""Largest number of fractional bits of a position."""
 
 _HEADER = struct.Struct("<4sIIBBBB")
 _TABLE_OFFSET = struct.Struct("<I12x")
 _HEAD = _HEADER.size + _TABLE_OFFSET.size
 _ENTRY = struct.Struct("<QQ")
 _MOST_A_BYTE = 1032
-"""Bytes that one byte of a deflate stream can become."""
+"""Most bytes that one byte of a deflate stream can expand to."""
 _EXTENDED = 2
 """The flag of extensions."""
 _EXTENSION = struct.Struct("<II")
 _AXES, _RIGHT_UP_BACK = 0xADBE0003, (0, 4)
-"""The extension that names the axes, and what it says of those that files without it have."""
+"""The extension that states the axes, and its value for the axes of files without it."""
 
 
 @dataclass(frozen=True)
 class SpzHeader:
-    """What the first bytes say.
+    """The contents of the first bytes.
 
     Attributes:
         version: 1 to 4.
         count: Number of splats N.
         sh_degree: Degree of the spherical harmonics, 0 to 3.
-        fraction_bits: Bits of the positions after the point.
+        fraction_bits: Fractional bits of the positions.
         flags: 1 for a scene trained with antialiasing, 2 where extensions follow.
     """
 
@@ -78,14 +78,14 @@ class SpzHeader:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Bytes a splat of each array, in file order."""
+        """Bytes per splat of each array, in file order."""
         means, quats = (6 if self.version == 1 else 9), (4 if self.version >= 3 else 3)
         sh = 3 * sh_coefficients(self.sh_degree)
         return {"means": means, "opacities": 1, "sh0": 3, "scales": 3, "quats": quats, "shN": sh}
 
     @property
     def streams(self) -> dict[str, int]:
-        """Bytes of each array that is not empty, in file order: what version 4 has streams of."""
+        """Bytes of each array that is not empty, in file order: the streams of version 4."""
         return {name: self.count * size for name, size in self.sizes.items() if self.count * size}
 
     def pack(self) -> bytes:
@@ -101,7 +101,7 @@ def write_frame(path: str | os.PathLike[str], header: SpzHeader, arrays: Mapping
     Args:
         path: File to write.
         header: Of one of :data:`SPZ_VERSIONS`.
-        arrays: By the names of :attr:`SpzHeader.sizes`, ``[N, ...]`` of so many bytes a splat.
+        arrays: By the names of :attr:`SpzHeader.sizes`, ``[N, ...]`` with that many bytes per splat.
 
     Returns:
         Bytes of the file.
@@ -117,17 +117,17 @@ def write_frame(path: str | os.PathLike[str], header: SpzHeader, arrays: Mapping
             table = (_ENTRY.pack(len(s), len(c)) for s, c in zip(streams, contents, strict=True))
             file.writelines([header.pack(), _TABLE_OFFSET.pack(_HEAD), *table, *streams])
         else:
-            # No name and no time: the same scene gives the same bytes.
+            # No file name and no time stamp: the same scene gives the same bytes.
             with gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as stream:
                 stream.writelines([header.pack(), *contents])
         return file.tell()
 
 
 def read_frame(path: str | os.PathLike[str]) -> tuple[SpzHeader, dict[str, NDArray[np.uint8]]]:
-    """Header and arrays ``[N, bytes a splat]`` by name; extensions are left out.
+    """Header and arrays ``[N, bytes per splat]`` by name; extensions are ignored.
 
     Raises:
-        FormatError: The file is truncated, altered, of another version, or no ``.spz`` file; or version 4 needs
+        FormatError: The file is truncated, altered, of another version, or not a ``.spz`` file; or version 4 needs
             Zstandard, and it is not installed.
     """
     data = Path(path).read_bytes()
@@ -140,10 +140,10 @@ def read_frame(path: str | os.PathLike[str]) -> tuple[SpzHeader, dict[str, NDArr
 
 
 def read_spz_header(path: str | os.PathLike[str]) -> tuple[SpzHeader, dict[str, int]]:
-    """Header, and bytes in the file by what they hold; the arrays are not looked at.
+    """Header, and the size in bytes of each part of the file; the arrays are not decoded.
 
     Raises:
-        FormatError: The file is truncated, of another version, or no ``.spz`` file.
+        FormatError: The file is truncated, of another version, or not a ``.spz`` file.
     """
     total = os.path.getsize(path)
     with naming_file(path), open(path, "rb") as file:
@@ -157,7 +157,7 @@ def read_spz_header(path: str | os.PathLike[str]) -> tuple[SpzHeader, dict[str, 
 
 
 def _unpack(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
-    """Version 4."""
+    """Header and arrays of version 4."""
     header, offset = _parse_head(data, len(data))
     if header.flags & _EXTENDED:
         _check_axes(data[_HEAD:offset])
@@ -170,7 +170,7 @@ def _unpack(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
 
 
 def _parse_head(start: bytes, file_bytes: int) -> tuple[SpzHeader, int]:
-    """Header of version 4 and offset of its table, which lies in the file as a whole."""
+    """Header of version 4 and offset of its table, which must be entirely in the file."""
     header = _parse(start[: _HEADER.size])
     if header.version < 4 or len(start) < _HEAD:
         raise FormatError(f"truncated or damaged: version {header.version} in {file_bytes} bytes without gzip")
@@ -195,7 +195,7 @@ def _lengths(header: SpzHeader, table: bytes, rest: int) -> dict[str, int]:
 
 
 def _check_axes(extensions: bytes) -> None:
-    """Refuse a file that says that its axes are not right, up, back."""
+    """Refuse a file that declares axes other than right, up, back."""
     start = 0
     while start + _EXTENSION.size <= len(extensions):
         kind, length = _EXTENSION.unpack_from(extensions, start)
@@ -210,7 +210,7 @@ def _check_axes(extensions: bytes) -> None:
 
 
 def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
-    """Versions 1 to 3."""
+    """Header and arrays of versions 1 to 3."""
     gunzip = zlib.decompressobj(wbits=31)
     header = _parse_stream(gunzip, data, len(data))
     contents = {}
@@ -218,7 +218,7 @@ def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
         contents[name] = _inflate(gunzip, gunzip.unconsumed_tail, size)
         if len(contents[name]) < size:
             raise FormatError(f"truncated: {name} of {header.count} splats has {len(contents[name])} of {size} bytes")
-    # What follows the arrays are extensions; reading on to the end of the stream checks its sum.
+    # Extensions follow the arrays; reading to the end of the stream verifies its checksum.
     while not gunzip.eof:
         if not _inflate(gunzip, gunzip.unconsumed_tail, 1 << 16) and not gunzip.eof:
             raise FormatError("truncated: the gzip stream has no end")
@@ -226,7 +226,7 @@ def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
 
 
 def _parse_stream(gunzip: zlib._Decompress, data: bytes, file_bytes: int) -> SpzHeader:
-    """Header of versions 1 to 3, whose arrays the file can hold."""
+    """Header of versions 1 to 3; refuses more splats than the file can hold."""
     header = _parse(_inflate(gunzip, data, _HEADER.size))
     if header.version > 3:
         raise FormatError(f"damaged: version {header.version} in a gzip stream, which only versions 1 to 3 are")
@@ -236,7 +236,7 @@ def _parse_stream(gunzip: zlib._Decompress, data: bytes, file_bytes: int) -> Spz
 
 
 def _inflate(gunzip: zlib._Decompress, data: bytes, most: int) -> bytes:
-    """At most so many bytes of the stream, which are more than 0: zlib takes that for no limit."""
+    """At most ``most`` bytes of the stream; ``most`` must be above 0, which zlib takes as no limit."""
     try:
         return gunzip.decompress(data, most)
     except zlib.error as error:
@@ -254,5 +254,5 @@ def _parse(start: bytes) -> SpzHeader:
     if sh_degree > 3:
         raise FormatError(f"damaged, or of a degree that this release does not read: SH degree {sh_degree}, not 0 to 3")
     if fraction_bits > MOST_FRACTION:
-        raise FormatError(f"damaged: {fraction_bits} bits after the point, more than {MOST_FRACTION}")
+        raise FormatError(f"damaged: {fraction_bits} fractional bits, more than {MOST_FRACTION}")
     return SpzHeader(version, count, sh_degree, fraction_bits, flags)

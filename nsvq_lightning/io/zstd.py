@@ -1,4 +1,4 @@
-"""Zstandard, which version 4 of ``.spz`` is compressed with: Python's own from 3.14 on, before that a package."""
+"""Zstandard, which compresses version 4 of ``.spz``: Python's own from 3.14 on, a package before that."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from nsvq_lightning.io.errors import FormatError
 __all__ = ["MOST_A_BYTE", "compress", "decompress"]
 
 MOST_A_BYTE = 1 << 15
-"""Bytes that one byte can become: a block of 128 KiB of equal bytes takes four."""
+"""Most bytes that one byte can expand to: a block of 128 KiB of equal bytes takes four."""
 _LEVEL = 19
 
 
@@ -28,7 +28,7 @@ def compress(data: bytes | memoryview) -> bytes:
 
 
 def decompress(data: bytes | memoryview, size: int) -> bytes:
-    """Content of a frame that must have ``size`` bytes; no more than that is ever held.
+    """Content of a frame that must have ``size`` bytes; no more than that is ever held in memory.
 
     Raises:
         FormatError: It is damaged, truncated, or of another size; or Zstandard is not installed.

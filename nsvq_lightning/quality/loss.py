@@ -64,7 +64,7 @@ def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2) -
 
 
 def _kernels(image: Tensor, target: Tensor) -> Literal["cpu", "cuda"] | None:
-    """Whose fused kernels can take the images; those of the CPU need rows of at least one vector."""
+    """Which fused kernels can take the images; the CPU kernels need rows of at least one vector."""
     kernels = kernels_for(image)
     fits = target.dtype in (torch.float32, torch.uint8) and not target.requires_grad and target.device == image.device
     wide = 3 * image.shape[1] >= 16 if kernels == "cpu" else image.numel() > 0
@@ -83,7 +83,7 @@ class _CpuLoss(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, scale: Tensor) -> tuple[Tensor, None, None]:
         (gradient,) = ctx.saved_tensors
-        # One view a step leaves the loss as it is, and a pass over the image is worth sparing.
+        # With one view per step the scale is 1, and skipping a pass over the image pays.
         return gradient if scale == 1 else gradient * scale, None, None
 
 

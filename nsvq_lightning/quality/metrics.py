@@ -38,13 +38,13 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
         image: ``[H, W, 3]`` in [0, 1].
         target: ``[H, W, 3]`` in [0, 1].
     """
-    # A norm adds up in float64 without a copy of the images in it.
+    # The norm sums in float64 without making a float64 copy of the images.
     error = torch.linalg.vector_norm(image - target, dtype=torch.float64)
     return -20.0 * torch.log10(error / math.sqrt(image.numel()))
 
 
 class _MeanOverImages(Metric):
-    """Mean of one value per image; processes add their sums and counts."""
+    """Mean of one value per image; sums and counts are added across processes."""
 
     is_differentiable = False
     higher_is_better = True
@@ -103,7 +103,7 @@ class SSIM(_MeanOverImages):
 
 def image_metrics() -> MetricCollection:
     """PSNR and SSIM under the names ``psnr`` and ``ssim``; calling it scores one image and adds it to the mean."""
-    # The two have states of the same shape, which torchmetrics would take for a group that shares them.
+    # Their states have the same shapes, so torchmetrics would group them and share the states.
     return MetricCollection({"psnr": PSNR(), "ssim": SSIM()}, compute_groups=False)
 
 

@@ -1,4 +1,4 @@
-"""What structural similarity is made of (Wang et al. 2004): window, constants, and its sum in plain torch."""
+"""Structural similarity (Wang et al. 2004): its window and constants, and the index itself in plain torch."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def check_pair(image: Tensor, target: Tensor) -> None:
 
 
 def in_range(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Two pictures as floats: the rendered one clamped to [0, 1], bytes of the other scaled to it."""
+    """Two pictures as floats: the rendered one clamped to [0, 1], the other scaled to [0, 1] if it is uint8."""
     return image.clamp(0.0, 1.0), target.to(image.dtype) / 255 if target.dtype == torch.uint8 else target
 
 
 def plain_ssim(image: Tensor, target: Tensor) -> Tensor:
-    """SSIM of two float pictures ``[H, W, 3]``, a scalar: the mean over pixels and RGB, with zeros around them."""
+    """SSIM of two float pictures ``[H, W, 3]``, a scalar: the mean over pixels and RGB, with zero padding."""
     planes = torch.cat([image, target, image * image, target * target, image * target], -1).movedim(-1, 0)[None]
     channels = planes.shape[1]
     taps = ssim_window().to(image).expand(channels, 1, -1)

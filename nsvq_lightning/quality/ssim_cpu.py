@@ -1,9 +1,9 @@
 """L1 and D-SSIM with their gradient in one sweep down an image.
 
-Each row is met once: it is clamped and brought to [0, 1] on entering a ring of eleven rows; five rows later follow the
-vertical blur of the four moment planes, their horizontal blur, SSIM and its three derivative planes and the horizontal
-blur of those into a second ring; after another five rows their vertical blur, which is the gradient (the blur is its
-own adjoint). Nothing but these rows is ever in memory.
+Each row is read once: it is clamped and brought to [0, 1] as it enters a ring buffer of eleven rows. Five rows later
+come the vertical blur of the four moment planes, their horizontal blur, SSIM, its three derivative planes, and the
+horizontal blur of those into a second ring buffer; another five rows later their vertical blur, which is the gradient
+(the blur is its own adjoint). Only these rows are ever in memory.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ __all__ = ["l1_dssim"]
 G0, G1, G2, G3, G4, G5 = (F(tap) for tap in ssim_window()[SSIM_RADIUS:].tolist())
 C1, C2 = F(SSIM_C1), F(SSIM_C2)
 PAD = 16
-"""Zeros beside every row, at least 3·radius floats, so that the horizontal blur needs no border case."""
+"""Zeros beside every row, at least 3·radius floats, so that the horizontal blur needs no special case at the border."""
 RING = 2 * SSIM_RADIUS + 1
 IMAGES = 2
 MOMENTS = 4
@@ -47,13 +47,13 @@ LANE_NUMBERS = np.arange(16, dtype=np.float32)
 
 @inline
 def row_of(y, planes, pitch):
-    """Offset of row y in a ring of rows with some planes each."""
+    """Offset of row y in a ring buffer of rows with several planes each."""
     return (y + RING) % RING * planes * pitch
 
 
 @inline
 def clear_row(ring, o, count):
-    """Write zeros over some floats."""
+    """Zero ``count`` floats."""
     zero = broadcast(F(0))
     for x in range(0, count, 16):
         store(ring, o + x, zero)
@@ -61,17 +61,17 @@ def clear_row(ring, o, count):
 
 @inline
 def take_row(image, target, white, images, y, height, length, pitch):
-    """Bring row y of both images into their ring: the image clamped, the target divided by ``white``."""
+    """Load row y of both images into their ring buffer: the image clamped, the target divided by ``white``."""
     o = row_of(y, IMAGES, pitch)
     if y < 0 or y >= height:
         clear_row(images, o, IMAGES * pitch)
     else:
         zero, one = broadcast(F(0)), broadcast(F(1))
         for x_ in range(0, length, 16):
-            # The last vector of a row overlaps the one before instead of running over.
+            # The last vector of a row overlaps the one before it instead of running past the end.
             x = min(x_, length - 16)
             p = load(image, y * length + x)
-            # Not a minimum and a maximum: a NaN must stay one.
+            # Not vmin and vmax: NaN must stay NaN.
             store(images, o + x, select(p < zero, zero, select(p > one, one, p)))
         for x in range(length):
             put(images, o + pitch + x, F(get(target, y * length + x)) / white)
@@ -90,7 +90,7 @@ def blur_along(row, o):
 
 @inline
 def add_pair(images, y, distance, x, pitch, weight, sums):
-    """Add the moments (p, q, p² + q², p·q) of the rows at a distance above and below row y, which share a tap."""
+    """Add the moments (p, q, p² + q², p·q) of the rows ``distance`` above and below row y, which share a tap."""
     above = row_of(y - distance, IMAGES, pitch) + x
     below = row_of(y + distance, IMAGES, pitch) + x
     p, q = load(images, above), load(images, above + pitch)
@@ -124,7 +124,7 @@ def moments_of_row(images, y, length, pitch, moments):
 
 @inline
 def similarity_of_row(moments, derivatives, length, pitch, lanes):
-    """Sum of SSIM over a row; its derivatives by blurred p, p² and pq into three padded rows."""
+    """Sum of SSIM over a row; its derivatives with respect to blurred p, p² and pq go into three padded rows."""
     one, two, c1, c2 = broadcast(F(1)), broadcast(F(2)), broadcast(C1), broadcast(C2)
     total = broadcast(F(0))
     lane = load(lanes, 0)
@@ -153,14 +153,14 @@ def similarity_of_row(moments, derivatives, length, pitch, lanes):
 
 @inline
 def pair_sum(ring, y, distance, o, pitch):
-    """Sum of the rows at a distance above and below row y."""
+    """Sum of the rows ``distance`` above and below row y."""
     above, below = row_of(y - distance, DERIVATIVES, pitch), row_of(y + distance, DERIVATIVES, pitch)
     return load(ring, above + o) + load(ring, below + o)
 
 
 @inline
 def blur_across(ring, y, plane, x, pitch):
-    """Eleven taps down the ring, centred on row y, of one derivative plane."""
+    """Eleven taps down the ring buffer, centred on row y, of one derivative plane."""
     o = plane * pitch + x
     total = broadcast(G0) * load(ring, row_of(y, DERIVATIVES, pitch) + o)
     total = fma(broadcast(G1), pair_sum(ring, y, 1, o, pitch), total)
@@ -197,7 +197,7 @@ def sweep(
     image, target, white, gradient, first, last, height, length, pitch, l1_step, ssim_step, images, moments,
     derivatives, ring, lanes, sums,
 ):  # fmt: skip
-    """Do some rows; their sums of SSIM and of absolute differences go to ``sums[2·y]`` and ``sums[2·y + 1]``."""
+    """Process a band of rows; the sums of SSIM and absolute differences go to ``sums[2·y]`` and ``sums[2·y + 1]``."""
     for y in range(first - 2 * SSIM_RADIUS, first):
         take_row(image, target, white, images, y, height, length, pitch)
     for y in range(first - SSIM_RADIUS, last + SSIM_RADIUS):
@@ -236,7 +236,7 @@ def sweep_image(
 
 
 def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float) -> tuple[float, Tensor]:
-    """Loss and its gradient by ``image``, which counts as clamped to [0, 1]; W at least 6.
+    """Loss and its gradient with respect to ``image``, which is clamped to [0, 1] first; W must be at least 6.
 
     Args:
         image: Contiguous float32 ``[H, W, 3]`` on the CPU.
@@ -244,14 +244,14 @@ def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float) -> tuple[float,
         dssim_weight: Share of 1 - SSIM.
 
     Raises:
-        ValueError: The shapes differ or are not ``[H, W, 3]``, W is below 6, or a picture has gaps.
-        TypeError: A type differs.
+        ValueError: The shapes differ or are not ``[H, W, 3]``, W is below 6, or a picture is not contiguous.
+        TypeError: A dtype is wrong.
     """
     check_pair(image, target)
     height, width = image.shape[:2]
     length = 3 * width
     if length < WIDTH:
-        raise ValueError(f"rows of the image must fill a vector, which takes a width of at least 6, got {width}")
+        raise ValueError(f"a row of the image must fill a vector, so its width must be at least 6, got {width}")
     kind = UINT8 if target.dtype == torch.uint8 else FLOAT32
     pixels = flat_checked("image", image, tuple(image.shape)), flat_checked("target", target, tuple(target.shape), kind)
     pitch = (length + 2 * PAD + 15) // 16 * 16

@@ -1,8 +1,8 @@
-"""L1 and D-SSIM with their gradient: four passes over the image, each a separable half of a blur.
+"""L1 and D-SSIM with their gradient: four passes over the image, each one half of a separable blur.
 
-Forward: vertical blur of the four moment planes, then their horizontal blur, SSIM and its derivatives by three of the
-blurred planes. Backward: vertical and horizontal blur of these derivatives (the blur is its own adjoint), which is the
-gradient. A program reads its neighbourhood tap by tap and leaves it to the first-level cache that it is fetched once.
+Forward: vertical blur of the four moment planes, then their horizontal blur, SSIM and its derivatives with respect to
+three of the blurred planes. Backward: vertical and horizontal blur of these derivatives (the blur is its own adjoint),
+which is the gradient. A program reads its neighbourhood tap by tap and relies on the L1 cache to fetch it only once.
 
 Every program writes its own sums and one program adds them up: no atomics, the same bits every time. Nothing is read
 back from the device.
@@ -30,18 +30,18 @@ WHITE = tl.constexpr(255.0)
 MOMENTS = 4
 DERIVATIVES = 3
 ROWS = 4
-"""Rows of an image a program does: four numbers a thread, so that registers suffice for all taps."""
+"""Image rows per program: four floats per thread, so that registers suffice for all taps."""
 COLUMNS = 128
-"""Numbers of each row it does; three are a pixel."""
+"""Floats of each row per program, three to a pixel."""
 BLOCK = 1024
-"""Programs whose sums are added up at a time."""
+"""Number of programs whose sums are added up at a time."""
 
 
 class Derivatives(NamedTuple):
     """What the backward pass needs besides the images.
 
     Attributes:
-        planes: Derivatives of SSIM by the blurred p, p² and p·q, ``[3, H, W, 3]``.
+        planes: Derivatives of SSIM with respect to blurred p, p² and p·q, ``[3, H, W, 3]``.
         dssim_weight: Share of 1 - SSIM in the loss.
     """
 
@@ -51,7 +51,7 @@ class Derivatives(NamedTuple):
 
 @triton.jit
 def place(ROWS: tl.constexpr, COLUMNS: tl.constexpr):
-    """Rows ``[ROWS, 1]`` and numbers in a row ``[1, COLUMNS]`` of this program, and its number."""
+    """Rows ``[ROWS, 1]`` and columns ``[1, COLUMNS]`` of this program, and its number."""
     row = tl.program_id(0) * ROWS + tl.arange(0, ROWS)[:, None]
     column = tl.program_id(1) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
     return row, column, tl.program_id(0) * tl.num_programs(1) + tl.program_id(1)
@@ -59,14 +59,14 @@ def place(ROWS: tl.constexpr, COLUMNS: tl.constexpr):
 
 @triton.jit
 def load_at(plane, row, column, height, length):
-    """Numbers of a plane, 0 outside of it."""
+    """Values of a plane, 0 outside it."""
     inside = (row >= 0) & (row < height) & (column >= 0) & (column < length)
     return tl.load(plane + row.to(tl.int64) * length + column, mask=inside, other=0.0)
 
 
 @triton.jit
 def clamped(image, row, column, height, length):
-    """The image clamped to [0, 1]; not by a minimum and a maximum, since a NaN must stay one."""
+    """The image clamped to [0, 1]; not by minimum and maximum, since NaN must stay NaN."""
     raw = load_at(image, row, column, height, length)
     return tl.where(raw < 0, 0.0, tl.where(raw > 1, 1.0, raw))
 
@@ -132,7 +132,7 @@ def blur_down(plane, row, column, height, length):
 
 @triton.jit
 def blur_along(plane, row, column, height, length):
-    """Eleven taps along the rows of interleaved RGB: neighbouring pixels are 3 numbers apart."""
+    """Eleven taps along the rows of interleaved RGB: neighbouring pixels are 3 floats apart."""
     total = load_at(plane, row, column, height, length) * G0
     total += (load_at(plane, row, column - 3, height, length) + load_at(plane, row, column + 3, height, length)) * G1
     total += (load_at(plane, row, column - 6, height, length) + load_at(plane, row, column + 6, height, length)) * G2
@@ -146,7 +146,7 @@ def blur_along(plane, row, column, height, length):
 def similarity_kernel(
     moments, derivatives, sums, height, length, DERIVED: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr
 ):  # fmt: skip
-    """Sum of SSIM into ``sums[2·program + 1]``; its derivatives by blurred p, p² and p·q where they are wanted."""
+    """Sum of SSIM into ``sums[2·program + 1]``; if ``DERIVED``, also its derivatives by blurred p, p² and p·q."""
     row, column, program = place(ROWS, COLUMNS)
     inside = (row < height) & (column < length)
     size = tl.cast(height, tl.int64) * length
@@ -185,7 +185,7 @@ def loss_kernel(sums, loss, programs, count, dssim_weight, BLOCK: tl.constexpr):
 
 @triton.jit
 def spread_kernel(derivatives, blurred, height, length, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
-    """Vertical blur of one of the derivative planes, the one that the third axis of the grid names."""
+    """Vertical blur of one derivative plane, the one selected by the third axis of the grid."""
     row, column, _ = place(ROWS, COLUMNS)
     shift = tl.program_id(2).to(tl.int64) * height * length
     value = blur_down(derivatives + shift, row, column, height, length)
@@ -228,7 +228,7 @@ def _check_pictures(image: Tensor, target: Tensor) -> None:
 def l1_dssim(
     image: Tensor, target: Tensor, dssim_weight: float, *, derived: bool = True
 ) -> tuple[Tensor, Derivatives | None]:
-    """Loss, a float32 scalar on the device, of ``image``, which counts as clamped to [0, 1].
+    """Loss, a float32 scalar on the device, of ``image``, which is clamped to [0, 1] first.
 
     Args:
         image: Contiguous float32 ``[H, W, 3]`` on a CUDA device, H and W at least 1.
@@ -237,8 +237,8 @@ def l1_dssim(
         derived: Whether :func:`l1_dssim_backward` will follow.
 
     Raises:
-        ValueError: The pictures differ in shape or device or are not ``[H, W, 3]``, or one has gaps.
-        TypeError: A type differs.
+        ValueError: The pictures differ in shape or device or are not ``[H, W, 3]``, or one is not contiguous.
+        TypeError: A dtype is wrong.
     """
     _check_pictures(image, target)
     height, width = image.shape[:2]
@@ -256,17 +256,17 @@ def l1_dssim(
 
 
 def l1_dssim_backward(image: Tensor, target: Tensor, derivatives: Derivatives, scale: Tensor) -> Tensor:
-    """Gradient ``[H, W, 3]`` of ``scale`` times the loss by ``image``; arguments are those of :func:`l1_dssim`.
+    """Gradient ``[H, W, 3]`` of ``scale`` times the loss with respect to ``image``.
 
     Args:
-        image: As there.
-        target: As there.
-        derivatives: What it returned.
+        image: As in :func:`l1_dssim`.
+        target: As in :func:`l1_dssim`.
+        derivatives: What :func:`l1_dssim` returned.
         scale: float32 scalar on the device.
 
     Raises:
-        ValueError: As of :func:`l1_dssim`, or the derivatives are those of another picture.
-        TypeError: A type differs.
+        ValueError: As in :func:`l1_dssim`, or the derivatives belong to another picture.
+        TypeError: A dtype is wrong.
     """
     _check_pictures(image, target)
     check_tensor("derivatives", derivatives.planes, (DERIVATIVES, *image.shape), image.device)

@@ -1,4 +1,4 @@
-"""The attributes of a splat that are vector quantized, and how many codes the paper gives each."""
+"""The vector-quantized attributes of a splat, and how many codes the paper gives each."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ class QuantizedAttribute:
 
     Attributes:
         name: Name of the raw attribute.
-        code_share: Number of codes as a share of those for scales (paper, section 4: Ks = Kr = 4·Kc = 4·Ksh).
+        code_share: Number of codes relative to that for scales (paper, section 4: Ks = Kr = 4·Kc = 4·Ksh).
     """
 
     name: str
     code_share: float
 
     def rows(self, tensor: Tensor) -> Tensor:
-        """The attribute ``[N, ...]`` as rows ``[N, D]``, one vector a splat (a view where possible)."""
+        """The attribute ``[N, ...]`` as rows ``[N, D]``, one vector per splat (a view where possible)."""
         return tensor.reshape(tensor.shape[0], tensor.shape[1:].numel())
 
     def unrows(self, rows: Tensor, like: Tensor) -> Tensor:
         """Rows ``[V, D]`` in the shape of the attribute ``like [N, ...]``: ``[V, ...]``.
 
         Raises:
-            ValueError: A row does not have the numbers of one splat of ``like``.
+            ValueError: A row does not have as many elements as one splat of ``like``.
         """
         if rows.dim() != 2 or rows.shape[1] != like.shape[1:].numel():
             raise ValueError(
@@ -52,17 +52,17 @@ QUANTIZED = {
 
 
 def codebook_sizes(name: str) -> dict[str, int]:
-    """Codes of each attribute for one of the paper's settings.
+    """Number of codes for each attribute in one of the paper's settings.
 
     Args:
         name: ``"0.5k"``, ``"1k"``, ``"2k"``, ``"4k"``, ``"8k"``, ``"16k"``: codes for scales and rotations in units of
-            1024; colours and SH have a quarter of them.
+            1024; colours and SH have a quarter as many.
 
     Returns:
         Attribute name to number of codes; ``codebook_sizes("16k")["shN"]`` is 4096.
 
     Raises:
-        ValueError: Another name.
+        ValueError: The name is unknown.
     """
     settings = {"0.5k": 512, "1k": 1024, "2k": 2048, "4k": 4096, "8k": 8192, "16k": 16384}
     if name not in settings:

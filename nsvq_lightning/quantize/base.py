@@ -1,4 +1,4 @@
-"""What a quantizer must offer to be driven by the callbacks."""
+"""The interface that a quantizer must offer to the callbacks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["Mendable", "Quantizer", "Refittable", "as_quantizer", "is_mendable",
 
 
 class Quantizer(Protocol):
-    """Vector quantizer of one attribute: rows ``[N, D]`` to codes ``[N]`` into a codebook ``[K, D]``.
+    """Vector quantizer of one attribute: maps rows ``[N, D]`` to codes ``[N]``, indices into a codebook ``[K, D]``.
 
     Implementations are ``nn.Module``s whose ``codebook`` is an ``nn.Parameter`` and whose usage counters and frozen
     codes are buffers, so that checkpoints and device moves carry them.
@@ -36,10 +36,10 @@ class Quantizer(Protocol):
     ) -> tuple[Tensor, Tensor]:
         """Quantize rows of ``x [N, D]`` in training: differentiable ``x_q [V, D]``, codes ``[V]``; counts the usage.
 
-        One that leaves training alone returns the rows themselves, -1 as their codes, and counts nothing.
+        A quantizer that leaves training alone returns the rows themselves, -1 as their codes, and counts nothing.
 
-        ``rows [V]`` int64, ascending and all different, says which; without it all rows are quantized. Gathering them
-        (:func:`nsvq_lightning.compute.rows.take_rows`) is left to the quantizer, which may do it on the way.
+        ``rows [V]`` int64, ascending and distinct, selects the rows; without it all rows are quantized. Gathering them
+        (:func:`nsvq_lightning.compute.rows.take_rows`) is left to the quantizer, whose kernels may do it themselves.
         """
 
     def encode(self, x: Tensor) -> Tensor:
@@ -49,10 +49,10 @@ class Quantizer(Protocol):
         """Codebook rows ``[N, D]`` of ``codes [N]``, differentiable in the codebook."""
 
     def replace_unused(self, generator: torch.Generator, rows: Tensor | None = None, jitter: float = 0.5) -> Tensor:
-        """Replace inactive codes by active ones, restart the window; returns the replaced codes ``[R]``.
+        """Replace inactive codes by active ones and restart the window; returns the replaced codes ``[R]``.
 
-        Callbacks pass ``rows [N, D]`` and ``jitter`` only where they are asked to split codes by the distortion of
-        these rows; a quantizer that cannot may leave them out.
+        Callbacks pass ``rows [N, D]`` and ``jitter`` only if configured to split codes by the distortion of these rows;
+        a quantizer that cannot do that may omit both parameters.
         """
 
     def freeze(self, codes: Tensor) -> None:
@@ -60,7 +60,7 @@ class Quantizer(Protocol):
 
 
 class Refittable(Protocol):
-    """Quantizer whose codebook gets no gradient in the quantize phase, but is moved to the rows now and then.
+    """Quantizer whose codebook gets no gradient in the quantize phase, but is refitted to the rows from time to time.
 
     :class:`nsvq_lightning.callbacks.CodebookRefit` does so with every quantizer that offers it.
     """
@@ -69,45 +69,45 @@ class Refittable(Protocol):
     """Codebook ``[K, D]`` in the raw space of the attribute."""
 
     def refit(self, x: Tensor, steps: int) -> None:
-        """Move the codebook to the rows ``x [N, D]`` by ``steps`` steps of k-means from where it is; K stays."""
+        """Fit the codebook to the rows ``x [N, D]`` by ``steps`` k-means steps from its current state; K stays."""
 
 
 class Mendable(Protocol):
-    """Quantizer that can put codes back that have turned non-finite.
+    """Quantizer that can repair codes that have become non-finite.
 
-    :class:`nsvq_lightning.callbacks.FiniteCodes` asks for it; for others it ends the run.
+    :class:`nsvq_lightning.callbacks.FiniteCodes` uses it; with other quantizers it ends the run.
     """
 
     def mend(self, broken: Tensor, rows: Tensor, generator: torch.Generator) -> None:
-        """Give the codes ``broken [B]`` finite values again, where others are finite; the scene is ``rows [N, D]``."""
+        """Make the codes ``broken [B]`` finite again, given that others are; the scene is ``rows [N, D]``."""
 
 
 def as_quantizer(module: object) -> Quantizer:
     """The module as a quantizer.
 
     Raises:
-        TypeError: It lacks something that :class:`Quantizer` names; the message says what.
+        TypeError: It lacks a member of :class:`Quantizer`; the message says which.
     """
     lacks = missing_members(module, Quantizer)
     if lacks:
         raise TypeError(
-            f"{type(module).__name__} is no quantizer, it lacks: {', '.join(lacks)}; derive it from "
+            f"{type(module).__name__} is not a quantizer; it lacks: {', '.join(lacks)}; derive it from "
             "nsvq_lightning.quantize.CodebookQuantizer, or offer the members of nsvq_lightning.quantize.Quantizer"
         )
     quantizer = cast(Quantizer, module)
     if not isinstance(module, nn.Module) or not isinstance(quantizer.codebook, nn.Parameter):
         raise TypeError(
-            f"{type(module).__name__} is no quantizer: it must be an nn.Module whose codebook is an nn.Parameter, so "
-            "that checkpoints carry it and the optimiser trains it"
+            f"{type(module).__name__} is not a quantizer: it must be an nn.Module whose codebook is an nn.Parameter, "
+            "so that checkpoints carry it and the optimiser trains it"
         )
     return quantizer
 
 
 def is_refittable(quantizer: object) -> TypeGuard[Refittable]:
-    """Whether a quantizer has all of :class:`Refittable`."""
+    """Whether a quantizer has all members of :class:`Refittable`."""
     return not missing_members(quantizer, Refittable)
 
 
 def is_mendable(quantizer: object) -> TypeGuard[Mendable]:
-    """Whether a quantizer has all of :class:`Mendable`."""
+    """Whether a quantizer has all members of :class:`Mendable`."""
     return not missing_members(quantizer, Mendable)

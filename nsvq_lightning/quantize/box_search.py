@@ -1,14 +1,14 @@
 """Exact nearest code in few dimensions: two levels of boxes around the codes, on 16-lane vectors.
 
-A query visits only the nodes and leaves whose box is not farther than its best code so far. The distance to a box and
-the distance to a code are the same sequence of roundings, each monotone in its operands, so the float32 bound never
+A query visits only the nodes and leaves whose box is not farther than its best code so far. The distances to a box and
+to a code are computed with the same sequence of roundings, each monotone in its operands, so the float32 bound never
 exceeds the float32 distance of a code inside: pruning needs no safety margin, and the result is that of a search over
-all codes, bit for bit. The first code to compare with is the best of the leaf that looks nearest; a bad start costs
-time and changes nothing.
+all codes, bit for bit. The first candidate is the best code of the leaf that looks nearest; a bad one costs time but
+does not change the result.
 
-Most queries of a later step need no search: :class:`BoxMemory` keeps where a query was searched and how far the second
-code was then. As long as the distance to its code, its own way and the way of the codes add up to less, the code is
-still the nearest (:mod:`tracking`).
+Most queries of a later step need no search: :class:`BoxMemory` keeps where a query was last searched and how far the
+second-nearest code was then. As long as the distance to its code and the distances that the query and the codes have
+moved add up to less, the code is still the nearest (:mod:`tracking`).
 """
 
 from __future__ import annotations
@@ -42,29 +42,29 @@ from nsvq_lightning.quantize.boxes import NO_CODE, Boxes, check_boxes
 __all__ = ["MAX_DIM", "ROUNDING", "UNKNOWN", "BoxMemory", "box_search", "empty_memory"]
 
 MAX_DIM = 8
-"""Above it a box holds most of the space around its codes, and the scores of :mod:`scores` are faster."""
+"""Beyond this dimension, boxes prune too little, and the scores of :mod:`scores` are faster."""
 
 UNKNOWN = np.int32(-1)
-"""The last code of a row that has not been searched."""
+"""Stands for the last code of a row that has not been searched."""
 
 ROUNDING = 1.0 + 1e-5
-"""Bounds are taken this much larger, far above what rounding does to a distance in float32."""
+"""Factor on the bounds, far above the relative rounding error of a float32 distance."""
 
 _LARGEST = np.finfo(np.float32).max
 _ROWS = 512
-"""Queries a unit of parallel work takes; a pass over them hides the latency of one query behind the others."""
+"""Queries per unit of parallel work; a pass over them hides the latency of one query behind the others."""
 _TASKS = 2048
-"""Visits to leaves that are put off until there are enough of them."""
+"""Capacity for visits to leaves, which are deferred and processed together."""
 
 
 class BoxMemory(NamedTuple):
-    """What is known of rows from their last search.
+    """What is known about rows from their last search.
 
     Attributes:
         last: Code, or ``UNKNOWN``, ``[N]`` int32.
         anchors: Where the row was then, ``[N, D]``.
-        clearance: Distance below which there was no code but the last, plus the way of the codes until then, ``[N]`` in
-            float64, because ways add up over a whole run.
+        clearance: Distance below which there was no other code, plus how far the codes had moved by then, ``[N]`` in
+            float64, because movements add up over a whole run.
     """
 
     last: NDArray[np.int32]
@@ -105,7 +105,7 @@ def _code_distances(dim, codes, leaf, x, row):  # type: ignore[no-untyped-def]
 def _visit_leaf(dim, codes, labels, leaf, x, row, limit, scratch, found):  # type: ignore[no-untyped-def]
     """Compare the codes of a leaf that are not farther than ``limit``; of equal distances the lower code wins.
 
-    ``found`` is the least distance so far, its code and the distance of the next code.
+    ``found`` holds the smallest distance so far, its code and the distance of the second-nearest code.
     """
     best, label, second = found
     distances = _code_distances(dim, codes, leaf, x, row)
@@ -125,7 +125,7 @@ def _visit_leaf(dim, codes, labels, leaf, x, row, limit, scratch, found):  # typ
 
 @inline
 def _nearest_node(dim, nodes, x, row):  # type: ignore[no-untyped-def]
-    """Node whose box is nearest (0 for a query that is not a number)."""
+    """Node whose box is nearest (0 for a query with a NaN)."""
     nearest, group_of = broadcast(np.float32(np.inf)), broadcast(np.float32(0.0))
     for group in range(nodes.size // (32 * dim)):
         distances = _box_distances(dim, nodes, group * 32 * dim, x, row)
@@ -153,19 +153,19 @@ def _prove(dim, codebook, x, row, code, memory, travelled):  # type: ignore[no-u
 
 @inline
 def _remember(dim, x, at, found, memory, row, travelled):  # type: ignore[no-untyped-def]
-    """Keep where a row was searched and the distance of the code that was second."""
+    """Keep where a row was searched and the distance of its second-nearest code."""
     last, anchors, clearance = memory
     _, code, second = found
     put(last, row, code)
     for j in range(dim):
         put(anchors, row * dim + j, get(x, at + j))
-    # Beyond the largest number in float32 there may still be codes.
+    # There may still be codes beyond the largest float32 number.
     put(clearance, row, np.sqrt(np.float64(min(second, _LARGEST))) / ROUNDING + travelled)
 
 
 @inline
 def _guess(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
-    """For each query the best code of one near leaf: three passes without unpredictable branches."""
+    """For each query, find the best code of one near leaf: three passes without unpredictable branches."""
     codes, labels, leaves, nodes = tree
     best, label, second, guess, _, scratch, bounded = state
     infinity = np.float32(np.inf)
@@ -205,7 +205,7 @@ def _visit_leaves(dim, tree, x, state, pending):  # type: ignore[no-untyped-def]
 
 @inline
 def _visit_near(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
-    """Visit every other leaf that is not farther than what is asked for: the best code so far, or the second."""
+    """Visit every other leaf that is not farther than the best code so far, or the second-best if that is needed."""
     _, _, leaves, nodes = tree
     best, _, second, guess, tasks, _, bounded = state
     pending = 0
@@ -231,7 +231,7 @@ def _visit_near(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
 
 @cache
 def _search_kernel(dim: int) -> Any:
-    """The search for one dimension: a constant for the compiler, so that short loops over it disappear."""
+    """The search for one dimension, a compile-time constant, so that short loops over it are unrolled."""
 
     def search(x, rows, codebook, codes, labels, leaves, nodes, memory, travelled, result):  # type: ignore[no-untyped-def]
         total, bounded, missing = result.shape[0], memory[0].shape[0] > 0, 0
@@ -276,19 +276,19 @@ def box_search(
     memory: BoxMemory | None = None,
     travelled: float = 0.0,
 ) -> NDArray[np.int64]:
-    """Nearest codes ``[V]`` of contiguous queries; one that is not a number gets code 0.
+    """Nearest codes ``[V]`` of contiguous queries; one with a NaN gets code 0.
 
     Args:
         x: Queries ``[N, D]``.
         codebook: Codes ``[K, D]``, contiguous.
         boxes: The same codes in boxes.
-        rows: Which queries, ``[V]``, all different; all of them by default.
-        memory: What earlier searches have left, updated; without it every query is searched.
-        travelled: Farthest that any code can have moved since ``memory`` was empty, in all.
+        rows: Which queries, ``[V]``, distinct; all of them by default.
+        memory: Results of earlier searches, updated in place; without it every query is searched.
+        travelled: Upper bound on how far any code has moved in total since ``memory`` was empty.
 
     Raises:
-        ValueError: The arrays do not fit together, one has gaps, there is no such row, or no code.
-        TypeError: The numbers have other types.
+        ValueError: The arrays do not fit together, one is not contiguous, a row is out of range, or there is no code.
+        TypeError: A dtype is wrong.
     """
     check_table("x", x)
     rows = np.arange(len(x)) if rows is None else rows
@@ -307,7 +307,7 @@ def box_search(
 
 
 def _check_memory(memory: BoxMemory, x: NDArray[np.float32]) -> None:
-    """Memory of no row, or at least of all; there may be more since the scene was larger."""
+    """Check that the memory is empty or has at least all rows; it may have more if the scene was larger before."""
     count = len(memory.last)
     if 0 < count < len(x):
         raise ValueError(f"memory must have the {len(x)} rows of x, got {count}")

@@ -25,7 +25,7 @@ class Boxes(NamedTuple):
         labels: Codes of the lanes, ``[nodes · 16, 16]`` int32.
         leaves: Lower and upper corners of the leaves of a node, ``[nodes, D, 2, 16]``.
         nodes: Lower and upper corners of the nodes, ``[nodes / 16, D, 2, 16]``.
-        order: Codes in the order of the lanes, ``[K]`` int32.
+        order: Codes in lane order, ``[K]`` int32.
     """
 
     codes: NDArray[np.float32]
@@ -73,7 +73,7 @@ def _split(values, order, start, stop, middle):  # type: ignore[no-untyped-def]
 
 @inline
 def _sort_into_leaves(points, order, start, stop):  # type: ignore[no-untyped-def]
-    """Split by medians, on multiples of 256 codes (a node), then of 16 (a leaf)."""
+    """Split by medians at multiples of 256 codes (a node), then of 16 (a leaf)."""
     stack = np.empty((64, 2), np.int64)
     stack[0, 0], stack[0, 1] = start, stop
     depth = 1
@@ -123,18 +123,18 @@ def _pack(points, order, codes, labels, leaves, nodes):  # type: ignore[no-untyp
 
 
 def build_boxes(codebook: NDArray[np.float32], order: NDArray[np.int32] | None = None) -> Boxes:
-    """Put the codes ``[K, D]`` into boxes. Codes that are not a number are put at infinity and never chosen.
+    """Put the codes ``[K, D]`` into boxes. Codes with a NaN are placed at infinity and never chosen.
 
-    ``order`` is that of earlier boxes: good as long as codes have moved little, right in any case, and much faster.
+    ``order`` may be that of earlier boxes: much faster, correct in any case, and good while codes have moved little.
 
     Raises:
-        ValueError: There is no code, the codebook has gaps, or ``order`` is not ``[K]`` numbers of codes.
-        TypeError: The numbers have other types.
+        ValueError: There is no code, the codebook is not contiguous, or ``order`` does not hold ``[K]`` codes.
+        TypeError: A dtype is wrong.
     """
     check_table("codebook", codebook)
     count, dim = codebook.shape
     if count == 0:
-        raise ValueError(f"the codebook must have a code, got shape {list(codebook.shape)}; fit it first")
+        raise ValueError(f"the codebook must have at least one code, got shape {list(codebook.shape)}; fit it first")
     points = np.ascontiguousarray(codebook.T)
     points[np.isnan(points)] = np.inf
     nodes = -(-count // 4096) * 16
@@ -158,16 +158,16 @@ def build_boxes(codebook: NDArray[np.float32], order: NDArray[np.int32] | None =
 
 
 def check_boxes(boxes: Boxes, codebook: NDArray[np.float32]) -> None:
-    """Refuse boxes that are not those of so many codes ``[K, D]``, K at least 1.
+    """Refuse boxes that do not fit a codebook ``[K, D]`` with K at least 1.
 
     Raises:
-        ValueError: There is no code, or an array has another shape or gaps.
-        TypeError: Its numbers have another type.
+        ValueError: There is no code, or an array has another shape or is not contiguous.
+        TypeError: A dtype is wrong.
     """
     count, dim = codebook.shape
     nodes = -(-count // 4096) * 16
     if count == 0:
-        raise ValueError(f"the codebook must have a code, got shape {list(codebook.shape)}; fit it first")
+        raise ValueError(f"the codebook must have at least one code, got shape {list(codebook.shape)}; fit it first")
     check_array("boxes.codes", boxes.codes, (nodes * 16, dim, 16), FLOAT32)
     check_array("boxes.labels", boxes.labels, (nodes * 16, 16), INT32)
     check_array("boxes.leaves", boxes.leaves, (nodes, dim, 2, 16), FLOAT32)

@@ -1,4 +1,4 @@
-"""A codebook that is fitted, counted, repaired, frozen and stored: what every vector quantizer here shares."""
+"""A codebook that is fitted, counted, repaired, frozen and stored: the base of every vector quantizer here."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ _log = logging.getLogger(__name__)
 
 
 class CodebookQuantizer(nn.Module, ABC):
-    """Base of the quantizers with one codebook; a subclass says how training sees the quantization.
+    """Base of the quantizers with one codebook; a subclass defines what training renders in place of the codes.
 
     Args:
         num_codes: Codes K, at least 1; :meth:`fit` may leave fewer.
-        dim: Numbers in a row, D.
+        dim: Dimension D of a row.
         kmeans_steps: Lloyd steps of :meth:`fit`.
         start: What :meth:`fit` starts from: ``sample`` is random rows, as in the paper; ``spread`` is rows far apart,
-            which reaches the sparse ends of the data: on 187 k splats and 4096 codes it took a quarter off the squared
-            error of scales, and +0.2 dB of test PSNR right after k-means.
+            which reaches the sparse ends of the data: on 187 k splats and 4096 codes it reduced the squared error of
+            scales by a quarter and gained 0.2 dB of test PSNR right after k-means.
 
     Attributes:
         codebook: Codes ``[K, D]`` in the raw space of the attribute, 0 until :meth:`fit`.
@@ -74,17 +74,17 @@ class CodebookQuantizer(nn.Module, ABC):
     def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator, rows: Tensor | None) -> Tensor:
         """Differentiable stand-in ``[V, D]`` in training for rows ``[V]`` of ``x [N, D]`` with codes ``[V]``.
 
-        ``rows`` is ascending; without it all rows of ``x`` are meant, in their order.
+        ``rows`` is ascending; without it, all rows of ``x`` in order.
         """
 
     @property
     def num_codes(self) -> int:
-        """Codes K."""
+        """Number of codes, K."""
         return self.codebook.shape[0]
 
     @property
     def dim(self) -> int:
-        """Numbers in a row, D."""
+        """Dimension of a row, D."""
         return self.codebook.shape[1]
 
     @property
@@ -99,15 +99,15 @@ class CodebookQuantizer(nn.Module, ABC):
     def fit(self, x: Tensor, weight: Tensor | None = None, generator: torch.Generator | None = None) -> None:
         """Place the codebook on rows by k-means; K becomes at most the number of distinct rows.
 
-        The parameter stays the same object, as an optimiser group refers to it; fit before its first optimiser step.
+        The parameter stays the same object, since an optimiser group refers to it; fit before its first optimiser step.
 
         Args:
             x: Rows ``[N, D]``.
             weight: Weight of each row, ``[N]``, not negative.
-            generator: Source of the start; by default a fixed one.
+            generator: Source of the random start; by default a fixed one.
 
         Raises:
-            ValueError: ``x`` does not have D columns, has no row, or has a number that is not finite.
+            ValueError: ``x`` does not have D columns, has no rows, or is not finite.
         """
         if x.dim() != 2 or x.shape[1] != self.dim:
             raise ValueError(f"rows must have shape [N, {self.dim}], got {list(x.shape)}")
@@ -122,12 +122,12 @@ class CodebookQuantizer(nn.Module, ABC):
     def forward(
         self, x: Tensor, generator: torch.Generator | None = None, rows: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Quantize rows; in training this counts the codes that are hit.
+        """Quantize rows; in training this also counts the codes that are hit.
 
         Args:
             x: Rows of the scene ``[N, D]``.
             generator: Source of the noise, needed in training.
-            rows: Which rows to quantize, ``[V]`` int64, ascending, all different; all of them by default.
+            rows: Which rows to quantize, ``[V]`` int64, ascending, distinct; all of them by default.
 
         Returns:
             ``x_q [V, D]``, differentiable, and the codes ``[V]`` int64.
@@ -162,7 +162,7 @@ class CodebookQuantizer(nn.Module, ABC):
     def count(self, codes: Tensor) -> None:
         """Count one iteration in which ``codes [N]`` were hit."""
         count_hits(codes, self.usage)
-        increment_version(self.usage)  # whoever keeps a copy must see that a kernel has written
+        increment_version(self.usage)  # tells autograd, and anyone with a copy, that a kernel has written
         self.window += 1
 
     def reset_usage(self) -> None:
@@ -180,9 +180,9 @@ class CodebookQuantizer(nn.Module, ABC):
     ) -> Tensor:
         """Replace inactive codes by active ones and start a new window (paper, section 3.1).
 
-        A code is inactive if it was hit in less than ``threshold`` of the window's iterations. By the paper's rule the
-        new codes are copies of a permutation of a random set of active codes, plus noise of 1e-12. With ``rows`` the
-        codes that distort most are split instead (:func:`~nsvq_lightning.quantize.replacement.split_codes`). The
+        A code is inactive if it was hit in fewer than ``threshold`` of the window's iterations. By the paper's rule the
+        new codes are copies of randomly chosen active codes, plus noise of 1e-12. With ``rows``, the codes with the
+        largest distortion are split instead (:func:`~nsvq_lightning.quantize.replacement.split_codes`). The
         optimiser's state is not touched.
 
         Args:
@@ -197,7 +197,7 @@ class CodebookQuantizer(nn.Module, ABC):
         Raises:
             ValueError: ``threshold`` is not in [0, 1].
         """
-        # A code that is not finite must not be copied; it is left to `mend`, as its moments are not finite either.
+        # A non-finite code must not be copied; it is left to `mend`, because its moments are not finite either.
         finite = torch.isfinite(self.codebook).all(1)
         inactive = inactive_codes(self.usage, self.window, threshold)
         replaced = (inactive & finite).nonzero()[:, 0]
@@ -218,10 +218,10 @@ class CodebookQuantizer(nn.Module, ABC):
 
     @torch.no_grad()
     def mend(self, broken: Tensor, rows: Tensor, generator: torch.Generator) -> None:
-        """Put codes back that have turned non-finite, at least one other is finite.
+        """Repair codes that have become non-finite; at least one other code must be finite.
 
-        A frozen code takes the mean of the rows that have it; any other becomes a copy of a random finite code, as a
-        code that is out of use.
+        A frozen code becomes the mean of the rows that have it; any other becomes a copy of a random finite code, like
+        an inactive one.
 
         Args:
             broken: The codes ``[B]`` int64.
@@ -279,7 +279,7 @@ class CodebookQuantizer(nn.Module, ABC):
         self.codebook.grad = None
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
-        """Take over the stored number of codes and rows before the values are copied."""
+        """Resize to the stored number of codes and rows before the values are copied."""
         stored = state_dict.get(f"{prefix}codebook")
         if stored is not None and stored.dim() == 2 and stored.shape[1] == self.dim:
             self._resize(stored.shape[0])

@@ -1,4 +1,4 @@
-"""k-means as the paper starts its codebooks: distinct random rows, Lloyd steps, an empty cluster keeps its centroid."""
+"""k-means as the paper initializes codebooks: distinct random rows, Lloyd steps, empty clusters keep their centroid."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def kmeans(
     Args:
         x: Rows ``[N, D]``, finite.
         k: Number of centroids wanted.
-        generator: Source of the start.
+        generator: Source of the random start.
         weight: Weight of each row, ``[N]``, not negative; rows of weight 0 are left out.
         steps: Lloyd steps.
         start: Initial centroids ``[k, D]``; by default a random sample of the distinct rows.
@@ -39,11 +39,11 @@ def kmeans(
             (:func:`~nsvq_lightning.quantize.kmeans.rows_far_apart`) instead.
 
     Returns:
-        Centroids ``[k', D]`` with k' = min(k, number of distinct rows); where k is not smaller, the distinct rows
+        Centroids ``[k', D]`` with k' = min(k, number of distinct rows); if k is at least that number, the distinct rows
         themselves, in the order of their first occurrence.
 
     Raises:
-        ValueError: A shape does not fit, there is no row, a number is not finite, or a weight is negative.
+        ValueError: A shape does not fit, there is no row, a value is not finite, or a weight is negative.
     """
     x, weight = _checked(x, k, weight)
     if start is None:
@@ -68,11 +68,11 @@ def _checked(x: Tensor, k: int, weight: Tensor | None) -> tuple[Tensor, Tensor |
         raise ValueError(f"k-means needs rows [N, D] with N > 0 and k > 0, got shape {list(x.shape)} and k = {k}")
     if not bool(torch.isfinite(x).all()):
         bad = int((~torch.isfinite(x).all(1)).sum())
-        raise ValueError(f"{bad} of {x.shape[0]} rows have a number that is not finite; drop them before k-means")
+        raise ValueError(f"{bad} of {x.shape[0]} rows are not finite; drop them before k-means")
     if weight is None:
         return x, None
     if weight.shape != x.shape[:1] or not bool((weight >= 0).all()) or not bool((weight > 0).any()):
-        raise ValueError(f"weight must have shape [{x.shape[0]}], no negative and some positive number")
+        raise ValueError(f"weight must have shape [{x.shape[0]}], no negative and at least one positive value")
     used = weight > 0
     return x[used], weight.detach()[used].double()
 
@@ -91,17 +91,17 @@ def _lloyd_step(x: Tensor, centroids: Tensor, weight: Tensor | None) -> Tensor:
 
 
 def distinct_rows(x: Tensor) -> Tensor:
-    """Numbers ``[M]`` int64, ascending, of the first occurrence of every distinct row of ``x [N, D]``.
+    """Indices ``[M]`` int64, ascending, of the first occurrence of every distinct row of ``x [N, D]``.
 
-    Rows are compared by a 64-bit hash of their bits, which is then verified, because sorting rows of 45 numbers would
-    take longer than k-means itself.
+    Rows are compared by a 64-bit hash of their bits, and matches are then verified, because sorting rows of 45 columns
+    would take longer than k-means itself.
 
     Raises:
         ValueError: ``x`` is not ``[N, D]``.
     """
     if x.dim() != 2:
         raise ValueError(f"rows must have shape [N, D], got {list(x.shape)}")
-    rows = (x.detach().cpu() + 0.0).contiguous().numpy()  # + 0.0 makes -0 and 0 the same bits
+    rows = (x.detach().cpu() + 0.0).contiguous().numpy()  # + 0.0 turns -0 into 0
     hashes = np.empty(len(rows), np.uint64)
     thread_count()
     _hash_rows(rows.view(np.uint32), hashes)
@@ -113,7 +113,7 @@ def distinct_rows(x: Tensor) -> Tensor:
 
 @kernel
 def _hash_rows(bits, hashes):  # type: ignore[no-untyped-def]
-    """One 64-bit number a row of integers ``[N, D]``, by multiplication and xor-shift."""
+    """One 64-bit hash per row of integers ``[N, D]``, by multiplication and xor-shift."""
     for i in prange(bits.shape[0]):
         value = np.uint64(0x9E3779B97F4A7C15)
         for j in range(bits.shape[1]):
@@ -123,31 +123,31 @@ def _hash_rows(bits, hashes):  # type: ignore[no-untyped-def]
 
 
 _ROUNDS = 3
-"""A spread start doubles its rows this often."""
+"""How often a spread start doubles its number of rows."""
 
 
 def draw_far_rows(rows: Tensor, codebook: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Numbers ``[count]`` of different rows, each drawn with a chance that grows with its squared distance to its code.
+    """Indices ``[count]`` of distinct rows, drawn with probabilities that grow with the squared distance to their code.
 
     This is the D² sampling of k-means++ (Arthur and Vassilvitskii 2007), many rows at a time and without replacement.
 
     Args:
         rows: Rows ``[N, D]``.
         codebook: Codes ``[K, D]``.
-        count: Rows wanted; fewer come where fewer have a distance to their code.
+        count: Number of rows wanted; fewer are returned if fewer differ from their code.
         generator: Source of the draw.
     """
     squared = (rows - codebook[nearest(rows, codebook)]).square().sum(1).double()
-    # The largest of w / e with e ~ Exp(1) are a draw without replacement with chances w (Efraimidis and Spirakis 2006).
+    # The largest w / e with e ~ Exp(1) are a draw without replacement with weights w (Efraimidis and Spirakis 2006).
     draws = torch.empty(len(rows), dtype=torch.float64, device=generator.device).exponential_(generator=generator)
     return (squared / draws.to(rows.device)).topk(min(count, int((squared > 0).sum()))).indices
 
 
 def rows_far_apart(rows: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """``[count, D]`` of different rows ``[N, D]``, N ≥ count, that reach into all corners: a start for k-means.
+    """``[count, D]`` of the distinct rows ``[N, D]``, N ≥ count, that reach into all corners: a start for k-means.
 
-    An eighth is a random sample; then each round draws as many far rows as there are already. Rows too close to those
-    for their squared distance to be above 0 come last.
+    An eighth is a random sample; then each round draws as many far rows as there already are. Rows so close to these
+    that their squared distance is 0 come last.
     """
     shuffled = torch.randperm(len(rows), generator=generator, device=generator.device).to(rows.device)
     chosen = shuffled[: -(-count // 2**_ROUNDS)]

@@ -1,7 +1,7 @@
-"""Exact nearest code: the search every training step of the quantize phase rests on.
+"""Exact nearest code: the search on which every training step of the quantize phase rests.
 
-TF32 and bfloat16 products give half to nine tenths of the rows a wrong code, so nothing here is ever subject to
-autocast or to a lowered matmul precision.
+TF32 and bfloat16 products give half to nine tenths of the rows a wrong code, so nothing here ever runs under autocast
+or with a reduced matmul precision.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from nsvq_lightning.quantize.scores import centre_codes, score_search
 __all__ = ["check_rows", "nearest", "nearest_reference"]
 
 _CPU_CHUNK, _DEVICE_CHUNK = 1 << 22, 1 << 26
-"""Distances held at once by the plain formulation: on a CPU what its caches hold, elsewhere enough to keep it busy."""
+"""Distances that the plain version holds at once: what fits the caches of a CPU, or enough to keep a GPU busy."""
 
 
 def check_rows(x: Tensor, codebook: Tensor) -> None:
@@ -56,12 +56,12 @@ def nearest_reference(x: Tensor, codebook: Tensor) -> Tensor:
     mode = "donot_use_mm_for_euclid_dist"
     with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
         distances = (torch.cdist(part, codebook, compute_mode=mode) for part in torch.split(x.detach(), rows))
-        # argmin would take a NaN for the smallest
+        # argmin would treat NaN as the smallest
         return torch.cat([part.nan_to_num(nan=torch.inf, posinf=torch.inf).argmin(1) for part in distances])
 
 
 def nearest(x: Tensor, codebook: Tensor) -> Tensor:
-    """Nearest codes in exact float32: a code differs from the float64 one only between equals to rounding.
+    """Nearest codes in exact float32: a code differs from the float64 one only where distances tie up to rounding.
 
     Args:
         x: Rows ``[N, D]``.

@@ -1,7 +1,7 @@
-"""Counter-based normal noise: vector m of a seed is a function of (seed, m), whoever computes it and in what order.
+"""Counter-based normal noise: vector m of a seed is a function of (seed, m), whichever thread computes it, and when.
 
-Two rounds of 64-bit mixing (the finalizer of splitmix64, with the seed entering twice) give two uniform numbers, the
-Box-Muller transform turns them into two normal ones. There are no branches and no tables, so all of it runs on vectors.
+Two rounds of 64-bit mixing (the finalizer of splitmix64, with the seed entering twice) give two uniform values, which
+the Box-Muller transform turns into two normal ones. There are no branches and no tables, so all of it is vectorized.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def draw_seed(generator: torch.Generator) -> int:
 
 @inline
 def _uniforms(seed, pair, radius, angle):  # type: ignore[no-untyped-def]
-    """Sixteen pairs from ``pair`` on: radius in (0, 1], angle in [-1/2, 1/2) turns, 24 random bits each."""
+    """Sixteen pairs starting at ``pair``: radius in (0, 1], angle in [-1/2, 1/2) turns, 24 random bits each."""
     key = np.uint64(seed)
     second_key = (key ^ (key >> _S31)) * _SECOND
     for lane in range(16):
@@ -86,13 +86,13 @@ def _normal_kernel(seed, out):  # type: ignore[no-untyped-def]
 
 
 def normal_vectors(seed: int, vectors: int) -> NDArray[np.float32]:
-    """The first ``vectors`` (an even number) vectors of 16 standard normal numbers of a seed, ``[vectors · 16]``.
+    """The first ``vectors`` (an even number) vectors of 16 standard normal values of a seed, ``[vectors · 16]``.
 
     Raises:
         ValueError: ``vectors`` is negative or odd.
     """
     if vectors < 0 or vectors % 2:
-        raise ValueError(f"vectors must be an even number that is not negative, got {vectors}")
+        raise ValueError(f"vectors must be even and at least 0, got {vectors}")
     out = np.empty(vectors * 16, np.float32)
     thread_count()
     _normal_kernel(seed, out)

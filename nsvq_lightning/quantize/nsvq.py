@@ -40,24 +40,24 @@ def noise_substitution(
     aim: float = 0.0,
     spread: float = 1.0,
 ) -> Tensor:
-    """``x + ‖x − c‖·d̂`` with c the code of each row and the direction d̂ = d/‖d‖ a constant for the gradient.
+    """``x + ‖x − c‖·d̂`` with c the code of each row; no gradient flows through d̂ = d/‖d‖.
 
     By default d = v ~ N(0, I); in general ``d = aim·(c − x) + spread·v``.
 
-    The gradients are closed forms. With g the gradient of the result and r = x − c: that of x is g + (g·d̂) r/‖r‖, that
-    of a code is −Σ (g·d̂) r/‖r‖ over its rows, always summed in the same order. The radial term is 0 where r is 0.
+    The gradients have closed forms. With g the gradient of the result and r = x − c: that of x is g + (g·d̂) r/‖r‖,
+    that of a code is −Σ (g·d̂) r/‖r‖ over its rows, always summed in the same order. The radial term is 0 where r is 0.
 
     Args:
         x: Table ``[N, D]``.
         codebook: Codes ``[K, D]``.
         codes: Code of each chosen row, ``[V]`` int64.
         generator: Source of the noise, on any device; one seed is drawn from it.
-        rows: Rows ``[V]`` of the table, int64, ascending, all different; all of them by default.
-        aim: Weight of the way to the code in the direction.
+        rows: Rows ``[V]`` of the table, int64, ascending, distinct; all of them by default.
+        aim: Weight of the residual c − x in the direction.
         spread: Weight of the noise in the direction.
 
     Returns:
-        Rows ``[V, D]`` at the distance ‖x − c‖ from those of ``x``.
+        Rows ``[V, D]``, each at distance ‖x − c‖ from its row of ``x``.
     """
     mix = draw_seed(generator), aim, spread
     result: Tensor = _Substitution.apply(x, codebook, codes, rows, mix)  # type: ignore[no-untyped-call]
@@ -116,13 +116,13 @@ def _contiguous(*tensors: Tensor) -> list[Tensor]:
 
 
 def _directions(residual: Tensor, seed: int, aim: float, spread: float) -> Tensor:
-    """Unit vectors ``[V, D]`` of the directions for the residuals x − c."""
+    """Unit direction vectors ``[V, D]`` for the residuals x − c."""
     generator = torch.Generator(residual.device).manual_seed(seed)
     noise = torch.randn(residual.shape, dtype=residual.dtype, device=residual.device, generator=generator)
     return _unit(spread * noise - aim * residual)
 
 
 def _unit(vectors: Tensor) -> Tensor:
-    """Rows of length 1, and 0 for those without length."""
+    """Rows scaled to length 1; zero rows stay 0."""
     length: Tensor = vectors.norm(dim=1, keepdim=True)
     return vectors / torch.where(length > 0, length, torch.inf)

@@ -1,4 +1,4 @@
-"""k-means of the finished splats: what vector quantization costs that training knows nothing of."""
+"""k-means of the finished splats: the cost of vector quantization of which training knows nothing."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ __all__ = ["PostHoc"]
 
 
 class PostHoc(CodebookQuantizer):
-    """Quantizer that leaves training alone: the codebook is k-means of whatever rows are encoded.
+    """Quantizer that leaves training alone: its codebook is fitted by k-means to the rows that are encoded.
 
-    In training the rows pass as they are; nothing is searched or counted, so that no code is ever replaced. Codes come
-    into being where they are needed, when the scene is evaluated, frozen or stored: :meth:`encode` fits the codebook to
-    the rows it is given, by k-means from a fixed start, and returns their nearest codes. The codebook so depends on the
-    rows alone, on every process and however often the scene was evaluated before; a file holds k-means of the final
-    rows, all counted alike. Once codes are frozen, codebook and codes are those of that moment, as with every other
+    In training the rows pass unchanged; nothing is searched or counted, so no code is ever replaced. Codes are made
+    only when needed, when the scene is evaluated, frozen or stored: :meth:`encode` fits the codebook to the rows it
+    is given, by k-means from a fixed start, and returns their nearest codes. So the codebook depends only on the rows,
+    whatever the process and however often the scene was evaluated before; a file holds the k-means of the final rows,
+    all with equal weight. Once codes are frozen, codebook and codes are those of that moment, as with every other
     quantizer.
 
-    ``configs/post_hoc_4k.yaml`` has no fine-tune phase, in which the codebooks would be trained after all.
+    ``configs/post_hoc_4k.yaml`` has no fine-tune phase, because that would train the codebooks after all.
 
     Args:
         num_codes: Codes K, at least 1.
-        dim: Numbers in a row, D.
+        dim: Dimension D of a row.
         **settings: Those of :class:`CodebookQuantizer`.
     """
 
@@ -36,14 +36,14 @@ class PostHoc(CodebookQuantizer):
         self.most_codes = num_codes
 
     def fit(self, x: Tensor, weight: Tensor | None = None, generator: torch.Generator | None = None) -> None:
-        """Place the codebook on rows, see :meth:`CodebookQuantizer.fit`; K may have been smaller for other rows."""
+        """Fit the codebook as :meth:`CodebookQuantizer.fit` does; K may grow again if earlier rows made it smaller."""
         self._resize(self.most_codes)
         super().fit(x, weight, generator)
 
     def forward(
         self, x: Tensor, generator: torch.Generator | None = None, rows: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """In training the rows ``[V, D]`` themselves, and -1 as the code of each; else hard codes."""
+        """In training, the rows ``[V, D]`` themselves, and -1 as the code of each; otherwise hard codes."""
         if self.frozen or not self.training:
             return super().forward(x, generator, rows)
         count = len(x) if rows is None else len(rows)
@@ -57,7 +57,7 @@ class PostHoc(CodebookQuantizer):
     def encode(self, x: Tensor) -> Tensor:
         """Nearest codes ``[N]`` int64 of ``x [N, D]``, in a codebook that is fitted to ``x`` unless it is frozen.
 
-        Rows that are not finite, which a run drops at its next search, have no part in the codebook.
+        The codebook ignores non-finite rows, which a run drops at its next search.
         """
         if not self.frozen:
             rows = x.detach()

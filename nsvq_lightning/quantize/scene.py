@@ -1,4 +1,4 @@
-"""Splats seen through their quantizers: hard codes, or noise substitution in training."""
+"""Splats after their quantizers: hard codes, or the training stand-in such as noise substitution."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ __all__ = ["attribute_rows", "build_quantizers", "codes_of", "decoded", "noisy_r
 def build_quantizers(
     quantizer: Callable[[int, int], nn.Module], codebooks: str | Mapping[str, int] | None, splats: Splats
 ) -> dict[str, nn.Module]:
-    """Quantizer by attribute, in the order of ``QUANTIZED``.
+    """Quantizers by attribute, in the order of ``QUANTIZED``.
 
     Args:
         quantizer: Makes one from (number of codes, dimension).
-        codebooks: The paper's name of the sizes, or number of codes by attribute, or None.
-        splats: For the dimensions; without higher SH coefficients there is no quantizer for them.
+        codebooks: The paper's name for the sizes, or number of codes by attribute, or None.
+        splats: Gives the dimensions; without higher SH coefficients there is no quantizer for them.
 
     Raises:
         ValueError: A codebook is for an unknown attribute, or has no code.
-        TypeError: What ``quantizer`` makes does not follow :class:`~nsvq_lightning.quantize.base.Quantizer`.
+        TypeError: What ``quantizer`` makes does not implement :class:`~nsvq_lightning.quantize.base.Quantizer`.
     """
     sizes = codebook_sizes(codebooks) if isinstance(codebooks, str) else dict(codebooks or {})
     unknown = sorted(set(sizes) - set(QUANTIZED))
@@ -81,7 +81,7 @@ def noisy_rows(
 
     Args:
         splats: Raw attributes of ``N`` splats.
-        rows: Which of them ``[V]``, int64, all different.
+        rows: Which of them ``[V]``, int64, distinct.
         quantizers: Quantizer by attribute; each counts the codes it uses.
         noise: Generator for an attribute.
 
@@ -94,7 +94,7 @@ def noisy_rows(
             subset[name] = take_rows(tensor, rows)
             continue
         attribute = QUANTIZED[name]
-        # The module's call, not its forward: hooks of user-made quantizers must run.
+        # Call the module, not its forward: hooks of user-made quantizers must run.
         call: Callable[..., tuple[Tensor, Tensor]] = quantizers[name]  # type: ignore[assignment]
         quantized, _ = call(attribute.rows(tensor), noise(name), rows)
         subset[name] = attribute.unrows(quantized, tensor)

@@ -1,11 +1,11 @@
-"""Exact nearest code in many dimensions: dot products on 16-lane vectors, settled by true distances where they tie.
+"""Exact nearest code in many dimensions: dot products on 16-lane vectors, with ties settled by true distances.
 
 With rows and codes centred on the mean of the codes, ‖x − c‖² = ‖x‖² + 2 s(c) with the score s(c) = ‖c‖²/2 − x·c, one
-fused multiply-add a number. A row keeps its few best scores, sorted; most blocks of codes hold no better one, which one
-branch tells for six rows. All codes that can be nearest after rounding are among the best, unless even the last of
-these is as near as rounding (many equal codes; then all codes are compared by true distances). What else this yields is
-a short list of the nearest codes and a distance below which there is no other code, which lets :mod:`tracking` skip
-most searches.
+fused multiply-add per element. A row keeps its few best scores, sorted; most blocks of codes hold no better one, which
+a single branch checks for six rows. All codes that can be nearest after rounding are among the best, unless even the
+last of these ties up to rounding (many equal codes; then all codes are compared by true distances). The search also
+yields a short list of the nearest codes and a distance below which there is no other code, which lets :mod:`tracking`
+skip most searches.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ __all__ = ["LIST", "CentredCodes", "centre_codes", "score_search", "true_distanc
 LIST = 8
 """Codes in the list of a row."""
 _BEST = LIST + 1
-"""Scores that a row keeps: those of a list, and the least of a code outside it."""
+"""Scores that a row keeps: those of a list, and the smallest of a code outside it."""
 _FEW = 4
-"""Scores that a row keeps where no list is asked for."""
+"""Scores that a row keeps where no list is requested."""
 _GROUP = 6
 """Rows scored together."""
 _TILE = 8 * _GROUP
-"""Rows that pass over the codes while a chunk of these stays in the first-level cache."""
+"""Rows that pass over a chunk of codes while it stays in the L1 cache."""
 _CHUNK = 4
 """Blocks of 32 codes in a chunk."""
 
@@ -53,10 +53,10 @@ class CentredCodes(NamedTuple):
     """Codes ready for :func:`score_search`.
 
     Attributes:
-        codebook: The codes as they are, ``[K, D]``.
+        codebook: The original codes, ``[K, D]``.
         centre: Mean of the finite codes, ``[D]``.
         blocks: Centred codes, ``[⌈K/32⌉, D, 32]``.
-        halves: Half the squared norm of each, ``[⌈K/32⌉ · 32]``; infinite where there is no finite code.
+        halves: Half their squared norms, ``[⌈K/32⌉ · 32]``; infinite where there is no finite code.
         longest: Largest norm of a centred code.
     """
 
@@ -69,7 +69,7 @@ class CentredCodes(NamedTuple):
 
 @kernel
 def _lay_out(codebook, centre, blocks, halves):  # type: ignore[no-untyped-def]
-    """Write blocks of centred codes and half their squared norms; a code that is not finite becomes 0 and infinite."""
+    """Write blocks of centred codes and half their squared norms; a non-finite code becomes 0 with an infinite norm."""
     count, dim = codebook.shape
     for block in prange(blocks.shape[0]):
         for lane in range(32):
@@ -92,12 +92,12 @@ def centre_codes(codebook: NDArray[np.float32]) -> CentredCodes:
     """Centre the codes ``[K, D]`` and lay them out in blocks of 32.
 
     Raises:
-        ValueError: There is no code, or the codebook has gaps.
+        ValueError: There is no code, or the codebook is not contiguous.
         TypeError: It is not float32.
     """
     check_table("codebook", codebook)
     if len(codebook) == 0:
-        raise ValueError(f"the codebook must have a code, got shape {list(codebook.shape)}; fit it first")
+        raise ValueError(f"the codebook must have at least one code, got shape {list(codebook.shape)}; fit it first")
     count, dim = codebook.shape
     with np.errstate(invalid="ignore"):
         centre = codebook.mean(0, dtype=np.float64).astype(np.float32)
@@ -123,7 +123,7 @@ def true_distance(dim, x, row, codebook, code):  # type: ignore[no-untyped-def]
 
 @inline
 def _insert(scores, codes, at, kept, score, code):  # type: ignore[no-untyped-def]
-    """Put a score into the sorted ones of a row; the last one falls out."""
+    """Insert a score into the sorted scores of a row; the last one drops out."""
     place = at + kept - 1
     while place > at and get(scores, place - 1) > score:
         put(scores, place, get(scores, place - 1))
@@ -135,7 +135,7 @@ def _insert(scores, codes, at, kept, score, code):  # type: ignore[no-untyped-de
 
 @inline
 def _keep(scores, codes, limits, slack, kept, first, block, found):  # type: ignore[no-untyped-def]
-    """Insert what is below the limits of 6 rows from their scores ``found`` of a block."""
+    """Of the scores ``found`` of a block, insert those below the limits of 6 rows."""
     for i in range(_GROUP):
         limit = broadcast(get(limits, first + i))
         below = mask_bits(load(found, 32 * i) < limit) | (mask_bits(load(found, 32 * i + 16) < limit) << 16)
@@ -236,7 +236,7 @@ def _compare_all(dim, x, row, codebook):  # type: ignore[no-untyped-def]
 
 @cache
 def _search_kernel(dim: int) -> Any:
-    """The search for one dimension, a constant for the compiler."""
+    """The search for one dimension, a compile-time constant."""
 
     def search(x, codebook, centre, blocks, halves, longest, result, lists, distances):  # type: ignore[no-untyped-def]
         count = result.shape[0]
@@ -255,7 +255,7 @@ def _search_kernel(dim: int) -> Any:
                     rows[i * dim + j] = value
                     squared[i] += value * value
                 reach = np.sqrt(squared[i]) + longest
-                # Without a list only what may be nearest after rounding is kept.
+                # Without a list, only codes that may be nearest after rounding are kept.
                 slack[i] = np.float32(np.inf) if with_lists else np.float32(2.0) * rounding * reach * reach
             _score_tile(dim, blocks, halves, rows, (valid + _GROUP - 1) // _GROUP * _GROUP, kept, state)
             for i in range(valid):
@@ -283,20 +283,20 @@ def _search_kernel(dim: int) -> Any:
 def score_search(
     x: NDArray[np.float32], codes: CentredCodes, with_lists: bool = False
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
-    """Nearest codes of contiguous rows ``x [N, D]``; a row that is not a number gets code 0.
+    """Nearest codes of contiguous rows ``x [N, D]``; a row with a NaN gets code 0.
 
     Args:
         x: Rows.
         codes: The codes from :func:`centre_codes`.
-        with_lists: Whether to return what the search knows beside the nearest code.
+        with_lists: Whether to return what else the search finds.
 
     Returns:
-        Codes ``[N]``; a list of the nearest codes ``[N, LIST]`` int32, filled up with the first where there are fewer;
-        and distances ``[2, N]``: below the first there is no code outside the list, below the second none but the
-        nearest. The last two are empty unless asked for.
+        Codes ``[N]``; lists of the nearest codes ``[N, LIST]`` int32, padded with the first where there are fewer; and
+        distances ``[2, N]``: below the first there is no code outside the list, below the second none but the nearest.
+        The last two are empty unless requested.
 
     Raises:
-        ValueError: Rows and codes do not fit together, or an array has gaps.
+        ValueError: Rows and codes do not fit together, or an array is not contiguous.
         TypeError: One is not float32.
     """
     check_table("x", x)
@@ -321,11 +321,11 @@ def score_search(
 
 
 def _check_codes(codes: CentredCodes, dim: int) -> None:
-    """Arrays of one number of codes; no row comes near the codes that fill up the last block."""
+    """Check that the arrays have the same number of codes, and that the padding of the last block is infinite."""
     count, blocks = len(codes.codebook), -(-len(codes.codebook) // 32)
     check_array("codes.codebook", codes.codebook, (count, dim), FLOAT32)
     check_array("codes.centre", codes.centre, (dim,), FLOAT32)
     check_array("codes.blocks", codes.blocks, (blocks, dim, 32), FLOAT32)
     check_array("codes.halves", codes.halves, (32 * blocks,), FLOAT32)
     if count == 0 or not np.isposinf(codes.halves[count:]).all():
-        raise ValueError(f"codes must be those of `centre_codes` for a codebook, got {count} codes of another origin")
+        raise ValueError(f"codes must come from `centre_codes` for one codebook, got {count} codes of another origin")

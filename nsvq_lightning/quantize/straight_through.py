@@ -1,4 +1,4 @@
-"""Straight-through vector quantization, with a codebook from k-means as in CompGS or one that is trained."""
+"""Straight-through vector quantization, with a k-means codebook as in CompGS or a trained one."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ __all__ = ["StraightThrough", "TrainedStraightThrough"]
 class StraightThrough(CodebookQuantizer):
     """Quantizer that renders the nearest code itself and copies the gradient to the input (Bengio et al. 2013).
 
-    In training ``x_q = c + x − sg(x)`` with c the nearest code and sg a constant for the gradient: the value is c to
-    the bit, the gradient of x is that of the result. The codebook gets none; :meth:`refit` moves it to the rows now and
-    then, as in CompGS (Navaneet et al. 2024), which :class:`nsvq_lightning.callbacks.CodebookRefit` does on schedule.
-    CompGS searches codes at its refits only; here a row has its nearest code in every step.
+    In training ``x_q = c + x − sg(x)`` with c the nearest code and sg the stop-gradient operator: the value is c to the
+    bit, the gradient of x is that of the result. The codebook gets none; :meth:`refit` fits it to the rows from time to
+    time, as in CompGS (Navaneet et al. 2024), and :class:`nsvq_lightning.callbacks.CodebookRefit` schedules this.
+    CompGS searches codes only at its refits; here a row has its nearest code in every step.
     """
 
     def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator, rows: Tensor | None) -> Tensor:
@@ -33,18 +33,18 @@ class StraightThrough(CodebookQuantizer):
 
     @torch.no_grad()
     def refit(self, x: Tensor, steps: int) -> None:
-        """Move the codebook to the rows ``x [N, D]`` by ``steps`` Lloyd steps from where it is; K stays."""
+        """Fit the codebook to the rows ``x [N, D]`` by ``steps`` Lloyd steps from its current state; K stays."""
         start = self.codebook.detach()
-        # With a start k-means draws nothing, whatever the generator.
+        # With a given start, k-means draws nothing from the generator.
         self.codebook.copy_(kmeans(x, self.num_codes, seeded(0), steps=steps, start=start))
 
 
 class TrainedStraightThrough(CodebookQuantizer):
-    """Straight-through quantizer whose codes are trained by the gradient they have in truth: x_q = c + x − sg(x).
+    """Straight-through quantizer whose codes are trained by their own gradient: x_q = c + x − sg(x).
 
     The gradient g of the result goes to the row, as in :class:`StraightThrough`, and to its code, summed over the rows
-    that have it. So codes follow their rows without refits, each of which costs up to half a dB of test PSNR for some
-    fifty iterations, and training may end at any of them.
+    that have it. So codes follow their rows without refits, each of which costs up to half a dB of test PSNR for about
+    fifty iterations, and training may end at any iteration.
     """
 
     def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator, rows: Tensor | None) -> Tensor:
@@ -54,7 +54,7 @@ class TrainedStraightThrough(CodebookQuantizer):
 
 
 class _CopiedGradient(torch.autograd.Function):
-    """Codes ``[V, D]`` whose gradient is also taken for that of the rows ``[V]`` of ``x [N, D]``."""
+    """Codes ``[V, D]`` whose gradient is also used as that of the rows ``[V]`` of ``x [N, D]``."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, codebook: Tensor, codes: Tensor, rows: Tensor | None) -> Tensor:

@@ -1,12 +1,12 @@
-"""Substitution of the error on the CPU: gather, residual, noise and result of a row in one pass, gradients in another.
+"""Error substitution on the CPU: gather, residual, noise and result of a row in one pass, gradients in another.
 
-Rows are read out of the whole table, and their gradient is written back into one. Short rows are handled 16 at a time,
-one row a lane. Rows of 16 and more numbers are handled one at a time, in vectors along the row of which the last two
+Rows are read from the whole table, and their gradient is written back into one. Short rows are handled 16 at a time,
+one row per lane. Rows of 16 or more columns are handled one at a time, in vectors along the row of which the last two
 may overlap. The backward pass takes the direction from the result, not from a second draw: with x̃ - x = ‖r‖ d̂ the
 radial term (g·d̂) r/‖r‖ is (g·(x̃ - x)) r/‖r‖².
 
-The sums of a code go over the rows in their order. A part of the rows has sums of its own, which are added in the order
-of the parts; where the parts lie depends on the sizes alone, so the bits do not depend on the number of threads.
+The sums of a code add up its rows in order. Each part of the rows has its own sums, which are added in the order of the
+parts; the parts depend only on the sizes, so the bits do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from nsvq_lightning.quantize.noise import fill_normal
 __all__ = ["substitute", "substitute_backward"]
 
 _ROWS = 256
-"""Rows a unit of parallel work takes; the noise of a row depends on its position alone."""
+"""Rows per unit of parallel work; the noise of a row depends only on its position."""
 _LEAST_PARTS, _MOST_PARTS = 4, 64
-"""Parts that the rows are summed in: enough for the threads, few enough that their sums are little work."""
+"""Number of parts in which the rows are summed: enough for the threads, few enough that adding them up is cheap."""
 
 _TINY = np.finfo(np.float32).tiny
 
@@ -39,7 +39,7 @@ Integers = NDArray[np.int64]
 
 @inline
 def _copy_in(dim, source, rows, first, count, group):  # type: ignore[no-untyped-def]
-    """Chosen rows to vectors, one row a lane."""
+    """Copy chosen rows into vectors, one row per lane."""
     for lane in range(count):
         start = get(rows, first + lane) * dim
         for j in range(dim):
@@ -48,9 +48,9 @@ def _copy_in(dim, source, rows, first, count, group):  # type: ignore[no-untyped
 
 @inline
 def _block(dim, x, rows, codebook, codes, block):  # type: ignore[no-untyped-def]
-    """First and last row of a block, and how many of their numbers are no row of the table or no code.
+    """First and last row of a block, and how many of its indices are outside the table or the codebook.
 
-    A block that has such numbers ends where it begins.
+    A block with such an index ends where it begins.
     """
     begin, stop = block * _ROWS, min(codes.shape[0], (block + 1) * _ROWS)
     found = count_outside(rows, begin, stop, x.shape[0] // dim)
@@ -60,7 +60,7 @@ def _block(dim, x, rows, codebook, codes, block):  # type: ignore[no-untyped-def
 
 @inline
 def _part(dim, x, rows, codebook, codes, part, parts):  # type: ignore[no-untyped-def]
-    """The same of a part; the row before its first one says where to begin to clear."""
+    """The same for a part; the row before its first one says where clearing begins."""
     begin, stop = codes.shape[0] * part // parts, codes.shape[0] * (part + 1) // parts
     found = count_outside(rows, begin - 1, stop, x.shape[0] // dim)
     found += count_outside(codes, begin, stop, codebook.shape[0] // dim)
@@ -69,7 +69,7 @@ def _part(dim, x, rows, codebook, codes, part, parts):  # type: ignore[no-untype
 
 @inline
 def _dots(dim, a, b):  # type: ignore[no-untyped-def]
-    """Products of rows with rows, one a lane."""
+    """Dot products of rows with rows, one per lane."""
     total = broadcast(np.float32(0.0))
     for j in range(dim):
         total = fma(load(a, 16 * j), load(b, 16 * j), total)
@@ -87,13 +87,13 @@ def _residuals_squared(dim, rows, chosen):  # type: ignore[no-untyped-def]
 
 @inline
 def _inverses(squared):  # type: ignore[no-untyped-def]
-    """1/s, and 0 where s is 0 (or its inverse too large): a vector without length has no direction."""
+    """1/s, and 0 where s is 0 (or its inverse too large): a zero vector has no direction."""
     return select(squared > broadcast(_TINY), broadcast(np.float32(1.0)) / squared, broadcast(np.float32(0.0)))
 
 
 @inline
 def _dot_difference(dim, g, at_g, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
-    """Product of a long row with a difference. ``keep`` leaves out what the last two vectors have in common."""
+    """Dot product of a long row with a difference. ``keep`` masks the overlap of the last two vectors."""
     total = broadcast(np.float32(0.0))
     for j in range(0, dim // 16 * 16, 16):
         total = fma(load(g, at_g + j), load(a, at_a + j) - load(b, at_b + j), total)
@@ -241,7 +241,7 @@ def _long_backward(dim: int) -> Any:
                 scale = _dot_difference(dim, grad, i * dim, out, i * dim, x, at, keep)
                 scale *= _inverse(_residual_squared(dim, x, at, codebook, code, keep))
                 clear_between(rows, i, dim, grad_x)
-                # The last two vectors overlap, so a sum is read before it is written.
+                # The last two vectors overlap, so the last sums are read before any are written.
                 last = load(total, code + dim - 16)
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
@@ -258,13 +258,13 @@ def _long_backward(dim: int) -> Any:
 
 @cache
 def _kernels(dim: int) -> tuple[Any, Any]:
-    """Forward and backward for rows of ``dim`` numbers, a constant for the compiler."""
+    """Forward and backward for rows of ``dim`` columns, a compile-time constant."""
     return (_short_forward(dim), _short_backward(dim)) if dim < 16 else (_long_forward(dim), _long_backward(dim))
 
 
 @kernel
 def _add_parts(sums, total):  # type: ignore[no-untyped-def]
-    """Add the sums of the parts in their order."""
+    """Add the sums of the parts in order."""
     parts, size = sums.shape
     for block in prange((size + 1023) // 1024):
         for i in range(block * 1024, min(size, (block + 1) * 1024)):
@@ -285,12 +285,12 @@ def substitute(
         rows: Which rows of it, ``[V]``.
         codebook: Codes ``[K, D]``.
         codes: Code of each chosen row, ``[V]``.
-        aim: Weight of the way to the code in the direction d.
-        spread: Weight of the noise in it.
+        aim: Weight of the residual c − x in the direction d.
+        spread: Weight of the noise in d.
 
     Raises:
-        ValueError: The arrays do not fit together, one has gaps, or there is no such row or code.
-        TypeError: The numbers have other types.
+        ValueError: The arrays do not fit together, one is not contiguous, or a row or code is out of range.
+        TypeError: A dtype is wrong.
     """
     _check(x, rows, codebook, codes)
     out = recycled((len(rows), x.shape[1])).numpy()
@@ -309,7 +309,7 @@ def _check(x: Floats, rows: Integers, codebook: Floats, codes: Integers) -> None
 
 
 def _missing(x: Floats, rows: Integers, codebook: Floats, codes: Integers) -> ValueError:
-    """The error for a row or a code that is not there."""
+    """The error for a row or a code that is out of range."""
     wrong_row = bool(((rows < 0) | (rows >= len(x))).any())
     return outside("rows", rows, len(x)) if wrong_row else outside("codes", codes, len(codebook))
 
@@ -319,11 +319,11 @@ def substitute_backward(
 ) -> tuple[Floats, Floats]:
     """Gradients of ``x [N, D]`` and ``codebook [K, D]`` from that of the result, ``grad [V, D]``.
 
-    ``out [V, D]`` is the result of :func:`substitute`; ``rows [V]`` must be ascending and all different here.
+    ``out [V, D]`` is the result of :func:`substitute`; ``rows [V]`` must be ascending and distinct here.
 
     Raises:
-        ValueError: As of :func:`substitute`.
-        TypeError: The numbers have other types.
+        ValueError: As for :func:`substitute`.
+        TypeError: A dtype is wrong.
     """
     _check(x, rows, codebook, codes)
     for name, table in (("grad", grad), ("out", out)):

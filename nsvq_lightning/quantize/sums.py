@@ -1,4 +1,4 @@
-"""Sums of rows by code: the gradient of a codebook, and the means of k-means. Repeatable to the bit on every device."""
+"""Sums of rows by code: the gradient of a codebook, and the means of k-means. Reproducible to the bit on any device."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["count_hits", "lookup", "sum_by_code"]
 
 @kernel
 def _sum_rows(values, codes, sums, parts):  # type: ignore[no-untyped-def]
-    """A part owns a range of codes and looks at all rows, so the order of the threads cannot change a sum."""
+    """Each part owns a range of codes and scans all rows, so the order of the threads cannot change a sum."""
     for part in prange(parts):
         first, last = part * sums.shape[0] // parts, (part + 1) * sums.shape[0] // parts
         for i in range(codes.shape[0]):
@@ -35,7 +35,7 @@ def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtyp
 
     Args:
         values: Rows ``[N, D]``.
-        codes: Codes ``[N]`` int64; a row whose code is not in [0, K) is in no sum.
+        codes: Codes ``[N]`` int64; a row whose code is not in [0, K) is ignored.
         num_codes: K.
         dtype: Dtype of the sums, that of ``values`` by default.
 
@@ -43,7 +43,7 @@ def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtyp
         Sums ``[K, D]``; 0 for a code without rows.
 
     Raises:
-        ValueError: The values are not ``[N, D]``, or there is not one code a row.
+        ValueError: The values are not ``[N, D]``, or there is not one code per row.
         TypeError: The codes are not int64.
     """
     if values.dim() != 2 or codes.shape != values.shape[:1]:
@@ -64,7 +64,7 @@ def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtyp
 
 
 def _sum_segments(values: Tensor, codes: Tensor, num_codes: int) -> Tensor:
-    """Sort the rows by code, then sum segments: no atomics, whose order would change from run to run."""
+    """Sort the rows by code, then sum segments: no atomics, whose order varies from run to run."""
     order = torch.argsort(codes, stable=True)
     lengths = torch.bincount(codes, minlength=num_codes)
     return torch.segment_reduce(values[order], "sum", lengths=lengths, axis=0, unsafe=True, initial=0)
@@ -72,7 +72,7 @@ def _sum_segments(values: Tensor, codes: Tensor, num_codes: int) -> Tensor:
 
 @partial(kernel, parallel=False)
 def _count_hits(codes, usage):  # type: ignore[no-untyped-def]
-    """Count what was hit, unless a number is no code; returns how many are none."""
+    """Count the codes that were hit, unless some are out of range; returns how many are."""
     hit, missing = np.zeros(usage.shape[0], np.uint8), 0
     for i in range(codes.shape[0]):
         if 0 <= codes[i] < usage.shape[0]:
@@ -88,8 +88,8 @@ def count_hits(codes: Tensor, usage: Tensor) -> None:
     """Add 1 to ``usage [K]`` (int64, in place) for every code that is among ``codes [N]``, however often.
 
     Raises:
-        ValueError: ``codes`` is not ``[N]``, ``usage`` has gaps, or there is no such code.
-        TypeError: A type differs.
+        ValueError: ``codes`` is not ``[N]``, ``usage`` is not contiguous, or a code is out of range.
+        TypeError: A dtype is wrong.
     """
     if usage.device.type == "cpu":
         numbers = flat_checked("codes", codes.contiguous(), (codes.numel(),), INT64)
@@ -102,7 +102,7 @@ def count_hits(codes: Tensor, usage: Tensor) -> None:
 
 
 def lookup(codebook: Tensor, codes: Tensor) -> Tensor:
-    """Codes' rows ``[N, D]`` of ``codebook [K, D]``, with a gradient that is summed in a fixed order."""
+    """Rows ``[N, D]`` of ``codebook [K, D]`` for the codes, with a gradient that is summed in a fixed order."""
     result: Tensor = _Lookup.apply(codebook, codes)  # type: ignore[no-untyped-call]
     return result
 

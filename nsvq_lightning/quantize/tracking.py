@@ -1,12 +1,12 @@
 """Searches that remember: the same codes as :func:`nearest`, bit for bit, mostly without a search.
 
-From one training step to the next rows and codes move little. In many dimensions the tracker keeps for every row its
-last code, the codes that were near when it was last searched, where the row was then, and two distances: R1 below which
-there was no code but the nearest, R below which there was none outside the list. With d the distance to the last code
-now, m how far the row has moved and Δ how far any code can have moved, d + m + Δ < R1 proves that the code has not
-changed; with d the distance to the nearest of the list, d + m + Δ < R proves that this is the nearest of all (the
-triangle inequality, as in Hamerly's k-means). In few dimensions there is no list, only R1, which
-:mod:`box_search` checks on its way, and the order in which codes were put into boxes.
+From one training step to the next, rows and codes move little. In many dimensions the tracker keeps for every row its
+last code, the list of codes that were near when it was last searched, where the row was then, and two distances: R1,
+below which there was no code but the nearest, and R, below which there was none outside the list. With d the distance
+to the last code now, m how far the row has moved and Δ how far any code can have moved, d + m + Δ < R1 proves that the
+code has not changed; with d the distance to the nearest code of the list, d + m + Δ < R proves that this is the nearest
+of all (the triangle inequality, as in Hamerly's k-means). In few dimensions there is no list, only R1, which
+:mod:`box_search` checks itself, and the order in which codes were put into boxes.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ from nsvq_lightning.quantize.scores import LIST, centre_codes, score_search, tru
 __all__ = ["NearestTracker"]
 
 _BLOCK = 256
-"""Rows a unit of parallel work takes."""
+"""Rows per unit of parallel work."""
 _BOX_STEPS = 32
-"""Searches after which the codes are put into boxes anew; boxes of an old order are right, but larger."""
+"""Searches after which the codes are sorted into boxes anew; boxes in an old order are correct, but larger."""
 _SNAPSHOT_STEPS = 16
-"""Searches between two snapshots of the codebook. A code's way is taken as the sum of its ways from one snapshot to the
-next: the more snapshots, the more a random walk counts as if it went straight on."""
+"""Searches between two snapshots of the codebook. How far a code has moved is the sum of its distances from snapshot to
+snapshot: the more snapshots, the more a random walk counts as if it were a straight line."""
 
 Floats = NDArray[np.float32]
 
 
 @inline
 def _squares(dim, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
-    """Squared differences of two rows, to be summed. ``keep`` leaves out where the last two vectors overlap."""
+    """Squared differences of two rows, to be summed. ``keep`` masks the overlap of the last two vectors."""
     total = broadcast(np.float32(0.0))
     if dim < 16:
         for j in range(dim):
@@ -72,7 +72,7 @@ def _squares(dim, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
 
 
 def _overlap(dim: int) -> Floats:
-    """The lanes in which the last vector of a row has numbers that the one before has not; one for short rows."""
+    """1 in the lanes of a row's last vector that the one before does not cover, else 0; a single 1 for short rows."""
     keep = np.zeros(16, np.float32)
     keep[-(dim % 16) if dim > 16 else -1 :] = 1
     return keep
@@ -85,7 +85,7 @@ def _member(dim, x, at, codebook, lists, place, keep):  # type: ignore[no-untype
 
 @inline
 def _list_squared(dim, x, at, codebook, lists, start, keep):  # type: ignore[no-untyped-def]
-    """Squared distances to the codes of a list, one a lane; the other lanes hold 0."""
+    """Squared distances to the codes of a list, one per lane; the other lanes hold 0."""
     return lane_sums(
         (
             _member(dim, x, at, codebook, lists, start, keep),
@@ -102,7 +102,7 @@ def _list_squared(dim, x, at, codebook, lists, start, keep):  # type: ignore[no-
 
 @inline
 def _settle(dim, x, row, codebook, lists, start, near):  # type: ignore[no-untyped-def]
-    """Nearest by true distance among the members of a list whose bits are set."""
+    """Nearest code by true distance among the members of a list whose bits are set."""
     code = np.int64(get(lists, start + lowest_bit(near)))
     if near & (near - 1) == 0:
         return code
@@ -118,7 +118,7 @@ def _settle(dim, x, row, codebook, lists, start, near):  # type: ignore[no-untyp
 
 @inline
 def _second_smallest(squared, near, scratch):  # type: ignore[no-untyped-def]
-    """Smallest lane but for the lowest one whose bit is set."""
+    """Smallest lane other than the lowest one whose bit is set."""
     store(scratch, 0, squared)
     put(scratch, lowest_bit(near), np.float32(np.inf))
     return lane_min(load(scratch, 0))
@@ -126,7 +126,7 @@ def _second_smallest(squared, near, scratch):  # type: ignore[no-untyped-def]
 
 @cache
 def _check_kernel(dim: int) -> Any:
-    """The check for one dimension, a constant for the compiler."""
+    """The check for one dimension, a compile-time constant."""
 
     def check(x, rows, codebook, memory, keep, travelled, drift, result):  # type: ignore[no-untyped-def]
         last, lists, anchors, clearance, limits = memory
@@ -155,7 +155,7 @@ def _check_kernel(dim: int) -> Any:
                     put(last, row, np.int32(code))
                     second = np.float64(np.sqrt(_second_smallest(squared, near, scratch)))
                     if near & (near - 1) == 0 and second - distance > moved:
-                        # From here on the gap to the second code is worth more than the way so far.
+                        # The gap to the second code now exceeds how far the row has moved, so a new anchor pays.
                         for j in range(dim):
                             put(anchors, at + j, get(x, at + j))
                         limit = get(limits, row) - moved
@@ -178,7 +178,7 @@ def _row_distances(a, b, squares):  # type: ignore[no-untyped-def]
 
 @partial(kernel, parallel=False)
 def _ascending(rows, count):  # type: ignore[no-untyped-def]
-    """Whether row numbers are ascending, all different and in [0, count)."""
+    """Whether row numbers are ascending, distinct and in [0, count)."""
     right = rows.shape[0] == 0 or (rows[0] >= 0 and rows[-1] < count)
     for i in range(1, rows.shape[0]):
         right &= rows[i - 1] < rows[i]
@@ -188,15 +188,15 @@ def _ascending(rows, count):  # type: ignore[no-untyped-def]
 class NearestTracker:
     """Nearest codes of the same rows, step after step.
 
-    What it remembers costs memory (232 bytes a row for D = 45, 24 for D = 3) and never changes a result, so no
-    checkpoint needs it.
+    What it remembers takes memory (232 bytes per row for D = 45, 24 for D = 3) but never changes a result, so
+    checkpoints do not store it.
     """
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Start afresh; worth calling when codes have jumped."""
+        """Forget all searches; worth calling when codes have jumped."""
         self._steps = 0
         self._order: NDArray[np.int32] | None = None
         self._snapshot: Floats | None = None
@@ -205,7 +205,7 @@ class NearestTracker:
         self._last = np.zeros(0, np.int32)
         self._lists = np.zeros((0, LIST), np.int32)
         self._anchors = np.zeros((0, 0), np.float32)
-        # In float64, because ways add up over a whole run.
+        # In float64, because movements add up over a whole run.
         self._clearance, self._limits = np.zeros(0), np.zeros(0)
 
     def search(self, x: Tensor, codebook: Tensor, rows: Tensor | None = None) -> Tensor:
@@ -214,13 +214,13 @@ class NearestTracker:
         Args:
             x: Rows ``[N, D]``.
             codebook: Codes ``[K, D]``.
-            rows: Which rows to search, ``[V]`` int64, ascending, all different; all of them by default.
+            rows: Which rows to search, ``[V]`` int64, ascending, distinct; all of them by default.
 
         Returns:
             Codes ``[V]`` int64.
 
         Raises:
-            ValueError: The shapes do not fit together, or rows are not ascending numbers of rows.
+            ValueError: The shapes do not fit together, or rows are not ascending, distinct and in range.
             TypeError: The dtypes differ or are not floating point, or rows are not int64.
         """
         check_rows(x, codebook)
@@ -232,7 +232,7 @@ class NearestTracker:
         chosen = np.arange(len(values)) if rows is None else rows.contiguous().numpy()
         check_array("rows", chosen, (len(chosen),), INT64)
         if not _ascending(chosen, len(values)):
-            raise ValueError(f"rows must be ascending numbers in [0, {len(values)}), all different")
+            raise ValueError(f"rows must be ascending, distinct and in [0, {len(values)})")
         if self._codebook_shape != codes.shape:
             self.forget()
             self._codebook_shape = codes.shape
@@ -256,7 +256,7 @@ class NearestTracker:
         thread_count()
         _check_kernel(dim)(x.ravel(), rows, codebook.ravel(), memory, _overlap(dim), self._travelled, drift, result)
         unsure = np.flatnonzero(result < 0)
-        if 2 * len(unsure) > len(rows):  # codes have jumped; the rows in the next searches need not pay for it again
+        if 2 * len(unsure) > len(rows):  # codes have jumped; a new snapshot spares the next searches the cost
             drift = self._take_snapshot(codebook, drift)
         if len(unsure):
             where = rows[unsure]
@@ -267,7 +267,7 @@ class NearestTracker:
         return result
 
     def _drift(self, codebook: Floats, every: int) -> float:
-        """Farthest way of a code since the snapshot; a new one is taken after ``every`` searches."""
+        """Farthest that any code has moved since the snapshot; a new one is taken after ``every`` searches."""
         if self._snapshot is None:
             self._snapshot = codebook.copy()
         squares = np.empty(len(codebook), np.float32)
@@ -278,13 +278,13 @@ class NearestTracker:
         return self._take_snapshot(codebook, drift) if self._steps % every == 0 else drift
 
     def _take_snapshot(self, codebook: Floats, drift: float) -> float:
-        """Take a snapshot of codes that have moved by ``drift`` since the last; returns their drift from it, 0."""
+        """Take a snapshot of codes that have moved by ``drift`` since the last; returns the new drift, 0."""
         self._travelled += drift
         self._snapshot = codebook.copy()
         return 0.0
 
     def _grow(self, count: int) -> None:
-        """Room for ``count`` rows."""
+        """Make room for ``count`` rows."""
         old = len(self._last)
         if count <= old:
             return

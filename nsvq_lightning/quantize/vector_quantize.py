@@ -14,22 +14,22 @@ __all__ = ["VectorQuantizeAdapter"]
 
 
 class VectorQuantizeAdapter(CodebookQuantizer):
-    """Lets a module of another library search, move its codebook and pass gradients, between the same callbacks.
+    """Quantizer that leaves the search, the codebook updates and the gradients to the library vector_quantize_pytorch.
 
     In training the rows go through ``vector_quantize_pytorch.VectorQuantize``: it takes the nearest codes, passes the
     gradient straight through to the rows (or by the rotation trick, Fifty et al. 2024), and moves every code to the
-    exponential moving average of its rows (van den Oord et al. 2017). ``codebook`` is copied to the library before and
-    from it after each pass; codes that others have placed or replaced meanwhile start a new average. All else, from
-    k-means to frozen codes, is :class:`CodebookQuantizer`'s.
+    exponential moving average of its rows (van den Oord et al. 2017). ``codebook`` is copied to the library before each
+    pass and from it afterwards; codes that were placed or replaced in between start a new average. All else, from
+    k-means to frozen codes, is inherited from :class:`CodebookQuantizer`.
 
-    The library holds the distances of all rows to all codes at once, 4·V·K bytes, so this is for small codebooks; and
-    it decides at construction whether processes share their averages, so this trains in one process. It is not among
-    this package's dependencies: ``pip install 'vector-quantize-pytorch>=1.25'``.
+    The library holds the distances of all rows to all codes at once, 4·V·K bytes, so this suits only small codebooks;
+    and it decides at construction whether processes share their averages, so this trains in a single process. It is not
+    one of this package's dependencies: ``pip install 'vector-quantize-pytorch>=1.25'``.
 
     Args:
         num_codes: Codes K, at least 1.
-        dim: Numbers in a row, D.
-        decay: Share of the old average that a step keeps.
+        dim: Dimension D of a row.
+        decay: Share of the old average that each step keeps.
         rotation_trick: Rotate and scale gradients from code to row instead of copying them; needs D > 1.
         **settings: Those of :class:`CodebookQuantizer`.
 
@@ -53,10 +53,10 @@ class VectorQuantizeAdapter(CodebookQuantizer):
     def forward(
         self, x: Tensor, generator: torch.Generator | None = None, rows: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Quantize rows ``[V]`` of ``x [N, D]``, in training with the library; no generator is needed.
+        """Quantize the rows ``rows [V]`` of ``x [N, D]``, in training with the library; no generator is needed.
 
         Raises:
-            RuntimeError: In training there are several processes.
+            RuntimeError: Training runs in several processes.
         """
         if self.frozen or not self.training:
             return super().forward(x, generator, rows)
@@ -65,7 +65,7 @@ class VectorQuantizeAdapter(CodebookQuantizer):
         return x_q, codes
 
     def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator, rows: Tensor | None) -> Tensor:
-        """What the library makes of the rows ``rows [V]`` of ``x [N, D]``; it searches codes itself."""
+        """The library's output for the rows ``rows [V]`` of ``x [N, D]``; it searches codes itself."""
         return self._quantize(x, rows)[0]
 
     def _quantize(self, x: Tensor, rows: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -83,8 +83,8 @@ class VectorQuantizeAdapter(CodebookQuantizer):
 
     @torch.no_grad()
     def _to_library(self, library: Any) -> None:
-        """Copy the codebook; where it differs from the library's, averages start from it with the weight of a row."""
-        averages = library._codebook  # the only place that has them
+        """Copy the codebook; where it differs from the library's, averages restart from it with the weight of a row."""
+        averages = library._codebook  # the averages are accessible only here
         placed = (averages.embed[0] != self.codebook).any(1)
         averages.embed[0] = self.codebook
         averages.embed_avg[0, placed] = self.codebook[placed]
@@ -103,11 +103,11 @@ class VectorQuantizeAdapter(CodebookQuantizer):
             codebook_size=self.num_codes,
             decay=self.decay,
             rotation_trick=self.rotation_trick,
-            commitment_weight=0.0,  # the loss of a scene has no such term
+            commitment_weight=0.0,  # the training loss has no such term
             threshold_ema_dead_code=0,  # callbacks replace codes
             sync_codebook=False,
         ).to(self.codebook.device)
-        self._to_library(library)  # its own start is a draw of the global generator
+        self._to_library(library)  # the library's own start is drawn from the global generator
         return library
 
     def _resize(self, num_codes: int) -> None:

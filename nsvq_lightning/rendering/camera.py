@@ -41,7 +41,7 @@ class Camera:
         if self._intrinsics is not None:
             return
         fx, fy = float(self.K[0, 0]), float(self.K[1, 1])
-        # Kept as numbers: reading them from an accelerator would stall it at every render.
+        # Kept as Python floats: reading them from an accelerator would stall it at every render.
         object.__setattr__(self, "_intrinsics", (fx, fy, float(self.K[0, 2]), float(self.K[1, 2])))
         if not (0 < fx < math.inf and 0 < fy < math.inf):
             raise ValueError(f"Camera.K needs positive, finite focal lengths, got fx={fx}, fy={fy}")
@@ -62,7 +62,7 @@ class Camera:
     def to(
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None, **kwargs: object
     ) -> Camera:
-        """The camera with both matrices on ``device`` and in ``dtype``; itself where they are so already."""
+        """The camera with both matrices on ``device`` and in ``dtype``; the same object if they already are."""
         K, viewmat = (matrix.to(device=device, dtype=dtype) for matrix in (self.K, self.viewmat))
         if K is self.K and viewmat is self.viewmat:
             return self

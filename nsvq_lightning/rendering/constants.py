@@ -29,20 +29,20 @@ ALPHA_MAX = 0.99
 """Opacity of one splat at one pixel is capped here; the cap has no gradient."""
 
 TRANSMITTANCE_MIN = 1e-4
-"""A pixel is finished in front of the splat that would bring its transmittance below this."""
+"""A pixel is finished before the splat that would bring its transmittance below this."""
 
 FRUSTUM_MARGIN = 0.3
-"""The Jacobian of the projection is taken at most this fraction of the half image outside the image."""
+"""The projection's Jacobian is evaluated at most this fraction of half the image size outside the image."""
 
 HUGE_QUATERNION, SHRINK = 1e18, 2.0**-66
-"""Quaternions with a larger number are made smaller by this factor first: their squares would overflow in float32."""
+"""Quaternions with a larger component are first scaled by ``SHRINK``: their squares would overflow in float32."""
 
 LARGEST_FOOTPRINT = 1e36
-"""Float32 back-ends cull splats whose sum of both variances is larger, square pixels: not even that is safe there."""
+"""Float32 back-ends cull splats whose sum of both variances is larger, square pixels: even the sum is unsafe there."""
 
 FINITE = 1e30
-"""Float32 back-ends cull splats that have anything beyond this on the image plane: it comes from broken attributes."""
+"""Float32 back-ends cull splats with any larger value on the image plane: it comes from broken attributes."""
 
 HUGE_FOOTPRINT = 1e10
-"""Where the sum of both variances is larger, square pixels, the determinant is taken in units of that sum: its terms
-would overflow in float32."""
+"""Where the sum of both variances is larger, square pixels, the determinant is computed in units of that sum: its
+terms would overflow in float32."""

@@ -1,4 +1,4 @@
-"""One function renders splats; the device chooses the back-end."""
+"""One function renders splats; the device determines the back-end."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 _Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 BACKENDS = ("auto", "reference", "cpu", "cuda", "gsplat")
-"""Names that ``render(backend=...)`` takes; ``auto`` is the package's own fastest one for the device of the splats."""
+"""Names that ``render(backend=...)`` takes; ``auto`` is this package's fastest one for the device of the splats."""
 
 
 class Render(NamedTuple):
@@ -36,8 +36,7 @@ class Render(NamedTuple):
         radii: Radius in pixels of the area a splat can change, rounded up; 0 for splats that are not in view ``[N]``
             int32.
         means2d: Projected centres ``[N, 2]`` in pixels, x right, y down. Call ``retain_grad()`` on it before the
-        backward
-            pass to get screen-space gradients.
+            backward pass to get screen-space gradients.
         depth: Σ weight · view-space z ``[H, W]``; divide by ``alpha`` for the mean depth.
     """
 
@@ -88,7 +87,7 @@ def render(
 
 
 def _check_alike(splats: SplatTensors) -> None:
-    """Kernels read the memory of all attributes as they read that of the means."""
+    """Refuse attributes whose dtype or device differs from that of the means, which the kernels assume for all."""
     tensors = {name: getattr(splats, name) for name in ATTRIBUTES}
     check_shapes(tensors)
     kinds = {name: (tensor.dtype, tensor.device) for name, tensor in tensors.items()}
@@ -108,7 +107,7 @@ def visible(splats: SplatTensors, camera: Camera, *, backend: str = "auto") -> T
         backend: One of :data:`BACKENDS`.
 
     Raises:
-        ValueError: As of :func:`render`.
+        ValueError: As for :func:`render`.
     """
     _check_alike(splats)
     name = resolve_backend(backend, splats.means)
@@ -119,10 +118,10 @@ def visible(splats: SplatTensors, camera: Camera, *, backend: str = "auto") -> T
 
 
 def resolve_backend(backend: str, like: Tensor) -> str:
-    """The back-end that ``backend`` means for tensors such as ``like``.
+    """The back-end that ``backend`` stands for with tensors such as ``like``.
 
     ``auto`` is ``cpu`` for float32 on the CPU, ``cuda`` for float32 on a CUDA device where Triton is installed, and
-    else ``reference``: plain torch, in any type, on any device that torch has, and slow. It is never ``gsplat``.
+    otherwise ``reference``: plain torch, for any dtype and any device of torch, and slow. It is never ``gsplat``.
 
     Raises:
         ValueError: It is unknown, or cannot take this device or floating-point type.
@@ -138,7 +137,7 @@ def resolve_backend(backend: str, like: Tensor) -> str:
 
 
 def fast_backends(like: Tensor) -> list[str]:
-    """Back-ends other than plain torch that take tensors such as ``like``; asks gsplat to load itself where it may."""
+    """Back-ends other than plain torch that take tensors such as ``like``; this may load gsplat."""
     return [name for name in BACKENDS if name not in ("auto", "reference") and _obstacle(name, like) is None]
 
 
@@ -147,14 +146,14 @@ def _automatic(like: Tensor) -> str:
     if kernels is not None:
         return kernels
     problem = _obstacle("cuda", like)
-    if problem is not None and like.dtype == torch.float32:  # who asks for another type wants the oracle
+    if problem is not None and like.dtype == torch.float32:  # another dtype is meant for the oracle
         _warn_of_plain_torch(like.device.type, problem)
     return "reference"
 
 
 @cache
 def _warn_of_plain_torch(device: str, problem: str) -> None:
-    """Say once that a device has no kernels of its own; a run of hours would else become one of weeks in silence."""
+    """Warn once that a device has no kernels of its own; a run of hours would else silently become one of weeks."""
     log.warning(
         "rendering on %s in plain torch, much slower than on the CPU (--trainer.accelerator=cpu); "
         "backend 'cuda' cannot be used: %s",
@@ -164,7 +163,7 @@ def _warn_of_plain_torch(device: str, problem: str) -> None:
 
 
 def _obstacle(backend: str, like: Tensor) -> str | None:
-    """Why a back-end cannot take tensors such as ``like``, with a way out; None where it can."""
+    """Why a back-end cannot take tensors such as ``like``, with a remedy; None where it can."""
     if backend == "cpu" and not (like.device.type == "cpu" and like.dtype == torch.float32):
         return f"it renders float32 tensors on the CPU, got {like.dtype} on {like.device}; move the splats"
     if backend == "cuda":
@@ -177,7 +176,7 @@ def _rasterizer(backend: str) -> Callable[[SplatTensors, Camera, int, Tensor], _
 
 
 def _fast_function(name: str, backend: str) -> Callable[..., Any]:
-    """``name`` of a fast back-end, whose kernels' compiler is imported only now."""
+    """The function ``name`` of a fast back-end, imported only now because that imports the kernels' compiler."""
     module = importlib.import_module(f"nsvq_lightning.rendering.{backend}.rasterizer")
     function: Callable[..., Any] = getattr(module, f"{name}_{backend}")
     return function

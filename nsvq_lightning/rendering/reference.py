@@ -1,6 +1,6 @@
 """The oracle: Gaussian splatting in plain torch, on any device and in any floating-point type.
 
-Written for trust, not for speed: the fast back-ends are tested against it in float64.
+Written for correctness, not for speed: the fast back-ends are tested against it in float64.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from nsvq_lightning.splats.splats import RawSplats, SplatTensors
 __all__ = ["Projection", "project", "render_reference", "rotation_matrices", "visible_rows"]
 
 TILE = 32
-"""Side of the squares of pixels that are blended at a time."""
+"""Side in pixels of the squares that are blended at a time."""
 
 
 class Projection(NamedTuple):
@@ -68,7 +68,7 @@ def project(splats: SplatTensors, camera: Camera) -> Projection:
     """Project splats through the local affine approximation of the camera (EWA splatting).
 
     The determinant uses Lagrange's identity, |u|²|v|² - (u·v)² = |u × v|²: the naive difference loses every digit for
-    splats of thousands of pixels. That of a huge splat is taken in units of its own size, or it would overflow.
+    splats of thousands of pixels. The determinant of a huge splat is taken in units of its size, or it would overflow.
     """
     means = splats.means
     viewmat = camera.viewmat.to(means)
@@ -104,7 +104,7 @@ def _on_image(projection: Projection, camera: Camera) -> Tensor:
 
 @torch.no_grad()
 def visible_rows(splats: SplatTensors, camera: Camera) -> Tensor:
-    """Rows of the splats that can change the image ``[V]``; splats with a non-finite geometry are not among them."""
+    """Rows of the splats that can change the image ``[V]``; splats with a non-finite geometry are left out."""
     return _on_image(project(splats, camera), camera).nonzero()[:, 0]
 
 

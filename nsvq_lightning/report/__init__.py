@@ -1,1 +1,1 @@
-"""What a run leaves to look at."""
+"""The reports, figures and pictures that a run leaves."""

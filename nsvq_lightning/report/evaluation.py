@@ -27,7 +27,7 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Quality:
-    """Mean quality over views, over all processes; ``views`` are those of this process."""
+    """Mean quality over the views of all processes; ``views`` are those of this process."""
 
     psnr: float
     ssim: float
@@ -44,7 +44,7 @@ def evaluate(render_image: Callable[[Camera], Tensor], views: Iterable[View], de
         device: Where the splats are.
 
     Raises:
-        ValueError: There is no view.
+        ValueError: There are no views.
     """
     metrics = image_metrics().to(device)
     scores = []
@@ -53,6 +53,6 @@ def evaluate(render_image: Callable[[Camera], Tensor], views: Iterable[View], de
         values = metrics(render_image(on_device.camera), on_device.image)
         scores.append(ViewScore(view.name, float(values["psnr"]), float(values["ssim"])))
     if not scores:
-        raise ValueError("there is no view to evaluate; the scene needs at least one test view")
+        raise ValueError("there are no views to evaluate; the scene needs at least one test view")
     mean = metrics.compute()
     return Quality(float(mean["psnr"]), float(mean["ssim"]), scores)

@@ -1,4 +1,4 @@
-"""Matplotlib figures without pyplot, and the keys of pictures that have a colour and a marker for each point."""
+"""Matplotlib figures without pyplot, and legends for plots with a colour and a marker for each point."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from nsvq_lightning.io.atomic import atomic_write, write_text
 __all__ = ["colours_of", "draw_keys", "markdown_table", "markers_of", "new_figure", "write_csv", "write_figure"]
 
 MARKERS = "os^Dvph*X<>"
-"""Matplotlib markers that are told apart in print."""
+"""Matplotlib markers that are distinguishable in print."""
 
 
 def new_figure(width: float, height: float) -> Any:
-    """An empty figure, inches; pyplot keeps global state and may look for a display, so it is not used."""
+    """An empty figure, size in inches; pyplot is not used, as it keeps global state and may look for a display."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def write_figure(path: Path, figure: Any) -> None:
-    """Write a figure as PNG, cut to what is drawn, atomically."""
+    """Write a figure as PNG, cropped to its content, atomically."""
     picture = io.BytesIO()
     figure.savefig(picture, format="png", bbox_inches="tight")
     with atomic_write(path) as file:
@@ -45,7 +45,7 @@ def markers_of(names: Sequence[str]) -> dict[str, str]:
 
 
 def draw_keys(figure: Any, colours: Mapping[str, Any], markers: Mapping[str, str], hollow: str | None = None) -> None:
-    """Say below a figure what its colours, markers and, where it has them, hollow markers mean."""
+    """Draw legends below a figure for its colours, markers and, if any, hollow markers."""
     from matplotlib.lines import Line2D
 
     def handle(marker: str, colour: Any, label: str, face: Any = None) -> Any:
@@ -60,7 +60,7 @@ def draw_keys(figure: Any, colours: Mapping[str, Any], markers: Mapping[str, str
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows with the same keys as CSV, atomically; the keys of the first, in their order, are the head."""
+    """Write rows with the same keys as CSV, atomically; the keys of the first row, in order, are the header."""
     text = io.StringIO()
     writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -69,7 +69,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: Collection[str]) -> str:
-    """A Markdown table that also reads well as plain text; the columns named in ``words`` stand left, numbers right."""
+    """A Markdown table that also reads well as plain text; columns named in ``words`` align left, numbers right."""
     lines = [list(head), *map(list, rows)]
     widths = [max(3, *map(len, column)) for column in zip(*lines, strict=True)]
     left = [name in words for name in head]

@@ -32,13 +32,13 @@ def summarize(
     host: SplatHost,
     paper: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Everything ``metrics.json`` says; sizes in bytes, PSNR in dB, times in seconds.
+    """The content of ``metrics.json``; sizes in bytes, PSNR in dB, times in seconds.
 
     Args:
         path: The file that was decoded.
-        scene: What it holds.
+        scene: The decoded scene.
         scores: Score of each test view.
-        lpips: Mean LPIPS, or None and why.
+        lpips: Mean LPIPS and None, or None and the reason.
         host: The module, for its history and schedule.
         paper: :func:`paper_level` of the scene that was stored.
     """
@@ -64,7 +64,7 @@ def summarize(
 
 
 def paper_level(scene: CompressedScene) -> dict[str, Any]:
-    """Bytes of the scene at level ``paper``, beside those of the paper's formula."""
+    """Bytes of the scene at level ``paper``, and by the paper's formula."""
     header = paper_header(scene)
     formula = formula_bytes(scene, header.size)
     return {
@@ -75,23 +75,23 @@ def paper_level(scene: CompressedScene) -> dict[str, Any]:
 
 
 def write_metrics(path: Path, metrics: Mapping[str, Any]) -> None:
-    """Write the numbers as JSON, atomically; a PSNR that is infinite (no error at all) becomes null."""
+    """Write the numbers as JSON, atomically; an infinite PSNR (no error at all) becomes null."""
     text = json.dumps(_json_value(metrics), indent=2, allow_nan=False) + "\n"
     write_text(path, text)
 
 
 def write_views(path: Path, scores: Sequence[ViewScore]) -> None:
-    """Write one row a test view, atomically."""
+    """Write one row per test view, atomically."""
     write_csv(path, [asdict(score) for score in scores])
 
 
 def write_curve_csv(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
-    """Write one row an evaluation, atomically."""
+    """Write one row per evaluation, atomically."""
     write_csv(path, history)
 
 
 def write_curve(path: Path, history: Sequence[Mapping[str, Any]], schedule: Schedule) -> None:
-    """Draw PSNR and number of splats over the iterations, phases shaded, atomically."""
+    """Plot PSNR and number of splats over the iterations, with phases shaded, atomically."""
     figure = new_figure(8, 4)
     quality = figure.add_subplot()
     count = quality.twinx()

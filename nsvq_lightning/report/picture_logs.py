@@ -1,4 +1,4 @@
-"""Pictures for the loggers that show some."""
+"""Pictures for the loggers that can show them."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ __all__ = ["SplatArrays", "check_floats"]
 
 
 def check_floats(name: str, array: NDArray[np.float32], shape: tuple[int, ...]) -> None:
-    """Refuse an array of another shape or type, by its name.
+    """Refuse an array of another shape or dtype, naming it in the error.
 
     Raises:
         ValueError: The shape differs.

@@ -11,7 +11,7 @@ import numpy as np
 __all__ = ["finite_rows", "listed"]
 
 _Array = TypeVar("_Array")
-"""NumPy's arrays or torch's tensors, on any device; torch is not imported for the former."""
+"""NumPy arrays, or torch tensors on any device; torch is not imported for the former."""
 
 
 def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int]]:
@@ -21,7 +21,7 @@ def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int
         attributes: Arrays or tensors ``[N, ...]`` by name, at least one.
 
     Returns:
-        A mask ``[N]`` of booleans and, for each attribute with other rows, how many.
+        A boolean mask ``[N]`` and, for each attribute with non-finite rows, how many it has.
     """
     mask: Any = None
     culprits: dict[str, int] = {}
@@ -36,5 +36,5 @@ def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int
 
 
 def listed(culprits: Mapping[str, int]) -> str:
-    """The attributes with rows that are not finite, for a message."""
+    """The attributes with non-finite rows, for a message."""
     return ", ".join(f"{name} in {count} rows" for name, count in culprits.items())

@@ -1,8 +1,8 @@
-"""One representative for the 48 pairs of scale and rotation that mean the same splat.
+"""One representative of the 48 pairs of scale and rotation that describe the same splat.
 
-The covariance R·diag(s²)·Rᵀ stays what it is when the three axes change their order or direction (24 rotations of the
-cube), when the quaternion changes its sign, and when it changes its length. Vectors that mean the same but lie apart
-cost a codebook codes; a canonical representative brings them together.
+The covariance R·diag(s²)·Rᵀ does not change when the three axes change their order or direction (24 rotations of the
+cube), nor when the quaternion changes its sign or length. Vectors that mean the same but lie apart waste codes of a
+codebook; a canonical representative brings them together.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ _AXIS_TURNS = torch.tensor(
     ],
     dtype=torch.float64,
 )
-"""For each order of the axes a rotation whose columns are, up to their signs, the unit vectors in that order."""
+"""For each order of the axes, a rotation whose columns are, up to sign, the unit vectors in that order."""
 
 
 _TURNS = _right_products(torch.eye(4, dtype=torch.float64)) @ _right_products(_AXIS_TURNS)[:, None]
-"""``[6, 4, 4, 4]``: for each order of the axes, then one of four half turns: a product from the right as a matrix."""
+"""``[6, 4, 4, 4]``: for each order of the axes and each of four half turns, the product from the right as a matrix."""
 
 
 class Canonical(NamedTuple):
-    """Scales and rotations in a canonical form, and what became of gradients by them.
+    """Scales and rotations in a canonical form, and the maps that carry gradients over to it.
 
     Attributes:
         scales: Log-scales ``[N, 3]``.
         quats: Quaternions ``[N, 4]``, wxyz, of length 1.
-        scale_maps: ``[N, 3, 3]``; a gradient by the old log-scales, multiplied by it, is that by the new ones.
+        scale_maps: ``[N, 3, 3]``; maps a gradient with respect to the old log-scales to one with respect to the new.
         quat_maps: ``[N, 4, 4]``, the same for the quaternions.
     """
 
@@ -67,9 +67,9 @@ class Canonical(NamedTuple):
 def canonical(scales: Tensor, quats: Tensor, form: Form) -> Canonical:
     """Scales and rotations of the same covariances in a canonical form.
 
-    ``sign`` gives every quaternion length 1 and w ≥ 0. ``full`` also sorts the axes, longest first, and of the
-    rotations that are left takes the smallest, the one with the largest w. A quaternion too short to have a direction
-    is the identity, as for the renderer; what is not finite stays so.
+    ``sign`` gives every quaternion length 1 and w ≥ 0. ``full`` also sorts the axes, longest first, and takes the
+    smallest of the remaining rotations, the one with the largest w. A quaternion too short to have a direction is the
+    identity, as for the renderer; NaN and infinity are kept.
 
     Args:
         scales: Log-scales ``[N, 3]``.
@@ -106,7 +106,7 @@ def canonical(scales: Tensor, quats: Tensor, form: Form) -> Canonical:
 def _turns_to(order: Tensor, quats: Tensor) -> Tensor:
     """Orthogonal matrices ``[N, 4, 4]`` that turn quaternions to axes in ``order [N, 3]`` by the smallest angle.
 
-    The order fixes a rotation up to half turns around the axes: one of four, the one that leaves the largest w.
+    The order fixes a rotation up to half turns around the axes; of these four, it takes the one with the largest w.
     """
     number = 2 * order[:, 0] + (order[:, 1] > order[:, 2])
     turns = _TURNS.to(quats)

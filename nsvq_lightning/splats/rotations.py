@@ -12,20 +12,20 @@ MIN_SQUARED_NORM = 1e-24
 
 
 def unit(quats: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Quaternions wxyz ``[N, 4]`` of length 1; zero means no rotation."""
+    """Quaternions wxyz ``[N, 4]`` scaled to length 1; zero becomes the identity."""
     wide = quats.astype(np.float64)
     length = np.linalg.norm(wide, axis=1, keepdims=True)
     return np.where(length > 0, wide / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
 
 
 def smallest_three(units: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Which component is the largest ``[N]``, and the other three ``[N, 3]`` in their order, each in ±1/√2.
+    """Index of the largest component ``[N]``, and the other three ``[N, 3]`` in order, each in ±1/√2.
 
     Args:
         units: Quaternions ``[N, 4]`` of length 1, components in any order.
 
     Returns:
-        Of the two quaternions of a rotation, the one whose largest component is positive is meant.
+        Both, of whichever of q and −q has a positive largest component.
     """
     largest = np.abs(units).argmax(1)
     negative = np.take_along_axis(units, largest[:, None], 1) < 0
@@ -34,7 +34,7 @@ def smallest_three(units: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArra
 
 
 def from_smallest_three(largest: NDArray[np.intp], others: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Unit quaternions ``[N, 4]`` of the two parts of :func:`smallest_three`, the second of which may be rounded."""
+    """Unit quaternions ``[N, 4]`` from the two results of :func:`smallest_three`; the second may be rounded."""
     quats = np.empty((len(largest), 4))
     np.put_along_axis(quats, _others(largest), others, 1)
     rest = np.sqrt(np.maximum(0, 1 - np.square(others).sum(1)))

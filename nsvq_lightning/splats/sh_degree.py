@@ -1,4 +1,4 @@
-"""How many coefficients spherical harmonics of a degree have; without torch, so that file headers can be read fast."""
+"""How many coefficients each SH degree has; without torch, so that reading a file header is fast."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["shN_degree", "sh_coefficients"]
 
 
 def sh_coefficients(degree: int) -> int:
-    """Number of higher spherical-harmonic coefficients a colour channel, (degree + 1)² - 1.
+    """Number of higher spherical-harmonic coefficients per colour channel, (degree + 1)² - 1.
 
     Raises:
         ValueError: ``degree`` is not in 0..3.
@@ -19,10 +19,10 @@ def sh_coefficients(degree: int) -> int:
 
 
 def shN_degree(coefficients: int) -> int:
-    """Degree that has this many higher coefficients a colour channel.
+    """Degree that has this many higher coefficients per colour channel.
 
     Raises:
-        ValueError: No degree in 0..3 has.
+        ValueError: No degree from 0 to 3 has.
     """
     degree = math.isqrt(max(coefficients, 0) + 1) - 1
     if degree > 3 or sh_coefficients(degree) != coefficients:

@@ -90,19 +90,19 @@ def check_shapes(tensors: Mapping[str, Tensor]) -> None:
 class Splats(nn.Module):
     """N Gaussian splats as six trainable raw attributes (3D Gaussian Splatting, Kerbl et al. 2023).
 
-    Side tables (:meth:`add_table`) hold one row a splat, for example the statistics of density control; they are
+    Side tables (:meth:`add_table`) hold one row per splat, for example the statistics of density control; they are
     buffers, so checkpoints carry them, and :mod:`nsvq_lightning.training.edit` keeps their rows together with the
     attributes.
 
     Attributes:
-        edits: How often rows were added or removed. What belongs to the rows of one count fits those of another no
-            more, even where there are as many.
+        edits: How often rows were added or removed. Data for the rows at one count does not fit the rows at another,
+            even if their number is the same.
 
     Args:
         sh_degree: Highest degree of the spherical harmonics, 0 to 3.
 
     Raises:
-        ValueError: ``sh_degree`` is none of these.
+        ValueError: ``sh_degree`` is out of range.
     """
 
     means: nn.Parameter
@@ -148,7 +148,7 @@ class Splats(nn.Module):
 
     @classmethod
     def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3) -> Splats:
-        """One isotropic splat a point, as 3D Gaussian Splatting starts from a COLMAP model.
+        """One isotropic splat per point, as 3D Gaussian Splatting starts from a COLMAP model.
 
         Opacity 0.1, no rotation, log-scale ½·log of the mean squared distance to the three nearest neighbours (clamped
         to [1e-7, 4]), constant colour. Non-finite and duplicate points are dropped: a duplicate adds nothing and has no
@@ -209,7 +209,7 @@ class Splats(nn.Module):
         return {name: getattr(self, name) for name in self._tables}
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
-        """Take over the stored number of rows before the values are copied."""
+        """Resize to the stored number of rows before the values are copied."""
         for key, stored in state_dict.items():
             name = key.removeprefix(prefix)
             if not key.startswith(prefix) or "." in name:

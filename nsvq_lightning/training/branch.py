@@ -1,4 +1,4 @@
-"""Go on from a checkpoint, also with other codebooks: before the quantize phase they have learned nothing."""
+"""Continue from a checkpoint, even with other codebooks: before the quantize phase they have learned nothing."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = [
 ]
 
 QUANTIZE_RULES = ("quantize_end", "min_finetune", "min_replacement_interval")
-"""Settings of a schedule that mean nothing before the quantize phase."""
+"""Settings of a schedule that have no effect before the quantize phase."""
 
 CODEBOOKS = "codebooks."
 """Prefix of the codebooks in a module's state."""
@@ -32,10 +32,10 @@ SPLATS = "splats."
 """Prefix of the splats in a module's state."""
 
 QUANTIZER_SETTINGS = "quantizer_settings"
-"""Where a checkpoint holds the class and the number of codes that each quantizer was made with."""
+"""Key under which a checkpoint holds the class and number of codes that each quantizer was made with."""
 
 PHASE = "state._phase"
-"""The phase of the last trained iteration in a module's state."""
+"""Key of the last trained iteration's phase in a module's state."""
 
 
 def can_branch(checkpoint: Mapping[str, Any], codebooks: nn.ModuleDict) -> bool:
@@ -48,14 +48,14 @@ def can_branch(checkpoint: Mapping[str, Any], codebooks: nn.ModuleDict) -> bool:
 
 
 def branch_checkpoint(checkpoint: dict[str, Any], codebooks: nn.ModuleDict, optimizer: Optimizer) -> None:
-    """Exchange the codebooks of a checkpoint for fresh ones, in place.
+    """Replace the codebooks of a checkpoint with fresh ones, in place.
 
-    Splats, side tables, their moments in the optimiser, the loops and the states of the callbacks stay; so the run that
-    goes on is, bit for bit, the run that had these codebooks from its start.
+    Splats, side tables, their moments in the optimiser, the loops and the callbacks' states stay; so the continued run
+    is, bit for bit, the run that would have had these codebooks from the start.
 
     Args:
         checkpoint: Checkpoint of a run that has not quantized yet (:func:`can_branch`).
-        codebooks: Untrained quantizers of the module that goes on, by attribute.
+        codebooks: Untrained quantizers of the continuing module, by attribute.
         optimizer: A new optimiser of that module, whose groups are named.
     """
     state = checkpoint["state_dict"]
@@ -67,11 +67,11 @@ def branch_checkpoint(checkpoint: dict[str, Any], codebooks: nn.ModuleDict, opti
 
 
 def branch_optimizer_state(stored: Mapping[str, Any], fresh: Mapping[str, Any]) -> dict[str, Any]:
-    """State of an optimiser with the groups of ``fresh``: attributes of the splats as stored, codebooks untrained.
+    """State of an optimiser with the groups of ``fresh``: splat attributes as stored, codebooks untrained.
 
     Args:
-        stored: ``state_dict()`` of the optimiser that has trained; its groups are named.
-        fresh: ``state_dict()`` of an optimiser that has not, with the groups to end up with.
+        stored: ``state_dict()`` of the trained optimiser; its groups are named.
+        fresh: ``state_dict()`` of a new optimiser, with the desired groups.
     """
     groups = {group["name"]: group for group in stored["param_groups"]}
     merged: dict[str, Any] = {"state": {}, "param_groups": []}
@@ -81,7 +81,7 @@ def branch_optimizer_state(stored: Mapping[str, Any], fresh: Mapping[str, Any]) 
             continue
         old = groups[group["name"]]
         merged["param_groups"].append({**old, "params": list(group["params"])})
-        # A state dict knows parameters by their place in the list of all; codebooks before them would shift it.
+        # A state dict refers to parameters by index in the list of all; codebooks before them would shift it.
         for place, old_place in zip(group["params"], old["params"], strict=True):
             if old_place in stored["state"]:
                 merged["state"][place] = stored["state"][old_place]
@@ -89,7 +89,7 @@ def branch_optimizer_state(stored: Mapping[str, Any], fresh: Mapping[str, Any]) 
 
 
 def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str | None:
-    """What to tell about a run that goes on from a checkpoint with this schedule; None where nothing changes by it."""
+    """What to report on a run that continues from a checkpoint with this schedule; None if nothing changes."""
     stored = Schedule(**checkpoint["schedule"])
     if stored.total != schedule.total:
         return (
@@ -103,7 +103,7 @@ def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str |
         return None
     return (
         f"the checkpoint is of a run with {', '.join(f'{name} = {value}' for name, value in changed.items())}, this "
-        f"one goes on with {', '.join(f'{name} = {own[name]}' for name in changed)}; pass "
+        f"one continues with {', '.join(f'{name} = {own[name]}' for name in changed)}; pass "
         f"{' '.join(f'--callbacks.phases.{name}={value}' for name, value in changed.items())} to continue that run as "
         "it was"
     )
@@ -112,19 +112,19 @@ def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str |
 def check_continuation(
     checkpoint: Mapping[str, Any], own: Mapping[str, Tensor], quantizers: Mapping[str, Mapping[str, Any]]
 ) -> None:
-    """Check that a module can be trained on from a checkpoint.
+    """Check that training of a module can continue from a checkpoint.
 
     Args:
-        checkpoint: The checkpoint, codebooks exchanged where they may be (:func:`branch_checkpoint`).
-        own: Its ``state_dict()``; numbers of splats may differ, and those of codes where k-means has found fewer rows.
-        quantizers: Its quantizers' class and number of codes by attribute, as asked for.
+        checkpoint: The checkpoint, with codebooks replaced where allowed (:func:`branch_checkpoint`).
+        own: Its ``state_dict()``; numbers of splats may differ, and those of codes if k-means found fewer rows.
+        quantizers: Class and number of codes of the module's quantizers by attribute, as requested.
 
     Raises:
-        ValueError: It holds weights only, or is of a module with other settings.
+        ValueError: It holds only weights, or is of a module with other settings.
     """
     if not checkpoint.get("optimizer_states"):
         raise ValueError(
-            "the checkpoint holds weights without the state of the optimiser, so that training cannot go on from it; "
+            "the checkpoint holds weights without the state of the optimiser, so training cannot continue from it; "
             "export its scene and start from that (--model.init_from=scene.ply)"
         )
     state = checkpoint["state_dict"]
@@ -138,26 +138,26 @@ def check_continuation(
     if trained is not None and trained != quantizers and not _is_unquantized(checkpoint):
         raise ValueError(
             f"the checkpoint has quantized with {_described(trained)}, and this run would with "
-            f"{_described(quantizers)}; that can change before the quantize phase only: pass "
+            f"{_described(quantizers)}; that can change only before the quantize phase: pass "
             f"{_options(trained)}, or a checkpoint from before it"
         )
-    # Side tables of the splats come and go.
+    # The splats' side tables may differ.
     stored, wanted = ({name for name in values if not name.startswith(SPLATS)} for values in (state, own))
     if stored != wanted:
         raise ValueError(
             f"the checkpoint is of a run with other codebooks or another quantizer: it has {_some(stored - wanted)} "
-            f"that this run has not, and lacks {_some(wanted - stored)}; pass the --model.codebooks and "
+            f"that this run lacks, and lacks {_some(wanted - stored)}; pass the --model.codebooks and "
             "--model.quantizer that it was trained with"
         )
 
 
 def _described(settings: Mapping[str, Mapping[str, Any]]) -> str:
-    """What a run quantizes with, for a message."""
+    """The quantizers of a run, for a message."""
     return f"{_kinds(settings)} ({_sizes(settings)})" if settings else "no codebooks"
 
 
 def _options(settings: Mapping[str, Mapping[str, Any]]) -> str:
-    """The options of a run that quantizes so."""
+    """The command-line options that select these quantizers."""
     if not settings:
         return "--model.codebooks=null"
     return f"--model.quantizer={_kinds(settings)} --model.codebooks='{{{_sizes(settings)}}}'"

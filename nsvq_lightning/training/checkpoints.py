@@ -1,4 +1,4 @@
-"""Read checkpoints: whole, undamaged, of this package, and without running anything that they hold."""
+"""Read checkpoints: only complete, undamaged ones of this package, and without executing anything they hold."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: No such file.
-        PermissionError: It may not be read.
-        FormatError: The file is damaged or truncated, holds more than tensors and plain data, or is no checkpoint of a
-            :class:`nsvq_lightning.SplatModule`.
+        PermissionError: The file is not readable.
+        FormatError: The file is damaged or truncated, holds more than tensors and plain data, or is not a checkpoint of
+            a :class:`nsvq_lightning.SplatModule`.
     """
     path = Path(path)
     if not path.exists():
@@ -45,7 +45,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         named = re.search(r"GLOBAL (\S+)", str(error))
         what = f"an object of {named[1]}" if named else "an object that is not plain data"
         raise FormatError(f"{path}: refused, it holds {what}, and loading that could run code", WAY_OUT) from error
-    except Exception as error:  # torch's readers of archives and pickles raise whatever damage leads them to
+    except Exception as error:  # damage can make torch's archive and pickle readers raise anything
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise FormatError(f"{path}: damaged, or not a checkpoint ({reason})", WAY_OUT) from error
     _check_contents(path, checkpoint)
@@ -53,7 +53,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def _check_sums(path: Path) -> None:
-    """Compare the checksums in the archive that a checkpoint is; torch itself does not look at them."""
+    """Verify the checksums of the zip archive that a checkpoint is; torch itself does not."""
     try:
         with ZipFile(path) as archive:
             damaged = archive.testzip()
@@ -73,7 +73,7 @@ def _check_contents(path: Path, checkpoint: Any) -> None:
 
 
 class PlainCheckpointIO(TorchCheckpointIO):
-    """Lightning's reading and writing of checkpoints, with :func:`read_checkpoint` for files of this machine."""
+    """Lightning's reading and writing of checkpoints, with :func:`read_checkpoint` for local files."""
 
     def load_checkpoint(
         self,
@@ -81,7 +81,7 @@ class PlainCheckpointIO(TorchCheckpointIO):
         map_location: Callable[..., Any] | None = None,
         weights_only: bool | None = None,
     ) -> dict[str, Any]:
-        """Read a checkpoint; remote ones as Lightning does, but nothing that could run code either.
+        """Read a checkpoint; remote ones as Lightning does, but also refusing anything that could run code.
 
         Raises:
             FormatError: See :func:`read_checkpoint`.
@@ -106,5 +106,5 @@ def _is_plain(value: Any) -> bool:
         return all(isinstance(key, str) and _is_plain(item) for key, item in value.items())
     if type(value) in (list, tuple):
         return all(_is_plain(item) for item in value)
-    # Exact types: an enumeration or a numpy number is an int or float too, but not to the unpickler.
+    # Exact types: an enum member or NumPy scalar is also an int or float, but not to the unpickler.
     return value is None or type(value) in (bool, int, float, str)

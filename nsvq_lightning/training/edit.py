@@ -1,4 +1,4 @@
-"""The only code that changes the rows of the splats.
+"""The only code that adds, removes or replaces rows of the splats.
 
 A splat is one row of six parameters, of their Adam moments and of every side table. All of them change together here:
 new ``nn.Parameter`` objects are bound in the module, in their parameter group (found by its name) and in the state of
@@ -34,8 +34,8 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 LARGEST_LOG_SCALE = 32.0
-"""Up to here (8e13 scene units) float32 holds the square of what a splat covers on the near plane of any camera; no
-view shows larger ones, so nothing would ever train or prune them."""
+"""Up to here (8e13 scene units) float32 holds the square of a splat's extent on the near plane of any camera; no view
+shows larger splats, so nothing would ever train or prune them."""
 
 FIRST_MOMENT = "exp_avg"
 MOMENTS = (FIRST_MOMENT, "exp_avg_sq", "max_exp_avg_sq")
@@ -75,7 +75,7 @@ def keep_rows(splats: Splats, optimizer: Optimizer, mask: Tensor) -> None:
     """Keep the splats where ``mask [N]`` (bool) is true, in their order, and drop the others.
 
     Raises:
-        ValueError: The mask is not one boolean a splat.
+        ValueError: The mask is not one boolean per splat.
     """
     if mask.dtype != torch.bool or mask.shape != (len(splats),):
         raise ValueError(f"mask must be [{len(splats)}] bool, got {list(mask.shape)} {mask.dtype}")
@@ -104,20 +104,20 @@ def replace_attribute(splats: Splats, optimizer: Optimizer, name: str, values: T
 
 
 def change_coordinates(splats: Splats, optimizer: Optimizer, name: str, values: Tensor, maps: Tensor) -> None:
-    """Overwrite all rows of one attribute by other coordinates of the same splats, and take the moments along.
+    """Overwrite all rows of one attribute with other coordinates of the same splats, and transform the moments.
 
     The mean of gradients becomes ``maps · mean``, that of their squares ``maps² · mean``, which is exact where a map
-    only moves and scales components, and otherwise takes them for uncorrelated.
+    only permutes and scales components, and otherwise assumes that they are uncorrelated.
 
     Args:
         splats: The ``N`` splats.
         optimizer: Their optimiser.
-        name: The attribute, with rows of D numbers.
+        name: The attribute, with rows of D columns.
         values: Its rows ``[N, D]`` in the new coordinates.
-        maps: ``[N, D, D]``: a gradient by the old coordinates, multiplied by it, is that by the new ones.
+        maps: ``[N, D, D]``; maps a gradient with respect to the old coordinates to one with respect to the new.
 
     Raises:
-        ValueError: ``values`` or ``maps`` has another shape than the attribute asks for.
+        ValueError: The shape of ``values`` or ``maps`` does not fit the attribute.
     """
     if maps.shape != (*values.shape, values.shape[-1]):
         raise ValueError(f"maps of {name} must be {[*values.shape, values.shape[-1]]}, got {list(maps.shape)}")
@@ -136,7 +136,7 @@ def raise_scales(splats: Splats, floor: float) -> None:
 
 
 def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -> None:
-    """Set the Adam moments of the group ``name`` to zero, of all rows or of ``rows`` (indices or a mask)."""
+    """Set the Adam moments of the group ``name`` to zero, for all rows or for ``rows`` (indices or a mask)."""
     state = optimizer.state.get(find_group(optimizer, name)["params"][0], {})
     for key in MOMENTS:
         if key in state:
@@ -147,10 +147,10 @@ def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -
 
 
 def trainable_rows(splats: Splats) -> tuple[Tensor, dict[str, int]]:
-    """Which splats are finite in every attribute, and so are their projections (:data:`LARGEST_LOG_SCALE`).
+    """Which splats are finite in every attribute and in projection (:data:`LARGEST_LOG_SCALE`).
 
     Returns:
-        A mask ``[N]`` (bool) and, for each attribute with other rows, how many.
+        A mask ``[N]`` (bool) and, for each attribute with non-finite rows, how many it has.
     """
     attributes = {name: parameter.detach() for name, parameter in splats.attributes().items()}
     attributes["scales"] = attributes["scales"].masked_fill(attributes["scales"] > LARGEST_LOG_SCALE, torch.inf)
@@ -161,7 +161,7 @@ def finite_splats(splats: Splats, source: str) -> Splats:
     """The splats without those that :func:`trainable_rows` leaves out, with a warning that names source and attributes.
 
     Args:
-        splats: Splats that no optimiser knows yet.
+        splats: Splats that have no optimiser yet.
         source: Where they come from.
 
     Raises:
@@ -170,7 +170,7 @@ def finite_splats(splats: Splats, source: str) -> Splats:
     kept = _finite_or_warn(
         splats,
         source,
-        lambda found: ValueError(f"{source} holds no splat with finite numbers ({found}); there is nothing to train"),
+        lambda found: ValueError(f"{source} holds no finite splat ({found}); there is nothing to train"),
     )
     return splats if bool(kept.all()) else Splats.from_tensors(*(tensor.detach()[kept] for tensor in splats.raw()))
 
@@ -196,7 +196,7 @@ def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> Tensor:
 
 
 def _finite_or_warn(splats: Splats, where: str, none_left: Callable[[str], Exception]) -> Tensor:
-    """Mask ``[N]`` of :func:`trainable_rows`, with a warning of the others; without any finite splat, the error."""
+    """Mask ``[N]`` of :func:`trainable_rows`, with a warning about the others; raises if no splat is finite."""
     kept, culprits = trainable_rows(splats)
     if culprits:
         found = listed(culprits)
@@ -210,7 +210,7 @@ def _finite_or_warn(splats: Splats, where: str, none_left: Callable[[str], Excep
 def _rebind(
     splats: Splats, optimizer: Optimizer, name: str, values: Tensor, edit_moment: Callable[[Tensor], Tensor]
 ) -> None:
-    """Bind ``values`` as the new parameter ``name`` everywhere the old one was known."""
+    """Bind ``values`` as the new parameter ``name`` everywhere the old one was referenced."""
     group = find_group(optimizer, name)
     old = group["params"][0]
     new = nn.Parameter(values.contiguous(), requires_grad=old.requires_grad)
@@ -222,7 +222,7 @@ def _rebind(
 
 
 def _edit_tables(splats: Splats, edit: Callable[[Tensor], Tensor]) -> None:
-    """Edit the rows of the side tables, the last of what an edit changes, and count it."""
+    """Edit the rows of the side tables, the last step of an edit, and count the edit."""
     splats.edits += 1
     for name, table in splats.tables().items():
         setattr(splats, name, edit(table))

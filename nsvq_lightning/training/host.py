@@ -1,4 +1,4 @@
-"""What a callback may touch of the module it is attached to."""
+"""What a callback may use of the module it is attached to."""
 
 from __future__ import annotations
 
@@ -33,30 +33,30 @@ __all__ = [
 class SplatHost(Protocol):
     """A module that trains splats; :class:`nsvq_lightning.SplatModule` is one.
 
-    Callbacks know each other only through this state, and take their decisions from ``schedule`` and the trainer's
-    step, so that each works without the others.
+    Callbacks interact only through this state, and decide by ``schedule`` and the trainer's step, so that each works
+    without the others.
 
     Besides the members below a host has
 
-    * one optimiser, with a parameter group of one parameter for each attribute of the splats, whose ``name`` is that of
+    * one optimiser, with one single-parameter group for each attribute of the splats, whose ``name`` is that of
       the attribute, and for each codebook, named ``codebook_<attribute>``:
       :func:`nsvq_lightning.training.optim.param_groups` makes them;
     * a ``training_step`` that returns a dictionary with ``loss`` and, for density control, the ``render`` of the
       splats, whose ``means2d`` retains its gradient while ``wants_screen_gradients`` is set, and ``edits``, the
-      ``splats.edits`` when they were rendered; None where the step is not to update anything;
+      ``splats.edits`` when they were rendered; None if the step must not update anything;
     * for reports, test and validation steps that return a dictionary with ``image``, ``psnr`` and ``ssim`` of a view.
 
     Callbacks check members and groups before the first iteration (:func:`splat_host`, :func:`check_optimizer`).
     """
 
     splats: Splats
-    """The splats; rows are edited through :mod:`nsvq_lightning.training.edit` only."""
+    """The splats; rows are edited only through :mod:`nsvq_lightning.training.edit`."""
     schedule: Schedule
     """Phases and milestones of the run."""
     phase: Phase
-    """Phase of the current iteration; a buffer behind it."""
+    """Phase of the current iteration, backed by a buffer."""
     active_sh_degree: int
-    """SH degree that is rendered; a buffer behind it."""
+    """SH degree that is rendered, backed by a buffer."""
     opacity_weight: float
     """λ of the loss term λ · Σ opacity."""
     wants_screen_gradients: bool
@@ -76,7 +76,7 @@ class SplatHost(Protocol):
 
     @property
     def quantizers(self) -> Mapping[str, Quantizer]:
-        """Quantizer by attribute; empty for a run without quantization."""
+        """Quantizers by attribute; empty for a run without quantization."""
 
     @property
     def extent(self) -> float:
@@ -107,7 +107,7 @@ def splat_host(module: LightningModule) -> SplatHost:
     """The module as a host.
 
     Raises:
-        TypeError: It lacks something that :class:`SplatHost` names.
+        TypeError: It lacks a member of :class:`SplatHost`.
     """
     missing = missing_members(module, SplatHost)
     if missing:
@@ -119,10 +119,10 @@ def splat_host(module: LightningModule) -> SplatHost:
 
 
 def check_optimizer(trainer: Trainer, module: LightningModule) -> None:
-    """Check that the optimiser has the parameter groups that callbacks edit by their names.
+    """Check that the optimiser has the parameter groups that callbacks edit by name.
 
     Raises:
-        ValueError: It has not, or there are several optimisers.
+        ValueError: It lacks some, or there are several optimisers.
     """
     groups = {group.get("name"): len(group["params"]) for each in trainer.optimizers for group in each.param_groups}
     needed = (*ATTRIBUTES, *(codebook_group(name) for name in as_host(module).quantizers))
@@ -137,5 +137,5 @@ def check_optimizer(trainer: Trainer, module: LightningModule) -> None:
 
 
 def as_host(module: LightningModule) -> SplatHost:
-    """The module as a host, unchecked: what the hooks of every step use."""
+    """The module as a host, unchecked; for the hooks of every step."""
     return cast(SplatHost, module)

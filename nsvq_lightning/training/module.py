@@ -1,4 +1,4 @@
-"""The Lightning module: splats, codebooks, state, one optimiser; what happens at certain steps is a callback."""
+"""The Lightning module: splats, codebooks, state, one optimiser; what happens at certain steps is left to callbacks."""
 
 from __future__ import annotations
 
@@ -67,15 +67,15 @@ class SplatModule(LightningModule):
     * warm-up, prune: the raw splats,
     * quantize: the splats that are in view unquantized, each attribute replaced by its noise-substituted quantization
       (paper, section 3.2); outside training their nearest codes,
-    * fine-tune: codebook rows by frozen codes; the raw quantized attributes get no gradient.
+    * fine-tune: the codebook rows of the frozen codes; the raw quantized attributes get no gradient.
 
     Args:
         sh_degree: Highest degree of the spherical harmonics, 0 to 3.
         quantizer: Makes the quantizer of an attribute from (number of codes, dimension).
-        codebooks: The paper's name of the codebook sizes ("0.5k" to "16k"), or number of codes by attribute (scales,
+        codebooks: The paper's name for the codebook sizes ("0.5k" to "16k"), or number of codes by attribute (scales,
             quats, sh0, shN; those left out stay unquantized), or None for plain 3D Gaussian splatting.
         background: Colour behind the splats; ``random`` draws a new one each step and tests on black.
-        dssim_weight: Share of 1 - SSIM in the loss, the rest is L1.
+        dssim_weight: Share of 1 - SSIM in the loss; the rest is L1.
         rates: Learning rates.
         backend: Rasterizer, see :func:`nsvq_lightning.render`.
         seed: Seed of every draw of the run except the order of the views.
@@ -85,7 +85,7 @@ class SplatModule(LightningModule):
 
     Raises:
         ValueError: A codebook is for an unknown attribute or has no code, or an argument is out of range.
-        TypeError: What ``quantizer`` makes does not follow :class:`nsvq_lightning.quantize.base.Quantizer`.
+        TypeError: What ``quantizer`` makes does not implement :class:`nsvq_lightning.quantize.base.Quantizer`.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class SplatModule(LightningModule):
         self.quantizer_settings = {
             name: {"quantizer": type(q).__name__, "codes": q.codebook.shape[0]} for name, q in self.quantizers.items()
         }
-        """Class and number of codes by attribute, as asked for; k-means and checkpoints may bring fewer codes."""
+        """Class and number of codes by attribute, as requested; k-means and checkpoints may give fewer codes."""
         self.background = background
         self.dssim_weight = dssim_weight
         # A checkpoint stores these two as plain dictionaries.
@@ -170,7 +170,7 @@ class SplatModule(LightningModule):
 
     @property
     def is_fitting(self) -> bool:
-        """Whether a trainer fits the module now, not evaluates it."""
+        """Whether a trainer is fitting the module now, not evaluating it."""
         return self._trainer is not None and self._trainer.state.fn == "fit"
 
     def rows(self, attribute: str) -> Tensor:
@@ -179,7 +179,7 @@ class SplatModule(LightningModule):
 
     @torch.no_grad()
     def hard_splats(self, phase: Phase) -> RawSplats:
-        """The splats as a file written in ``phase`` would hold them, detached: nearest codes from ``QUANTIZE`` on."""
+        """The splats as a file written in ``phase`` would hold them, detached: hard codes from ``QUANTIZE`` on."""
         raw = RawSplats(*(tensor.detach() for tensor in self.splats.raw()))
         return decoded(raw, self.quantizers) if phase >= Phase.QUANTIZE else raw
 
@@ -201,10 +201,10 @@ class SplatModule(LightningModule):
         if self.quantizers and not quantizers:
             log.warning("the %s phase has no codebooks yet: the scene is stored unquantized", self.phase.name.lower())
         scene = compress(self.splats.raw(), quantizers)
-        return replace(scene, config=self._settings(quantizers))  # PostHoc places its codebooks while they are stored
+        return replace(scene, config=self._settings(quantizers))  # PostHoc fits its codebooks while the scene is stored
 
     def forward(self, camera: Camera) -> Render:
-        """Render what the current phase trains, or outside training what a file would hold."""
+        """Render what the current phase trains or, outside training, what a file would hold."""
         background = self._random_background() if self.training and self.background == "random" else self._background()
         return self._render(self._phase_splats(camera), camera, background)
 
@@ -238,14 +238,14 @@ class SplatModule(LightningModule):
     def _generator(self, *salts: str) -> torch.Generator:
         """Generator of one view of this step; quantizers draw a seed from it, so it lives on the CPU.
 
-        The view's number in the step decides, not who renders it: 2 processes with a view each draw what one process
-        with 2 micro-batches draws. The 0 keeps the draws of runs from before that.
+        It depends on the view's number in the step, not on the process: 2 processes with a view each draw what one
+        process with 2 micro-batches draws. Number 0 keeps the draws of older runs.
         """
         processes = 1 if self._trainer is None else self._trainer.world_size
         return generator(self.seed, self.global_step, 0, *salts, self._micro_batch * processes + self.global_rank)
 
     def _settings(self, quantizers: Mapping[str, Quantizer]) -> dict[str, Any]:
-        """What is stored in the file about the run: nothing that differs between two runs of one seed."""
+        """What the file stores about the run: nothing that differs between two runs with the same seed."""
         sizes = {name: int(q.codebook.shape[0]) for name, q in quantizers.items()}
         quantizer = {name: type(q).__name__ for name, q in quantizers.items()}
         return {
@@ -261,7 +261,7 @@ class SplatModule(LightningModule):
         }
 
     def setup(self, stage: str) -> None:
-        """Fill empty splats from ``init_from`` or the scene's points; take over the extent of the scene.
+        """Fill empty splats from ``init_from`` or the scene's points, and set the extent of the scene.
 
         Raises:
             ValueError: There is nothing to start from, or the trainer has another precision than ``32-true``.
@@ -269,9 +269,9 @@ class SplatModule(LightningModule):
         if self.trainer.precision != "32-true":
             raise ValueError(
                 f"splats train in float32, trainer.precision is {self.trainer.precision}: kernels compute in float32 "
-                "whatever it says, and a scaled loss would grow splats without need; leave it at 32-true"
+                "whatever it says, and a scaled loss would grow splats needlessly; leave it at 32-true"
             )
-        # An evaluation that was interrupted may have left its splats.
+        # An interrupted evaluation may have left its splats.
         self.evaluation_splats = None
         if stage != "fit":
             return
@@ -300,7 +300,7 @@ class SplatModule(LightningModule):
         return Splats.from_points(scene.points, scene.colors, self.splats.sh_degree)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """One Adam, one named group for each attribute and codebook."""
+        """One Adam optimiser with one named group for each attribute and codebook."""
         return build_adam(param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -313,10 +313,10 @@ class SplatModule(LightningModule):
             checkpoint[self.CHECKPOINT_HYPER_PARAMS_KEY] = plain(stored)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take over history and schedule; a fit keeps its own schedule, and may go on with other codebooks.
+        """Restore history and schedule; a fit keeps its own schedule, and may continue with other codebooks.
 
         Raises:
-            ValueError: A fit cannot go on from the checkpoint.
+            ValueError: A fit cannot continue from the checkpoint.
         """
         self.history = list(checkpoint.get("history", []))
         if not self.is_fitting:
@@ -330,7 +330,7 @@ class SplatModule(LightningModule):
         check_continuation(checkpoint, self.state_dict(), self.quantizer_settings)
 
     def on_fit_start(self) -> None:
-        """Say what the user should know of this device."""
+        """Warn about what the user should know of this device."""
         if self.device.type == "cuda":
             log.warning(
                 "training on %s with kernels that are tested under Triton's interpreter, but have never run on a GPU: "
@@ -339,12 +339,12 @@ class SplatModule(LightningModule):
             )
         elif threads_spin() and torch.get_num_threads() > 1 and hasattr(os, "getloadavg") and os.getloadavg()[0] > 1.0:
             log.warning(
-                "other processes need the cores, too, and waiting threads hold them: a run may take twice as long; "
+                "other processes also need the cores, and idle threads occupy them: a run may take twice as long; "
                 "import nsvq_lightning before torch, or set OMP_WAIT_POLICY=passive"
             )
 
     def on_train_start(self) -> None:
-        """Take the learning rates of this run, not those of a checkpoint; start counting the training time."""
+        """Set the learning rates of this run, not those of a checkpoint; start measuring the training time."""
         views = self.trainer.world_size * self.trainer.accumulate_grad_batches
         apply_rates(self.trainer.optimizers[0], self.rates, self.extent, views)
         self._step_rates = self.rates.of_step(views)
@@ -362,9 +362,9 @@ class SplatModule(LightningModule):
         """Loss of one view: (1 - w)·L1 + w·(1 - SSIM) + λ·Σ opacity (paper, section 3.3).
 
         Returns:
-            ``loss``, the attached ``render`` and the ``edits`` that its splats had seen. When the loss is not finite,
-            the step will update nothing: then None, or with several processes, which go through the backward pass
-            together, the loss alone.
+            ``loss``, the attached ``render`` and the ``edits`` count of its splats. If the loss is not finite, the step
+            will update nothing: then None or, with several processes, which run the backward pass together, only the
+            loss.
         """
         edits = self.splats.edits
         rendered = self(batch.camera)
@@ -382,7 +382,7 @@ class SplatModule(LightningModule):
         return {"loss": loss, "render": rendered, "edits": edits}
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Drop the gradients of a step that must not update; of several processes the strategy has done so."""
+        """Drop the gradients of a step that must not update; with several processes the strategy has done so."""
         if not self._updates:
             optimizer.zero_grad()
 
@@ -400,7 +400,7 @@ class SplatModule(LightningModule):
         self.stopwatch.lap()
 
     def on_train_end(self) -> None:
-        """Stop counting the training time."""
+        """Stop measuring the training time."""
         self.stopwatch.stop()
 
     def _evaluation_start(self) -> None:
@@ -423,7 +423,7 @@ class SplatModule(LightningModule):
 
     def _evaluation_image(self, camera: Camera) -> Tensor:
         if self.evaluation_splats is None:
-            raise RuntimeError("evaluation steps run inside Trainer.validate, test or predict only")
+            raise RuntimeError("evaluation steps run only inside Trainer.validate, test or predict")
         return eight_bit(self.render_splats(self.evaluation_splats, camera).image)
 
     def validation_step(self, batch: View, batch_idx: int) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""One Adam with a named parameter group for every attribute and every codebook, and the position's learning rate."""
+"""One Adam with a named parameter group per attribute and codebook, and the position's learning rate."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ BETAS = 0.9, 0.999
 """Adam's defaults."""
 
 EPS = 1e-15
-"""Adam's epsilon of 3D Gaussian splatting: gradients of a splat are far below PyTorch's default of 1e-8."""
+"""Adam's epsilon in 3D Gaussian splatting: gradients of a splat are far below PyTorch's default of 1e-8."""
 
 FUSED_DEVICES = frozenset({"cpu", "cuda"})
-"""Device types on which torch has a fused Adam."""
+"""Device types for which torch has a fused Adam."""
 
 CODEBOOK_PREFIX = "codebook_"
-"""A codebook's parameter group is named after its attribute with this in front."""
+"""Prefix of a codebook's parameter group, before the name of its attribute."""
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Learning rates of 3D Gaussian splatting, which the paper keeps.
+    """Learning rates of 3D Gaussian splatting, which the paper also uses.
 
     Attributes:
         means: Position at the start, times the extent of the scene.
@@ -51,9 +51,9 @@ class LearningRates:
         opacities: Opacity logit.
         sh0: Constant colour coefficient.
         shN: Higher colour coefficients.
-        codebook_factor: A codebook learns with the rate of its attribute times this.
-        scale_with_views: With B views in a step take √B times these rates, and Adam's other numbers to match
-            (:func:`apply_rates`); else those of one view.
+        codebook_factor: Factor from the rate of an attribute to that of its codebook.
+        scale_with_views: For B views in a step, multiply these rates by √B and adapt Adam's other settings
+            (:func:`apply_rates`); otherwise use the rates for one view.
 
     Raises:
         ValueError: A rate is negative or not finite, or a rate of the position is 0.
@@ -79,7 +79,7 @@ class LearningRates:
                 )
 
     def of_step(self, views: int) -> LearningRates:
-        """The rates of a step of ``views`` views, none left to scale."""
+        """The rates for a step of ``views`` views, with nothing left to scale."""
         factor = math.sqrt(views) if self.scale_with_views else 1.0
         scaled = {name: factor * getattr(self, name) for name in (*ATTRIBUTES, "means_final")}
         return replace(self, **scaled, scale_with_views=False)
@@ -102,16 +102,16 @@ def codebook_group(attribute: str) -> str:
 def param_groups(
     splats: Splats, quantizers: Mapping[str, nn.Module], rates: LearningRates, extent: float
 ) -> list[dict[str, Any]]:
-    """One group a parameter, named after its attribute (``means``) or its codebook (``codebook_scales``).
+    """One group per parameter, named after its attribute (``means``) or its codebook (``codebook_scales``).
 
-    Codebooks are there from the start: without a gradient Adam skips them, and a checkpoint of any phase has the same
-    groups.
+    Codebooks are included from the start: Adam skips them while they have no gradient, and a checkpoint of any phase
+    has the same groups.
 
     Args:
         splats: The splats.
         quantizers: Quantizer by attribute, each with a parameter ``codebook``.
         rates: Learning rates.
-        extent: Extent of the scene, scene units; the position's rate is in its unit.
+        extent: Extent of the scene, scene units; the position's rate is relative to it.
     """
     parameters: dict[str, Any] = dict(splats.attributes())
     parameters |= {codebook_group(name): quantizer.codebook for name, quantizer in quantizers.items()}
@@ -122,7 +122,7 @@ def param_groups(
 
 
 def group_lr(name: str, rates: LearningRates, extent: float) -> float:
-    """Learning rate at the start of the parameter group ``name``."""
+    """Initial learning rate of the parameter group ``name``."""
     attribute = name.removeprefix(CODEBOOK_PREFIX)
     rate: float = getattr(rates, attribute)
     if attribute != name:
@@ -131,17 +131,17 @@ def group_lr(name: str, rates: LearningRates, extent: float) -> float:
 
 
 def apply_rates(optimizer: torch.optim.Optimizer, rates: LearningRates, extent: float, views: int = 1) -> None:
-    """Set learning rates, betas and epsilon of all groups, for example after a checkpoint has brought others.
+    """Set learning rates, betas and epsilon of all groups, for example after a checkpoint has replaced them.
 
-    With ``rates.scale_with_views``, of a step of B views, whose gradients are averaged: √B·lr, 1 - B·(1 - β), ε / √B.
-    B views in one step then move parameters as B steps of a view each, in mean and in variance (Malladi et al. 2022,
+    With ``rates.scale_with_views``, for a step of B views with averaged gradients: √B·lr, 1 - B·(1 - β), ε / √B.
+    B views in one step then move parameters like B steps of a view each, in mean and in variance (Malladi et al. 2022,
     "On the SDEs and Scaling Rules for Adaptive Gradient Algorithms").
 
     Args:
         optimizer: Adam with named groups.
-        rates: Learning rates of a step of one view.
+        rates: Learning rates for a step of one view.
         extent: Extent of the scene, scene units.
-        views: Views in a step, of all processes and micro-batches.
+        views: Views in a step, over all processes and micro-batches.
 
     Raises:
         ValueError: So many views that a beta would not be positive.
@@ -185,5 +185,5 @@ def find_group(optimizer: torch.optim.Optimizer, name: str) -> dict[str, Any]:
 
 
 def raw_optimizer(trainer: Trainer) -> torch.optim.Optimizer:
-    """The one optimiser, unwrapped."""
+    """The trainer's only optimiser, unwrapped."""
     return trainer.optimizers[0]

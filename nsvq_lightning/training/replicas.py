@@ -1,4 +1,4 @@
-"""Replicas of one scene on several processes: start equal, and prove to be equal."""
+"""Replicas of one scene on several processes: make them equal at the start, and check that they stay equal."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ __all__ = ["check_replicas", "checksum", "follow_first", "from_first_process", "
 
 
 def follow_first(strategy: Strategy, module: nn.Module) -> None:
-    """Give a module on every process the first one's parameters and buffers; numbers of rows may differ before."""
+    """Copy the first process's parameters and buffers to the module on every process; row counts may differ before."""
     state = {name: tensor.cpu() for name, tensor in module.state_dict().items()}
     module.load_state_dict(strategy.broadcast(state))
 
 
 @torch.no_grad()
 def checksum(tensor: Tensor) -> Tensor:
-    """Checksum of a tensor's bits and of their places, scalar int64: Σ (i + 1)·(bits of number i) modulo 2⁶⁴.
+    """Checksum of a tensor's bits and their positions, scalar int64: Σ (i + 1)·(bits of element i) modulo 2⁶⁴.
 
     Args:
         tensor: Float32, any shape.
@@ -34,10 +34,10 @@ def checksum(tensor: Tensor) -> Tensor:
 def check_replicas(trainer: Trainer, event: str) -> None:
     """Check that all processes hold the same trained parameters, to the bit.
 
-    A collective: every process must call it at the same place.
+    This is a collective: every process must call it at the same point.
 
     Args:
-        trainer: The trainer, whose optimiser knows the parameters by name.
+        trainer: The trainer, whose optimiser names the parameters.
         event: What has just happened, for the message.
 
     Raises:
@@ -52,7 +52,7 @@ def check_replicas(trainer: Trainer, event: str) -> None:
     if different:
         raise RuntimeError(
             f"iteration {trainer.global_step}, after {event}: the replicas of {trainer.world_size} processes differ in "
-            f"{', '.join(different)}. A decision was taken from what one process has alone, or the machines compute "
+            f"{', '.join(different)}. A decision used data of one process alone, or the machines compute "
             "differently: pass it through nsvq_lightning.training.replicas.sum_over_processes or from_first_process, "
             "and train on machines of one kind"
         )
@@ -60,12 +60,12 @@ def check_replicas(trainer: Trainer, event: str) -> None:
 
 def from_first_process(trainer: Trainer, tensor: Tensor) -> Tensor:
     """The first process's value of a tensor, on every process; its shape may differ before."""
-    # It travels pickled: from the CPU, or every process would load it onto the first one's device.
+    # It is sent pickled, so move it to the CPU; otherwise every process would load it onto the first one's device.
     return tensor if trainer.world_size == 1 else trainer.strategy.broadcast(tensor.cpu()).to(tensor.device)
 
 
 def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:
-    """Sum of a tensor over all processes, written into it; the tensor itself where there is one."""
+    """Sum of a tensor over all processes, in place; the tensor unchanged if there is one process."""
     if trainer.world_size == 1:
         return tensor
     reduced = trainer.strategy.reduce(tensor, reduce_op="sum")

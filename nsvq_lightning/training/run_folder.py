@@ -1,4 +1,4 @@
-"""Where a run writes its files: a folder of its own, whatever the logger, in which no other run is overwritten."""
+"""Where a run writes its files: a folder of its own, whatever the logger, which never overwrites another run."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ RUN_FILES = (
     "renders",
     "predictions",
 )
-"""What tells that a folder holds a run."""
+"""Files that show that a folder holds a run."""
 
 LOG = "metrics.csv"
-"""File of Lightning's CSV logger, which removes one that it finds."""
+"""File of Lightning's CSV logger, which removes an existing one."""
 
 _FOLDERS: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
 _RESERVED: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
 
 
 def run_folder(trainer: Trainer) -> Path:
-    """Folder of the trainer's run, which exists; the same one for all that this trainer does.
+    """Folder of the trainer's run, which exists; the same one for everything that this trainer does.
 
-    It is, of these the first one that is given: the trainer's ``run_folder`` (:class:`nsvq_lightning.training.trainer.
+    It is the first of these that is given: the trainer's ``run_folder`` (:class:`nsvq_lightning.training.trainer.
     SplatTrainer`), the folder of a logger that has one for each run (CSV, TensorBoard), or a new
     ``<default_root_dir>/<scene>/version_<n>``. The first process chooses: the first call is a collective, which every
     process must make.
 
     Raises:
-        FileExistsError: The folder holds another run. That of the checkpoint which a fit goes on from is its own.
+        FileExistsError: The folder holds another run. The run of the checkpoint that a fit continues from is its own.
     """
     folder = _FOLDERS.get(trainer)
     if folder is None:
@@ -51,7 +51,7 @@ def run_folder(trainer: Trainer) -> Path:
                 chosen = str(error)
         chosen = trainer.strategy.broadcast(chosen)
         if not isinstance(chosen, Path):
-            raise FileExistsError(chosen)  # on every process: none waits for another
+            raise FileExistsError(chosen)  # on every process, so that none waits for another
         folder = _FOLDERS[trainer] = chosen
     return folder
 
@@ -62,11 +62,11 @@ def is_trial(trainer: Trainer) -> bool:
 
 
 def reserve(trainer: Trainer, checkpoint: str | Path | None) -> None:
-    """Take a folder that was given before the trainer starts: its loggers write, and remove what they find, at once.
+    """Claim a given folder before the trainer starts: its loggers write, and remove existing files, at once.
 
     Args:
         trainer: Trainer that is about to start.
-        checkpoint: What a fit goes on from, if it does.
+        checkpoint: Checkpoint that a fit continues from, if any.
 
     Raises:
         FileExistsError: The folder holds another run.
@@ -78,7 +78,7 @@ def reserve(trainer: Trainer, checkpoint: str | Path | None) -> None:
 
 
 def claim_version(parent: Path) -> Path:
-    """Make and return the next folder ``version_<n>`` in ``parent``; runs that start together get different ones."""
+    """Create and return the next folder ``version_<n>`` in ``parent``; runs that start together get different ones."""
     parent.mkdir(parents=True, exist_ok=True)
     numbers = [path.name.removeprefix("version_") for path in parent.glob("version_*")]
     for number in count(max((int(number) + 1 for number in numbers if number.isdecimal()), default=0)):
@@ -92,11 +92,11 @@ def claim_version(parent: Path) -> Path:
 
 
 def take(folder: Path, checkpoint: str | Path | None) -> None:
-    """Make the folder where there is none; set the log of the run in it aside, before a CSV logger removes it.
+    """Create the folder if needed; set aside the log of the run in it, before a CSV logger removes it.
 
     Args:
         folder: Folder that was given for a run.
-        checkpoint: What a fit goes on from, if it does.
+        checkpoint: Checkpoint that a fit continues from, if any.
 
     Raises:
         FileExistsError: It holds a run, and the checkpoint is not in it.
@@ -104,8 +104,8 @@ def take(folder: Path, checkpoint: str | Path | None) -> None:
     if any((folder / name).exists() for name in RUN_FILES):
         if checkpoint is None or not Path(checkpoint).resolve().is_relative_to(folder.resolve()):
             raise FileExistsError(
-                f"{folder} holds a run already, and no run is overwritten: name another folder or version, or none, "
-                "and the next free one is taken"
+                f"{folder} already holds a run, and no run is overwritten: name another folder or version, or none "
+                "to take the next free one"
             )
         _set_aside(folder / LOG)
     folder.mkdir(parents=True, exist_ok=True)

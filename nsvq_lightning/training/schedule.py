@@ -1,7 +1,7 @@
-"""The four phases of a run, and how the paper's iteration numbers turn into those of a shorter or longer one.
+"""The four phases of a run, and how the paper's iteration numbers scale to a shorter or longer run.
 
-This module is the one place that decides what scales. Every other part of the package writes the paper's numbers (of a
-run of 45 000 iterations) and asks the :class:`Schedule` for the numbers of this run:
+Only this module decides what scales. Every other part of the package uses the paper's numbers (for a run of 45 000
+iterations) and asks the :class:`Schedule` for the numbers of this run:
 
 ===============================  ==========================================================================
 what                             how it scales with ``total / reference_total``
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 __all__ = ["Phase", "Schedule", "log_interval", "next_iteration"]
 
 POSITION_DECAY_END = 30_000
-"""The position's learning rate falls until here in the paper's run, then stays."""
+"""The position's learning rate decays until here in the paper's run, then stays constant."""
 
 
 class Phase(IntEnum):
@@ -58,7 +58,7 @@ class Phase(IntEnum):
     QUANTIZE = 2
     """Splats and codebooks are trained together through noise substitution."""
     FINETUNE = 3
-    """Codes are frozen; codebooks, positions and opacities are trained on."""
+    """Codes are frozen; training of codebooks, positions and opacities continues."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,11 @@ class Schedule:
     """Phases and milestones of a run of ``total`` iterations.
 
     Iterations are 1-based: iteration 1 is the first optimiser step, ``phase_at(1)`` is ``WARMUP``. A phase covers the
-    iterations after the end of the one before, up to and including its own end. Equal ends leave a phase out.
+    iterations after the end of the one before, up to and including its own end. Equal ends skip a phase.
 
     Attributes:
         total: Iterations of this run.
-        reference_total: Iterations of the run whose numbers the rules are written in; the paper's is 45 000.
+        reference_total: Iterations of the reference run, in whose numbers the rules are given; the paper's 45 000.
         warmup_end: Last iteration of the warm-up phase, in the reference run.
         prune_end: Last iteration of the prune phase, in the reference run.
         quantize_end: Last iteration of the quantize phase, in the reference run; fine-tuning takes the rest.
@@ -131,16 +131,16 @@ class Schedule:
         ends: list[int] = []
         for phase, end in enumerate(reference[1:]):
             before = ends[-1] if ends else 0
-            # Rounding must not swallow a phase: one iteration for this one, one for each that follows.
+            # Rounding must not drop a phase: at least one iteration for this one and for each that follows.
             latest = self.total - sum(exists[phase + 1 :])
             ends.append(min(max(self._end(phase, end, before), before + 1), latest) if exists[phase] else before)
         warmup, prune, quantize, finetune = (max(end, 0) for end in ends)
         if exists[Phase.QUANTIZE] and quantize == prune:
-            quantize = finetune  # a run of one iteration: codes are placed before they are tuned
+            quantize = finetune  # a run of one iteration: codes must be placed before they are tuned
         return warmup, prune, quantize, finetune
 
     def _end(self, phase: int, reference: int, before: int) -> int:
-        """Where a phase after iteration ``before`` ends in this run, but for the rounding of tiny runs."""
+        """Where a phase that starts after iteration ``before`` ends in this run, before the rounding of tiny runs."""
         end = round(reference * self.scale)
         if self.scale < 1 and phase == Phase.QUANTIZE and reference < self.reference_total:
             end = min(end, self.total - min(self.min_finetune, (self.total - before) // 2))
@@ -155,22 +155,22 @@ class Schedule:
         return max(phase for phase in Phase if ends[phase] > (ends[phase - 1] if phase else 0))
 
     def first_of(self, phase: Phase) -> int | None:
-        """First iteration of a phase, or None when this run has no such phase."""
+        """First iteration of a phase, or None if this run has no such phase."""
         first = self.ends[phase - 1] + 1 if phase else 1
         return first if first <= self.ends[phase] else None
 
     def iteration(self, reference: float) -> int:
-        """The iteration of this run that stands for iteration ``reference`` of the reference run, at least 1."""
+        """The iteration of this run that corresponds to iteration ``reference`` of the reference run, at least 1."""
         return max(1, round(reference * self.scale))
 
     def stride(self, reference: int, minimum: int) -> float:
-        """The interval ``reference``, at least ``minimum`` iterations of this run, in those of the reference run."""
+        """The interval ``reference``, in reference iterations, but at least ``minimum`` iterations of this run."""
         return max(reference, minimum / self.scale) if self.scale < 1 else reference
 
     def times(self, start: float, last: float, every: int, minimum: int = 1) -> tuple[int, ...]:
         """The iterations ``start, start + every, …, last`` of the reference run as iterations of this run.
 
-        Each is rounded on its own: an interval rounded up would lose the last of them.
+        Each is rounded separately: an interval rounded up would lose the last of them.
         """
         return _times(self, start, last, self.stride(every, minimum))
 
@@ -192,9 +192,9 @@ class Schedule:
     ) -> tuple[int, ...]:
         """Iterations of the quantize phase at which inactive codes are replaced.
 
-        An early series from ``start`` to ``early_end``, a late one to ``end``. No window, the first included, is
-        shorter than ``min_replacement_interval``. Where a longer fine-tune phase moves the end of the quantize phase,
-        ``end`` keeps its distance to it.
+        There is an early series from ``start`` to ``early_end``, and a late one to ``end``. No window, even the first,
+        is shorter than ``min_replacement_interval``. If a longer fine-tune phase moves the end of the quantize phase,
+        ``end`` keeps its distance from it.
         """
         minimum = self.min_replacement_interval
         first = max(start, self.prune_end + self.stride(1, minimum))
@@ -212,7 +212,7 @@ class Schedule:
         return min(highest, iteration // self.iteration(every))
 
     def strength(self, reference: float) -> float:
-        """The weight of a loss term whose effect adds up over a phase, for one of ``reference`` in the reference run.
+        """The weight of a loss term whose effect adds up over a phase, from its weight in the reference run.
 
         Measured with 4500 iterations: with λ = 1e-7 unchanged the prune phase removed 6 % of the splats of a scene that
         the tenfold λ brought to half, at the same test PSNR (25.43 and 25.44 dB).
@@ -227,16 +227,16 @@ class Schedule:
 
 @lru_cache
 def _times(schedule: Schedule, start: float, last: float, stride: float) -> tuple[int, ...]:
-    """Kept, as callbacks ask in every step."""
+    """Cached, because callbacks ask in every step."""
     count = math.floor((last - start) / stride + 1e-9) + 1
     return tuple(dict.fromkeys(schedule.iteration(start + k * stride) for k in range(count)))
 
 
 def next_iteration(trainer: Trainer) -> int:
-    """1-based number of the iteration that starts (or runs) now; at the end of a step: of the next one."""
+    """1-based number of the iteration that starts (or runs) now; at the end of a step, that of the next one."""
     return trainer.global_step + 1
 
 
 def log_interval(trainer: Trainer) -> int:
-    """Iterations between two lines of the loggers."""
+    """Iterations between two log entries."""
     return max(1, int(getattr(trainer, "log_every_n_steps", 50)))

@@ -19,8 +19,8 @@ __all__ = ["RunState", "Stopwatch"]
 class RunState(nn.Module):
     """Scalars that checkpoints carry as buffers and code reads as plain numbers.
 
-    Each buffer has a mirror on the Python side, so that reading the phase every step never waits for the device. Write
-    through the properties; loading a state dict refreshes the mirrors.
+    Each buffer has a mirror in Python, so that reading the phase every step never waits for the device. Write through
+    the properties; loading a state dict refreshes the mirrors.
     """
 
     _phase: Tensor
@@ -38,7 +38,7 @@ class RunState(nn.Module):
         self.refresh()
 
     def refresh(self) -> None:
-        """Read the mirrors from the buffers again, for example after they were broadcast."""
+        """Read the mirrors from the buffers again, for example after a broadcast."""
         self._mirror_phase = Phase(int(self._phase))
         self._mirror_sh_degree = int(self._sh_degree)
         self._mirror_extent = float(self._extent)
@@ -57,7 +57,7 @@ class RunState(nn.Module):
 
     @property
     def sh_degree(self) -> int:
-        """SH degree in use; the coefficients above are not looked at."""
+        """SH degree in use; higher coefficients are ignored."""
         return self._mirror_sh_degree
 
     @sh_degree.setter
@@ -92,7 +92,7 @@ def _refresh(state: RunState, _: Any) -> None:
 
 
 class Stopwatch:
-    """Adds the time between two laps to ``state.train_seconds``; pauses and the compilation of kernels are left out.
+    """Adds the time between two laps to ``state.train_seconds``, without pauses and the compilation of kernels.
 
     Args:
         state: Where the seconds go.
@@ -103,11 +103,11 @@ class Stopwatch:
         self._since: float | None = None
 
     def start(self) -> None:
-        """Start counting now; time before is forgotten."""
+        """Start counting now; earlier time is forgotten."""
         self._since = _working_time()
 
     def lap(self) -> None:
-        """Add the time since the last lap; nothing when the watch does not run."""
+        """Add the time since the last lap; does nothing if the watch is not running."""
         if self._since is not None:
             now = _working_time()
             self._state.train_seconds += now - self._since
@@ -120,7 +120,7 @@ class Stopwatch:
 
     @contextmanager
     def paused(self, device: torch.device) -> Iterator[None]:
-        """Leave the body's time out. Work already queued on ``device`` still belongs to the training."""
+        """Leave out the time of the body. Work already queued on ``device`` still counts as training."""
         running = self._since is not None
         if running:
             torch.get_device_module(device).synchronize()
@@ -134,5 +134,5 @@ class Stopwatch:
 
 
 def _working_time() -> float:
-    """Seconds on a clock that stands still while kernels are compiled."""
+    """Seconds on a clock that stops while kernels are compiled."""
     return time.perf_counter() - compile_seconds()

@@ -1,4 +1,4 @@
-"""Training on several devices: a replica of the scene on each, one view each a step."""
+"""Training on several devices: each has a replica of the scene and renders one view per step."""
 
 from __future__ import annotations
 
@@ -20,35 +20,34 @@ log = logging.getLogger(__name__)
 
 
 class ViewParallelStrategy(DDPStrategy):
-    """Averages the gradients of all processes, whatever the parameters are by then: ``strategy="view_parallel"``.
+    """Averages gradients over all processes, even if parameters were replaced: ``strategy="view_parallel"``.
 
-    ``DistributedDataParallel`` holds on to the parameters it finds at the start, but cloning and pruning replace them.
-    Here nothing is wrapped: every process starts from the first one's parameters and buffers, and after each backward
-    pass the gradients of the parameters that the module has then are summed and divided by the number of processes.
-    All replicas so take the same update and stay equal to the bit, as long as whatever enters a decision has passed a
-    collective (:mod:`nsvq_lightning.training.host`); :func:`nsvq_lightning.training.replicas.check_replicas` compares
-    them.
+    ``DistributedDataParallel`` keeps the parameters it finds at the start, but cloning and pruning replace them. Here
+    nothing is wrapped: every process starts from the first one's parameters and buffers, and after each backward pass
+    the gradients of the module's current parameters are summed and divided by the number of processes. So all replicas
+    take the same update and stay equal to the bit, as long as all data that enters a decision has passed a collective
+    (:mod:`nsvq_lightning.training.host`); :func:`nsvq_lightning.training.replicas.check_replicas` compares them.
 
-    With gradient accumulation there is one reduction a step. A parameter without a gradient on every process stays
-    without one; a step in which any process has a loss that is not finite updates nothing.
+    With gradient accumulation there is one reduction per step. A parameter that has no gradient on any process stays
+    without one; a step in which any process has a non-finite loss updates nothing.
 
     Arguments are those of ``DDPStrategy`` that do not concern the wrapper, such as ``process_group_backend``.
     """
 
     follows_replaced_parameters = True
-    """What :class:`~nsvq_lightning.callbacks.DensityControl` asks of a strategy for several processes."""
+    """What :class:`~nsvq_lightning.callbacks.DensityControl` requires of a strategy for several processes."""
 
     _accumulates = False
     _finite = True
 
     def configure_ddp(self) -> None:
-        """Take over the first process's parameters and buffers."""
+        """Copy the first process's parameters and buffers."""
         assert self.lightning_module is not None
         follow_first(self, self.lightning_module)
 
     @contextmanager
     def block_backward_sync(self) -> Iterator[None]:
-        """Keep gradients to this process for now: further ones will be added to them."""
+        """Keep gradients local for now: more will be added to them."""
         self._accumulates = True
         try:
             yield
@@ -83,5 +82,5 @@ class ViewParallelStrategy(DDPStrategy):
 
 
 StrategyRegistry.register(
-    "view_parallel", ViewParallelStrategy, description="A replica on each device, one view each a step", override=True
+    "view_parallel", ViewParallelStrategy, description="A replica on each device, one view each per step", override=True
 )

@@ -1,4 +1,4 @@
-"""What callbacks ask of the train views, on all processes."""
+"""What callbacks need from the train views, on all processes."""
 
 from __future__ import annotations
 

@@ -25,12 +25,12 @@ class SplatTrainer(Trainer):
 
     Checkpoints are read by :class:`~nsvq_lightning.training.checkpoints.PlainCheckpointIO` unless a plugin does it.
 
-    Where several devices or machines are asked for and no strategy is, it takes ``view_parallel``: DDP, which Lightning
-    would choose, cannot follow a changing number of splats.
+    If several devices or machines are requested but no strategy, it uses ``view_parallel``: DDP, which Lightning would
+    choose, cannot handle a changing number of splats.
 
     Args:
-        run_folder: Folder for all files of the run; None is that of the logger if it has one for each run, else a new
-            ``<default_root_dir>/<scene>/version_<n>``. A run that is there already is not overwritten.
+        run_folder: Folder for all files of the run; None uses that of the logger if it has one for each run, else a new
+            ``<default_root_dir>/<scene>/version_<n>``. An existing run is not overwritten.
     """
 
     def __init__(self, *args: Any, run_folder: str | None = None, **kwargs: Any) -> None:
@@ -47,7 +47,7 @@ class SplatTrainer(Trainer):
         Args:
             model: Module that the checkpoint is loaded into.
             ckpt_path: Checkpoint of a run.
-            output: File to write; its suffix names the format: .nsvq is the compressed scene, any other format holds
+            output: File to write; its suffix selects the format: .nsvq is the compressed scene, any other format holds
                 the decoded splats (.ply, .sog, .spz, .splat).
 
         Raises:

@@ -359,7 +359,7 @@ def test_a_missing_opencv_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: p
 
     monkeypatch.setattr(cli, "import_module", without_opencv)
     assert main(["compress"]) == 1
-    assert capsys.readouterr().err.startswith("error: there is no OpenCV (cv2): pip install opencv-")
+    assert capsys.readouterr().err.startswith("error: OpenCV (cv2) is missing: pip install opencv-")
 
 
 def test_configs_are_found_as_files_first_then_by_name(tmp_path: Path) -> None:

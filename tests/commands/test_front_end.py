@@ -103,7 +103,7 @@ SCENE = ["--data.root=no_scene", "--callbacks.progress=null"]
         ("--callbacks.report.every=-1", "every must be None or at least 0, got -1"),
         ("--trainer.logger=MLFlowLogger", "mlflow"),
         ("--trainer.accelerator=gpu", "No supported gpu backend found"),
-        ("--model.quantizer=nn_modules.NoQuantizer", "NoQuantizer is no quantizer, it lacks: codebook, codes, decode"),
+        ("--model.quantizer=nn_modules.NoQuantizer", "NoQuantizer is not a quantizer; it lacks: codebook, codes"),
     ],
 )
 def test_settings_that_cannot_be_are_one_line(

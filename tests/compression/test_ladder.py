@@ -143,7 +143,7 @@ def test_the_command_compresses_a_file(tmp_path: Path, capsys: pytest.CaptureFix
     ("arguments", "message"),
     [
         (["missing.ply", "x.nsvq"], "missing.ply"),
-        (["empty.ply", "x.nsvq"], "no splat with finite numbers"),
+        (["empty.ply", "x.nsvq"], "no finite splat"),
     ],
 )
 def test_bad_files_are_one_line_and_status_1(
@@ -231,7 +231,7 @@ def test_photos_keep_to_the_aim(
     assert settings.endswith(", without training")
     assert reached <= aimed
     (message,) = [message for message in caplog.messages if message.startswith("the trained file")]
-    assert f"more than {aim}={aimed:g}: {output} is the one without training" in message
+    assert f"more than {aim}={aimed:g}: {output} is the untrained one" in message
     (trained,) = tmp_path.glob("out_training/version_0/scene.nsvq")
     assert str(trained) in message
 

@@ -41,7 +41,7 @@ def test_photos_of_another_shape_than_their_camera_are_warned_of(
     assert cv2.imwrite(str(path), cv2.rotate(cv2.imread(str(path)), cv2.ROTATE_90_CLOCKWISE))
     load_scene(root)
     (message,) = caplog.messages
-    assert re.match(r"1 of \d+ photos have another aspect ratio than their camera: they were cropped, turned", message)
+    assert re.match(r"1 of \d+ photos have another aspect ratio than their camera: they were cropped, rotated", message)
 
 
 def test_a_larger_model_beside_the_first_is_named(make_scene: SceneFactory, caplog: pytest.LogCaptureFixture) -> None:
@@ -109,7 +109,7 @@ def test_points_at_a_camera_centre_are_left_out(make_scene: SceneFactory, caplog
             reconstruction.add_point3D(xyz, import_pycolmap().Track(), np.zeros(3, np.uint8))
     reconstruction.write_binary(str(model))
     points = load_scene(root).points
-    assert "left out 4 of 26 points, which are at the centre of a camera" in caplog.text
+    assert "left out 4 of 26 points: they are at the centre of a camera" in caplog.text
     assert torch.equal(points[:20], scene.points)
     assert len(points) == 22
 

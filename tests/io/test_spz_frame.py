@@ -79,7 +79,7 @@ def test_truncated_and_altered_streams_are_refused_or_read_as_they_were(tmp_path
         (4, struct.pack("<I", 3), "version 3 .* without gzip"),
         (8, struct.pack("<I", 1 << 31), "means of 2147483648 splats cannot be"),
         (12, bytes([4]), "SH degree 4"),
-        (13, bytes([31]), "31 bits after the point"),
+        (13, bytes([31]), "31 fractional bits"),
         (15, bytes([5]), "5 streams where there must be 6"),
         (16, struct.pack("<I", 16), "a table of 6 streams at 16"),
         (16, struct.pack("<I", 1 << 31), "a table of 6 streams at 2147483648"),

@@ -94,7 +94,7 @@ def test_a_branch_tells_which_rules_of_its_trunk_have_changed(
         assert messages == []
         return
     assert messages == [
-        f"the checkpoint is of a run with {named[0]}, this one goes on with {named[1]}; pass "
+        f"the checkpoint is of a run with {named[0]}, this one continues with {named[1]}; pass "
         "--callbacks.phases.min_reset_interval=11 to continue that run as it was"
     ]
 
@@ -196,5 +196,5 @@ def test_a_fit_from_a_quantized_checkpoint_keeps_its_codebooks(run: RunFactory, 
     loaded = SplatModule.load_from_checkpoint(path)
     assert loaded.quantizer_settings == module.quantizer_settings
     for other in ({"codebooks": {"scales": 23, "quats": 24, "sh0": 16, "shN": 16}}, {"quantizer": StraightThrough}):
-        with pytest.raises(ValueError, match="that can change before the quantize phase only"):
+        with pytest.raises(ValueError, match="that can change only before the quantize phase"):
             run(recipe().values(), ckpt_path=path, module=other, max_steps=12)

@@ -61,7 +61,7 @@ def test_a_folder_that_holds_a_run_is_refused(run: RunFactory, tmp_path: Path) -
     folder = run_folder(fit())
     assert folder == tmp_path / "a" / "b"
     before = contents(folder)
-    with pytest.raises(FileExistsError, match=r"b holds a run already, and no run is overwritten: name another"):
+    with pytest.raises(FileExistsError, match=r"b already holds a run, and no run is overwritten: name another"):
         fit()
     assert {k: v for k, v in contents(folder).items() if k != "metrics.csv"}.items() <= before.items()
     # Only to go on from its own checkpoint is no other run.
@@ -75,7 +75,7 @@ def test_what_callbacks_were_told_to_write_elsewhere_is_not_overwritten_either(r
 
     fit()
     before = contents(tmp_path / "kept")
-    with pytest.raises(FileExistsError, match="kept holds a run already"):
+    with pytest.raises(FileExistsError, match="kept already holds a run"):
         fit()
     assert contents(tmp_path / "kept") == before
 
@@ -130,7 +130,7 @@ def test_the_command_neither_overwrites_nor_loses_a_log(
     before = contents(folder)
     assert "config.yaml" in before
     assert main([*arguments, "--trainer.max_steps=3"]) == 1
-    assert "holds a run already" in capsys.readouterr().err
+    assert "already holds a run" in capsys.readouterr().err
     assert contents(folder) == before
     going_on = [f"--ckpt_path={folder / 'checkpoints' / 'last.ckpt'}", "--callbacks.phases.total=3"]
     assert main([*arguments, "--trainer.max_steps=5", *going_on]) == 0

@@ -1,1 +1,1 @@
-"""``nsvq doctor``: whether this machine and a scene folder are fit for training, and what would help."""
+"""``nsvq doctor``: check whether this machine and a scene folder are fit for training, and say what would help."""

@@ -1,4 +1,4 @@
-"""Which back-ends and extras are here, and why others are not."""
+"""Which back-ends and extras are available, and why others are not."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from nsvq_lightning.rendering.rasterize import fast_backends
 __all__ = ["check_backends", "check_extras", "usable_backends"]
 
 WIDE = 256
-"""Bits of a vector register below which the kernels take about twice the time on x86; ARM64 has no wider ones."""
+"""Vector register width in bits below which kernels take about twice the time on x86; ARM64 has none wider."""
 
 
 def usable_backends() -> dict[str, str]:
-    """Device by name of each fast back-end that this machine has."""
+    """Device of each fast back-end of this machine, by name."""
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     return {name: device for device in devices for name in fast_backends(torch.zeros(1, device=device))}
 
 
 def check_backends() -> Iterator[Finding]:
-    """The renderers: Numba on the CPU, those of a GPU."""
+    """The renderers: Numba on the CPU, and those for a GPU."""
     yield _cpu()
     yield _gpu()
     if find_spec("gsplat") is None:
@@ -50,7 +50,7 @@ def _gpu() -> Finding:
     if torch.version.cuda is None and torch.version.hip is None:
         return note("gpu", f"torch {torch.__version__} is built without CUDA; with an NVIDIA GPU install a CUDA build")
     if not torch.cuda.is_available():
-        return note("gpu", "torch finds none: see whether nvidia-smi does, and CUDA_VISIBLE_DEVICES")
+        return note("gpu", "torch finds none: check whether nvidia-smi does, and CUDA_VISIBLE_DEVICES")
     name, fast = torch.cuda.get_device_name(), [name for name in usable_backends() if name != "cpu"]
     if not fast:
         return note("gpu", f"{name}: this version renders on it in plain torch, slower than on the CPU: use the CPU")
@@ -58,7 +58,7 @@ def _gpu() -> Finding:
 
 
 def check_extras() -> Iterator[Finding]:
-    """Optional packages that a run uses where they are."""
+    """Optional packages that a run uses if installed."""
     if find_spec("torchvision") is None:
         yield note("lpips", "not measured: pip install 'nsvq-lightning[lpips]'")
     elif not any((Path(torch.hub.get_dir()) / "checkpoints").glob("vgg16-*.pth")):

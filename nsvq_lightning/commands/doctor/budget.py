@@ -1,4 +1,4 @@
-"""About how much memory and time a run will take here."""
+"""Estimate of the memory and time that a run will take here."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from nsvq_lightning.splats.splats import Splats
 __all__ = ["check_budget", "grown"]
 
 SPLATS = 150_000
-"""What scenes of some tens of photos grow to in a run of a tenth of the paper's length."""
+"""Number of splats that scenes of some tens of photos grow to in a run of a tenth of the paper's length."""
 RENDERS_A_STEP = 2.0
-"""Time of a training step by that of rendering forward and backward: loss, optimiser and codebooks take the rest."""
+"""Ratio of a training step's time to that of rendering forward and backward; the rest is loss, optimiser, codebooks."""
 SHORT, FULL = 4500, 45_000
-"""Iterations of a tenth of the paper's run and of the whole."""
+"""Iterations of a tenth of the paper's run, and of the whole run."""
 BYTES_A_SPLAT = 59 * 4 * 6
-"""59 float32 a splat: value, gradient, two moments, and copies while quantizing or editing."""
+"""Bytes per splat: 59 float32, each with gradient, two moments, and copies while quantizing or editing."""
 BYTES_A_PIXEL = 100
-"""Buffers of the renderer, the loss and the picture itself."""
+"""Bytes per pixel: buffers of the renderer, the loss and the picture itself."""
 BASE = 1.2e9
-"""Python, torch, Lightning and compiled kernels."""
+"""Bytes for Python, torch, Lightning and compiled kernels."""
 CACHE = 4 << 30
 """Default of ``--data.cache_bytes``."""
 REPEATS = 3
@@ -43,7 +43,7 @@ def check_budget(scene: Scene) -> Iterator[Finding]:
     free = available_memory()
     text = f"about {readable_bytes(needed)} with {SPLATS:,} splats and {readable_bytes(min(photos, CACHE))} of photos"
     if photos > CACHE:
-        text += f" (all would take {readable_bytes(photos)}; the others are decoded anew each time)"
+        text += f" (all would take {readable_bytes(photos)}; the others are decoded each time)"
     if free is not None and needed > free:
         help_ = "lower --data.max_width or --data.cache_bytes"
         yield note("run memory", f"{text}, {readable_bytes(free)} are available: {help_}", bytes=needed)
@@ -51,25 +51,25 @@ def check_budget(scene: Scene) -> Iterator[Finding]:
         yield good("run memory", text, bytes=needed)
     step = RENDERS_A_STEP * _render_seconds(scene)
     text = f"about {_duration(SHORT * step)} for {SHORT:,} steps, {_duration(FULL * step)} for the paper's {FULL:,}"
-    yield good("run time", f"{text}, with {SPLATS:,} splats and as busy as the machine is now", step_seconds=step)
+    yield good("run time", f"{text}, with {SPLATS:,} splats and the machine as busy as now", step_seconds=step)
 
 
 def grown(scene: Scene, count: int) -> Splats:
-    """The scene's points as splats, repeated with small shifts until there are ``count``, and as much smaller."""
+    """The scene's points as splats, repeated with small shifts until there are ``count``, and shrunk to match."""
     start = Splats.from_points(scene.points, scene.colors)
     copies = -(-count // len(start))
     draw = generator(0, 0, "doctor")
     rows = torch.arange(len(start)).repeat(copies)[: max(count, len(start))]
     tensors: dict[str, Tensor] = {name: value.detach()[rows] for name, value in start.attributes().items()}
     tensors["means"] = tensors["means"] + tensors["scales"].exp() * torch.randn(len(rows), 3, generator=draw)
-    # Surfaces are covered by their number, and trained splats are smaller than the gaps between points.
+    # More splats cover the surfaces with smaller ones, and trained splats are smaller than the gaps between points.
     tensors["scales"] = tensors["scales"] - math.log(copies) / 2 - 1
     tensors["opacities"] = torch.randn(len(rows), generator=draw)
     return Splats.from_tensors(**tensors)
 
 
 def _render_seconds(scene: Scene) -> float:
-    """Median over views of the least time to render forward and backward."""
+    """Median over views of the shortest time to render forward and backward."""
     splats = grown(scene, SPLATS)
     chosen = [scene.train[i * len(scene.train) // REPEATS] for i in range(REPEATS)]
     times = [min(_seconds(splats, scene, view) for _ in range(REPEATS)) for view in chosen]

@@ -1,4 +1,4 @@
-"""``nsvq doctor [FOLDER]``: whether this machine and a scene folder are fit for training, and what would help."""
+"""``nsvq doctor [FOLDER]``: check whether this machine and a scene folder are fit for training."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ examples:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Look at this machine and, if asked, at a scene folder.
+    """Check this machine and, if given, a scene folder.
 
     Args:
         argv: Arguments after ``nsvq doctor``; those of the process if None.
@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         findings.append(finding)
         if not options.json:
             sys.stdout.write(f"{finding}\n")
-            sys.stdout.flush()  # checks take seconds each
+            sys.stdout.flush()  # each check takes seconds
     problems = sum(finding.verdict == "problem" for finding in findings)
     if options.json:
         from dataclasses import asdict
@@ -84,7 +84,7 @@ def _findings(folder: Path | None) -> Iterator[Finding]:
 
 
 def _self_test() -> Iterator[Finding]:
-    # Imported within the check, which then says what is missing, say OpenCV, and lets the others run.
+    # Imported within the check, which then reports what is missing, such as OpenCV, and lets the others run.
     from nsvq_lightning.commands.doctor.self_test import check_rendering
 
     yield from check_rendering()
@@ -93,11 +93,11 @@ def _self_test() -> Iterator[Finding]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="nsvq doctor",
-        description="Say whether this machine is fit for training, by a test against a float64 oracle, and whether a "
+        description="Check whether this machine is fit for training, by a test against a float64 oracle, and whether a "
         "COLMAP folder is a good scene.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("folder", nargs="?", type=Path, metavar="FOLDER", help="COLMAP folder to look at")
+    parser.add_argument("folder", nargs="?", type=Path, metavar="FOLDER", help="COLMAP folder to check")
     parser.add_argument("--json", action="store_true", help="print JSON instead of lines")
     return parser

@@ -1,4 +1,4 @@
-"""What a check says: one line with a verdict."""
+"""The result of a check: one line with a verdict."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Finding:
 
     Attributes:
         verdict: ``good``; ``note`` for what costs quality or time; ``problem`` for what keeps a run from working.
-        subject: What was looked at, one or two words.
+        subject: What was checked, one or two words.
         text: What was found and, unless it is good, what would help.
         values: The figures behind it, as JSON values.
     """
@@ -49,10 +49,10 @@ def problem(subject: str, text: str, **values: Any) -> Finding:
 
 
 def report(subject: str, check: Check) -> Iterator[Finding]:
-    """The findings of a check; one that breaks is a problem itself and does not keep the others from running."""
+    """The findings of a check; a check that raises is a problem itself and does not keep the others from running."""
     try:
         yield from check()
     except (ValueError, OSError) as error:  # bad files: the message says what and where
         yield problem(subject, " ".join(str(error).split()))
-    except Exception as error:  # whatever this machine or folder makes other people's code do
+    except Exception as error:  # third-party code may fail in any way on this machine or folder
         yield problem(subject, f"the check itself failed: {type(error).__name__}: {' '.join(str(error).split())}")

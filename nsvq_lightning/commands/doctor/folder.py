@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 def check_folder(root: Path) -> Iterator[Finding]:
-    """All findings about a scene folder; never raises for one that cannot be used."""
+    """All findings about a scene folder; an unusable folder is a finding, not an exception."""
     model, failures = _attempt("model", lambda: read_model(root, observations=True))
     yield from failures
     if model is None:
@@ -74,7 +74,7 @@ def _check_extent(scene: Scene) -> Iterator[Finding]:
 
 
 def _attempt(subject: str, make: Callable[[], T]) -> tuple[T | None, list[Finding]]:
-    """What a loader makes, or its error as a finding."""
+    """The result of a loader, or its error as a finding."""
     made: list[T] = []
 
     def check() -> list[Finding]:
@@ -87,7 +87,7 @@ def _attempt(subject: str, make: Callable[[], T]) -> tuple[T | None, list[Findin
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Warnings of the loaders would stand in the middle of the report, which says the same."""
+    """Silence the loaders' warnings, which would appear in the middle of the report that says the same."""
     log = logging.getLogger("nsvq_lightning")
     before, log.level = log.level, logging.ERROR
     try:

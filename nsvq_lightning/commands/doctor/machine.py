@@ -27,15 +27,15 @@ __all__ = [
 ]
 
 PACKAGES = ("lightning", "torchmetrics", "jsonargparse", "scipy", "pycolmap")
-"""What is used beside the packages that :func:`describe_machine` names."""
+"""Packages used besides those that :func:`describe_machine` names."""
 
 OPENCV = tuple(f"opencv-{part}python{screen}" for part in ("contrib-", "") for screen in ("-headless", ""))
-"""Packages that bring ``cv2``; any of them will do."""
+"""Packages that provide ``cv2``; any of them will do."""
 
 SMALL_MEMORY, SMALL_DISK = 4 << 30, 2 << 30
 """Bytes below which a run of usual size may not fit: pictures, splats and moments; checkpoints, report and exports."""
 BUSY = 0.5
-"""Share of the cores that others may use before times are not to be trusted."""
+"""Share of the cores that other processes may use before times become unreliable."""
 
 
 def check_versions() -> Iterator[Finding]:
@@ -55,7 +55,7 @@ def _version(name: str) -> str | None:
 
 
 def check_opencv() -> Iterator[Finding]:
-    """Whether there is an OpenCV, and only one: several overwrite each other's files."""
+    """Whether OpenCV is installed, and only once: several packages overwrite each other's files."""
     installed = [name for name in OPENCV if _version(name) is not None]
     try:
         import cv2
@@ -76,11 +76,11 @@ def check_threads() -> Iterator[Finding]:
     values = {"cores": cores, "torch": torchs, "numba": numbas, "used": used}
     counts = f"{used} used of {cores} cores (torch {torchs}, numba {numbas})"
     if used < cores and _is_apple_silicon() and not {"OMP_NUM_THREADS", "NUMBA_NUM_THREADS"} & os.environ.keys():
-        yield good("threads", f"{counts}: those that are fast; the slow ones would hold them up", **values)
+        yield good("threads", f"{counts}: only the fast ones; slow cores would hold them up", **values)
     elif used < cores:
         yield note("threads", f"{counts}: raise or unset OMP_NUM_THREADS and NUMBA_NUM_THREADS to use all", **values)
     elif used > cores:
-        yield note("threads", f"{counts}: more threads than cores wait for each other; lower OMP_NUM_THREADS", **values)
+        yield note("threads", f"{counts}: more threads than cores block each other; lower OMP_NUM_THREADS", **values)
     else:
         yield good("threads", counts, **values)
     policy = os.environ.get("OMP_WAIT_POLICY", "not set")
@@ -95,12 +95,12 @@ def check_threads() -> Iterator[Finding]:
 
 
 def _is_apple_silicon() -> bool:
-    """Whether torch leaves out the efficiency cores on its own."""
+    """Whether torch skips the efficiency cores on its own."""
     return (platform.system(), platform.machine()) == ("Darwin", "arm64")
 
 
 def check_memory() -> Iterator[Finding]:
-    """Memory that a run may still take."""
+    """Memory that is available to a run."""
     free = available_memory()
     if free is None:
         yield note("memory", "this system does not say how much is available")
@@ -112,7 +112,7 @@ def check_memory() -> Iterator[Finding]:
 
 
 def available_memory() -> int | None:
-    """Bytes that this process may still allocate: of the machine, or of its control group if that is less."""
+    """Bytes that this process may still allocate: of the machine, or of its control group if less."""
     limits = [_meminfo_available(), _group_available()]
     return min((limit for limit in limits if limit is not None), default=None)
 
@@ -126,7 +126,7 @@ def _meminfo_available() -> int | None:
 
 
 def _group_available() -> int | None:
-    """What the container is still allowed; page cache, which is given back when needed, counts as used in it."""
+    """What the container may still allocate; its usage includes page cache, which is reclaimable."""
     group = Path("/sys/fs/cgroup")
     try:
         limit, used = ((group / name).read_text(encoding="ascii").strip() for name in ("memory.max", "memory.current"))
@@ -136,7 +136,7 @@ def _group_available() -> int | None:
 
 
 def check_disk(folder: Path) -> Iterator[Finding]:
-    """Room for checkpoints, report and exports where runs are written."""
+    """Disk space for checkpoints, report and exports where runs are written."""
     free = shutil.disk_usage(folder).free
     text = f"{readable_bytes(free)} free in {folder.resolve()}"
     if free < SMALL_DISK:
@@ -148,5 +148,5 @@ def check_disk(folder: Path) -> Iterator[Finding]:
 
 
 def readable_bytes(count: float) -> str:
-    """A number of bytes for people."""
+    """A number of bytes in readable form."""
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"

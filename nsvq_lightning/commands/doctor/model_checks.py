@@ -1,4 +1,4 @@
-"""What a COLMAP model says about itself: cameras, points, and how the views overlap."""
+"""Checks of a COLMAP model: cameras, points, and how the views overlap."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ __all__ = ["check_cameras", "check_overlap", "check_points", "corner_shift", "sh
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 FEW_POINTS = 1000
 FAR = 10.0
-"""An outlier is this many times as far from the median as four fifths of the points."""
+"""An outlier is this many times farther from the median than four fifths of the points are."""
 MANY_OUTLIERS = 0.02
 SEEN_BY, SEEN_WELL = 3, 0.5
-"""A point of two views may be a wrong match; three confirm each other. At least this share should."""
+"""A point seen by two views may be a wrong match; three confirm each other. At least this share should have three."""
 COMMON, LITTLE_OVERLAP = 15, 0.3
-"""Points that two views must share to count as joined, and the least share of a view's points its best partner has."""
+"""Points that two views must share to count as connected, and the least share of its points with its best partner."""
 SHOWN = 3
 
 
 def check_cameras(model: ColmapModel) -> Iterator[Finding]:
-    """Number, models, sizes, and what distortion does to the corners."""
+    """Number, models and sizes of the cameras, and what distortion does to the corners."""
     used = Counter(image.camera_id for image in model.images)
     cameras = [model.cameras[number] for number in used]
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
@@ -37,7 +37,7 @@ def check_cameras(model: ColmapModel) -> Iterator[Finding]:
     text = f"{len(cameras)} of {'/'.join(names)}, {_sizes(sizes)}, for {len(model.images)} registered photos"
     values = {"cameras": len(cameras), "models": names, "sizes": sizes, "photos": len(model.images)}
     if len(cameras) > max(1, len(model.images) // 2) and len(sizes) <= 2:
-        help_ = "if one lens took them, COLMAP with --ImageReader.single_camera 1 finds it more exactly"
+        help_ = "if one lens took them, COLMAP with --ImageReader.single_camera 1 calibrates it more exactly"
         yield note("cameras", f"{text}: nearly every photo has a camera of its own; {help_}", **values)
     else:
         yield good("cameras", text, **values)
@@ -55,7 +55,7 @@ def _distortion(distorted: list[Any]) -> Finding:
     shifts = [corner_shift(camera) for camera in distorted]
     if not np.isfinite(shifts).all():
         text = "the model of a camera has no values at the corners of its photos; they will be black"
-        return note("distortion", f"{text}: undistort with COLMAP first and look at the result")
+        return note("distortion", f"{text}: undistort with COLMAP first and check the result")
     text = f"moves corners by up to {max(shifts):.1f} px; photos are undistorted when they are decoded"
     return good("distortion", text, largest_shift=max(shifts))
 
@@ -69,7 +69,7 @@ def corner_shift(camera: Any) -> float:
 
 
 def check_points(model: ColmapModel) -> Iterator[Finding]:
-    """Number, outliers, and how many views saw them."""
+    """Number of points, outliers, and how many views saw them."""
     points = model.points
     finite = points[np.isfinite(points).all(1)]
     if not len(finite):
@@ -94,7 +94,7 @@ def check_points(model: ColmapModel) -> Iterator[Finding]:
 def _tracks(model: ColmapModel) -> Finding:
     pairs = model.observations
     if pairs is None or not len(pairs):
-        return note("tracks", "the model has no observations, so what views have in common cannot be told")
+        return note("tracks", "the model has no observations, so the overlap of views is unknown")
     lengths = np.bincount(pairs[:, 0], minlength=len(model.points))
     share = float(np.mean(lengths >= SEEN_BY))
     text = f"{100 * share:.0f} % of the points were seen by {SEEN_BY} views or more, {lengths.mean():.1f} on average"
@@ -105,7 +105,7 @@ def _tracks(model: ColmapModel) -> Finding:
 
 
 def check_overlap(model: ColmapModel) -> Iterator[Finding]:
-    """Whether each view shares points with another, and all are joined."""
+    """Whether each view shares points with another, and all are connected."""
     if model.observations is None or not len(model.observations):
         return
     common = shared_points(model.observations, len(model.images))
@@ -136,10 +136,10 @@ def _some(names: list[str]) -> str:
 
 
 def shared_points(observations: NDArray[np.int64], views: int) -> NDArray[np.int64]:
-    """Number of points that two views both saw ``[V, V]``; on the diagonal those that one saw.
+    """Number of points that two views both saw ``[V, V]``; on the diagonal, those that one view saw.
 
     Args:
-        observations: Rows of point and view of each sighting ``[O, 2]``, each pair once, O > 0.
+        observations: Point row and view row of each observation ``[O, 2]``, each pair once, O > 0.
         views: V.
     """
     ones = np.ones(len(observations), np.int64)

@@ -25,9 +25,9 @@ GAMMA = 2.2
 LOWEST = 4.0
 """Grey level below which noise and black clipping say nothing about exposure."""
 ENOUGH = 30
-"""Points that a view must see before their median brightness is taken for its exposure."""
+"""Points that a view must see for their median brightness to give its exposure."""
 UNEVEN = 0.5
-"""Stops between the darkest and brightest tenth of the photos from which colours visibly disagree."""
+"""Stops between the darkest and brightest tenth of the photos above which colours visibly disagree."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Photo:
     Attributes:
         error: Why it could not be decoded, None if it could.
         brightness: Mean grey level, 0 to 255.
-        exposure: How much brighter than elsewhere it shows the points it saw, in stops; None where it saw too few.
+        exposure: How much brighter than in other photos its points are, in stops; None where it saw too few.
     """
 
     error: str | None = None
@@ -69,13 +69,13 @@ def _rows_by_view(model: ColmapModel) -> Mapping[int, NDArray[np.int64]]:
 
 
 def exposure_of(image: Tensor, camera: Camera, model: ColmapModel, rows: NDArray[np.int64] | None) -> float | None:
-    """Median over points of log2(light in this photo / light of the point's colour, the mean of all photos of it).
+    """Median over points of log2(light in this photo / light of the point's colour, its mean over all photos).
 
     Args:
         image: The photo ``[H, W, 3]`` uint8 RGB.
         camera: Its camera.
         model: The model that has the points.
-        rows: Points of the model that it saw.
+        rows: Points of the model that the photo saw.
 
     Returns:
         Stops; None if it saw too few points that are neither black nor outside the picture.
@@ -102,7 +102,7 @@ def check_photos(scene: Scene, photos: list[Photo], folder: Path) -> Iterator[Fi
     if broken:
         yield problem("photos", f"{len(broken)} of {len(photos)} cannot be used; first: {broken[0]}", errors=broken)
     else:
-        yield good("photos", f"all {len(photos)} registered ones can be read")
+        yield good("photos", f"all {len(photos)} registered photos can be read")
     known = {Path(name).with_suffix("") for name in scene.names}
     files = [path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES]
     extra = sorted(str(path) for path in files if path.with_suffix("") not in known)
@@ -138,14 +138,14 @@ def check_exposure(scene: Scene, photos: list[Photo]) -> Iterator[Finding]:
     middle = f"mean grey level {np.quantile(brightness, 0.1):.0f} to {np.quantile(brightness, 0.9):.0f}"
     stops = np.array([photo.exposure for photo in photos if photo.exposure is not None])
     if len(stops) < len(brightness) / 2:
-        yield good("exposure", f"{middle}; without observations exposure cannot be told from what a photo shows")
+        yield good("exposure", f"{middle}; without observations, exposure and content of a photo cannot be separated")
         return
     low, high = np.quantile(stops, 0.1), np.quantile(stops, 0.9)
     values = {"stops": [float(low), float(high)], "grey": [float(b) for b in brightness]}
     text = f"{middle}; the same points are {low:+.2f} to {high:+.2f} stops from their usual brightness"
     if high - low > UNEVEN:
         worst = max((p.exposure, name) for p, name in zip(photos, scene.names, strict=True) if p.exposure is not None)
-        help_ = "lock exposure and white balance, or even the photos out"
+        help_ = "lock exposure and white balance, or equalize the photos"
         yield note("exposure", f"{text} (brightest {worst[1]}): colours disagree; {help_}", **values)
     else:
         yield good("exposure", text, **values)

@@ -1,4 +1,4 @@
-"""Each fast back-end against the float64 oracle, on a scene of seconds."""
+"""Test each fast back-end against the float64 oracle, on a scene that takes seconds."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ __all__ = ["check_rendering", "rendering_errors"]
 
 SPLATS, WIDTH, HEIGHT = 4000, 96, 72
 LARGEST_ERROR = 1e-3
-"""Relative error that passes: rounding stays below 1e-4; one splat at α = 1/255 that falls the other way takes more."""
+"""Largest relative error that passes: rounding stays below 1e-4, but a splat that crosses α = 1/255 costs more."""
 REPEATS = 5
 
 
 def check_rendering() -> Iterator[Finding]:
-    """Image and gradients of every usable back-end."""
+    """Check image and gradients of every usable back-end."""
     workload = _small(synthetic_workload("A20k"))
     truth = _render(workload, "reference", torch.float64, "cpu")
     for backend, device in usable_backends().items():
@@ -36,12 +36,12 @@ def check_rendering() -> Iterator[Finding]:
 
 
 def rendering_errors(results: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, float]:
-    """Relative error of the image and of the gradient of each attribute; NaN where a number is not finite."""
+    """Relative error of the image and of the gradient of each attribute; NaN where a value is not finite."""
     return {name: relative_l2(results[name].cpu(), value) for name, value in truth.items()}
 
 
 def _judge(backend: str, errors: dict[str, float], ms: float, first: float) -> Finding:
-    # Asked this way round so that NaN fails.
+    # "not <" rather than ">=", so that NaN fails.
     wrong = [name for name, error in errors.items() if not error < LARGEST_ERROR]
     worst = max((error for name, error in errors.items() if name != "image"), default=0.0)
     values = {"backend": backend, "errors": errors, "ms": ms, "first_seconds": first}

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 __all__ = ["code_bits", "pack_fields", "packed_bytes", "unpack_fields"]
 
 _CHUNK = 1 << 14
-"""Rows at a time: a multiple of 8, so that every chunk ends on a whole byte; its bits stay in the cache."""
+"""Rows per chunk: a multiple of 8, so that every chunk ends on a whole byte, and small enough for the cache."""
 
 _MAX_BITS = 32
 
 
 def code_bits(codes: int) -> int:
-    """Bits that tell ``codes`` values apart: ⌈log2 codes⌉, and 0 for a single one.
+    """Bits that distinguish ``codes`` values: ⌈log2 codes⌉, and 0 for a single one.
 
     Raises:
         ValueError: ``codes`` is not in 1..2³².
@@ -32,14 +32,14 @@ def packed_bytes(rows: int, widths: Sequence[int]) -> int:
 
 
 def pack_fields(fields: Sequence[NDArray[np.integer]], widths: Sequence[int]) -> bytes:
-    """Pack one record a row: field after field, lowest bit first, rows without any padding between them.
+    """Pack one record per row: field after field, lowest bit first, rows without any padding between them.
 
     Bit ``b`` of the stream is bit ``b % 8`` of byte ``b // 8``; row ``i`` starts at bit ``i · Σ widths``; the bits
     after the last row are 0.
 
     Args:
         fields: Non-negative integer arrays ``[N]``, at least one.
-        widths: Bits of each field, 0 to 32. A field of 0 bits holds only zeros and takes no room.
+        widths: Bits of each field, 0 to 32. A field of 0 bits holds only zeros and takes no space.
 
     Returns:
         :func:`packed_bytes` bytes.
@@ -68,10 +68,10 @@ def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) ->
         widths: Bits of each field, 0 to 32.
 
     Returns:
-        One array ``[N]`` a field: uint16 up to 16 bits, uint32 above.
+        One array ``[N]`` per field: uint16 up to 16 bits, uint32 above.
 
     Raises:
-        ValueError: ``data`` has not exactly :func:`packed_bytes` bytes.
+        ValueError: ``data`` does not have exactly :func:`packed_bytes` bytes.
     """
     _check_widths(widths)
     if len(data) != packed_bytes(rows, widths):

@@ -1,4 +1,4 @@
-"""Order the rows of a codebook so that like rows have like numbers: leaves of a tree of halvings."""
+"""Order the rows of a codebook so that similar rows have similar indices: the leaves of a tree of halvings."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from nsvq_lightning.compute.memory import check_table
 __all__ = ["leaf_paths", "sibling_distance", "tree_order"]
 
 _ITERATIONS = 4
-"""Steps of the power iteration for the direction of a cut. It need not be exact: 12 save another 0.02 % of a file."""
+"""Power-iteration steps for the direction of a cut. It need not be exact: 12 would save another 0.02 % of a file."""
 
 
 def tree_order(codebook: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Numbers ``[K]`` of the rows of ``codebook [K, D]`` in the order of the leaves of a tree.
+    """Indices ``[K]`` of the rows of ``codebook [K, D]`` in the order of the leaves of a tree.
 
-    The rows are cut in two halves across the direction in which they differ most, each half again, and so on; of an
-    odd number the first half gets one more.
+    The rows are cut into two halves across the direction in which they differ most, each half again, and so on; for an
+    odd number of rows, the first half gets one more.
 
     Raises:
-        ValueError: It has another shape, or gaps.
+        ValueError: It has another shape, or is not contiguous.
         TypeError: It is not float32.
     """
     check_table("codebook", codebook)
@@ -45,10 +45,10 @@ def leaf_paths(count: int) -> NDArray[np.int64]:
 
 
 def sibling_distance(ordered: NDArray[np.float32]) -> float:
-    """How much two neighbours of an ordered codebook typically differ in a number; 0 for a single row.
+    """How much two neighbours of an ordered codebook typically differ per column; 0 for a single row.
 
-    The median over the pairs of the root mean square over the columns: how far apart codes are where they are dense,
-    and so how exactly they must be stored.
+    It is the median over the pairs of the root mean square over the columns: how far apart codes are where they are
+    dense, and so how exactly they must be stored.
     """
     differences = np.diff(ordered.astype(np.float64), axis=0)[::2]
     return float(np.median(np.sqrt((differences**2).mean(1)))) if differences.size else 0.0
@@ -69,7 +69,7 @@ def _cut(rows, order):  # type: ignore[no-untyped-def]
         for i in range(start, end):
             center += rows[order[i]]
         center /= end - start
-        # The column that varies most is where the search for the direction starts.
+        # The search for the direction starts from the column that varies most.
         product[:] = 0
         for i in range(start, end):
             product += (rows[order[i]] - center) ** 2

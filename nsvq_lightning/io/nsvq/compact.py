@@ -1,15 +1,15 @@
-"""Level ``compact``: what can be seen of a scene, entropy-coded.
+"""Level ``compact``: a scene rounded to what can be seen, entropy-coded.
 
-* Splats are in **Morton order** of their positions. A position is stored down to a cell whose width follows the splat's
+* Splats are in **Morton order** of their positions. A position is stored as a cell whose width follows its splat's
   size (:class:`~nsvq_lightning.io.nsvq.precision.Precision`), so scales come first in the file. A splat far outside the
   scene, which would make the grid coarse for all, keeps its position as float32, after the others.
-* Codes are **paths down a tree** of the codebook's rows, which are in an order where like rows are neighbours; a
-  decision is predicted from the codes of two splats near by. Rows that no splat uses are left out, equal ones are one.
-* Codebooks are integer multiples of a step that follows the distance between codes. Quaternions are normalised before.
-* Opacities are equal steps of [0, 1], coded like codes.
+* Codes are **paths down a tree** of the codebook's rows, which are ordered so that similar rows are neighbours; a
+  decision is predicted from the codes of two nearby splats. Rows that no splat uses are left out, equal rows merged.
+* Codebooks are integer multiples of a step that follows the distance between codes. Quaternions are normalised first.
+* Opacities are rounded to equal steps of [0, 1] and coded like codes.
 * Attributes without a codebook are integer multiples of a step.
 
-Nothing is decoded by floating-point numbers that two machines might round differently.
+Decoding never depends on floating-point arithmetic that two machines might round differently.
 
 ==========================  ================================================================================
 stream                      content
@@ -60,9 +60,9 @@ _T = TypeVar("_T")
 
 _GRID = struct.Struct("<qqqd")
 _MOST_A_BYTE = 4096
-"""Splats, or rows of a codebook, a byte of their streams: chances have a floor, so no honest file comes near."""
+"""Limit on splats or codebook rows per byte of stream; probabilities have a floor, so valid files have fewer."""
 _LARGEST_LOG_SIZE = 300.0
-"""Logarithm of a size, scene units, that float64 still holds together with its multiples."""
+"""Largest logarithm of a size in scene units whose multiples float64 still holds."""
 
 _STREAMS = {"grid": ("means.grid", "means", "means.far"), "codes": ("{}.codebook", "{}"), "steps": ("{}",)}
 _ENCODINGS = {"means.grid": "grid", "means": "keys", "means.far": "float32"}
@@ -75,8 +75,8 @@ class _Stored(NamedTuple):
 
     Attributes:
         entry: Its line in the header.
-        values: Codes ``[N]`` (row of the codebook, or level) or integers ``[N, D]``, one row a splat.
-        codebook: Integers ``[K, D]`` of the codebook, None without one.
+        values: Codes ``[N]`` (row of the codebook, or level) or integers ``[N, D]``, one row per splat.
+        codebook: Integers ``[K, D]`` of the codebook; None if there is none.
     """
 
     entry: AttributeEntry
@@ -96,11 +96,11 @@ def encode_compact(scene: CompressedScene, precision: Precision | None = None) -
     """Header and streams of a scene.
 
     Args:
-        scene: The scene, all numbers finite.
-        precision: Its largest errors.
+        scene: The scene, all values finite.
+        precision: The largest errors.
 
     Raises:
-        ValueError: A number is not finite, or so large that it has no step.
+        ValueError: A value is not finite, or too large for its step.
     """
     precision = precision or Precision()
     _check_finite({"means": scene.means, "opacities": scene.opacities, **scene.raw})
@@ -152,7 +152,7 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
     """Scene from header and streams.
 
     Raises:
-        FormatError: The tables are not those of this level, or a stream does not hold what they say.
+        FormatError: The tables do not belong to this level, or a stream does not hold what they say.
     """
     entries = _checked_tables(header)
     n = header.splats
@@ -205,7 +205,7 @@ def _stored(scene: CompressedScene, name: str, dim: int, precision: Precision) -
 def _compacted(
     name: str, codebook: NDArray[np.float32], codes: NDArray[np.integer]
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """The rows that are used, each once, and the codes into them."""
+    """The rows in use, each once, and the codes into them."""
     used = np.bincount(codes, minlength=len(codebook)) > 0
     rows = codebook[used] if len(codes) else np.zeros_like(codebook[:1])
     _check_finite({f"codebook of {name}": rows})
@@ -214,7 +214,7 @@ def _compacted(
 
 
 def _normalised(quats: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Unit quaternions of the same rotations; that of a zero is the identity, as it is rendered."""
+    """Unit quaternions of the same rotations; zero becomes the identity, as in rendering."""
     rows = quats.astype(np.float64)
     norm = np.linalg.norm(rows, axis=1, keepdims=True)
     identity = np.array([1.0, 0.0, 0.0, 0.0])
@@ -240,13 +240,13 @@ def _levels(logits: NDArray[np.float32], count: int) -> _Stored:
 
 
 def _doublings(sums: NDArray[np.int64], step: float, for_size_one: float) -> NDArray[np.float64]:
-    """Base-2 logarithm ``[N]`` of the widest cell of each splat in steps of the grid.
+    """Base-2 logarithm ``[N]`` of the width of each splat's widest cell, in steps of the grid.
 
-    Sums, products and quotients only, whose rounding is the same everywhere: the depth of a key hangs on it.
+    It uses only sums, products and quotients, whose rounding is the same everywhere: key depths depend on it.
 
     Args:
-        sums: Sum of the three integers ``[N]`` of each splat's log-scales.
-        step: What these are multiples of.
+        sums: Sum ``[N]`` of the three integers of each splat's log-scales.
+        step: The step that these are multiples of.
         for_size_one: The result for a splat of size 1.
     """
     factor = step / 3 / math.log(2.0)
@@ -263,7 +263,7 @@ def _before(count: int) -> NDArray[np.int32]:
 
 
 def _neighbours(keys: NDArray[np.uint64], depths: NDArray[np.int64], count: int) -> NDArray[np.int32]:
-    """Two near rows ``[N, 2]`` before each row; for the far splats after the keys the two rows before."""
+    """Two near rows ``[N, 2]`` before each row; for the far splats, which follow the keys, the two rows before."""
     half = (np.int64(1) << (AXIS_BITS - depths)) >> 1
     neighbours = _before(count)
     neighbours[: len(keys)] = nearest_before(unmorton(keys) + half[:, None])
@@ -295,7 +295,7 @@ def _decode(entry: AttributeEntry, streams: Mapping[str, memoryview], neighbours
 def _decode_means(
     step: float, scales: _Stored, streams: Mapping[str, memoryview]
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Positions ``[N, 3]``, and two near rows ``[N, 2]`` of each."""
+    """Positions ``[N, 3]``, and two near rows ``[N, 2]`` for each."""
     *base, doublings = _GRID.unpack(streams["means.grid"])
     grid = Grid(step, (base[0], base[1], base[2]))
     far = np.frombuffer(streams["means.far"], "<f4").astype(np.float32).reshape(-1, 3)
@@ -307,7 +307,7 @@ def _decode_means(
 
 
 def _all_of(tasks: Mapping[str, Callable[[], _T]]) -> dict[str, _T]:
-    """Results of independent tasks, run on torch's number of threads; the kernels let each other run."""
+    """Results of independent tasks, run in as many threads as torch uses; the kernels release the GIL."""
     with ThreadPoolExecutor(max_workers=torch.get_num_threads()) as pool:
         futures = {name: pool.submit(task) for name, task in tasks.items()}
         return {name: future.result() for name, future in futures.items()}
@@ -325,7 +325,7 @@ def _stream_names(attributes: tuple[AttributeEntry, ...]) -> list[tuple[str, str
 
 
 def _checked_tables(header: Header) -> dict[str, AttributeEntry]:
-    """Compare with the tables this release would write, before anything is allocated by them."""
+    """Compare with the tables this release would write, before anything is allocated from their sizes."""
     dims = {"means": 3, "opacities": 1, **attribute_dims(header.sh_degree)}
     if [(entry.name, entry.dim) for entry in header.attributes] != [(name, dims[name]) for name in _ORDER]:
         raise FormatError(f"damaged: the attribute table must list {', '.join(_ORDER)}, got {header.attributes}")

@@ -1,7 +1,7 @@
-"""Three kinds of numbers, entropy-coded: paths down a tree, sorted keys, integers. Each to bytes and back.
+"""Entropy coding of paths down a tree, sorted keys, and integers: each to bytes and back.
 
-All three write decisions between two ways with :mod:`nsvq_lightning.io.nsvq.range_coder` and differ in the contexts:
-what a decision's chance is kept by.
+All three write binary decisions with :mod:`nsvq_lightning.io.nsvq.range_coder` and differ in the contexts by which the
+probability of a decision is kept.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ KEY_BITS = 63
 """Bits of a key; the highest is bit 62."""
 
 _MODELLED_BITS = 16
-"""Decisions of a path that have contexts; those below are written plain."""
+"""Decisions of a path that have contexts; those further down are written without a model."""
 
 _LONGEST_PATH = 32
 
 _RELATIONS = 9
-"""What two neighbours say about a decision: each one took another way before, takes 0 now, or takes 1 now."""
+"""What two neighbours say about a decision: each one has left the path before, takes 0 here, or takes 1 here."""
 
 _START = uint64(0xFFFFFFFFFFFFFFFF)
 _WORD_BITS = 32
@@ -55,16 +55,16 @@ _KEY_MASK = uint64((1 << KEY_BITS) - 1)
 def encode_paths(paths: NDArray[np.int64], bits: int, neighbours: NDArray[np.int32]) -> bytes:
     """Bytes of paths ``[N]`` of ``bits`` decisions each, the first one in the highest bit.
 
-    A decision's context is the node of the tree where it is taken, and the ways that two earlier paths took there.
+    A decision's context is the node of the tree where it is taken, and the branches that two earlier paths took there.
 
     Args:
         paths: The paths, in [0, 2^bits).
         bits: Length of each, 0 to 32.
-        neighbours: Two earlier rows ``[N, 2]`` that are likely to be alike, -1 where there is none.
+        neighbours: Two earlier rows ``[N, 2]`` that are likely to be similar, -1 where there is none.
 
     Raises:
-        ValueError: The arrays do not fit together, one has gaps, or a number is out of its range.
-        TypeError: The numbers have other types.
+        ValueError: The arrays do not fit together, one is not contiguous, or a value is out of range.
+        TypeError: A dtype is wrong.
     """
     check_array("paths", paths, (len(neighbours),), INT64)
     _check_paths(bits, neighbours)
@@ -85,9 +85,9 @@ def decode_paths(data: bytes | memoryview, bits: int, neighbours: NDArray[np.int
     """Invert :func:`encode_paths` with the same ``bits`` and ``neighbours``.
 
     Raises:
-        FormatError: There are more or fewer bytes than N paths have.
-        ValueError: As of :func:`encode_paths`.
-        TypeError: The numbers have other types.
+        FormatError: There are more or fewer bytes than N paths take.
+        ValueError: As for :func:`encode_paths`.
+        TypeError: A dtype is wrong.
     """
     _check_paths(bits, neighbours)
     paths, words = np.empty(len(neighbours), np.int64), _words(data)
@@ -97,15 +97,15 @@ def decode_paths(data: bytes | memoryview, bits: int, neighbours: NDArray[np.int
 
 
 def encode_keys(keys: NDArray[np.uint64], depths: NDArray[np.int64]) -> bytes:
-    """Bytes of ascending keys ``[N]``, of each only its ``depths [N]`` highest bits of 63; the others must be 0.
+    """Bytes of ascending keys ``[N]``, of each only the highest ``depths [N]`` of 63 bits; the others must be 0.
 
-    Written is the difference to the key before, in units of the key's own depth: how many bits it has by an adaptive
-    model, those after the first plain. So the order of N points, which nobody needs, costs nothing: about log2(N!) bits
-    fewer than the keys as they are.
+    What is written is the difference from the previous key, in units of the key's own depth: its number of bits by an
+    adaptive model, and the bits after the first without a model. So the order of N points, which nobody needs, costs
+    nothing: about log2(N!) bits fewer than the keys themselves.
 
     Raises:
-        ValueError: The arrays do not fit together, one has gaps, or the numbers do not ascend or are out of range.
-        TypeError: The numbers have other types.
+        ValueError: The arrays do not fit together, one is not contiguous, or keys do not ascend or are out of range.
+        TypeError: A dtype is wrong.
     """
     _check_depths(depths)
     check_array("keys", keys, (len(depths),), UINT64)
@@ -125,8 +125,8 @@ def decode_keys(data: bytes | memoryview, depths: NDArray[np.int64]) -> NDArray[
     """Invert :func:`encode_keys` with the same ``depths``.
 
     Raises:
-        FormatError: There are more or fewer bytes than N keys have.
-        ValueError: As of :func:`encode_keys`.
+        FormatError: There are more or fewer bytes than N keys take.
+        ValueError: As for :func:`encode_keys`.
         TypeError: The depths are not int64.
     """
     _check_depths(depths)
@@ -136,14 +136,14 @@ def decode_keys(data: bytes | memoryview, depths: NDArray[np.int64]) -> NDArray[
 
 
 def encode_integers(values: NDArray[np.int64]) -> bytes:
-    """Bytes of integers ``[N, D]`` below 2⁶² in size.
+    """Bytes of integers ``[N, D]`` of absolute value below 2⁶².
 
-    Each column is written as it is or as differences from row to row, whichever is smaller; one byte a column says so.
-    Of a number is written how many bits it has, by an adaptive model of its column, its sign, the bit after the leading
-    one by a model, and the others plain.
+    Each column is written as values or as differences from row to row, whichever is smaller; one byte per column says
+    which. An integer is written as its number of bits, by an adaptive model of its column, its sign, the bit after the
+    leading one by a model, and the other bits without a model.
 
     Raises:
-        ValueError: The values are not ``[N, D]``, have gaps, or one is too large.
+        ValueError: The values are not ``[N, D]``, not contiguous, or one is too large.
         TypeError: They are not int64.
     """
     check_array("values", values, values.shape, INT64)
@@ -161,7 +161,7 @@ def decode_integers(data: bytes | memoryview, rows: int, columns: int) -> NDArra
     """Invert :func:`encode_integers`.
 
     Raises:
-        FormatError: There are more or fewer bytes than these integers have.
+        FormatError: There are more or fewer bytes than these integers take.
     """
     if len(data) < columns:
         raise FormatError(f"damaged: {len(data)} bytes for {columns} columns of integers")
@@ -175,7 +175,7 @@ def decode_integers(data: bytes | memoryview, rows: int, columns: int) -> NDArra
 
 
 def _room(bits: int) -> NDArray[np.uint32]:
-    """Words that certainly hold so many modelled bits: a surprise costs 11 bits, not one."""
+    """Enough words for this many modelled bits: an unlikely bit costs up to 11 bits."""
     return np.zeros(11 * bits // _WORD_BITS + 4, np.uint32)
 
 
@@ -185,12 +185,12 @@ def _bytes(words: NDArray[np.uint32], used: int) -> bytes:
 
 def _words(data: bytes | memoryview) -> NDArray[np.uint32]:
     if len(data) % 4:
-        raise FormatError(f"damaged: an entropy-coded stream of {len(data)} bytes, which is no multiple of 4")
+        raise FormatError(f"damaged: an entropy-coded stream of {len(data)} bytes, not a multiple of 4")
     return np.frombuffer(data, "<u4").astype(np.uint32, copy=False)
 
 
 def _check_used(words: NDArray[np.uint32], used: int) -> None:
-    """The decoder looks one word ahead of the last one."""
+    """Refuse a stream that is not used up; the decoder reads one word ahead."""
     if used > len(words) + 1 or used < len(words):
         raise FormatError(f"damaged: an entropy-coded stream of {len(words)} words, of which {used - 1} were read")
 
@@ -200,19 +200,19 @@ def _check_used(words: NDArray[np.uint32], used: int) -> None:
 
 @inline
 def _path_of(paths, row):  # type: ignore[no-untyped-def]
-    """The path of a row, or -1 without one, which agrees with no other."""
+    """The path of a row, or -1 without a row, which agrees with no path."""
     return paths[row] if row >= 0 else np.int64(-1)
 
 
 @inline
 def _way(neighbour, path, left):  # type: ignore[no-untyped-def]
-    """What a neighbour's path did at a decision with ``left`` more to come: 1 or 2, or 0 if it had left ``path``."""
+    """What a neighbour's path did at a decision with ``left`` more to come: 1 or 2, or 0 if it has left ``path``."""
     return 1 + ((neighbour >> left) & 1) if neighbour >> (left + 1) == path else 0
 
 
 @inline
 def _context(first, second, path, left, bits):  # type: ignore[no-untyped-def]
-    """The node where a decision is taken, and the ways of the two neighbours there."""
+    """The node where a decision is taken, and the branches of the two neighbours there."""
     node = (np.int64(1) << (bits - 1 - left)) + path
     return _RELATIONS * node + 3 * _way(first, path, left) + _way(second, path, left)
 
@@ -252,12 +252,12 @@ def _read_paths(words, bits, neighbours, paths, contexts):  # type: ignore[no-un
 # Lengths of numbers
 
 _LENGTH_BITS = 6
-"""Decisions that tell the bits of a number, 0 to 63."""
+"""Decisions that encode a number's bit length, 0 to 63."""
 
 
 @inline
 def _length(size):  # type: ignore[no-untyped-def]
-    """Bits of a number; 0 for 0."""
+    """Bit length of a number; 0 for 0."""
     length = 0
     while length < KEY_BITS and size >> uint64(length):
         length += 1
@@ -298,13 +298,13 @@ def _read_length(start, contexts, code, width, words, used):  # type: ignore[no-
 # Keys
 
 _BEFORE = 11
-"""Classes of the size of the difference before."""
+"""Number of size classes of the previous difference."""
 _KEY_CONTEXTS = (KEY_BITS + 1) * _BEFORE << _LENGTH_BITS
 
 
 @inline
 def _key_context(depth, before):  # type: ignore[no-untyped-def]
-    """Start of the contexts of a key of this depth, after a difference with its highest bit at ``before``."""
+    """First context of a key of this depth, after a difference with its highest bit at ``before``."""
     return (depth * _BEFORE + before // 6) << _LENGTH_BITS
 
 
@@ -331,7 +331,7 @@ def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
         shift = uint64(KEY_BITS - depths[i])
         start = _key_context(depths[i], before)
         length, code, width, used = _read_length(start, contexts, code, width, words, used)
-        # Only an altered stream has a step that is longer than its key.
+        # Only an altered stream has a difference longer than its key.
         length = min(length, depths[i])
         rest, code, width, used = decode_plain(length - 1, code, width, words, used)
         step = (uint64(1) << uint64(length - 1)) | rest if length else uint64(0)
@@ -344,17 +344,17 @@ def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
 # Integers
 
 _INTEGER_CONTEXTS = 2 << _LENGTH_BITS
-"""Contexts of a column: the tree of the lengths, and the second bit by the length."""
+"""Contexts per column: the tree of the lengths, and the second bit by length."""
 
 
 def _bit_lengths(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Bits of each number's size; 0 for 0."""
+    """Bit length of each absolute value; 0 for 0."""
     exponents: NDArray[np.int64] = np.frexp(np.abs(values).astype(np.float64))[1].astype(np.int64)
     return exponents
 
 
 def _size(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """About how many bits each column takes."""
+    """Approximate number of bits of each column."""
     total: NDArray[np.int64] = _bit_lengths(values).sum(0)
     return total
 

@@ -40,7 +40,7 @@ def encode(
         ValueError: Unknown level, or ``config`` is not made of JSON values.
     """
     check_level(level)
-    # The level's module only: entropy coding waits for Numba, which level ``paper`` has no use for.
+    # Import only the level's module: entropy coding needs Numba, which level ``paper`` does without.
     if level == "compact":
         from nsvq_lightning.io.nsvq.compact import encode_compact
 
@@ -56,7 +56,7 @@ def write_nsvq(
     level: str = DEFAULT_LEVEL,
     precision: Precision | None = None,
 ) -> int:
-    """Write a scene to a file, replaced atomically; arguments and errors as of :func:`encode`.
+    """Write a scene to a file, replaced atomically; arguments and errors are those of :func:`encode`.
 
     Returns:
         Bytes of the file.
@@ -70,7 +70,7 @@ def write_nsvq(
 def as_stored(scene: CompressedScene, storage: Storage) -> CompressedScene:
     """What the ``.nsvq`` file of a scene decodes to, for files of other formats that hold the same splats.
 
-    A scene without codebooks stays as it is: rounding it would only cost quality, and its record is the ``.ply``.
+    A scene without codebooks stays as it is: rounding it would only cost quality, and its reference is the ``.ply``.
     """
     if not scene.codes:
         return scene
@@ -79,10 +79,10 @@ def as_stored(scene: CompressedScene, storage: Storage) -> CompressedScene:
 
 
 def read_nsvq(path: str | os.PathLike[str]) -> CompressedScene:
-    """Read a scene: of level ``paper`` exactly what was written, of ``compact`` within its precision, splats reordered.
+    """Read a scene: exact for level ``paper``; within its precision, with splats reordered, for ``compact``.
 
     Raises:
-        FormatError: The file is truncated, altered, of a newer version or level, or no ``.nsvq`` file.
+        FormatError: The file is truncated, altered, of a newer version or level, or not a ``.nsvq`` file.
     """
     header, streams = read_frame(path)
     with naming_file(path):
@@ -94,7 +94,7 @@ def decode(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene
     """Scene from header and streams of any level.
 
     Raises:
-        FormatError: Of a newer level, or the streams are not what the header says.
+        FormatError: The level is newer, or the streams do not match the header.
     """
     if header.level == "compact":
         from nsvq_lightning.io.nsvq.compact import decode_compact

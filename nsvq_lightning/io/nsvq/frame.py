@@ -11,8 +11,8 @@ offset        bytes  content
 32 + J        rest   streams, back to back in the order of the stream table
 ============  =====  ==========================================================================================
 
-Nothing in the file is executable, and every length is checked against the bytes at hand before it is used. New levels
-add attributes' storage kinds, stream names and stream encodings; the frame stays.
+Nothing in the file is executable, and every length is checked against the available bytes before it is used. New levels
+add storage kinds of attributes, stream names and stream encodings; the frame stays the same.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ def frame(header: Header, streams: Mapping[str, bytes]) -> list[bytes]:
 
 
 def with_origin(data: bytes, origin: tuple[float, float, float]) -> bytes:
-    """A whole file whose positions are relative to another point of the world; all else is as it was.
+    """A whole file with another origin for its positions; all else is unchanged.
 
     Raises:
-        FormatError: As of :func:`unframe`.
+        FormatError: As for :func:`unframe`.
     """
     header, streams = unframe(data)
     return b"".join(frame(replace(header, origin=origin), {name: bytes(part) for name, part in streams.items()}))
@@ -94,11 +94,11 @@ def unframe(data: bytes) -> tuple[Header, dict[str, memoryview]]:
 
 
 def read_frame(path: str | os.PathLike[str]) -> tuple[Header, dict[str, memoryview]]:
-    """:func:`unframe` of a file, its name in every error."""
+    """:func:`unframe` for a file, with its name in every error."""
     with naming_file(path):
         return unframe(Path(path).read_bytes())
 
 
 def read_header(path: str | os.PathLike[str]) -> Header:
-    """Header of a ``.nsvq`` file, the checksum of the whole file verified."""
+    """Header of a ``.nsvq`` file, after verifying the checksum of the whole file."""
     return read_frame(path)[0]

@@ -14,7 +14,7 @@ from nsvq_lightning.io.errors import FormatError
 __all__ = ["PREFIX_BYTES", "AttributeEntry", "Header", "StreamEntry", "tile"]
 
 PREFIX_BYTES = 32
-"""Bytes in front of the JSON, see :mod:`nsvq_lightning.io.nsvq.frame`."""
+"""Bytes before the JSON, see :mod:`nsvq_lightning.io.nsvq.frame`."""
 
 _T = TypeVar("_T")
 
@@ -25,12 +25,12 @@ class AttributeEntry:
 
     Attributes:
         name: Attribute, for example ``quats``.
-        dim: Numbers a splat, D.
-        storage: ``raw`` (float32, one row a splat), ``codes`` (rows of a codebook), ``steps`` (integers, one row a
-            splat), ``levels`` (shares of 1), or ``grid`` (cells of a grid).
+        dim: Values per splat, D.
+        storage: ``raw`` (float32, one row per splat), ``codes`` (rows of a codebook), ``steps`` (integers, one row per
+            splat), ``levels`` (equal steps of [0, 1]), or ``grid`` (cells of a grid).
         codes: Rows of the codebook K, or number of levels; 0 where there are none.
         bits: Bits of one code before entropy coding; 0 without codes.
-        step: What the integers of this attribute, or of its codebook, are multiples of; 0 for float32.
+        step: Step of which the integers of this attribute, or of its codebook, are multiples; 0 for float32.
     """
 
     name: str
@@ -48,7 +48,7 @@ class StreamEntry:
     Attributes:
         name: What it holds.
         offset: First byte, counted from the end of the header.
-        length: Bytes.
+        length: Number of bytes.
         encoding: How to read it, for example ``float32`` or ``bits``.
     """
 
@@ -135,7 +135,7 @@ class Header:
 
 
 def tile(streams: Sequence[tuple[str, int, str]]) -> tuple[StreamEntry, ...]:
-    """Stream table of streams given as (name, length, encoding), laid back to back."""
+    """Stream table for streams given as (name, length, encoding), back to back."""
     entries: list[StreamEntry] = []
     offset = 0
     for name, length, encoding in streams:
@@ -196,7 +196,7 @@ def _finite(table: object, key: str) -> float:
 
 def _origin(table: object) -> tuple[float, float, float]:
     values = _items(table, "origin", (int, float))
-    # Comparing is safe where float() of a huge integer would overflow.
+    # Comparing is safe; float() of a huge integer would overflow.
     if len(values) != 3 or not all(abs(value) <= sys.float_info.max for value in values):
         raise FormatError("damaged: header entry 'origin' must be three finite numbers")
     return float(values[0]), float(values[1]), float(values[2])

@@ -1,11 +1,12 @@
-"""Level ``paper``: the storage that the paper counts.
+"""Level ``paper``: the storage as the paper counts it.
 
-Positions and opacities are float32, the codes of all quantized attributes one bit-packed stream, codebooks float32:
+Positions and opacities are float32, the codes of all quantized attributes are one bit-packed stream, and codebooks are
+float32:
 
     16 · N + ⌈N · Σ bits / 8⌉ + Σ 4 · K · D + header bytes,
 
 with bits = ⌈log2 K⌉ (0 for a single row). An attribute that is not quantized adds 4 · N · D instead of its bits and its
-codebook. The header is the prefix of 32 bytes and the JSON;
+codebook. The header is the 32-byte prefix and the JSON;
 :attr:`nsvq_lightning.io.nsvq.header.Header.size` states it.
 """
 
@@ -28,7 +29,7 @@ _BITS = "bits"
 
 
 def paper_header(scene: CompressedScene) -> Header:
-    """Header of the scene's file; costs nothing, since it depends on counts only."""
+    """Header of the scene's file; cheap, since it depends only on counts."""
     attributes = (
         AttributeEntry("means", 3, "raw"),
         AttributeEntry("opacities", 1, "raw"),
@@ -62,7 +63,7 @@ def decode_paper(header: Header, streams: Mapping[str, memoryview]) -> Compresse
     """Scene from header and streams.
 
     Raises:
-        FormatError: The tables are not those of this level, or a code is not a row of its codebook.
+        FormatError: The tables do not belong to this level, or a code is not a row of its codebook.
     """
     _check_tables(header)
     n = header.splats
@@ -105,7 +106,7 @@ def _layout(n: int, attributes: tuple[AttributeEntry, ...]) -> list[tuple[str, i
 
 
 def _check_tables(header: Header) -> None:
-    """Compare with the tables this release would write, before anything is allocated by them."""
+    """Compare with the tables this release would write, before anything is allocated from their sizes."""
     dims = {"means": 3, "opacities": 1, **attribute_dims(header.sh_degree)}
     if [(entry.name, entry.dim) for entry in header.attributes] != list(dims.items()):
         raise FormatError(f"damaged: the attribute table must list {dims}, got {header.attributes}")

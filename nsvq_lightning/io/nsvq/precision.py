@@ -1,4 +1,4 @@
-"""How a scene is stored: level, and how exactly."""
+"""How a scene is stored: at which level, and how exactly."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 __all__ = ["DEFAULT_LEVEL", "LEVELS", "MOST_OPACITY_LEVELS", "OPACITY_ERRORS", "Precision", "Storage", "check_level"]
 
 LEVELS = ("compact", "paper")
-"""Compression levels: ``compact`` is small, ``paper`` stores float32 and whole bits, as the paper counts."""
+"""Compression levels: ``compact`` is small; ``paper`` stores float32 values and whole bits, as the paper counts."""
 
 DEFAULT_LEVEL = "compact"
 
 MOST_OPACITY_LEVELS = 1 << 20
-"""Readers refuse files with more."""
+"""Largest number of opacity levels that readers accept."""
 
 OPACITY_ERRORS = 0.5 / MOST_OPACITY_LEVELS, 0.25
 """Smallest and largest error that the opacity may have."""
@@ -27,17 +27,17 @@ class Precision:
 
     Attributes:
         position: Of each coordinate, as a share of the splat's size: the geometric mean of its axis lengths. Small
-            splats get more digits than large ones, down to 2⁻²¹ of the extent of the scene; the smallest thousandth of
-            them gets no more than the others.
+            splats get finer positions than large ones, down to 2⁻²¹ of the extent of the scene; the smallest thousandth
+            of them gets none finer than the rest.
         opacity: Of the opacity, which is in [0, 1]; at least 2⁻²¹.
-        codebook: Of the numbers of a codebook, as a share of how much neighbouring codes typically differ.
-        scales: Of logarithms of axis lengths without a codebook; 0.01 is one per cent of the length.
+        codebook: Of the values of a codebook, as a share of how much neighbouring codes typically differ.
+        scales: Of log-scales without a codebook; 0.01 is one per cent of the length.
         quats: Of the components of normalised quaternions without a codebook.
         sh0: Of constant colour coefficients without a codebook.
         shN: Of higher colour coefficients without a codebook.
 
     Raises:
-        ValueError: A number is not positive and finite, or the opacity's is above 1/4 or below 2⁻²¹.
+        ValueError: A value is not positive and finite, or that of the opacity is above 1/4 or below 2⁻²¹.
     """
 
     position: float = 0.05
@@ -83,12 +83,12 @@ class Storage:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Storage:
-        """The settings from plain data, as a checkpoint keeps them."""
+        """The settings from plain data, as stored in a checkpoint."""
         return cls(values["level"], Precision(**values["precision"]))
 
 
 def check_level(level: str) -> None:
-    """Refuse a level that there is not.
+    """Refuse an unknown level.
 
     Raises:
         ValueError: Unknown level.

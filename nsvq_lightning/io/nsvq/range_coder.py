@@ -1,10 +1,10 @@
-"""Binary arithmetic coding with adaptive probabilities, in integers only: every machine decodes the same numbers.
+"""Binary arithmetic coding with adaptive probabilities, in integers only: every machine decodes the same values.
 
-A range coder (Martin 1979) with a window of 64 bits that moves by words of 32: the interval ``[low, low + width)`` is
-divided in proportion to the chance of a bit. A carry out of ``low`` is added to the words that are written already.
+A range coder (Martin 1979) with a 64-bit window that moves by 32-bit words: the interval ``[low, low + width)`` is
+divided in proportion to the probability of a bit. A carry out of ``low`` is added to the words already written.
 
-The chance of a bit is kept per *context* as a 16-bit number that moves towards each bit it meets, by 1/(n + 1.6) at the
-n-th and by 1/128 at last: as exact as a count at the start, as quick as a running mean later on.
+The probability of a bit is kept per *context* as a 16-bit number that moves towards each bit it meets, by 1/(n + 1.6)
+at the n-th and finally by 1/128: as exact as a count at first, as adaptive as a running mean later.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ __all__ = [
 ]
 
 COUNT_LIMIT = 126
-"""Bits after which the chance of a context moves at its slowest."""
+"""Number of bits after which the probability of a context moves at its slowest."""
 
 _RATES = np.rint(65536 / (np.arange(COUNT_LIMIT + 1) + 1.6)).astype(np.int64)
 _LEAST = 48
-"""No chance is below 48/65536: a surprise costs at most 11 bits."""
+"""No probability is below 48/65536: an unlikely bit costs at most 11 bits."""
 
 PLAIN_BITS = 16
-"""Bits that are written at once without a model."""
+"""Largest number of bits written at once without a model."""
 
 _FULL = uint64(0xFFFFFFFFFFFFFFFF)
 _LOW_WORD = uint64(0xFFFFFFFF)
 
 
 def new_contexts(count: int) -> NDArray[np.uint32]:
-    """States ``[count]``: the chance of the bit 1 in 65536ths times 256, plus how many bits were met."""
+    """States ``[count]``: the probability of a 1 in 65536ths times 256, plus how many bits were met."""
     return np.full(count, 1 << 23, np.uint32)
 
 
@@ -52,7 +52,7 @@ def _chance(context, contexts):
 
 @inline
 def _learn(bit, context, contexts):
-    """Move the chance towards the bit. Without branches: which way they go is what is not known."""
+    """Move the probability towards the bit; without branches, which would be unpredictable."""
     n = np.int64(contexts[context] & uint32(255))
     chance = np.int64(contexts[context] >> uint32(8))
     target = _LEAST + np.int64(bit) * (65536 - 2 * _LEAST)
@@ -62,7 +62,7 @@ def _learn(bit, context, contexts):
 
 @inline
 def _carry(words, used):
-    """Add one to the number that the words make up."""
+    """Add one to the number that the written words form."""
     last = used - 1
     while words[last] == _LOW_WORD:
         words[last] = 0
@@ -112,7 +112,7 @@ def encode_plain(value, bits, low, width, words, used):
 
 @inline
 def encode_end(low, words, used):
-    """Write the one word that tells the last interval apart; returns the number of words."""
+    """Write the one word that identifies the last interval; returns the number of words."""
     if low > _FULL - _LOW_WORD:
         _carry(words, used)
         words[used] = 0
@@ -123,7 +123,7 @@ def encode_end(low, words, used):
 
 @inline
 def _word(words, at):
-    """A word of the stream; zeros follow its end."""
+    """A word of the stream; 0 beyond its end."""
     return uint64(words[at]) if at < len(words) else uint64(0)
 
 
@@ -163,7 +163,7 @@ def decode_plain(bits, code, width, words, used):
         now = min(bits, PLAIN_BITS)
         bits -= now
         width >>= uint64(now)
-        # Only an altered stream has more than fits.
+        # Only an altered stream exceeds the range.
         digit = min(code // width, uint64((1 << now) - 1))
         code -= digit * width
         value = (value << uint64(now)) | digit

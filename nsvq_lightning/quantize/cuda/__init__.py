@@ -1,1 +1,1 @@
-"""The quantizers' CUDA kernels in Triton, compiled where they run; each mirrors a module of the folder above."""
+"""The quantizers' CUDA kernels in Triton, compiled where they run; each module mirrors one in the folder above."""

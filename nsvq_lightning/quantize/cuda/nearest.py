@@ -1,12 +1,12 @@
 """Exact nearest code on a GPU: a running minimum over all codes, whose distances never leave the registers.
 
-Distances are sums of squared differences in float32, one fused multiply-add a number in the order of the columns: what
-decides on the CPU too, so both choose the same code to the bit. Differences need no centring and lose nothing to
-cancellation, which dot products would (and TF32 would give most rows a wrong code); they cost twice the arithmetic.
+Distances are sums of squared differences in float32, one fused multiply-add per element in column order. The CPU
+decides by the same sums, so both always choose the same code. Differences need no centring and lose nothing to
+cancellation, as dot products would (and TF32 would give most rows a wrong code); they cost twice the arithmetic.
 
-Rows and codes lie column by column and are padded to whole tiles, so that no load of the inner loop has a mask. A
-program is one warp, of which a thread compares 8 rows with 4 codes: 12 loads for 32 differences. The programs of a
-multiprocessor pass over the codes side by side and find them in its first-level cache.
+Rows and codes are stored column by column and padded to whole tiles, so that no load of the inner loop has a mask. A
+program is one warp, in which a thread compares 8 rows with 4 codes: 12 loads for 32 differences. The programs of a
+multiprocessor pass over the codes side by side and find them in its L1 cache.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from nsvq_lightning.compute.memory import check_tensor
 __all__ = ["nearest_codes"]
 
 ROWS = 8
-"""Rows a program searches."""
+"""Rows per program."""
 CODES = 128
-"""Codes it compares them with at a time."""
+"""Codes that a program compares its rows with at a time."""
 
 
 @triton.jit
@@ -32,7 +32,7 @@ def nearest_kernel(
     x, codebook, result, count, num_codes, x_stride, code_stride, DIM: tl.constexpr, ROWS: tl.constexpr,
     CODES: tl.constexpr,
 ):  # fmt: skip
-    """Nearest of the codes ``[DIM, code_stride]``, infinite beyond ``num_codes``, of the rows ``[DIM, x_stride]``."""
+    """Nearest of the codes ``[DIM, code_stride]``, infinite beyond ``num_codes``, to the rows ``[DIM, x_stride]``."""
     begin = tl.program_id(0).to(tl.int64) * ROWS
     row, code = tl.arange(0, ROWS), tl.arange(0, CODES)
     smallest = tl.full([ROWS, CODES], float("inf"), tl.float32)
@@ -44,7 +44,7 @@ def nearest_kernel(
             centre = tl.load(codebook + tl.cast(code_stride, tl.int64) * j + first + code)
             difference = centre[None, :] - value[:, None]
             distance = tl.fma(difference, difference, distance)
-        # Of equal ones the first stays, and what is not a number is no nearer.
+        # Of equally near codes the first is kept, and a NaN is never nearer.
         nearer = distance < smallest
         smallest = tl.where(nearer, distance, smallest)
         chosen = tl.where(nearer, (first + code)[None, :], chosen)
@@ -54,15 +54,15 @@ def nearest_kernel(
 
 
 def nearest_codes(x: Tensor, codebook: Tensor) -> Tensor:
-    """Nearest codes ``[N]`` int64; of equally near ones the lowest, and 0 for a row that is not a number.
+    """Nearest codes ``[N]`` int64; of equally near ones the lowest, and 0 for a row with a NaN.
 
     Args:
         x: float32 rows ``[N, D]`` on a CUDA device.
         codebook: Codes ``[K, D]`` there.
 
     Raises:
-        ValueError: Rows and codes do not fit together, or one has gaps.
-        TypeError: A type differs.
+        ValueError: Rows and codes do not fit together, or one is not contiguous.
+        TypeError: A dtype is wrong.
     """
     check_tensor("x", x, (len(x), codebook.shape[-1]), x.device)
     check_tensor("codebook", codebook, (len(codebook), x.shape[1]), x.device)
@@ -78,7 +78,7 @@ def nearest_codes(x: Tensor, codebook: Tensor) -> Tensor:
 
 
 def _by_column(table: Tensor, multiple: int) -> Tensor:
-    """``[D, M]`` of a table ``[N, D]``, M the next multiple; infinite where there is no row."""
+    """A table ``[N, D]`` transposed to ``[D, M]``, N rounded up to a multiple; infinite where there is no row."""
     count, dim = table.shape
     columns = table.new_full((dim, triton.cdiv(count, multiple) * multiple), torch.inf)
     columns[:, :count] = table.t()

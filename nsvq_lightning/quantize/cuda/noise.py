@@ -1,4 +1,4 @@
-"""The counter-based normal noise of :mod:`nsvq_lightning.quantize.noise` inside a kernel: the same numbers.
+"""The counter-based normal noise of :mod:`nsvq_lightning.quantize.noise` inside a kernel: the same values.
 
 The integers are the same, and the arithmetic after them is the same sequence of roundings, polynomials included.
 """
@@ -57,7 +57,7 @@ def random_bits(seed, counter):
 
 @triton.jit
 def normal(seed, vector, lane):
-    """Numbers ``lane`` (0 to 15) of the vectors ``vector`` (int64) of a seed, standard normal."""
+    """Standard normal values: lanes ``lane`` (0 to 15) of the vectors ``vector`` (int64) of a seed."""
     bits = random_bits(seed, (vector // 2) * 16 + lane)
     radius = ((bits >> 40).to(tl.int32) + 1).to(tl.float32) * UNIT
     turn = (bits & 0xFFFFFF).to(tl.int32).to(tl.float32) * UNIT - 0.5
@@ -72,13 +72,13 @@ def normal(seed, vector, lane):
 
 @triton.jit(do_not_specialize=["seed"])
 def normal_kernel(seed, out, count, BLOCK: tl.constexpr):
-    """The first ``count`` numbers of a seed."""
+    """The first ``count`` values of a seed."""
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     tl.store(out + at, normal(seed, at // 16, (at % 16).to(tl.int32)), mask=at < count)
 
 
 def normal_vectors(seed: int, vectors: int, device: torch.device) -> Tensor:
-    """The first ``vectors`` vectors of 16 standard normal numbers of a seed, ``[vectors · 16]``."""
+    """The first ``vectors`` vectors of 16 standard normal values of a seed, ``[vectors · 16]``."""
     out = torch.empty(vectors * 16, device=device)
     if vectors:
         with torch.cuda.device_of(out):

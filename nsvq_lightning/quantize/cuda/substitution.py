@@ -1,7 +1,7 @@
-"""Substitution of the error on a GPU: gather, residual, noise and result of a row in one pass, gradients in another.
+"""Error substitution on a GPU: gather, residual, noise and result of a row in one pass, gradients in another.
 
-As on the CPU the backward pass takes the direction from the result, not from a second draw: with x̃ - x = ‖r‖ d̂ the
-radial term (g·d̂) r/‖r‖ is (g·(x̃ - x)) r/‖r‖². The noise of a row is that of the CPU's kernel.
+As on the CPU, the backward pass takes the direction from the result, not from a second draw: with x̃ - x = ‖r‖ d̂ the
+radial term (g·d̂) r/‖r‖ is (g·(x̃ - x)) r/‖r‖². The noise of a row is that of the CPU kernel.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from nsvq_lightning.quantize.cuda.sums import sum_rows
 __all__ = ["substitute", "substitute_backward"]
 
 BLOCK = 1024
-"""Numbers a program holds."""
+"""Elements per program."""
 TINY = tl.constexpr(torch.finfo(torch.float32).tiny)
 
 
@@ -27,9 +27,9 @@ TINY = tl.constexpr(torch.finfo(torch.float32).tiny)
 def chosen_rows(
     x, rows, codebook, codes, count, height, num_codes, DIM: tl.constexpr, ROWS: tl.constexpr, WIDTH: tl.constexpr
 ):
-    """Number of each row in the table, place among the chosen ones, which numbers there are, rows and their codes.
+    """Place among the chosen rows, columns, row numbers, masks (inside the tile, and valid), rows, and their codes.
 
-    A row that the table does not have, or whose code the codebook does not have, is NaN; nobody waits here to say so.
+    A row outside the table, or whose code is outside the codebook, is NaN; raising an error would need a sync.
     """
     i = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)[:, None]
     column = tl.arange(0, WIDTH)[None, :]
@@ -44,7 +44,7 @@ def chosen_rows(
 
 @triton.jit
 def inverses(squared):
-    """1/s, and 0 where s is 0 (or its inverse too large): a vector without length has no direction."""
+    """1/s, and 0 where s is 0 (or its inverse too large): a zero vector has no direction."""
     return tl.where(squared > TINY, 1 / tl.where(squared > TINY, squared, 1.0), 0.0)
 
 
@@ -53,11 +53,11 @@ def substitute_kernel(
     seed, aim, spread, x, rows, codebook, codes, out, count, height, num_codes, DIM: tl.constexpr, ROWS: tl.constexpr,
     WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """``x + ‖x − c‖·d/‖d‖`` with ``d = aim·(c − x) + spread·v`` of some rows."""
+    """``x + ‖x − c‖·d/‖d‖`` with ``d = aim·(c − x) + spread·v``, for some rows."""
     i, column, _, inside, _, value, centre = chosen_rows(
         x, rows, codebook, codes, count, height, num_codes, DIM, ROWS, WIDTH
     )
-    # The order of the CPU's vectors of 16: short rows one a lane, long ones along the vectors.
+    # The order of the CPU's vectors of 16: one short row per lane, long rows along the vectors.
     if DIM < 16:
         noise = normal(seed, i // 16 * DIM + column, (i % 16).to(tl.int32))
     else:
@@ -74,7 +74,7 @@ def radial_kernel(
     grad, x, rows, codebook, codes, out, grad_x, radials, count, height, num_codes, DIM: tl.constexpr,
     ROWS: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Gradient of the rows into the table of all rows, and minus its radial term into ``radials``."""
+    """Write the gradient of the rows to the table of all rows, and minus its radial term to ``radials``."""
     i, column, row, inside, there, value, centre = chosen_rows(
         x, rows, codebook, codes, count, height, num_codes, DIM, ROWS, WIDTH
     )
@@ -106,16 +106,16 @@ def substitute(
 
     Args:
         seed: 63 random bits; v is a function of them and of the position in ``rows``.
-        x: Contiguous float32 table ``[N, D]`` on a CUDA device, as all else here.
+        x: Contiguous float32 table ``[N, D]`` on a CUDA device, as are all tensors here.
         rows: Which rows of it, ``[V]`` int64.
         codebook: Codes ``[K, D]``.
         codes: Code of each chosen row, ``[V]`` int64.
-        aim: Weight of the way to the code in the direction d.
-        spread: Weight of the noise in it.
+        aim: Weight of the residual c − x in the direction d.
+        spread: Weight of the noise in d.
 
     Raises:
-        ValueError: The tensors do not fit together, or one has gaps.
-        TypeError: A type differs.
+        ValueError: The tensors do not fit together, or one is not contiguous.
+        TypeError: A dtype is wrong.
     """
     _check(x, rows, codebook, codes)
     out = x.new_empty(len(rows), x.shape[1])
@@ -134,11 +134,11 @@ def substitute_backward(
 ) -> tuple[Tensor, Tensor]:
     """Gradients of ``x [N, D]`` and ``codebook [K, D]`` from that of the result, ``grad [V, D]``.
 
-    ``out [V, D]`` is the result of :func:`substitute`; the ``rows [V]`` must all be different here.
+    ``out [V, D]`` is the result of :func:`substitute`; the ``rows [V]`` must be distinct here.
 
     Raises:
-        ValueError: As of :func:`substitute`.
-        TypeError: A type differs.
+        ValueError: As for :func:`substitute`.
+        TypeError: A dtype is wrong.
     """
     _check(x, rows, codebook, codes)
     for name, table in (("grad", grad), ("out", out)):

@@ -1,4 +1,4 @@
-"""Sums of rows by code on a GPU, in one fixed order: the rows are sorted by code, and a program adds up one code's."""
+"""Sums of rows by code on a GPU, in one fixed order: rows are sorted by code, and one program adds up one code's."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ __all__ = ["sorted_by_code", "sum_rows"]
 ROWS = 16
 """Rows of a code that are added up side by side."""
 WIDTH = 64
-"""Columns a program does at most."""
+"""Largest number of columns per program."""
 
 
 @triton.jit
 def sum_kernel(values, order, offsets, sums, dim, ROWS: tl.constexpr, WIDTH: tl.constexpr):
-    """Sum the rows ``order[offsets[code]:offsets[code + 1]]`` of a code, in the dtype of ``sums``."""
+    """Sum a code's rows ``order[offsets[code]:offsets[code + 1]]`` in the dtype of ``sums``."""
     code = tl.program_id(0).to(tl.int64)
     column = tl.program_id(1) * WIDTH + tl.arange(0, WIDTH)[None, :]
     begin, end = tl.load(offsets + code), tl.load(offsets + code + 1)
@@ -35,8 +35,8 @@ def sum_kernel(values, order, offsets, sums, dim, ROWS: tl.constexpr, WIDTH: tl.
 
 
 def sorted_by_code(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:
-    """Rows ``[N]`` int64, in the order of codes and their own, and where each code begins ``[K + 1]`` int32."""
-    # Sixteen bits sort in a quarter of the passes of sixty-four.
+    """Rows ``[N]`` int64, stably sorted by code, and where each code begins ``[K + 1]`` int32."""
+    # 16-bit keys take a quarter of the sorting passes of 64-bit ones.
     key = torch.int16 if num_codes < 2**15 else torch.int32
     keys, order = codes.to(key).sort(stable=True)
     starts = torch.searchsorted(keys, torch.arange(num_codes + 1, dtype=key, device=codes.device), out_int32=True)
@@ -50,11 +50,11 @@ def sum_rows(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype) 
         values: Contiguous rows ``[N, D]`` on a CUDA device.
         codes: Codes ``[N]`` int64 in [0, K).
         num_codes: K.
-        dtype: Dtype of the sums, in which they are taken.
+        dtype: Dtype of the sums and of their accumulation.
 
     Raises:
-        ValueError: The values are not ``[N, D]`` or have gaps, or there is not one code a row.
-        TypeError: A type differs.
+        ValueError: The values are not ``[N, D]`` or not contiguous, or there is not one code per row.
+        TypeError: A dtype is wrong.
     """
     check_tensor("values", values, (len(values), values.shape[-1]), values.device, values.dtype)
     check_tensor("codes", codes, (len(values),), values.device, torch.int64)

@@ -1,1 +1,1 @@
-"""The CPU back-end: Numba kernels on explicit 16-lane vectors, compiled where they run."""
+"""The CPU back-end: Numba kernels on explicit 16-lane vectors, compiled on the machine they run on."""

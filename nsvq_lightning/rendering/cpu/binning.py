@@ -12,7 +12,7 @@ from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES
 DIGIT_BITS = 11
 DIGITS = 1 << DIGIT_BITS
 AHEAD = 16
-"""How many splats ahead a box is asked for."""
+"""How many splats ahead a box is prefetched."""
 
 
 @kernel
@@ -64,7 +64,7 @@ def tile_index(x, y, group_columns):
 
 @inline
 def tile_range(boxes, place):
-    """First column and row of a box, and the ones behind its last."""
+    """First column and row of a box, and its end column and row (exclusive)."""
     box = np.int64(get(boxes, place))
     x, y = box & 0xFFFF, (box >> 16) & 0xFFFF
     return x, y, x + ((box >> 32) & 0xFFFF), y + (box >> 48)
@@ -72,11 +72,11 @@ def tile_range(boxes, place):
 
 @kernel
 def count_tiles(threads, count, order, boxes, group_columns, histogram, offsets):
-    """How many splats touch each tile: ``offsets[t]`` is where the list of tile t begins; returns the length of all.
+    """Count the splats that touch each tile: the list of tile t begins at ``offsets[t]``; returns the total length.
 
-    ``order`` are the places of the visible splats, front to back; ``boxes`` their tiles, by place: first column and
-    row, columns and rows, 16 bits each. ``histogram`` [threads, tiles] becomes the place of each thread's first entry
-    in every tile.
+    ``order`` holds the places of the visible splats, front to back; ``boxes`` their tiles, by place: first column and
+    row, number of columns and rows, 16 bits each. ``histogram`` [threads, tiles] becomes the position of each thread's
+    first entry in every tile.
     """
     tiles = offsets.shape[0] - 1
     for thread in prange(threads):

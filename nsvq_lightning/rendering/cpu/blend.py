@@ -1,12 +1,12 @@
-"""Front-to-back blending of sorted splats and its backward pass, a 4x4 block of pixels a vector.
+"""Front-to-back blending of sorted splats and its backward pass, with one vector per 4x4 block of pixels.
 
-Forward: a tile takes its splats in batches; an exact test tells which of its 16 blocks each splat can reach, then
+Forward: a tile takes its splats in batches; an exact test finds which of its 16 blocks each splat can reach, then
 each block runs through its own splats, four at a time, with transmittance and colour in registers. Nothing branches
-on a single pixel: one that is closed goes on losing transmittance, and a splat counts only where the transmittance
-after it would still be open. The blocks that a splat was blended into are kept as a 16-bit mask for the backward pass,
-which goes through the splats once more from front to back:
-with d = g·colour and ``rest`` = what all splats from here on (and the background) add to g·image, dL/dα = (T·d - rest
-after this splat/(1 - α)), so neither the last contributor nor any atomic is needed.
+on a single pixel: a closed (finished) one keeps losing transmittance, and a splat counts only where the transmittance
+after it is still above the threshold. The blocks that a splat was blended into are kept as a 16-bit mask for the
+backward pass, which goes through the splats once more from front to back:
+with d = g·colour and ``rest`` = what this splat and all after it (and the background) add to g·image, dL/dα =
+(T·d - rest)/(1 - α), so neither the last contributor nor any atomic operation is needed.
 """
 
 from __future__ import annotations
@@ -69,21 +69,21 @@ ALPHA_MAX = F(constants.ALPHA_MAX)
 TRANSMITTANCE_MIN = F(constants.TRANSMITTANCE_MIN)
 BATCH = 128
 TINY = F(1e-20)
-"""Where the transmittance of closed pixels is held: far below the threshold, far above denormal numbers."""
+"""Lower bound on the transmittance of closed pixels: far below the threshold, far above denormal numbers."""
 REACH_MARGIN = F(2.0**-8)
 """How far below the threshold, in log2 α, a block still counts as reached: what rounding can add to the exponent of a
-pixel, so that culling blocks changes no bit. It lets one in a thousand more through."""
+pixel, so that culling blocks changes no bit. It lets one block in a thousand more through."""
 AHEAD = 24
-"""How many entries ahead a record is asked for; its slot, whose number stands in the record, a little later."""
+"""How many entries ahead a record is prefetched; its slot, whose number is in the record, a little later."""
 SLOT_AHEAD = 10
 BLOCKS = 16
 BLOCK_SIDE = 4
 
-# Planes of the per-thread scratch of the forward pass, one vector a block each: T falls on when a pixel is closed,
-# T_LEFT is what its image keeps.
+# Planes of the per-thread scratch of the forward pass, with one vector per block: T keeps falling once a pixel is
+# closed, T_LEFT is the transmittance that the image keeps.
 T, T_LEFT, R_SUM, G_SUM, B_SUM, Z_SUM = (256 * plane for plane in range(6))
 FORWARD_SCRATCH = 6 * 256 + (BATCH + 1) * RECORD
-# Vectors a block owns in the scratch of the backward pass.
+# Vectors of one block in the scratch of the backward pass.
 BACK_T, BACK_REST, BACK_RED, BACK_GREEN, BACK_BLUE, BACK_DEPTH, BACK_X, BACK_Y = (16 * part for part in range(8))
 BLOCK_STATE = 16 * 8
 BACKWARD_SCRATCH = BLOCKS * BLOCK_STATE
@@ -173,7 +173,7 @@ def accumulate(batch, r, weight, sums):
 
 @inline
 def waiting(touched, first, count, block):
-    """Which of the next 64 splats, of which ``count`` belong to the batch, reach a block, as bits."""
+    """Bits of those of the next 64 splats that reach a block; only the first ``count`` belong to the batch."""
     if count <= 0:
         return np.int64(0)
     bits = column_bits(touched, first, block)
@@ -182,7 +182,7 @@ def waiting(touched, first, count, block):
 
 @inline
 def next_splat(low, high, base):
-    """Take the lowest bit of a queue of 128; without one the position is 128."""
+    """Take the lowest set bit of a queue of 128; the position is 128 if there is none."""
     if low == 0:
         low, high, base = high, np.int64(0), np.int64(64)
     return base + lowest_bit(low), low & (low - 1), high, base
@@ -198,7 +198,7 @@ def blend_one(batch, r, alpha, t, after, left, sums):
 
 @inline
 def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
-    """Blend a batch into one block; returns whether a pixel of it is still open."""
+    """Blend a batch into one block; returns the block's bit, or 0 once all its pixels are closed."""
     o = 16 * block
     t, left = load(state, T + o), load(state, T_LEFT + o)
     sums = load(state, R_SUM + o), load(state, G_SUM + o), load(state, B_SUM + o), load(state, Z_SUM + o)
@@ -228,7 +228,7 @@ def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
                 put(touched, first + j, get(touched, first + j) & ~bit)
             bit = 0
             low, high = np.int64(0), np.int64(0)
-        # Pixels that are closed fall on; keep them clear of denormals.
+        # The transmittance of closed pixels keeps falling; keep it clear of denormals.
         t = vmax(t4, broadcast(TINY))
     store(state, T + o, t)
     store(state, T_LEFT + o, left)
@@ -241,7 +241,7 @@ def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
 
 @inline
 def write_block(block, left, top, width, height, background, state, image, transmittance, depth):
-    """Add the background and write one block, pixel by pixel where it sticks out of the image."""
+    """Add the background and write one block, pixel by pixel where it extends beyond the image."""
     o = 16 * block
     x0, y0 = left + (block & 3) * BLOCK_SIDE, top + (block >> 2) * BLOCK_SIDE
     t = load(state, T_LEFT + o)
@@ -289,7 +289,7 @@ def blend_tile(
     cull_blocks,
     drop_closed,
 ):
-    """Blend one tile; returns the end of the part of its list that was looked at."""
+    """Blend one tile; returns the end of the part of its list that was processed."""
     zero, one = broadcast(F(0)), broadcast(F(1))
     columns, rows = broadcast(F(width - left)), broadcast(F(height - top))
     alive = 0
@@ -302,7 +302,7 @@ def blend_tile(
         if any_lane(inside):
             alive |= 1 << block
     batch = state[6 * 256 :]
-    # What fills up a group of four.
+    # A record without effect, which fills up the last group of four.
     store(batch, BATCH * RECORD, zero)
     put(batch, BATCH * RECORD + LOG2_OPACITY, F(-100))
     fx, fy = F(left), F(top)
@@ -369,9 +369,9 @@ def blend(
     drop_closed,
     counter,
 ):
-    """Blend all tiles, handed out dynamically; a pixel depends on its own tile only.
+    """Blend all tiles, scheduled dynamically; a pixel depends only on its own tile.
 
-    ``cull_blocks`` leaves out the blocks that a splat cannot reach, ``drop_closed`` those whose pixels are all closed.
+    ``cull_blocks`` skips the blocks that a splat cannot reach, ``drop_closed`` those whose pixels are all closed.
     """
     tiles = offsets.shape[0] - 1
     for thread in prange(threads):
@@ -396,7 +396,7 @@ def start_block(
 ):  # fmt: skip
     """Backward state of a block: transmittance 1, and ``rest`` = g · everything that this pixel received.
 
-    Alpha is 1 - T, so its gradient enters as -g_alpha·T at the far end. Gradients that are not asked for are not read.
+    Alpha is 1 - T, so its gradient enters as -g_alpha·T at the far end. Gradients that are not needed are not read.
     """
     s = BLOCK_STATE * block
     x0, y0 = left + (block & 3) * BLOCK_SIDE, top + (block >> 2) * BLOCK_SIDE
@@ -452,7 +452,7 @@ def slot_of(integers, row, group_x, group_y):
 
 @inline
 def splat_backward(records, row, blocks, left, top, with_depth, state):
-    """Sums of one splat over the blocks it changed in a tile (the fields of a slot); moves the blocks' state on."""
+    """Sums of one splat over the blocks it changed in a tile (the fields of a slot); advances the blocks' state."""
     zero, one = broadcast(F(0)), broadcast(F(1))
     lowest, highest = broadcast(LOG2_ALPHA_MIN), broadcast(ALPHA_MAX)
     r = RECORD * row
@@ -498,7 +498,7 @@ def splat_backward(records, row, blocks, left, top, with_depth, state):
 def tile_backward(
     records, integers, entries, begin, end, left, top, group_x, group_y, with_depth, touched, sums, state
 ):
-    """All splats of a tile, front to back."""
+    """Add up the gradients of all splats of a tile, front to back."""
     for i in range(begin, end):
         if i + AHEAD < end:
             prefetch(records, RECORD * np.int64(get(entries, i + AHEAD)))
@@ -539,7 +539,7 @@ def blend_backward(
     scratch,
     counter,
 ):
-    """Sums of every (splat, group) pair into its slot; groups are handed out dynamically, each is done in one order."""
+    """Write the sums of every (splat, group) pair to its slot; groups are scheduled dynamically, each in one order."""
     tiles = offsets.shape[0] - 1
     groups = tiles // GROUP_TILES
     for thread in prange(threads):

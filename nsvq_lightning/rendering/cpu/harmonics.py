@@ -30,9 +30,9 @@ C0, C1 = F(sh.C0), F(sh.C1)
 C2A, C2B, C2C = (F(value) for value in sh.C2)
 C3A, C3B, C3C, C3D, C3E = (F(value) for value in sh.C3)
 AHEAD = 32
-"""How many splats ahead the rows of a list are asked for."""
+"""How many splats ahead the rows of a list are prefetched."""
 SH_ROW = 45
-"""Floats of a row of degree-3 coefficients, which is read by whole vectors."""
+"""Floats in a row of degree-3 coefficients, which is read in whole vectors."""
 
 
 @inline
@@ -47,7 +47,7 @@ def unit_direction(camera, means):
 
 @inline
 def prefetch_sh(array, ids, start, end, stride, used):
-    """Ask for the SH rows of 16 splats of the list ahead of their turn, ``used`` floats of each."""
+    """Prefetch the SH rows of 16 later splats of the list, ``used`` floats of each."""
     if start < end:
         for lane in range(16):
             row = stride * np.int64(get(ids, start + lane))
@@ -70,7 +70,7 @@ def clear_bands(columns, degree, evaluated):
 
 @inline
 def gather_sh(shN, ids, start, stride, count, columns):
-    """The first ``count`` coefficients of 16 rows, one vector a column, into the scratch array ``columns``."""
+    """Gather the first ``count`` coefficients of 16 rows, one vector per column, into the scratch array ``columns``."""
     if stride == SH_ROW:
         rows = gather_columns(shN, ids, start, stride, 0)
         for k in range(16):
@@ -157,7 +157,7 @@ def color(degree, d, sh0, columns):
 
 @inline
 def color_range(camera, means, sh0, shN, stride, degree, evaluated, ids, first, last, records, scratch):
-    """Colours into the records of ``ids[first:last]``; the list is padded to whole vectors."""
+    """Write colours to the records of ``ids[first:last]``; the list is padded to whole vectors."""
     zero = broadcast(F(0))
     coefficients = coefficients_of(evaluated)
     for start in range(first, last, 16):
@@ -168,7 +168,7 @@ def color_range(camera, means, sh0, shN, stride, degree, evaluated, ids, first, 
             gather_sh(shN, ids, start, stride, coefficients, scratch)
             clear_bands(scratch, degree, evaluated)
         r, g, b = color(evaluated, direction, gather_rows3(sh0, ids, start), scratch)
-        # In this order NaN stays: the loss must show it.
+        # This order of arguments keeps NaN, so that the loss shows it.
         store(scratch, 0, vmax(zero, r))
         store(scratch, 16, vmax(zero, g))
         store(scratch, 32, vmax(zero, b))
@@ -210,7 +210,7 @@ def direction_gradient(degree, d, e):
 
 @inline
 def put_band(gradient, e, columns, k, basis, rgb):
-    """Gradient columns of coefficient k, and its share of the direction gradient."""
+    """Write the gradient columns of coefficient k, and its share of the direction gradient."""
     o = 48 * k
     total = load(columns, o) * rgb[0]
     total = fma(load(columns, o + 16), rgb[1], total)

@@ -1,4 +1,4 @@
-"""Splats onto the image plane, 16 at a time.
+"""Projection of splats onto the image plane, 16 at a time.
 
 Equations: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting (Kerbl et al. 2023, sec. 4).
 """
@@ -145,7 +145,7 @@ def image_axes(t, m):
 
 @inline
 def footprint(camera, means, quats, scales, logits):
-    """Everything of a record but the colour, the tile rectangle, and which of 16 splats can change the image."""
+    """All of a record except the colour, the tile rectangle, and which of 16 splats can change the image."""
     zero, one, half = broadcast(F(0)), broadcast(F(1)), broadcast(F(0.5))
     (x, y, z), inverse, _, t0, t1 = affine(camera, means)
     _, _, _, m = axes_of(quats, scales)
@@ -182,7 +182,7 @@ def footprint(camera, means, quats, scales, logits):
         & (vfabs(py) < finite)
         & (logits >= -finite)
     )
-    # exp2_clamped gives a broken scale a value again; the raw one still shows it.
+    # exp2_clamped makes a broken scale finite; the raw one still shows that it is broken.
     seen = seen & (scales[0] + scales[1] + scales[2] < finite)
 
     factor = broadcast(FACTOR_SCALE)
@@ -222,7 +222,7 @@ def load_shapes(quats, scales, logits, start, count, scratch):
 
 @inline
 def project_range(camera, means, quats, scales, logits, first, last, records, integers, ids, scratch):
-    """Records of the visible splats of a range; returns how many there are and how many slots they need."""
+    """Write the records of a range's visible splats; returns how many there are and how many slots they need."""
     zero = broadcast(F(0))
     visible = 0
     slots = 0
@@ -263,7 +263,7 @@ def project_range(camera, means, quats, scales, logits, first, last, records, in
 
 @kernel
 def project_splats(threads, camera, means, quats, scales, logits, records, integers, found, counts, slots, scratch):
-    """Project all splats: records of the visible ones; ``found`` holds a run of rows for each thread's range."""
+    """Write the records of all visible splats; ``found`` gets a run of rows for each thread's range."""
     for thread in prange(threads):
         first, last = vector_range(logits.shape[0], thread, threads)
         counts[thread], slots[thread] = project_range(
@@ -273,7 +273,7 @@ def project_splats(threads, camera, means, quats, scales, logits, records, integ
 
 @kernel
 def find_visible(threads, camera, means, quats, scales, logits, found, runs, scratch):
-    """Only the rows of the visible splats; thread t leaves them in ``found`` from ``runs[t, 0]`` to ``runs[t, 1]``."""
+    """Find the rows of the visible splats; thread t writes them to ``found`` from ``runs[t, 0]`` to ``runs[t, 1]``."""
     for thread in prange(threads):
         first, last = vector_range(logits.shape[0], thread, threads)
         at = first
@@ -316,11 +316,11 @@ def finish_records(
     radii,
     scratch,
 ):
-    """Join the runs of all threads to ``ids`` (ascending rows, padded by 16), number the slots and add the colours.
+    """Join the runs of all threads into ``ids`` (ascending rows, padded by 16), number the slots and add the colours.
 
     Also writes, by place in ``ids``, the depths as ``keys``, the places themselves as ``order`` and the tiles that a
-    splat touches as ``boxes`` (first column and row, columns and rows, 16 bits each), and the projected centres
-    ``means2d [N·2]`` and ``radii [N]`` of the visible splats.
+    splat touches as ``boxes`` (first column and row, number of columns and rows, 16 bits each), and the projected
+    centres ``means2d [N·2]`` and ``radii [N]`` of the visible splats.
     """
     total = counts.sum()
     for thread in prange(threads):

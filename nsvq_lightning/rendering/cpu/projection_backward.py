@@ -51,7 +51,7 @@ from nsvq_lightning.rendering.cpu.records import (
 from nsvq_lightning.rendering.cpu.vectors import cross, dot3, rotate, rotate_back, vector_range
 
 COVARIANCE_SCALE = F(2 * np.log(2.0) ** 2)
-"""From moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)²."""
+"""Converts moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)²."""
 
 
 @inline
@@ -95,7 +95,7 @@ def geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y):
     u, v = image_axes(t0, m), image_axes(t1, m)
 
     # dL/dΣ = ½ Fᵀ S F with S = Σ h uuᵀ, so dL/dU = Fᵀ S (F U). The rows of F U are a·u + b·v and c·v; by Lagrange's
-    # identity the first is a·(v × (u × v) + blur·u)/|v|², which keeps its digits on needles.
+    # identity the first is a·(v × (u × v) + blur·u)/|v|², which stays accurate for needles.
     a, b, c = record[A], record[B], record[C]
     k = two * broadcast(COVARIANCE_SCALE)
     uu, uv, vv = k * total[SUM_UU], k * total[SUM_UV], k * total[SUM_VV]
@@ -190,7 +190,7 @@ def project_backward(
     for thread in prange(threads):
         work = scratch[thread]
         slot = work[2048:].view(np.int32)
-        # Between its first and last visible splat every thread clears the rows that it passes by.
+        # Between its first and last visible splat, every thread clears the rows that it skips.
         begin, end = vector_range(count, thread, threads)
         row = np.int64(get(ids, begin - 1)) + 1 if begin > 0 else 0
         for i in range(begin, end):
@@ -219,7 +219,7 @@ def project_backward(
             quat, scale = gather_rows4(quats, ids, start), gather_rows3(scales, ids, start)
             g_mean, g_quat, g_scale = geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y)
             zero = broadcast(F(0))
-            # A colour below 0 was cut off.
+            # A colour below 0 was clamped.
             rgb = (
                 select(record[RED] > zero, total[SUM_RED], zero),
                 select(record[GREEN] > zero, total[SUM_GREEN], zero),

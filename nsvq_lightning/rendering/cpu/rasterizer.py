@@ -34,7 +34,7 @@ __all__ = ["render_cpu", "visible_cpu"]
 PROJECTION_SCRATCH = 2048 + 64
 MAX_ENTRIES = 2**31 - 1
 MAX_SIDE = TILE * (2**15 - 1)
-"""Pixels along the side of an image: a record has 16 bits for the number of a tile, one of them its sign."""
+"""Largest image side in pixels: a record has 16 bits, one of them the sign, for a tile's column or row."""
 
 
 def _pack_camera(camera: Camera) -> Array:
@@ -61,7 +61,7 @@ def _geometry(splats: SplatTensors) -> tuple[Array, ...]:
 
 
 class _Frame:
-    """One view of the splats on its way through the stages; holds its workspace as long as it lives."""
+    """One view of the splats on its way through the stages; holds its workspace for as long as it lives."""
 
     def __init__(self, splats: SplatTensors, camera: Camera) -> None:
         self.camera = _pack_camera(camera)
@@ -86,7 +86,7 @@ class _Frame:
             work.give_back()
 
     def project(self) -> tuple[Array, Array, Array]:
-        """Find the visible splats; returns their rows in one run a thread, the lengths of the runs and their slots."""
+        """Find the visible splats; returns their rows, one run per thread, the runs' lengths and their slots."""
         found = self.work.array("found", self.n, np.int32)
         counts, slots = (self.work.array(name, self.threads, np.int64) for name in ("counts", "slot_counts"))
         project_splats(
@@ -98,7 +98,7 @@ class _Frame:
     def finish(
         self, sh0: Array, shN: Array, stride: int, degrees: tuple[int, int], means2d: Array, radii: Array
     ) -> None:
-        """Complete the records; list the visible splats by row (``ids``) and, as places there, by depth (``order``)."""
+        """Complete the records; list the visible splats by row (``ids``) and, as places in it, by depth (``order``)."""
         runs = self.project()
         self.ids = self.work.array("ids", self.count + 16, np.int32)
         keys = self.work.array("keys", self.count + 1, np.int32)
@@ -141,24 +141,24 @@ def _colors(n: int, sh0: Tensor, shN: Tensor) -> tuple[Array, Array]:
 
 
 def _check_kept(attributes: tuple[Tensor, ...], shapes: tuple[tuple[int, ...], ...]) -> None:
-    """Refuse attributes whose data were exchanged since the forward pass, which autograd does not see."""
+    """Refuse attributes whose data were replaced since the forward pass, which autograd does not notice."""
     for name, tensor, shape in zip(ATTRIBUTES, attributes, shapes, strict=True):
         if tensor.shape != shape:
             raise ValueError(
                 f"{name} had shape {list(shape)} when it was rendered and {list(tensor.shape)} in the backward pass; "
-                "change the rows of splats after it"
+                "add or remove splats only after it"
             )
 
 
 class _Project(torch.autograd.Function):
-    """Raw attributes to projected centres; the records travel in the frame, the token ties the graph together."""
+    """Raw attributes to projected centres; the records travel in the frame, and the token links the graph."""
 
     @staticmethod
     def forward(ctx: Any, frame: _Frame, degree: int, *attributes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         means, *_, sh0, shN = attributes
         means2d = means.new_zeros(frame.n, 2)
         radii = torch.zeros(frame.n, dtype=torch.int32)
-        # Bands above the active degree count as zero, whether they are left out or evaluated.
+        # Bands above the active degree count as zero, whether they are skipped or evaluated.
         degrees = degree, degree if is_on("sh_bands") else sh_degree_of(shN)
         ctx.frame, ctx.degrees, ctx.shapes = frame, degrees, tuple(tuple(tensor.shape) for tensor in attributes)
         ctx.save_for_backward(*attributes)
@@ -172,7 +172,7 @@ class _Project(torch.autograd.Function):
     def backward(ctx: Any, g_means2d: Tensor | None, g_token: Tensor | None, g_radii: Tensor | None) -> tuple[Any, ...]:
         frame: _Frame = ctx.frame
         if g_token is None:
-            # Only the centres were differentiated: no blend has left its sums.
+            # Only the centres were differentiated, so no blend has written sums.
             frame.sums = frame.work.array("sums", RECORD * frame.slots)
             frame.sums.fill(0)
         g_means2d = torch.zeros(frame.n, 2) if g_means2d is None else g_means2d
@@ -217,7 +217,7 @@ class _Blend(torch.autograd.Function):
     def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, g_depth: Tensor | None) -> tuple[Any, ...]:
         frame: _Frame = ctx.frame
         image, transmittance, depth = ctx.saved_tensors
-        # Arguments that are not read stand in for gradients that do not exist.
+        # Placeholders that are never read stand in for missing gradients.
         with_alpha, with_depth = g_alpha is not None, g_depth is not None
         g_image = torch.zeros_like(image) if g_image is None else g_image
         g_alpha = transmittance if g_alpha is None else g_alpha

@@ -1,13 +1,13 @@
-"""What the stages of the CPU back-end hand to one another.
+"""The data that the stages of the CPU back-end pass to one another.
 
 A *record* is one visible splat on the image plane, 16 floats (one cache line), written by the projection at the
 splat's own row. Its exponent is kept as a sum of squares, ``log2 α = LOG2_OPACITY - u² - v²`` with ``u = A·dx +
-B·dy`` and ``v = C·dy``: (A, B; 0, C) is the Cholesky factor of the inverse covariance times √(½·log2 e). The usual
-conic form loses 10 to 40 times more digits on needles and on splats of hundreds of pixels.
+B·dy`` and ``v = C·dy``: (A, B; 0, C) is the Cholesky factor of the inverse covariance times √(½·log2 e). The errors
+of the usual conic form are 10 to 40 times larger on needles and on splats of hundreds of pixels.
 
 A *group* is a square of 4x4 tiles of 16x16 pixels, the unit of work of the blend. A *slot* is 16 floats in which one
-group sums the gradients of one splat. Slots are numbered splat by splat, so that every splat's total is taken in one
-fixed order, whatever thread did which group: results have the same bits for any number of threads.
+group sums the gradients of one splat. Slots are numbered splat by splat, so that every splat's total is summed in one
+fixed order, whichever thread processed which group: results have the same bits for any number of threads.
 """
 
 from __future__ import annotations

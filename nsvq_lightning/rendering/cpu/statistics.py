@@ -30,13 +30,13 @@ def add_view(sums: Tensor, views: Tensor, gradients: Tensor, radii: Tensor, fact
     Args:
         sums: Sum of the norms ``[N]`` float32.
         views: Number of views ``[N]`` float32.
-        gradients: Gradient by the projected centres ``[N, 2]`` float32, per pixel.
+        gradients: Gradient with respect to the projected centres ``[N, 2]`` float32, per pixel.
         radii: Radius on the screen ``[N]`` int32, 0 for splats that were not seen.
-        factors: What the two components count times.
+        factors: Factors of the two components.
 
     Raises:
-        ValueError: The tensors are not of the same splats, or one that is read or written in place has gaps.
-        TypeError: A type differs.
+        ValueError: The tensors differ in length, or one that is read or written in place is not contiguous.
+        TypeError: A dtype is wrong.
     """
     rows = tuple(radii.shape[:1])
     inputs = (

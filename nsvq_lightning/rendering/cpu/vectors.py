@@ -1,4 +1,4 @@
-"""Vectors of three numbers for 16 splats at a time, and the splats that a thread takes."""
+"""3D vectors for 16 splats at a time, and each thread's share of the splats."""
 
 from __future__ import annotations
 
@@ -35,6 +35,6 @@ def cross(u, v):
 
 @inline
 def vector_range(count, thread, threads):
-    """First and end of a thread's share of ``count`` splats: whole vectors, but for the last of all."""
+    """First and end of a thread's share of ``count`` splats: whole vectors, except for the very last one."""
     vectors = (count + 15) // 16
     return 16 * (vectors * thread // threads), min(count, 16 * (vectors * (thread + 1) // threads))

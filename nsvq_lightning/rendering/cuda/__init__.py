@@ -1,1 +1,1 @@
-"""The CUDA back-end: Triton kernels, compiled where they run."""
+"""The CUDA back-end: Triton kernels, compiled on the machine they run on."""

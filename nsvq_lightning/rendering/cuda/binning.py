@@ -1,7 +1,7 @@
 """Which splats touch which tile, front to back: a stable sort of (splat, tile) pairs by tile.
 
-The splats come sorted by depth, so the order inside a tile needs no key of its own: the sort handles 16 bits a pair
-instead of 64.
+The splats come sorted by depth, so the order inside a tile needs no key of its own: the sort handles 16 bits per
+pair instead of 64.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Tiles(NamedTuple):
         offsets: Where the list of each tile begins in ``ranks`` ``[tiles + 1]`` int32.
         ranks: The splats of the tiles, front to back, as places in the list of splats in view ``[P]`` int32.
         slots: The slot of each of these pairs ``[P]`` int32.
-        ends: Behind the last slot of each splat ``[V]`` int32; the slots of a splat are consecutive.
+        ends: End (exclusive) of each splat's slots ``[V]`` int32; the slots of a splat are consecutive.
     """
 
     offsets: Tensor
@@ -36,12 +36,13 @@ def list_tiles(boxes: Tensor, columns: int, rows: int) -> Tiles:
     """List the splats of every tile.
 
     Args:
-        boxes: First column and row, columns and rows of the tiles that each splat touches, front to back ``[V, 4]``.
+        boxes: First column and row, number of columns and rows of the tiles that each splat touches, front to back
+            ``[V, 4]``.
         columns: Columns of tiles in the image.
-        rows: Rows of tiles.
+        rows: Rows of tiles in the image.
 
     Raises:
-        RuntimeError: More pairs than can be numbered.
+        RuntimeError: There are more pairs than can be numbered.
     """
     device, tiles = boxes.device, columns * rows
     x0, y0, nx, ny = boxes.unbind(1)
@@ -58,7 +59,7 @@ def list_tiles(boxes: Tensor, columns: int, rows: int) -> Tiles:
     place = torch.arange(total, dtype=torch.int32, device=device) - (ends - counts)[owners]
     width = nx[owners]
     tile = (y0[owners] + place // width) * columns + x0[owners] + place % width
-    # Sixteen bits sort in a quarter of the passes of sixty-four.
+    # 16-bit keys take a quarter of the sorting passes of 64-bit ones.
     key = torch.int16 if tiles < 2**15 else torch.int32
     keys, slots = tile.to(key).sort(stable=True)
     offsets = torch.searchsorted(keys, torch.arange(tiles + 1, dtype=key, device=device), out_int32=True)

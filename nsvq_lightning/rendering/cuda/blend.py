@@ -1,12 +1,12 @@
-"""Front-to-back blending of sorted splats and its backward pass, one tile of 16x16 pixels a program.
+"""Front-to-back blending of sorted splats and its backward pass, with one program per tile of 16x16 pixels.
 
-Forward: a pixel that is closed goes on losing transmittance, and a splat counts only where the transmittance after it
-would still be open; so nothing branches on a single pixel. After each batch of splats the program looks whether a
-pixel is still open.
+Forward: a closed (finished) pixel keeps losing transmittance, and a splat counts only where the transmittance after it
+is still above the threshold; so nothing branches on a single pixel. After each batch of splats the program checks
+whether a pixel is still open.
 
-Backward: the splats are gone through once more from front to back. With d = g·colour and ``rest`` = what all splats
-from here on (and the background) add to g·image, α·dL/dα = α/(1 - α)·(T·d - rest). Every pair of splat and tile writes
-its own slot and a second kernel adds up the slots of each splat: no atomics, the same bits every time.
+Backward: the program goes through the splats once more from front to back. With d = g·colour and ``rest`` = what this
+splat and all after it (and the background) add to g·image, α·dL/dα = α/(1 - α)·(T·d - rest). Every pair of splat and
+tile writes its own slot and a second kernel adds up the slots of each splat: no atomics, the same bits every time.
 """
 
 from __future__ import annotations
@@ -53,18 +53,18 @@ from nsvq_lightning.rendering.cuda.records import (
 __all__ = ["blend", "blend_backward", "tile_grid"]
 
 BATCH = 32
-"""Splats between two looks at whether a tile is finished."""
+"""Splats between two checks of whether a tile is finished."""
 WARPS = 1
-"""Warps a tile: one keeps every reduction inside the warp."""
+"""Warps per tile: with one, every reduction stays inside the warp."""
 SLOTS = 8
-"""Slots of one splat that are added up at a time."""
+"""Number of slots of one splat that are added up at a time."""
 LANES = 16
 """Power of two that holds the fields of a slot."""
 
 
 @triton.jit
 def tile_pixels(tile, columns, width, height):
-    """Corner of a tile, pixel centres in it, their numbers in the image and which of them there are."""
+    """Corner of a tile, its pixel centres, their indices in the image, and which of them lie inside the image."""
     left, top = (tile % columns) * TILE, (tile // columns) * TILE
     lane = tl.arange(0, TILE * TILE)
     x, y = lane % TILE, lane // TILE
@@ -85,10 +85,10 @@ def alpha_at(record, left, top, x, y):
 
 @triton.jit
 def blend_step(record, left, top, x, y, t):
-    """What one splat does to pixels with transmittance ``t``, the same to the bit in both directions.
+    """What one splat does to pixels with transmittance ``t``, the same to the bit in the forward and backward pass.
 
-    α before the cap, the two factors of its exponent, α, the transmittance after it, whether that leaves the pixel
-    open, and the weight of the splat's colour.
+    Returns α before the cap, the two factors of its exponent, α, the transmittance after it, whether that leaves the
+    pixel open, and the weight of the splat's colour.
     """
     raw, u, v = alpha_at(record, left, top, x, y)
     alpha = tl.minimum(raw, ALPHA_MAX)
@@ -102,7 +102,7 @@ def blend_kernel(
     records, ranks, offsets, ends, background, image, transmittance, depth, columns, width, height,
     BATCH: tl.constexpr,
 ):  # fmt: skip
-    """Image, transmittance and depth of a tile, and the end of the part of its list that was looked at."""
+    """Image, transmittance and depth of a tile, and the end of the part of its list that was processed."""
     tile = tl.program_id(0)
     left, top, x, y, pixel, inside = tile_pixels(tile, columns, width, height)
     t = tl.where(inside, 1.0, 0.0)
@@ -135,7 +135,7 @@ def blend_backward_kernel(
     records, ranks, slots, offsets, ends, image, transmittance, depth, g_image, g_alpha, g_depth, sums,
     columns, width, height, WITH_ALPHA: tl.constexpr, WITH_DEPTH: tl.constexpr,
 ):  # fmt: skip
-    """Sums of every splat of a tile into its slot."""
+    """Write the sums of every splat of a tile to its slot."""
     tile = tl.program_id(0)
     left, top, x, y, pixel, inside = tile_pixels(tile, columns, width, height)
     g_red = tl.load(g_image + 3 * pixel, mask=inside, other=0.0)
@@ -208,7 +208,7 @@ def tile_grid(width: int, height: int) -> tuple[int, int]:
 
 
 def _check_lists(records: Tensor, tiles: Tiles, count: int) -> None:
-    """Records, and the lists of ``count`` tiles."""
+    """Check the records, and the lists of ``count`` tiles."""
     visible, pairs, device = len(records), len(tiles.ranks), records.device
     check_tensor("records", records, (visible, RECORD.value), device)
     for name, length in (("offsets", count + 1), ("ranks", pairs), ("slots", pairs), ("ends", visible)):
@@ -216,7 +216,7 @@ def _check_lists(records: Tensor, tiles: Tiles, count: int) -> None:
 
 
 def blend(lens: Lens, records: Tensor, tiles: Tiles, background: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Image ``[H, W, 3]``, transmittance ``[H, W]``, depth ``[H, W]``, and how far each list was gone through.
+    """Image ``[H, W, 3]``, transmittance ``[H, W]``, depth ``[H, W]``, and how far each list was processed.
 
     Args:
         lens: Gives the size of the image.
@@ -226,7 +226,7 @@ def blend(lens: Lens, records: Tensor, tiles: Tiles, background: Tensor) -> tupl
 
     Raises:
         ValueError: The tensors do not fit together.
-        TypeError: A type differs.
+        TypeError: A dtype is wrong.
     """
     columns, rows = tile_grid(lens.width, lens.height)
     _check_lists(records, tiles, columns * rows)
@@ -261,11 +261,11 @@ def blend_backward(
         tiles: As in :func:`blend`.
         ends: What :func:`blend` returned, as are ``outputs``: image, transmittance and depth.
         outputs: See ``ends``.
-        gradients: Of image, alpha and depth, contiguous; None where nothing depends on one.
+        gradients: Of image, alpha and depth, contiguous; None for those on which nothing depends.
 
     Raises:
         ValueError: The tensors do not fit together.
-        TypeError: A type differs.
+        TypeError: A dtype is wrong.
     """
     columns, rows = tile_grid(lens.width, lens.height)
     _check_lists(records, tiles, columns * rows)
@@ -285,7 +285,7 @@ def blend_backward(
         blend_backward_kernel[(columns * rows,)](
             records, tiles.ranks, tiles.slots, tiles.offsets, ends, image, transmittance, depth,
             torch.zeros_like(image) if g_image is None else g_image,
-            # Arguments that are not read stand in for gradients that do not exist.
+            # Placeholders that are never read stand in for missing gradients.
             depth if g_alpha is None else g_alpha, depth if g_depth is None else g_depth,
             sums, columns, lens.width, lens.height,
             WITH_ALPHA=g_alpha is not None, WITH_DEPTH=g_depth is not None, num_warps=WARPS, **COMPILE,

@@ -1,7 +1,7 @@
 """Spherical harmonics up to degree 3 inside a kernel: colours and their gradients.
 
-Order and signs are those of :mod:`nsvq_lightning.rendering.sh`. A row of coefficients beyond the constant one begins
-at ``shN + base``, three channels each.
+Order and signs are those of :mod:`nsvq_lightning.rendering.sh`. A row of higher coefficients begins at ``shN + base``,
+with three channels each.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def color(sh0, shN, row, base, x, y, z, mask, DEGREE: tl.constexpr):
 
 @triton.jit
 def put_band(g_shN, shN, base, k, basis, r, g, b, mask):
-    """Store the gradient of coefficient k; returns Σ_channel coefficient·gradient, the basis value's own."""
+    """Store the gradient of coefficient k; returns Σ_channel coefficient·gradient, the gradient of the basis value."""
     cr, cg, cb = coefficient(shN, base, k, mask)
     at = g_shN + base + 3 * k
     tl.store(at, basis * r, mask=mask)

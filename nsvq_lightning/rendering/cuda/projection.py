@@ -1,4 +1,4 @@
-"""Projection, spherical harmonics and their backward pass, one splat a lane.
+"""Projection, spherical harmonics and their backward pass, one splat per lane.
 
 Equations: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting (Kerbl et al. 2023, sec. 4).
 """
@@ -56,9 +56,9 @@ LARGEST_FOOTPRINT = tl.constexpr(constants.LARGEST_FOOTPRINT)
 HUGE_QUATERNION, SHRINK = tl.constexpr(constants.HUGE_QUATERNION), tl.constexpr(constants.SHRINK)
 
 BLOCK = 128
-"""Splats a program."""
+"""Splats per program."""
 RADIUS_ONLY = -1
-"""Stands for the SH degree where no record is wanted."""
+"""Passed as the SH degree where no record is wanted."""
 
 
 @triton.jit
@@ -75,7 +75,7 @@ def cross(a, b):
 
 @triton.jit
 def positive(x):
-    """max(x, 0) that keeps NaN, so that the loss shows it; ``tl.maximum`` drops it on a GPU."""
+    """max(x, 0) that keeps NaN, so that the loss shows it; ``tl.maximum`` drops NaN on a GPU."""
     return tl.where(x < 0, 0.0, x)
 
 
@@ -127,7 +127,7 @@ def view_point(view, mean):
 
 @triton.jit
 def limited_slope(tangent, focal, centre, size):
-    """The slope at which the Jacobian is taken: not far outside the image."""
+    """The slope at which the Jacobian is evaluated, limited to a margin around the image."""
     margin = size * (0.5 * FRUSTUM_MARGIN)
     return tl.minimum(tl.maximum(tangent, (-centre - margin) / focal), (size - centre + margin) / focal)
 
@@ -203,7 +203,7 @@ def project_kernel(
     seen = inside & (z > NEAR) & (reach > 0) & (left <= right) & (top <= bottom)
     seen = seen & (size < LARGEST_FOOTPRINT) & (determinant < FINITE)
     seen = seen & (tl.abs(px) < FINITE) & (tl.abs(py) < FINITE) & (logit >= -FINITE)
-    # A scale of -inf is a splat without extent, one of +inf or NaN is broken.
+    # A log-scale of -inf is a splat without extent; one of +inf or NaN is broken.
     seen = seen & (scale[0] + scale[1] + scale[2] < FINITE)
 
     radius = tl.minimum(tl.ceil(tl.maximum(half_x, half_y)), 1e9)
@@ -262,7 +262,7 @@ def project_backward_kernel(
     means, quats, scales, logits, shN, view, fx, fy, cx, cy, width, height, count, stride, ids, records, totals,
     g_means2d, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of the attributes of the splats ``ids`` from their moments (``totals``, a slot each)."""
+    """Gradients of the attributes of the splats ``ids`` from their moments (``totals``, one slot each)."""
     rank = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     seen = rank < count
     row = tl.load(ids + rank, mask=seen, other=0)
@@ -277,7 +277,7 @@ def project_backward_kernel(
     u, v = image_axes(t0, m0, m1, m2), image_axes(t1, m0, m1, m2)
 
     # dL/dΣ = ½ Fᵀ S F with S = Σ h uuᵀ, so dL/dU = Fᵀ S (F U). The rows of F U are a·u + b·v and c·v; by Lagrange's
-    # identity the first is a·(v × (u × v) + blur·u)/|v|², which keeps its digits on needles.
+    # identity the first is a·(v × (u × v) + blur·u)/|v|², which stays accurate for needles.
     total, record = totals + rank * RECORD, records + rank * RECORD
     a, b, c = load3(record + A, seen)
     uu, uv, vv = load3(total + SUM_UU, seen)
@@ -331,7 +331,7 @@ def project_backward_kernel(
     vz -= fx_zz * (x * g2x + j00) + fy_zz * (y * g2y + j11)
     vz += tl.load(total + SUM_DEPTH, mask=seen, other=0.0)
 
-    # A colour below 0 was cut off.
+    # A colour below 0 was clamped.
     rgb, g_rgb = load3(record + RED, seen), load3(total + SUM_RED, seen)
     red, green, blue = (
         tl.where(rgb[0] > 0, g_rgb[0], 0.0),
@@ -389,9 +389,9 @@ class Projected(NamedTuple):
     Attributes:
         means2d: Projected centres of all splats ``[N, 2]``, 0 for those not in view.
         radii: Their radii ``[N]`` int32.
-        ids: Rows of the splats in view, front to back; the first row first where depths are equal ``[V]`` int64.
+        ids: Rows of the splats in view, front to back ``[V]`` int64; the lower row first where depths are equal.
         records: Their records ``[V, RECORD]``.
-        boxes: The tiles they touch: first column and row, columns and rows ``[V, 4]`` int32.
+        boxes: The tiles they touch: first column and row, number of columns and rows ``[V, 4]`` int32.
     """
 
     means2d: Tensor
@@ -434,7 +434,7 @@ def project_radii(lens: Lens, attributes: tuple[Tensor, ...]) -> Tensor:
 
     Raises:
         ValueError: The tensors do not fit together.
-        TypeError: A type differs.
+        TypeError: A dtype is wrong.
     """
     unused = attributes[0]
     return _launch_projection(lens, attributes, RADIUS_ONLY, unused, unused, unused)
@@ -444,13 +444,13 @@ def project(lens: Lens, attributes: tuple[Tensor, ...], degree: int) -> Projecte
     """Project all splats and list those in view.
 
     Args:
-        lens: Where to look from.
+        lens: The camera.
         attributes: The six raw attributes, contiguous float32, in the order of :class:`~nsvq_lightning.RawSplats`.
-        degree: Highest degree of the spherical harmonics that is evaluated.
+        degree: Highest SH degree that is evaluated.
 
     Raises:
         ValueError: The tensors do not fit together, or the degree is above the stored one.
-        TypeError: A type differs.
+        TypeError: A dtype is wrong.
     """
     _check_degree(degree, attributes)
     means = attributes[0]
@@ -486,7 +486,7 @@ def project_backward(
 
     Raises:
         ValueError: The tensors do not fit together, or the degree is above the stored one.
-        TypeError: A type differs.
+        TypeError: A dtype is wrong.
     """
     _check_degree(degree, attributes)
     _check_attributes(lens, attributes)

@@ -1,13 +1,13 @@
-"""What the kernels hand to one another.
+"""The data that the kernels pass to one another.
 
-A constant stands to the right of what it multiplies: on the left, the interpreter takes the product for a constant.
+A constant stands to the right of what it multiplies: on the left, Triton's interpreter makes the product a constant.
 
 A *record* is one visible splat on the image plane; records lie front to back. Its exponent is kept as a sum of
 squares, ``log2 α = LOG2_OPACITY - u² - v²`` with ``u = A·dx + B·dy`` and ``v = C·dy``: (A, B; 0, C) is the Cholesky
 factor of the inverse covariance times √(½·log2 e).
 
 A *slot* holds the gradients that one tile sums for one splat, as moments in (u, v). The slots of a splat are
-consecutive, so that its total is taken in one fixed order and no kernel needs an atomic: a render gives the same bits
+consecutive, so that its total is summed in one fixed order and no kernel needs an atomic: a render gives the same bits
 every time.
 """
 
@@ -53,9 +53,9 @@ __all__ = [
 ]
 
 RECORD = tl.constexpr(12)
-"""Floats from one record, or slot, to the next: whole 16-byte words."""
+"""Stride between records, or slots, in floats: whole 16-byte words."""
 FIELDS = tl.constexpr(10)
-"""Floats of a record, or slot, that are used."""
+"""Floats used in a record or slot."""
 
 # Fields of a record.
 X, Y, A, B, C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH = (tl.constexpr(field) for field in range(10))
@@ -76,4 +76,4 @@ TRANSMITTANCE_MIN = tl.constexpr(constants.TRANSMITTANCE_MIN)
 FACTOR_SCALE = tl.constexpr(math.sqrt(0.5 * math.log2(math.e)))
 """√(½·log2 e): turns the Cholesky factor of the inverse covariance into that of the binary exponent."""
 COVARIANCE_SCALE = tl.constexpr(2 * math.log(2.0) ** 2)
-"""From moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)²."""
+"""Converts moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)²."""

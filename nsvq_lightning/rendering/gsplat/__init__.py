@@ -1,1 +1,1 @@
-"""The optional gsplat back-end: the CUDA kernels of another package behind the same interface."""
+"""The optional gsplat back-end: the CUDA kernels of the gsplat package behind the same interface."""

@@ -1,21 +1,21 @@
 """gsplat's CUDA kernels behind the interface of the package's own back-ends.
 
 The kernels are called one by one (projection, spherical harmonics, tiles, blend) rather than through
-``gsplat.rasterization``: the projected centres that :func:`nsvq_lightning.render` returns must stand between projection
-and blend, so that the gradient of the image arrives at them, in pixels, as density control needs it.
+``gsplat.rasterization``: the projected centres that :func:`nsvq_lightning.render` returns must lie between projection
+and blend in the graph, so that they receive the gradient of the image, in pixels, as density control needs it.
 
-What is the same: activations (log-scales, opacity logits, quaternions of any norm, wxyz), axes and pixel centres, the
+The same: activations (log-scales, opacity logits, quaternions of any norm, wxyz), axes and pixel centres, the
 near plane, the blur of the projected covariance, the margin outside which its Jacobian is clamped, the threshold of
 1/255, the order by view-space z, spherical harmonics with the floor at 0, the background. There is no far plane, no
-smallest radius and no anti-aliasing. What differs, because gsplat has no argument for it:
+minimum radius and no anti-aliasing. Different, because gsplat has no argument for it:
 
 * Opacity of one splat at one pixel is capped at 0.999, not at 0.99: only splats more opaque than 0.99 look different.
 * The box of a splat is rounded up to whole pixels, so ``radii`` and :func:`visible_gsplat` count a few splats that
   reach no pixel centre; they change no pixel.
-* A zero quaternion is not drawn, where the package takes it as the identity. Quaternions whose squares overflow, and
-  splats of thousands of pixels, lose the digits that the package's own kernels keep.
-* The gradients of a splat with a number that is not finite may be NaN; the others are not touched.
-* Gradients are summed in the order in which threads come by: two runs of one seed differ in their last bits.
+* A splat with a zero quaternion is not drawn; this package takes it as the identity. Quaternions whose squares
+  overflow, and splats of thousands of pixels, lose the precision that the package's own kernels keep.
+* The gradients of a splat with a non-finite attribute may be NaN; those of the others are not affected.
+* Gradients are summed in the order in which threads arrive: two runs with one seed differ in their last bits.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from nsvq_lightning.splats.splats import SplatTensors
 __all__ = ["render_gsplat", "visible_gsplat"]
 
 TILE = 16
-"""Side of the tiles in pixels; gsplat tests no other."""
+"""Side of the tiles in pixels; the only one that gsplat tests."""
 
 
 class _Projected(NamedTuple):
@@ -43,8 +43,8 @@ class _Projected(NamedTuple):
     Attributes:
         radii: Half sizes of their boxes in pixels, 0 for those not in view ``[1, N, 2]`` int32.
         means2d: Projected centres, 0 for those not in view ``[1, N, 2]`` pixels.
-        depths: View-space z ``[1, N]``, anything where not in view.
-        conics: Inverse covariances with the blur ``[1, N, 3]``, anything where not in view.
+        depths: View-space z ``[1, N]``, undefined for those not in view.
+        conics: Inverse covariances with the blur ``[1, N, 3]``, undefined for those not in view.
     """
 
     radii: Tensor
@@ -54,21 +54,21 @@ class _Projected(NamedTuple):
 
 
 def _project(splats: SplatTensors, camera: Camera, opacities: Tensor) -> _Projected:
-    """Project with gsplat; ``opacities`` ``[N]`` are those between 0 and 1."""
+    """Project with gsplat; ``opacities`` ``[N]`` are between 0 and 1, not logits."""
     at = camera.to(splats.means.device, splats.means.dtype)
     radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
         splats.means, None, splats.quats, splats.scales.exp(), at.viewmat[None], at.K[None], camera.width,
         camera.height, eps2d=BLUR, near_plane=NEAR, far_plane=math.inf, radius_clip=0.0, packed=False,
         opacities=opacities.detach(),
     )  # fmt: skip
-    # gsplat leaves unwritten what it culls, and would draw a splat at NaN into the first tile.
+    # gsplat leaves the rows that it culls unwritten, and would draw a splat at NaN into the first tile.
     seen = (radii > 0).all(-1) & torch.isfinite(means2d).all(-1) & torch.isfinite(conics).all(-1)
     zero = means2d.new_zeros(())
     return _Projected(radii * seen[..., None], torch.where(seen[..., None], means2d, zero), depths, conics)
 
 
 def _colors(splats: SplatTensors, camera: Camera, degree: int, seen: Tensor) -> Tensor:
-    """Colours ``[1, N, 3]`` of the splats that are ``seen [1, N]``; anything for the others."""
+    """Colours ``[1, N, 3]`` of the splats that are ``seen [1, N]``; undefined for the others."""
     direction = splats.means - camera.to(splats.means.device, splats.means.dtype).position
     coefficients = torch.cat([splats.sh0, splats.shN[:, : (degree + 1) ** 2 - 1]], 1)
     colors: Tensor = gsplat.spherical_harmonics(degree, direction[None], coefficients[None], masks=seen)

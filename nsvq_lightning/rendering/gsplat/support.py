@@ -1,4 +1,4 @@
-"""Whether gsplat can render here; asked only where its back-end is asked for by name."""
+"""Whether gsplat can render here; checked only where its back-end is requested by name."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ COMPILING = "it needs nvcc of torch's CUDA version and a C++ compiler, or a whee
 
 
 def obstacle(like: Tensor) -> str | None:
-    """Why gsplat cannot take tensors such as ``like``, with a way out; None where it can.
+    """Why gsplat cannot take tensors such as ``like``, with a remedy; None where it can.
 
-    The first answer for tensors on a GPU loads gsplat's CUDA code, which may compile it: minutes, once a machine.
+    The first call with tensors on a GPU loads gsplat's CUDA code, which may compile it: minutes, once per machine.
     """
     problem = not_on_cuda(like)
     if problem is not None:
@@ -32,12 +32,12 @@ def obstacle(like: Tensor) -> str | None:
 
 @cache
 def missing_kernels() -> str | None:
-    """Why gsplat's CUDA code is not there; None once it is loaded."""
+    """Why gsplat's CUDA code is unavailable; None once it is loaded."""
     try:
-        # Its functions import this at their first call, and fail with an AttributeError of None where nvcc is missing.
+        # Its functions import this at their first call, and fail with an AttributeError on None where nvcc is missing.
         backend = importlib.import_module("gsplat.cuda._backend")
     except (ImportError, OSError, RuntimeError) as error:
-        said = textwrap.shorten(str(error), 300)  # a compiler says pages
+        said = textwrap.shorten(str(error), 300)  # a compiler's output can fill pages
         return f"gsplat could not compile or load its CUDA code ({said}); {COMPILING}"
     if getattr(backend, "_C", None) is None:
         return f"gsplat is installed without its CUDA code and found no CUDA toolkit to compile it with; {COMPILING}"
