@@ -40,8 +40,9 @@ STANDARD: dict[str, type[Callback]] = {
     "checkpoint": RunCheckpoint,
     "progress": SplatProgressBar,
 }
-"""Callback by name. The order matters in two places: density control comes before the canonical form, which may act
-after the same iteration, and contribution pruning before the report, which then measures the remaining splats.
+"""Callback by name. The order matters in three places: density control comes before the canonical form, which may act
+after the same iteration; the canonical form, whose floor raises scales, before the replacement of codes, which may copy
+them; contribution pruning before the report, whose figures are then those of the remaining splats.
 """
 
 

@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 from nsvq_lightning.io import CompressedScene, read_nsvq, write_nsvq
 from nsvq_lightning.io.compressed import attribute_dims
-from nsvq_lightning.io.formats import FORMATS, read_scene
-from nsvq_lightning.io.nsvq.precision import Precision
+from nsvq_lightning.io.formats import FORMATS, read_scene, save
+from nsvq_lightning.io.nsvq.precision import Precision, Storage
 
 CASES = int(os.environ.get("NSVQ_FUZZ_CASES", "40"))
 """Scenes for each property; more in a run by hand."""
@@ -50,12 +50,9 @@ def any_scene(seed: int) -> CompressedScene:
 @pytest.mark.parametrize("suffix", [".ply", ".nsvq"])
 def test_what_loses_nothing_gives_every_number_back(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"scene{suffix}"
-    options = {"level": "paper"} if suffix == ".nsvq" else {}
     for seed in range(CASES):
         scene = any_scene(seed)
-        writer = FORMATS[suffix].write
-        assert writer is not None
-        writer(path, scene, **options)
+        save(scene, path, Storage("paper"))
         back, expected = read_scene(path).arrays(), scene.arrays()
         for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
             np.testing.assert_array_equal(getattr(back, name), getattr(expected, name), err_msg=f"{name}, seed {seed}")
@@ -86,10 +83,8 @@ def test_the_same_scene_gives_the_same_bytes_and_all_its_splats(suffix: str, tmp
     first, second = tmp_path / f"first{suffix}", tmp_path / f"second{suffix}"
     for seed in range(CASES):
         scene = any_scene(seed)
-        writer = FORMATS[suffix].write
-        assert writer is not None
         for path in (first, second):
-            writer(path, scene)
+            save(scene, path)
         assert first.read_bytes() == second.read_bytes(), f"seed {seed}"
         back = read_scene(first).arrays()
         assert len(back) == len(scene), f"seed {seed}"

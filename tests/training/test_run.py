@@ -338,7 +338,7 @@ def test_splats_that_turn_non_finite_in_fine_tuning_are_dropped(
 def test_codebooks_are_placed_on_finite_splats(
     with_density: bool, run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
 ) -> None:
-    callbacks = recipe(codebook_init=CodebookInit(weights="contribution"))
+    callbacks = recipe(codebook_init=CodebookInit(weights="contribution"), canonical=None)
     if not with_density:
         del callbacks["density"]
     # After the search at the end of the prune phase, and before the form of the covariances is chosen.
@@ -352,7 +352,7 @@ def test_codebooks_are_placed_on_finite_splats(
 @pytest.mark.parametrize(
     ("callbacks", "quantizer", "step"),
     [
-        ({"refit": CodebookRefit()}, StraightThrough, 13),  # refits come at 14 and 19
+        ({"codebook_refit": CodebookRefit()}, StraightThrough, 13),  # refits come at 14 and 19
         ({"codebook_replacement": CodebookReplacement(jitter=0.5)}, NSVQ, 15),  # after 10 and 15
     ],
 )

@@ -30,7 +30,7 @@ pytestmark = pytest.mark.skipif(
     reason="this torch has no gloo, which several processes on the CPU need",
 )
 
-HERE = Path(__file__).resolve().parent
+TESTS = Path(__file__).resolve().parents[1]
 IN_QUANTIZE = 42
 """Iteration of a checkpoint between two replacements of codes."""
 
@@ -83,9 +83,9 @@ TWO = ("--trainer.devices=2", "--trainer.strategy=view_parallel")
 
 def run_command(arguments: list[str]) -> tuple[int, str]:
     """Run the command in a group of processes of its own; its exit status and what it printed."""
-    package = HERE.parents[1]
+    package = TESTS.parent
     environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join([str(HERE), str(package)]),
+        "PYTHONPATH": os.pathsep.join([str(TESTS / "support"), str(package)]),
         "OMP_NUM_THREADS": "1",
         "NUMBA_NUM_THREADS": "1",
     }
