@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 
 # Before torch loads OpenMP: threads that wait by spinning slow everything down where cores are shared.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -16,6 +18,26 @@ from guards import guarded
 
 from nsvq_lightning.data.colmap import import_pycolmap
 from nsvq_lightning.data.synthetic import write_synthetic_scene
+
+FIRST = ("test_view_parallel.py", "test_triton.py", "test_kernel_entries.py", "test_interruption.py", "test_fuzz.py")
+"""Files that take longest: one that starts last would be waited for."""
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile kernels before test processes start, in two processes: both would compile the same ones otherwise."""
+    if hasattr(session.config, "workerinput") or not getattr(session.config.option, "numprocesses", None):
+        return
+    warm = Path(__file__).parent / "support" / "warm.py"
+    halves = [subprocess.Popen([sys.executable, str(warm), half]) for half in ("rendering", "quantizing")]
+    results = [half.wait() for half in halves]
+    if any(results):
+        raise pytest.UsageError(f"{warm} failed, see above")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files first that take longest."""
+    items.sort(key=lambda item: FIRST.index(item.path.name) if item.path.name in FIRST else len(FIRST))
+
 
 SceneFactory = Callable[..., Path]
 

@@ -9,7 +9,7 @@ from nsvq_lightning.quantize.base import as_quantizer, is_refittable
 from nsvq_lightning.quantize.nsvq import noise_substitution
 from nsvq_lightning.random import generator
 
-DIMS = [1, 3, 4, 16, 45]
+DIMS = [3, 45, *(pytest.param(dim, marks=pytest.mark.slow) for dim in (1, 4, 16))]
 
 
 def problem(dim: int, dtype: torch.dtype = torch.float32, count: int = 523) -> tuple[Tensor, Tensor, Tensor]:

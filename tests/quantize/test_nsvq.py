@@ -11,7 +11,7 @@ from nsvq_lightning.quantize.nsvq import noise_substitution
 from nsvq_lightning.quantize.substitution import substitute, substitute_backward
 from nsvq_lightning.random import generator
 
-DIMS = [1, 4, 9, 16, 45]
+DIMS = [4, 9, 45, *(pytest.param(dim, marks=pytest.mark.slow) for dim in (1, 16))]
 
 
 def problem(dim: int, dtype: torch.dtype = torch.float32, count: int = 523) -> tuple[Tensor, Tensor, Tensor]:
