@@ -28,7 +28,7 @@ def _checked(what: str, cache: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", env=environment)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_scalar_kernels_stay_within_their_arrays(tmp_path: Path) -> None:
     done = _checked("rightly", tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]

@@ -12,15 +12,15 @@ from nsvq_lightning.random import generator
 
 
 def test_rows_are_drawn_by_squared_distance() -> None:
-    rows = torch.tensor([[1.0], [-3.0], [0.0]])
-    drawn = [int(draw_far_rows(rows, torch.zeros(1, 1), 1, generator(seed))) for seed in range(1000)]
+    rows = torch.tensor([[1.0, 0, 0], [0, -3.0, 0], [0, 0, 0]])
+    drawn = [int(draw_far_rows(rows, torch.zeros(1, 3), 1, generator(seed))) for seed in range(1000)]
     assert 60 < drawn.count(0) < 140  # 1 in 10, deviation 9.5
     assert drawn.count(0) + drawn.count(1) == 1000
 
 
 def test_rows_on_their_codes_are_never_drawn() -> None:
-    rows = torch.tensor([[0.0], [0.0], [2.0], [1.0]])
-    assert sorted(draw_far_rows(rows, torch.zeros(1, 1), 4, generator(0)).tolist()) == [2, 3]
+    rows = torch.tensor([[0.0], [0.0], [2.0], [1.0]]).expand(4, 3)
+    assert sorted(draw_far_rows(rows, torch.zeros(1, 3), 4, generator(0)).tolist()) == [2, 3]
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 63, 64])
@@ -34,9 +34,9 @@ def test_a_spread_start_is_different_rows(count: int) -> None:
 
 
 def test_a_spread_start_of_rows_too_close_to_tell_apart_ends() -> None:
-    rows = torch.arange(100.0)[:, None] * 1e-25  # squares below float32
+    rows = torch.arange(100.0)[:, None].expand(100, 3) * 1e-25  # squares below float32
     chosen = rows_far_apart(rows, 90, generator(1))
-    assert len(chosen.unique()) == 90
+    assert len(chosen[:, 0].unique()) == 90
 
 
 def lopsided() -> Tensor:

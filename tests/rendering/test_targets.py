@@ -40,9 +40,8 @@ def _compiled(processor: str, *kernels: str) -> dict[str, Any]:
     ("processor", "kernels"),
     [
         ("generic", MAIN),
-        ("haswell", MAIN),
         ("nehalem", MAIN[:1]),
-        *(pytest.param(processor, tuple(SIGNATURES), marks=pytest.mark.slow) for processor in PROCESSORS),
+        *(pytest.param(processor, tuple(SIGNATURES), marks=pytest.mark.long) for processor in PROCESSORS),
     ],
 )
 def test_kernels_stay_vectors_and_call_no_library(processor: str, kernels: tuple[str, ...]) -> None:

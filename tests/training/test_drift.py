@@ -66,7 +66,7 @@ def _bad_splats(root: Path) -> Splats:
     return Splats.from_points(points, torch.cat([scene.colors, more]), sh_degree=1)
 
 
-@pytest.mark.parametrize("steps", [200, pytest.param(45_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("steps", [200, pytest.param(45_000, marks=pytest.mark.long)])
 def test_a_run_on_bad_points_never_has_a_number_that_is_none(
     steps: int,
     tiny_scene: Path,

@@ -90,7 +90,7 @@ def test_codes_in_training_are_the_nearest(demo_scene: Path) -> None:
     check(train(demo_scene, 2, 500, 40), 40)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["fox", "horns"])
 def test_codes_in_a_thousand_steps_on_a_real_scene(shared_scenes: Path, name: str) -> None:
     if not (shared_scenes / name).is_dir():
