@@ -185,8 +185,8 @@ def test_what_one_process_meets_both_decide_alike(two: Finished) -> None:
     ("by", "iteration", "left"),
     [
         ("exception", 16, 15),
-        pytest.param("SIGTERM", 41, 41, marks=pytest.mark.slow),
-        pytest.param("SIGKILL", 59, 57, marks=pytest.mark.slow),
+        pytest.param("SIGTERM", 41, 41, marks=pytest.mark.long),
+        pytest.param("SIGKILL", 59, 57, marks=pytest.mark.long),
     ],
 )
 def test_a_run_stopped_in_one_process_continues_to_the_same_bits(
