@@ -35,6 +35,7 @@ class Format:
         read: Scene from a file; None if the format is only written. Codebooks are kept where the format has them.
         write: ``write(path, scene, **options) -> bytes written``; None if the format is only read.
         keeps_origin: Whether the file holds the origin that positions are relative to.
+        takes_storage: Whether ``write`` has an option ``storage``, the level and precision.
         in_order: Gives the splats of a scene that a file holds, in file order, for comparison with what is read back;
             None if the format loses nothing, or states its errors itself.
     """
@@ -43,6 +44,7 @@ class Format:
     read: Callable[[Path], CompressedScene] | None
     write: Callable[..., int] | None
     keeps_origin: bool = False
+    takes_storage: bool = False
     in_order: Callable[[CompressedScene], CompressedScene] | None = None
 
 
@@ -107,7 +109,7 @@ def save(
     scene = scene.finite()
     if any(scene.origin) and not entry.keeps_origin:
         logger.warning("%s: the origin %s of the positions is not stored; add it in the viewer", path, scene.origin)
-    if entry.write is _write_nsvq:
+    if entry.takes_storage:
         options["storage"] = storage or Storage()
     elif storage is not None:
         scene = as_stored(scene, storage)
@@ -136,7 +138,7 @@ def _write_nsvq(path: Path, scene: CompressedScene, *, storage: Storage) -> int:
 
 FORMATS: dict[str, Format] = {
     ".ply": Format("3D Gaussian Splatting", _read_ply, _write_ply),
-    ".nsvq": Format("compressed scene of this package", read_nsvq, _write_nsvq, keeps_origin=True),
+    ".nsvq": Format("compressed scene of this package", read_nsvq, _write_nsvq, keeps_origin=True, takes_storage=True),
     ".sog": Format("PlayCanvas, SuperSplat", read_sog, write_sog, in_order=in_sog_order),
     ".spz": Format("Niantic", read_spz, write_spz, in_order=in_spz_order),
     ".splat": Format(
