@@ -19,7 +19,7 @@ __all__ = ["ExportScene"]
 log = logging.getLogger(__name__)
 
 
-EXPORT_FORMATS = tuple(suffix.removeprefix(".") for suffix, entry in FORMATS.items() if entry.write is not None)
+EXPORT_FORMATS = tuple(suffix.removeprefix(".") for suffix in FORMATS)
 """Formats that can be written."""
 DEFAULT_EXPORT = ("nsvq", "ply")
 """The compressed scene, and its decoded splats for viewers."""

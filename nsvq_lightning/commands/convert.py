@@ -96,18 +96,15 @@ def _measure(source: Path, output: Path, root: Path | None) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    readable, writable = (
-        ", ".join(suffix for suffix, entry in FORMATS.items() if getattr(entry, action) is not None)
-        for action in ("read", "write")
-    )
+    suffixes = ", ".join(FORMATS)
     parser = argparse.ArgumentParser(
         prog="nsvq convert",
         description="Write a scene file in another format; the suffixes select the formats.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("input", type=Path, metavar="SCENE", help=f"file to read: {readable}")
-    parser.add_argument("output", type=Path, metavar="OUT", help=f"file to write: {writable}")
+    parser.add_argument("input", type=Path, metavar="SCENE", help=f"file to read: {suffixes}")
+    parser.add_argument("output", type=Path, metavar="OUT", help=f"file to write: {suffixes}")
     parser.add_argument(
         "--palette",
         type=int,

@@ -32,8 +32,8 @@ class Format:
 
     Attributes:
         description: A few words for error messages and help.
-        read: Scene from a file; None if the format is only written. Codebooks are kept where the format has them.
-        write: ``write(path, scene, **options) -> bytes written``; None if the format is only read.
+        read: Scene from a file; codebooks are kept where the format has them.
+        write: ``write(path, scene, **options) -> bytes written``.
         keeps_origin: Whether the file holds the origin that positions are relative to.
         takes_storage: Whether ``write`` has an option ``storage``, the level and precision.
         in_order: Gives the splats of a scene that a file holds, in file order, for comparison with what is read back;
@@ -41,8 +41,8 @@ class Format:
     """
 
     description: str
-    read: Callable[[Path], CompressedScene] | None
-    write: Callable[..., int] | None
+    read: Callable[[Path], CompressedScene]
+    write: Callable[..., int]
     keeps_origin: bool = False
     takes_storage: bool = False
     in_order: Callable[[CompressedScene], CompressedScene] | None = None
@@ -70,10 +70,7 @@ def load(path: str | os.PathLike[str]) -> Splats:
 def read_scene(path: str | os.PathLike[str]) -> CompressedScene:
     """Read a scene of any supported format, keeping its codebooks; arguments and errors are those of :func:`load`."""
     path = Path(path)
-    reader = _format_of(path, "read").read
-    if reader is None:
-        raise ValueError(f"cannot load {path}: {path.suffix} files are only written")
-    return replace(reader(path), stored_bytes=path.stat().st_size)
+    return replace(_format_of(path, "read").read(path), stored_bytes=path.stat().st_size)
 
 
 def save(
@@ -102,8 +99,6 @@ def save(
     """
     path = Path(path)
     entry = _format_of(path, "write")
-    if entry.write is None:
-        raise ValueError(f"cannot save {path}: {path.suffix} files are only read")
     if not isinstance(scene, CompressedScene):
         scene = CompressedScene.from_arrays(SplatArrays.from_splats(scene))
     scene = scene.finite()
