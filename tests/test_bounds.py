@@ -1,5 +1,5 @@
 """Kernels that index arrays as Python does, once under Numba's own bounds checks; the others address memory themselves,
-and only the guard words see what they do (tests/guards.py)."""
+and only the guard words see what they do (tests/support/guards.py)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Readers of damaged files, see tests/fuzzing.py; ``NSVQ_FUZZ_CASES=10000 pytest tests/test_fuzz.py`` looks deeper."""
+"""Readers of damaged files, see tests/support/fuzzing.py; ``NSVQ_FUZZ_CASES=10000 pytest tests/test_fuzz.py`` looks
+deeper."""
 
 from __future__ import annotations
 

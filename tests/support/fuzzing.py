@@ -1,7 +1,8 @@
 """Random damage to small valid files, and what readers may do with it: read it, or raise one clear error.
 
 Runs as a program, so that a reader that aborts, hangs or allocates without end takes only itself along:
-``python tests/fuzzing.py NAME FOLDER CASES [SEED]``. A case that fails stays in FOLDER, and its number is shown.
+``python tests/support/fuzzing.py NAME FOLDER CASES [SEED]``. A case that fails stays in FOLDER, and its number is
+shown.
 """
 
 from __future__ import annotations
