@@ -9,6 +9,7 @@ from pathlib import Path
 from lightning.pytorch import LightningModule, Trainer
 
 from nsvq_lightning.io.formats import FORMATS, save
+from nsvq_lightning.io.nsvq.file import as_stored
 from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.run_folder import is_trial, run_folder
 
@@ -57,8 +58,11 @@ class ExportScene(WritingCallback):
         if is_trial(trainer) or not trainer.is_global_zero:
             return
         host = as_host(pl_module)
-        scene = host.compressed()
+        scene = host.compressed().finite()
+        # The files of viewers hold what the compressed one decodes to: found once, however many there are.
+        decoded = as_stored(scene, host.storage) if set(self.formats) - {"nsvq"} else scene
         folder.mkdir(parents=True, exist_ok=True)
         for suffix in self.formats:
             path = folder / f"scene.{suffix}"
-            log.info("wrote %s (%d bytes)", path, save(scene, path, host.storage))
+            size = save(scene, path, host.storage) if suffix == "nsvq" else save(decoded, path)
+            log.info("wrote %s (%d bytes)", path, size)

@@ -13,7 +13,7 @@ from torch import Tensor
 from nsvq_lightning.io.compressed import QUANTIZABLE, CompressedScene
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.quantize.scene import attribute_rows, codes_of
-from nsvq_lightning.splats.finite import finite_rows, listed
+from nsvq_lightning.splats.finite import dropped, finite_rows
 from nsvq_lightning.splats.splats import RawSplats, sh_degree_of
 
 __all__ = ["compress", "formula_bytes"]
@@ -43,7 +43,7 @@ def compress(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> Compress
     )
     if not culprits:
         return scene
-    log.warning("left out %d of %d splats with non-finite values: %s", (~finite).sum(), len(scene), listed(culprits))
+    log.warning(dropped(finite, culprits))
     return scene.take(_numpy(finite))
 
 

@@ -54,5 +54,7 @@ def _interpreted() -> bool:
     return os.environ.get("TRITON_INTERPRET", "0") == "1"
 
 
+@cache
 def _has_triton() -> bool:
+    """Whether Triton is installed; a render with ``backend="cuda"`` asks each time."""
     return importlib.util.find_spec("triton") is not None

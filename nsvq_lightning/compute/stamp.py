@@ -42,9 +42,13 @@ class KernelStore(FunctionCache):
 
     _impl_class = _Layout
 
+    @functools.cached_property
+    def _stamp(self) -> str:
+        # Not before the first call: a kernel may refer to helpers that its module defines after it.
+        return digest(_Template(self._py_func))
+
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
-        # Not earlier: a kernel may refer to helpers that its module defines after it.
-        self._cache_file._source_stamp = digest(_Template(self._py_func))
+        self._cache_file._source_stamp = self._stamp
         return super()._load_overload(sig, target_context)
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:

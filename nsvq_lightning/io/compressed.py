@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.ply import plain_ply_bytes
 from nsvq_lightning.splats.arrays import SplatArrays, check_floats
-from nsvq_lightning.splats.finite import finite_rows, listed
+from nsvq_lightning.splats.finite import dropped, finite_rows
 from nsvq_lightning.splats.sh_degree import sh_coefficients
 
 if TYPE_CHECKING:
@@ -146,8 +146,7 @@ class CompressedScene:
         keep, culprits = finite_rows({"means": self.means, "opacities": self.opacities, **self.raw, **flags})
         if not culprits:
             return self
-        dropped = len(self) - int(keep.sum())
-        log.warning("dropped %d of %d splats with non-finite values: %s", dropped, len(self), listed(culprits))
+        log.warning(dropped(keep, culprits))
         return self.take(keep)
 
     def arrays(self) -> SplatArrays:

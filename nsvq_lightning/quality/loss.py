@@ -60,7 +60,7 @@ def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2) -
         loss: Tensor = function.apply(image, target, dssim_weight)  # type: ignore[no-untyped-call]
         return loss
     image, target = in_range(image, target)
-    return (1 - dssim_weight) * (image - target).abs().mean() + dssim_weight * (1 - ssim(image, target))
+    return (1 - dssim_weight) * (image - target).abs().mean() + dssim_weight * (1 - plain_ssim(image, target))
 
 
 def _kernels(image: Tensor, target: Tensor) -> Literal["cpu", "cuda"] | None:

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-__all__ = ["finite_rows", "listed"]
+__all__ = ["dropped", "finite_rows", "listed"]
 
 _Array = TypeVar("_Array")
 """NumPy arrays, or torch tensors on any device; torch is not imported for the former."""
@@ -38,3 +38,8 @@ def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int
 def listed(culprits: Mapping[str, int]) -> str:
     """The attributes with non-finite rows, for a message."""
     return ", ".join(f"{name} in {count} rows" for name, count in culprits.items())
+
+
+def dropped(mask: Any, culprits: Mapping[str, int]) -> str:
+    """The warning about rows that are left out, from both results of :func:`finite_rows`."""
+    return f"dropped {int((~mask).sum())} of {len(mask)} splats with non-finite values: {listed(culprits)}"

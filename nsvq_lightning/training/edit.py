@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from nsvq_lightning.splats.finite import finite_rows, listed
+from nsvq_lightning.splats.finite import dropped, finite_rows, listed
 from nsvq_lightning.splats.splats import ATTRIBUTES, Splats
 from nsvq_lightning.training.optim import find_group
 
@@ -199,11 +199,9 @@ def _finite_or_warn(splats: Splats, where: str, none_left: Callable[[str], Excep
     """Mask ``[N]`` of :func:`trainable_rows`, with a warning about the others; raises if no splat is finite."""
     kept, culprits = trainable_rows(splats)
     if culprits:
-        found = listed(culprits)
         if not bool(kept.any()):
-            raise none_left(found)
-        dropped = int((~kept).sum())
-        log.warning("%s: dropped %d of %d splats with non-finite values: %s", where, dropped, len(kept), found)
+            raise none_left(listed(culprits))
+        log.warning("%s: %s", where, dropped(kept, culprits))
     return kept
 
 

@@ -17,6 +17,7 @@ from nsvq_lightning.compression.pictures import look_at, middle_of
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.splats.finite import finite_rows
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
 __all__ = ["Workload", "folder_workload", "scene_workload", "single_workload", "synthetic_workload", "workloads"]
@@ -166,9 +167,8 @@ def folder_workload(root: Path, init_from: Path | None = None) -> Workload:
 
 def _finite_splats(path: Path) -> RawSplats:
     """The splats of a file without those that have a number that is not finite."""
-    loaded = [tensor.detach() for tensor in load(path).raw()]
-    rows = [tensor.reshape(len(tensor), tensor.shape[1:].numel()) for tensor in loaded]
-    finite = torch.isfinite(torch.cat(rows, 1)).all(1)
+    loaded = RawSplats(*(tensor.detach() for tensor in load(path).raw()))
+    finite, _ = finite_rows(loaded._asdict())
     if not bool(finite.any()):
         raise ValueError(f"{path} holds no splat with finite numbers; there is nothing to measure")
     return RawSplats(*(tensor[finite] for tensor in loaded))
