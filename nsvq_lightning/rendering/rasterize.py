@@ -38,6 +38,9 @@ class Render(NamedTuple):
         means2d: Projected centres ``[N, 2]`` in pixels, x right, y down. Call ``retain_grad()`` on it before the
             backward pass to get screen-space gradients.
         depth: Σ weight · view-space z ``[H, W]``; divide by ``alpha`` for the mean depth.
+        observed: With ``observe``, zeros ``[N, 3]`` whose ``grad`` the backward pass of a loss L sets to sums over the
+            pixels p: Σ |∂L/∂x at p|, Σ |∂L/∂y at p| of the projected centre (x, y) in pixels (AbsGS, Ye et al. 2024),
+            and Σ weight · ``observe``. Otherwise None.
     """
 
     image: Tensor
@@ -45,6 +48,7 @@ class Render(NamedTuple):
     radii: Tensor
     means2d: Tensor
     depth: Tensor
+    observed: Tensor | None = None
 
 
 def render(
@@ -53,6 +57,7 @@ def render(
     *,
     sh_degree: int | None = None,
     background: Tensor | None = None,
+    observe: Tensor | None = None,
     backend: str = "auto",
 ) -> Render:
     """Render splats as a camera sees them (3D Gaussian Splatting, eq. 3), differentiable in all six raw attributes.
@@ -62,6 +67,8 @@ def render(
         camera: Where to look from; COLMAP axes.
         sh_degree: Highest degree of the spherical harmonics that is evaluated; all stored ones by default.
         background: RGB ``[3]`` behind the splats; black by default.
+        observe: Strength of each pixel ``[H, W]``; the backward pass then also sums up what ``Render.observed`` holds.
+            Back-end ``gsplat`` cannot do this.
         backend: One of :data:`BACKENDS`.
 
     Returns:
@@ -70,7 +77,7 @@ def render(
     Raises:
         ValueError: Unknown back-end, or a back-end that cannot take the device or type of the splats; attributes that
             differ in device or type, or whose shapes do not fit; ``sh_degree`` above the stored degree; a background
-            that is not ``[3]``.
+            that is not ``[3]``; a map to observe that is not ``[H, W]``, or with back-end ``gsplat``.
     """
     _check_alike(splats)
     stored = sh_degree_of(splats.shN)
@@ -83,7 +90,16 @@ def render(
     elif tuple(background.shape) != (3,):
         raise ValueError(f"background must be one RGB colour of shape [3], got {list(background.shape)}")
     background = background.to(means)
-    return Render(*_rasterizer(resolve_backend(backend, means))(splats, camera, degree, background))
+    name = resolve_backend(backend, means)
+    if observe is None:
+        return Render(*_rasterizer(name)(splats, camera, degree, background))
+    if tuple(observe.shape) != (camera.height, camera.width):
+        raise ValueError(f"observe must be [{camera.height}, {camera.width}], got {list(observe.shape)}")
+    if name == "gsplat":
+        raise ValueError("back-end 'gsplat' cannot observe its backward pass; use backend='auto'")
+    observed = means.new_zeros(means.shape[0], 3).requires_grad_()
+    pixel_map = observe.to(means).contiguous()
+    return Render(*_rasterizer(name)(splats, camera, degree, background, pixel_map, observed), observed)
 
 
 def _check_alike(splats: SplatTensors) -> None:
@@ -171,7 +187,7 @@ def _obstacle(backend: str, like: Tensor) -> str | None:
     return gsplat_support.obstacle(like) if backend == "gsplat" else None
 
 
-def _rasterizer(backend: str) -> Callable[[SplatTensors, Camera, int, Tensor], _Outputs]:
+def _rasterizer(backend: str) -> Callable[..., _Outputs]:
     return render_reference if backend == "reference" else _fast_function("render", backend)
 
 

@@ -5,7 +5,7 @@ Written for correctness, not for speed: the fast back-ends are tested against it
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -109,7 +109,12 @@ def visible_rows(splats: SplatTensors, camera: Camera) -> Tensor:
 
 
 def render_reference(
-    splats: SplatTensors, camera: Camera, sh_degree: int, background: Tensor
+    splats: SplatTensors,
+    camera: Camera,
+    sh_degree: int,
+    background: Tensor,
+    pixel_map: Tensor | None = None,
+    observed: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``, differentiable.
 
@@ -133,6 +138,9 @@ def render_reference(
     order = torch.sort(projection.depths.detach(), stable=True).indices
     low = (centres - projection.half_sizes).detach()[order]
     high = (centres + projection.half_sizes).detach()[order]
+    if pixel_map is None or observed is None:
+        pixel_map, observed = centres.new_zeros(camera.height, camera.width), centres.new_zeros(n, 3)
+    watched = observed[rows]
     strips = []
     for top in range(0, camera.height, TILE):
         bottom = min(top + TILE, camera.height)
@@ -145,7 +153,10 @@ def render_reference(
                 torch.arange(top, bottom).to(centres), torch.arange(left, right).to(centres), indexing="ij"
             )
             pixels = torch.stack([xs, ys], -1).reshape(-1, 2) + 0.5
-            inputs = (pixels, centres[near], projection.conics[near], opacities[near], features[near])
+            here_map = pixel_map[top:bottom, left:right].reshape(-1)
+            inputs = (
+                pixels, centres[near], projection.conics[near], opacities[near], features[near], here_map, watched[near]
+            )  # fmt: skip
             blended = checkpoint(_blend, *inputs, use_reentrant=False) if torch.is_grad_enabled() else _blend(*inputs)
             tiles.append(blended.view(bottom - top, right - left, 5))
         strips.append(torch.cat(tiles, 1))
@@ -155,9 +166,43 @@ def render_reference(
     return image, 1 - transmittance, radii, means2d, blended[..., 3]
 
 
-def _blend(pixels: Tensor, centres: Tensor, conics: Tensor, opacities: Tensor, features: Tensor) -> Tensor:
+class _WatchOffsets(torch.autograd.Function):
+    """Offsets ``[P, n, 2]`` unchanged; their absolute gradients, summed over the pixels, go to ``[n, 2]`` zeros."""
+
+    @staticmethod
+    def forward(ctx: Any, offsets: Tensor, zeros: Tensor) -> Tensor:
+        return offsets.view_as(offsets)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        return gradient, gradient.abs().sum(0)
+
+
+class _WatchWeights(torch.autograd.Function):
+    """Weights ``[P, n]`` unchanged; Σ weight · map over the pixels goes to ``[n]`` zeros as their gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, weights: Tensor, pixel_map: Tensor, zeros: Tensor) -> Tensor:
+        ctx.save_for_backward(weights, pixel_map)
+        return weights.view_as(weights)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, Tensor]:
+        weights, pixel_map = ctx.saved_tensors
+        return gradient, None, pixel_map @ weights
+
+
+def _blend(
+    pixels: Tensor,
+    centres: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    pixel_map: Tensor,
+    observed: Tensor,
+) -> Tensor:
     """Front-to-back blend of sorted splats at ``pixels [P, 2]``: Σ w·feature and the transmittance left ``[P, 5]``."""
-    dx, dy = (pixels[:, None] - centres[None]).unbind(-1)
+    dx, dy = _WatchOffsets.apply(pixels[:, None] - centres[None], observed[:, :2]).unbind(-1)
     power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy
     alpha = (opacities * power.clamp_max(0).exp()).clamp_max(ALPHA_MAX)
     alpha = torch.where(alpha >= ALPHA_MIN, alpha, torch.zeros_like(alpha))
@@ -165,4 +210,5 @@ def _blend(pixels: Tensor, centres: Tensor, conics: Tensor, opacities: Tensor, f
         running = (1 - alpha).cumprod(1) >= TRANSMITTANCE_MIN
     alpha = torch.where(running, alpha, torch.zeros_like(alpha))
     transmittance = torch.cat([pixels.new_ones(pixels.shape[0], 1), (1 - alpha).cumprod(1)], 1)
-    return torch.cat([(alpha * transmittance[:, :-1]) @ features, transmittance[:, -1:]], 1)
+    weights = _WatchWeights.apply(alpha * transmittance[:, :-1], pixel_map, observed[:, 2])
+    return torch.cat([weights @ features, transmittance[:, -1:]], 1)

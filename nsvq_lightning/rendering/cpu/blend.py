@@ -55,6 +55,9 @@ from nsvq_lightning.rendering.cpu.records import (
     SLOPE_X,
     SLOPE_Y,
     SLOT,
+    SUM_ABS_X,
+    SUM_ABS_Y,
+    SUM_MAP,
     SUM_U,
     SUM_V,
     TILE,
@@ -84,8 +87,10 @@ BLOCK_SIDE = 4
 T, T_LEFT, R_SUM, G_SUM, B_SUM, Z_SUM = (256 * plane for plane in range(6))
 FORWARD_SCRATCH = 6 * 256 + (BATCH + 1) * RECORD
 # Vectors of one block in the scratch of the backward pass.
-BACK_T, BACK_REST, BACK_RED, BACK_GREEN, BACK_BLUE, BACK_DEPTH, BACK_X, BACK_Y = (16 * part for part in range(8))
-BLOCK_STATE = 16 * 8
+BACK_T, BACK_REST, BACK_RED, BACK_GREEN, BACK_BLUE, BACK_DEPTH, BACK_MAP, BACK_X, BACK_Y = (
+    16 * part for part in range(9)
+)
+BLOCK_STATE = 16 * 9
 BACKWARD_SCRATCH = BLOCKS * BLOCK_STATE
 TWO_LN2 = F(2 * np.log(2.0))
 
@@ -391,12 +396,13 @@ def blend(
 
 @inline
 def start_block(
-    block, left, top, width, height, image, depth, transmittance, g_image, g_alpha, g_depth, with_alpha, with_depth,
-    grid, state,
+    block, left, top, width, height, image, depth, transmittance, g_image, g_alpha, g_depth, pixel_map, with_alpha,
+    with_depth, with_map, grid, state,
 ):  # fmt: skip
     """Backward state of a block: transmittance 1, and ``rest`` = g · everything that this pixel received.
 
-    Alpha is 1 - T, so its gradient enters as -g_alpha·T at the far end. Gradients that are not needed are not read.
+    Alpha is 1 - T, so its gradient enters as -g_alpha·T at the far end. Gradients that are not needed are not read, nor
+    is a map.
     """
     s = BLOCK_STATE * block
     x0, y0 = left + (block & 3) * BLOCK_SIDE, top + (block >> 2) * BLOCK_SIDE
@@ -413,6 +419,8 @@ def start_block(
             far = load_block(g_depth, pixel, width)
             store(state, s + BACK_DEPTH, far)
             rest = fma(far, load_block(depth, pixel, width), rest)
+        if with_map:
+            store(state, s + BACK_MAP, load_block(pixel_map, pixel, width))
         store(state, s + BACK_T, broadcast(F(1)))
         store(state, s + BACK_REST, rest)
         store(state, s + BACK_RED, red)
@@ -435,6 +443,8 @@ def start_block(
             if with_depth:
                 put(state, o + BACK_DEPTH, get(g_depth, pixel))
                 rest += get(g_depth, pixel) * get(depth, pixel)
+            if with_map:
+                put(state, o + BACK_MAP, get(pixel_map, pixel))
             put(state, o + BACK_REST, rest)
             put(state, o + BACK_T, F(1))
 
@@ -451,7 +461,7 @@ def slot_of(integers, row, group_x, group_y):
 
 
 @inline
-def splat_backward(records, row, blocks, left, top, with_depth, state):
+def splat_backward(records, row, blocks, left, top, with_depth, with_map, state):
     """Sums of one splat over the blocks it changed in a tile (the fields of a slot); advances the blocks' state."""
     zero, one = broadcast(F(0)), broadcast(F(1))
     lowest, highest = broadcast(LOG2_ALPHA_MIN), broadcast(ALPHA_MAX)
@@ -467,6 +477,7 @@ def splat_backward(records, row, blocks, left, top, with_depth, state):
     )
     z = broadcast(get(records, r + DEPTH))
     s_r, s_g, s_b, s_h, s_u, s_v, s_uu, s_uv, s_vv, s_z = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+    s_ax, s_ay, s_map = zero, zero, zero
     while blocks != 0:
         s = BLOCK_STATE * lowest_bit(blocks)
         blocks &= blocks - 1
@@ -491,12 +502,16 @@ def splat_backward(records, row, blocks, left, top, with_depth, state):
         s_uu, s_uv, s_vv = fma(hu, u, s_uu), fma(hu, v, s_uv), fma(hv, v, s_vv)
         if with_depth:
             s_z = fma(weight, load(state, s + BACK_DEPTH), s_z)
-    return lane_sums((s_r, s_g, s_b, s_h, s_u, s_v, s_uu, s_uv, s_vv, s_z))
+        if with_map:
+            along_y = fma(b, hu, c * hv)
+            s_ax, s_ay = s_ax + vmax(hu, zero - hu), s_ay + vmax(along_y, zero - along_y)
+            s_map = fma(weight, load(state, s + BACK_MAP), s_map)
+    return lane_sums((s_r, s_g, s_b, s_h, s_u, s_v, s_uu, s_uv, s_vv, s_z, s_ax, s_ay, s_map))
 
 
 @inline
 def tile_backward(
-    records, integers, entries, begin, end, left, top, group_x, group_y, with_depth, touched, sums, state
+    records, integers, entries, begin, end, left, top, group_x, group_y, with_depth, with_map, touched, sums, state
 ):
     """Add up the gradients of all splats of a tile, front to back."""
     for i in range(begin, end):
@@ -510,7 +525,9 @@ def tile_backward(
             continue
         row = np.int64(get(entries, i))
         slot = RECORD * slot_of(integers, row, group_x, group_y)
-        store(sums, slot, load(sums, slot) + splat_backward(records, row, blocks, left, top, with_depth, state))
+        store(
+            sums, slot, load(sums, slot) + splat_backward(records, row, blocks, left, top, with_depth, with_map, state)
+        )
 
 
 @kernel
@@ -532,8 +549,10 @@ def blend_backward(
     g_image,
     g_alpha,
     g_depth,
+    pixel_map,
     with_alpha,
     with_depth,
+    with_map,
     sums,
     slots,
     scratch,
@@ -560,17 +579,20 @@ def blend_backward(
                 for block in range(BLOCKS):
                     start_block(
                         block, left, top, width, height, image, depth, transmittance, g_image, g_alpha, g_depth,
-                        with_alpha, with_depth, grid, state,
+                        pixel_map, with_alpha, with_depth, with_map, grid, state,
                     )  # fmt: skip
                 tile_backward(
                     records, integers, entries, begin, end, left, top, group % group_columns, group // group_columns,
-                    with_depth, touched, sums, state,
+                    with_depth, with_map, touched, sums, state,
                 )  # fmt: skip
 
 
 @kernel
-def total_slots(threads, ids, count, slots, records, integers, sums, g_means2d):
-    """Add up the slots of each splat into its first one, and derive the gradient of the projected centre ``[N·2]``."""
+def total_slots(threads, ids, count, slots, records, integers, sums, g_means2d, with_map, observed):
+    """Add up the slots of each splat into its first one, and derive the gradient of the projected centre ``[N·2]``.
+
+    ``with_map`` also writes what the pass observed ``[N·3]``: Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · map over pixels.
+    """
     for thread in prange(threads):
         last = count * (thread + 1) // threads
         for i in range(count * thread // threads, last):
@@ -587,3 +609,7 @@ def total_slots(threads, ids, count, slots, records, integers, sums, g_means2d):
             u, v = get(sums, o + SUM_U), get(sums, o + SUM_V)
             put(g_means2d, 2 * row, TWO_LN2 * get(records, r + A) * u)
             put(g_means2d, 2 * row + 1, TWO_LN2 * (get(records, r + B) * u + get(records, r + C) * v))
+            if with_map:
+                put(observed, 3 * row, abs(TWO_LN2 * get(records, r + A)) * get(sums, o + SUM_ABS_X))
+                put(observed, 3 * row + 1, TWO_LN2 * get(sums, o + SUM_ABS_Y))
+                put(observed, 3 * row + 2, get(sums, o + SUM_MAP))

@@ -192,7 +192,13 @@ class _Blend(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, frame: _Frame, means2d: Tensor, token: Tensor, background: Tensor
+        ctx: Any,
+        frame: _Frame,
+        means2d: Tensor,
+        token: Tensor,
+        background: Tensor,
+        pixel_map: Tensor | None,
+        observed: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         shape = frame.height, frame.width
         image, transmittance, depth, alpha = (recycled((*shape, *last)) for last in ((3,), (), (), ()))
@@ -207,7 +213,7 @@ class _Blend(torch.autograd.Function):
             work.rows("blend", frame.threads, FORWARD_SCRATCH), is_on("blocks"), is_on("saturated"),
             np.zeros(1, np.int64),
         )  # fmt: skip
-        ctx.frame = frame
+        ctx.frame, ctx.pixel_map = frame, pixel_map
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(image, transmittance, depth)
         return image, torch.sub(1, transmittance, out=alpha), depth
@@ -218,33 +224,38 @@ class _Blend(torch.autograd.Function):
         frame: _Frame = ctx.frame
         image, transmittance, depth = ctx.saved_tensors
         # Placeholders that are never read stand in for missing gradients.
-        with_alpha, with_depth = g_alpha is not None, g_depth is not None
+        with_alpha, with_depth, with_map = g_alpha is not None, g_depth is not None, ctx.pixel_map is not None
+        pixel_map = ctx.pixel_map if with_map else transmittance
         g_image = torch.zeros_like(image) if g_image is None else g_image
         g_alpha = transmittance if g_alpha is None else g_alpha
         g_depth = depth if g_depth is None else g_depth
         work = frame.work
         frame.sums = work.array("sums", RECORD * frame.slots)
-        g_means2d = torch.zeros(frame.n, 2)
+        g_means2d, g_observed = torch.zeros(frame.n, 2), torch.zeros(frame.n if with_map else 0, 3)
         blend_backward(
             frame.threads, frame.records, frame.integers, frame.entries, frame.offsets, frame.ends,
             frame.group_columns, frame.width, frame.height, _GRID, frame.touched,
-            *(flat(tensor) for tensor in (image, transmittance, depth, g_image, g_alpha, g_depth)), with_alpha,
-            with_depth,
-            frame.sums, frame.slots, work.rows("blend_backward", frame.threads, BACKWARD_SCRATCH),
-            np.zeros(1, np.int64),
+            *(flat(tensor) for tensor in (image, transmittance, depth, g_image, g_alpha, g_depth, pixel_map)),
+            with_alpha, with_depth, with_map, frame.sums, frame.slots, work.rows("blend_backward", frame.threads,
+            BACKWARD_SCRATCH), np.zeros(1, np.int64),
         )  # fmt: skip
         total_slots(
             frame.threads, frame.ids, frame.count, frame.slots, frame.records, frame.integers, frame.sums,
-            flat(g_means2d),
+            flat(g_means2d), with_map, flat(g_observed),
         )  # fmt: skip
         g_background = None
         if ctx.needs_input_grad[3]:
             g_background = (g_image * transmittance[..., None]).sum((0, 1))
-        return None, g_means2d, torch.zeros(()), g_background
+        return None, g_means2d, torch.zeros(()), g_background, None, g_observed if with_map else None
 
 
 def render_cpu(
-    splats: SplatTensors, camera: Camera, sh_degree: int, background: Tensor
+    splats: SplatTensors,
+    camera: Camera,
+    sh_degree: int,
+    background: Tensor,
+    pixel_map: Tensor | None = None,
+    observed: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
 
@@ -259,7 +270,7 @@ def render_cpu(
     attributes = splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN
     frame = _Frame(splats, camera)
     means2d, token, radii = _Project.apply(frame, sh_degree, *attributes)
-    image, alpha, depth = _Blend.apply(frame, means2d, token, background)
+    image, alpha, depth = _Blend.apply(frame, means2d, token, background, pixel_map, observed)
     return image, alpha, radii, means2d, depth
 
 

@@ -24,8 +24,11 @@ X, Y, A, B, C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, SLOPE_X, SLOPE_Y, SLOT, OR
 """SLOPE_X, SLOPE_Y: dy/dx and dx/dy of the exponent's ridges, for the largest value on a rectangle. The last four hold
 integers: first slot; first tile column and row; tile columns and rows (16 bits each); radius in pixels."""
 
-# Fields of a slot: with h = α·dL/dα, sums over pixels of w·g (colour), h, h·u, h·v, h·u², h·u·v, h·v², w·g (depth).
-SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_DEPTH = range(10)
+# Fields of a slot: with h = α·dL/dα, sums over pixels of w·g (colour), h, h·u, h·v, h·u², h·u·v, h·v², w·g (depth) and,
+# if somebody observes the pass, |h·u|, |B·h·u + C·h·v|, w·map.
+SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_DEPTH, SUM_ABS_X, SUM_ABS_Y, SUM_MAP = (
+    range(13)
+)
 
 TILE_SHIFT = 4
 TILE = 1 << TILE_SHIFT
