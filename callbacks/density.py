@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, ClassVar
 
 import torch
 from lightning.pytorch import LightningModule, Trainer
-from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 
-from nsvq_lightning.compression.importance import most_contributing
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.edit import append_rows, keep_rows, replace_attribute, reset_moments
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.optim import raw_optimizer
-from nsvq_lightning.training.replicas import check_replicas, sum_over_processes
-from nsvq_lightning.training.schedule import Phase, next_iteration
-from nsvq_lightning.training.train_views import train_contributions
+from nsvq_lightning.training.replicas import check_replicas
+from nsvq_lightning.training.schedule import Phase
 
+from .densification import Densification
 from .density_rules import (
     DensityRules,
     add_view,
@@ -32,8 +30,6 @@ from .density_rules import (
     split,
     split_mask,
 )
-from .finite import FiniteSearch, keep_finite_splats
-from .latch import LatchedCallback
 
 __all__ = ["DensityControl"]
 
@@ -43,7 +39,7 @@ GRADIENTS, VIEWS = "gradient_sum", "view_count"
 """Side tables of the splats: sum of the screen-space gradient norms, and number of views that saw the splat."""
 
 
-class DensityControl(LatchedCallback):
+class DensityControl(Densification):
     """Clones, splits and prunes splats (Kerbl et al. 2023, section 5), and drops those that become NaN or infinite.
 
     During warm-up the norm of the screen-space gradient is averaged over the views that see a splat; at the scheduled
@@ -71,37 +67,19 @@ class DensityControl(LatchedCallback):
         [200000]
     """
 
+    tables: ClassVar[tuple[str, ...]] = (GRADIENTS, VIEWS)
+
     def __init__(
         self,
         rules: DensityRules = DensityRules(),  # noqa: B008  frozen
         max_splats: int | None = None,
         finite_every: int = 100,
     ) -> None:
-        super().__init__()
+        super().__init__(finite_every)
         if max_splats is not None and max_splats < rules.min_splats:
             raise ValueError(f"max_splats must be at least min_splats={rules.min_splats}, got {max_splats}")
         self.rules = rules
         self.max_splats = max_splats
-        self._search = FiniteSearch(finite_every, "finite_every")
-        self._warned = False
-
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Reject strategies that would lose the replaced parameters.
-
-        Raises:
-            ValueError: The strategy wraps the module in ``DistributedDataParallel``.
-        """
-        super().setup(trainer, pl_module, stage)
-        if stage == "fit":
-            self._warned = False
-        # A strategy that follows replaced parameters has this attribute.
-        follows = getattr(trainer.strategy, "follows_replaced_parameters", False)
-        if stage == "fit" and isinstance(trainer.strategy, DDPStrategy) and not follows:
-            raise ValueError(
-                "DistributedDataParallel binds gradient hooks to the parameters it finds at the start: after the first "
-                "clone it crashes or silently stops averaging. Train with --trainer.strategy=view_parallel, or on one "
-                "device (--trainer.devices=1)"
-            )
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Remove splats if there are already more than ``max_splats``.
@@ -110,74 +88,34 @@ class DensityControl(LatchedCallback):
             ValueError: There are more, and the trainer has no data module whose views show which ones matter.
         """
         super().on_train_start(trainer, pl_module)
-        host = as_host(pl_module)
-        count = len(host.splats)
-        if self.max_splats is None or count <= self.max_splats:
-            return
-        if host.phase > Phase.PRUNE:
-            log.warning(
-                "max_splats=%d comes too late for %d splats with codebooks; all are kept", self.max_splats, count
-            )
-            return
-        kept = most_contributing(train_contributions(trainer, host), self.max_splats)
-        keep_rows(host.splats, raw_optimizer(trainer), kept)
-        check_replicas(trainer, "the limit of splats")
-        log.info("kept %d of %d splats, those that contribute most to the train views", self.max_splats, count)
+        if self.max_splats is not None:
+            self.keep_at_most(trainer, as_host(pl_module), self.max_splats, "max_splats")
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def ask(self, host: SplatHost, iteration: int, batch: Any) -> None:
         """Ask for screen-space gradients while they are needed."""
-        host = as_host(pl_module)
-        iteration = next_iteration(trainer)
         growing = host.schedule.phase_at(iteration) is Phase.WARMUP
         host.wants_screen_gradients = growing and iteration <= host.schedule.iteration(self.rules.last)
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        """Add the statistics of this view; after a complete step do what is due."""
-        host = as_host(pl_module)
-        if host.wants_screen_gradients:
-            self._observe(trainer, host, self._view(trainer, host, outputs or {}))
-        iteration = trainer.global_step
-        if iteration == 0 or not self._latch.first_time(iteration):
+    def has_asked(self, host: SplatHost) -> bool:
+        """Whether screen-space gradients are there."""
+        return host.wants_screen_gradients
+
+    def add(self, tables: Sequence[Tensor], render: Render, micro_batches: int) -> None:
+        """Add the norms of a view's screen-space gradients, and count it."""
+        if render.means2d.grad is None:
             return
-        if self._search.is_due(trainer):
-            keep_finite_splats(trainer, host)
+        height, width = render.alpha.shape
+        # Gradient accumulation divides the loss by the number of micro-batches; each is a separate view here.
+        sums, views = tables
+        add_view(sums, views, render.means2d.grad, render.radii, width * micro_batches, height * micro_batches)
+
+    def act(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
+        """Clone, split, prune and reset when due."""
         phase = host.schedule.phase_at(iteration)
         if phase is Phase.WARMUP:
             self._warmup_step(trainer, host, iteration)
         elif phase is Phase.PRUNE:
             self._prune_step(trainer, host, iteration)
-
-    def _view(self, trainer: Trainer, host: SplatHost, outputs: Mapping[str, Any]) -> Render | None:
-        """The step's rendering; None if there is none, or if the splats have changed since."""
-        splats, render = host.splats, outputs.get("render")
-        if render is None or (len(render.radii) == len(splats) and outputs.get("edits", splats.edits) == splats.edits):
-            return render
-        if not self._warned:
-            self._warned = True
-            log.warning(
-                "iteration %d: another callback has removed or added splats (%d were rendered, now %d) before density "
-                "control took the statistics of the view; such views are left out from now on. List that callback "
-                "after DensityControl to count all views",
-                trainer.global_step,
-                len(render.radii),
-                len(splats),
-            )
-        return None
-
-    def _observe(self, trainer: Trainer, host: SplatHost, render: Render | None) -> None:
-        """Add one view (of each process) to the statistics; None, for a view without a loss, adds nothing."""
-        sums, views = host.splats.add_table(GRADIENTS), host.splats.add_table(VIEWS)
-        if trainer.world_size == 1:
-            _add(sums, views, render, trainer.accumulate_grad_batches)
-            return
-        observed = sums.new_zeros(2, len(sums))
-        _add(observed[0], observed[1], render, trainer.accumulate_grad_batches)
-        # A collective: every process must call it, even with nothing to add.
-        norms, seen = sum_over_processes(trainer, observed)
-        sums.add_(norms)
-        views.add_(seen)
 
     def _warmup_step(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
         rules, schedule = self.rules, host.schedule
@@ -249,15 +187,6 @@ class DensityControl(LatchedCallback):
         lowered = lower_opacities(host.splats.opacities, self.rules.reset_opacity)
         replace_attribute(host.splats, optimizer, "opacities", lowered)
         reset_moments(optimizer, "opacities")
-
-
-def _add(sums: Tensor, views: Tensor, render: Render | None, micro_batches: int) -> None:
-    """Add a view to the statistics with :func:`~nsvq_lightning.callbacks.density_rules.add_view`, if there is one."""
-    if render is None or render.means2d.grad is None:
-        return
-    height, width = render.alpha.shape
-    # Gradient accumulation divides the loss by the number of micro-batches; each is a separate view here.
-    add_view(sums, views, render.means2d.grad, render.radii, width * micro_batches, height * micro_batches)
 
 
 def _rows(splats: RawSplats, mask: Tensor) -> RawSplats:
