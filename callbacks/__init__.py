@@ -4,26 +4,34 @@ Each decides from the module's schedule and the trainer's step alone, through
 :class:`nsvq_lightning.training.host.SplatHost`; none depends on another. :func:`standard` makes those of ``nsvq fit``.
 """
 
+from .budget import SplatBudget
 from .canonical import CanonicalCovariance
 from .checkpoint import RunCheckpoint
 from .codebooks import CodebookInit, CodebookReplacement
 from .contribution import ContributionPruning
 from .density import DensityControl
 from .density_rules import DensityRules
+from .dropout import SplatDropout
 from .export import ExportScene
 from .finite import FiniteCodes
 from .freeze import FreezeCodes
+from .growth import BudgetedGrowth
+from .growth_rules import GrowthRules
 from .metric_report import MetricReport
 from .opacity import OpacityRegularization
 from .phases import PhaseSchedule
 from .predictions import RenderWriter
 from .progress import SplatProgressBar
+from .rates import RateDecay
 from .refit import CodebookRefit
+from .selection import OpacitySelection
 from .sh_degree import ShDegreeSchedule
 from .standard import STANDARD, standard
+from .views import ViewsPerStep
 
 __all__ = [
     "STANDARD",
+    "BudgetedGrowth",
     "CanonicalCovariance",
     "CodebookInit",
     "CodebookRefit",
@@ -34,12 +42,18 @@ __all__ = [
     "ExportScene",
     "FiniteCodes",
     "FreezeCodes",
+    "GrowthRules",
     "MetricReport",
     "OpacityRegularization",
+    "OpacitySelection",
     "PhaseSchedule",
+    "RateDecay",
     "RenderWriter",
     "RunCheckpoint",
     "ShDegreeSchedule",
+    "SplatBudget",
+    "SplatDropout",
     "SplatProgressBar",
+    "ViewsPerStep",
     "standard",
 ]

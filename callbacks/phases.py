@@ -29,6 +29,7 @@ class PhaseSchedule(HostedCallback):
         warmup_end: Last iteration of the warm-up phase in the reference run.
         prune_end: Last iteration of the prune phase in the reference run.
         quantize_end: Last iteration of the quantize phase in the reference run.
+        position_decay: Iteration of the reference run from which the position's learning rate is constant.
         min_density_interval: Lower limit of the interval of density control in this run.
         min_reset_interval: Lower limit of the interval of opacity resets in this run.
         min_replacement_interval: Lower limit of the window of code replacement and of the interval of refits.
@@ -52,6 +53,7 @@ class PhaseSchedule(HostedCallback):
         warmup_end: int = 15_000,
         prune_end: int = 20_000,
         quantize_end: int = 43_000,
+        position_decay: int = Schedule.position_decay,
         min_density_interval: int = Schedule.min_density_interval,
         min_reset_interval: int = Schedule.min_reset_interval,
         min_replacement_interval: int = Schedule.min_replacement_interval,
@@ -63,6 +65,7 @@ class PhaseSchedule(HostedCallback):
             "warmup_end": warmup_end,
             "prune_end": prune_end,
             "quantize_end": quantize_end,
+            "position_decay": position_decay,
             "min_density_interval": min_density_interval,
             "min_reset_interval": min_reset_interval,
             "min_replacement_interval": min_replacement_interval,

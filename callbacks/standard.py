@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from lightning.pytorch import Callback
 
+from .budget import SplatBudget
 from .canonical import CanonicalCovariance
 from .checkpoint import RunCheckpoint
 from .codebooks import CodebookInit, CodebookReplacement
 from .contribution import ContributionPruning
 from .density import DensityControl
+from .dropout import SplatDropout
 from .export import ExportScene
 from .finite import FiniteCodes
 from .freeze import FreezeCodes
@@ -17,15 +19,23 @@ from .opacity import OpacityRegularization
 from .phases import PhaseSchedule
 from .predictions import RenderWriter
 from .progress import SplatProgressBar
+from .rates import RateDecay
 from .refit import CodebookRefit
+from .selection import OpacitySelection
 from .sh_degree import ShDegreeSchedule
+from .views import ViewsPerStep
 
 __all__ = ["STANDARD", "standard"]
 
 STANDARD: dict[str, type[Callback]] = {
     "phases": PhaseSchedule,
     "sh_degree": ShDegreeSchedule,
+    "rate_decay": RateDecay,
+    "views": ViewsPerStep,
+    "dropout": SplatDropout,
+    "budget": SplatBudget,
     "density": DensityControl,
+    "selection": OpacitySelection,
     "opacity": OpacityRegularization,
     "contribution": ContributionPruning,
     "canonical": CanonicalCovariance,
@@ -60,8 +70,8 @@ def standard(**replaced: Callback | None) -> list[Callback]:
         >>> len(standard()) == len(STANDARD)
         True
         >>> few = standard(density=DensityControl(max_splats=200_000), report=None, progress=None)
-        >>> [type(callback).__name__ for callback in few[:3]]
-        ['PhaseSchedule', 'ShDegreeSchedule', 'DensityControl']
+        >>> [type(callback).__name__ for callback in few[:2]]
+        ['PhaseSchedule', 'ShDegreeSchedule']
     """
     unknown = sorted(set(replaced) - set(STANDARD))
     if unknown:

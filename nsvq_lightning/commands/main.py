@@ -14,6 +14,7 @@ from typing import TextIO
 
 from nsvq_lightning.commands.configs import check_config, configs_among, resolve_configs, written_by_run
 from nsvq_lightning.commands.registry import COMMANDS, overview
+from nsvq_lightning.commands.shorthands import expand
 from nsvq_lightning.version import __version__
 
 __all__ = ["main"]
@@ -57,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments[0] in COMMANDS and (module := COMMANDS[arguments[0]].module) is not None:
             command: Callable[[Sequence[str]], int] = import_module(module).main
             return command(arguments[1:])
-        return _run_lightning(resolve_configs(arguments))
+        return _run_lightning(expand(resolve_configs(arguments)))
     except ModuleNotFoundError as error:
         if error.name != "cv2":
             raise

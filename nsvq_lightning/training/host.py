@@ -42,8 +42,9 @@ class SplatHost(Protocol):
       the attribute, and for each codebook, named ``codebook_<attribute>``:
       :func:`nsvq_lightning.training.optim.param_groups` makes them;
     * a ``training_step`` that returns a dictionary with ``loss`` and, for density control, the ``render`` of the
-      splats, whose ``means2d`` retains its gradient while ``wants_screen_gradients`` is set, and ``edits``, the
-      ``splats.edits`` when they were rendered; None if the step must not update anything;
+      splats, whose ``means2d`` retains its gradient while ``wants_screen_gradients`` is set and which is made with
+      ``observe=pixel_map``, and ``edits``, the ``splats.edits`` when they were rendered; None if the step must not
+      update anything;
     * for reports, test and validation steps that return a dictionary with ``image``, ``psnr`` and ``ssim`` of a view.
 
     Callbacks check members and groups before the first iteration (:func:`splat_host`, :func:`check_optimizer`).
@@ -61,6 +62,12 @@ class SplatHost(Protocol):
     """λ of the loss term λ · Σ opacity."""
     wants_screen_gradients: bool
     """Whether the training step retains the gradient of the projected centres."""
+    pixel_map: Tensor | None
+    """Strength ``[H, W]`` of the pixels of the next view, whose rendering then has ``observed``; None for neither."""
+    splat_budget: int | None
+    """How many splats the scene is to have in the end; None for as many as density control makes."""
+    dropout: float
+    """Share of the splats that each training view leaves out at random."""
     evaluation_splats: SplatTensors | None
     """What test and predict steps render instead of the module's own splats."""
     history: list[dict[str, Any]]
@@ -95,6 +102,13 @@ class SplatHost(Protocol):
 
     def hard_splats(self, phase: Phase) -> RawSplats:
         """The splats as a file written in ``phase`` would hold them, detached."""
+
+    def scale_rate(self, group: str, factor: float) -> None:
+        """Multiply the learning rate of a parameter group in the iteration that starts.
+
+        To be called in ``on_train_batch_start``, for every view of the iteration; factors of several callbacks
+        multiply.
+        """
 
     def render_splats(self, splats: SplatTensors, camera: Camera) -> Render:
         """Render any splats with the module's settings."""

@@ -29,6 +29,7 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, render, visible
 from nsvq_lightning.skips import is_on
+from nsvq_lightning.splats.dropout import dropped_out
 from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, sh_degree_of
 from nsvq_lightning.training.branch import (
     QUANTIZER_SETTINGS,
@@ -43,9 +44,9 @@ from nsvq_lightning.training.optim import (
     LearningRates,
     apply_rates,
     build_adam,
+    group_lr,
     param_groups,
     position_lr,
-    set_lr,
 )
 from nsvq_lightning.training.schedule import Phase, Schedule, log_interval
 from nsvq_lightning.training.state import RunState, Stopwatch
@@ -128,10 +129,14 @@ class SplatModule(LightningModule):
         self.schedule = Schedule()
         self.opacity_weight = 0.0
         self.wants_screen_gradients = False
+        self.pixel_map: Tensor | None = None
+        self.splat_budget: int | None = None
+        self.dropout = 0.0
         self.evaluation_splats: SplatTensors | None = None
         self.history: list[dict[str, Any]] = []
         self.view_metrics = image_metrics()
         self._step_rates = self.rates
+        self._rate_factors: dict[str, float] = {}
         self._updates = True
         self._micro_batch = 0
 
@@ -183,6 +188,10 @@ class SplatModule(LightningModule):
         raw = RawSplats(*(tensor.detach() for tensor in self.splats.raw()))
         return decoded(raw, self.quantizers) if phase >= Phase.QUANTIZE else raw
 
+    def scale_rate(self, group: str, factor: float) -> None:
+        """Multiply the learning rate of a parameter group in the iteration that starts."""
+        self._rate_factors[group] = factor * self._rate_factors.get(group, 1.0)
+
     def render_splats(self, splats: SplatTensors, camera: Camera) -> Render:
         """Render any splats at the active SH degree, over the module's background (``random``: black)."""
         return self._render(splats, camera, self._background())
@@ -203,14 +212,24 @@ class SplatModule(LightningModule):
         scene = compress(self.splats.raw(), quantizers)
         return replace(scene, config=self._settings(quantizers))  # PostHoc fits its codebooks while the scene is stored
 
-    def forward(self, camera: Camera) -> Render:
-        """Render what the current phase trains or, outside training, what a file would hold."""
-        background = self._random_background() if self.training and self.background == "random" else self._background()
-        return self._render(self._phase_splats(camera), camera, background)
+    def forward(self, camera: Camera, observe: Tensor | None = None) -> Render:
+        """Render what the current phase trains or, outside training, what a file would hold.
 
-    def _render(self, splats: SplatTensors, camera: Camera, background: Tensor | None) -> Render:
+        Args:
+            camera: Where to look from.
+            observe: Strength of each pixel ``[H, W]``, see :func:`nsvq_lightning.render`.
+        """
+        background = self._random_background() if self.training and self.background == "random" else self._background()
+        splats = self._phase_splats(camera)
+        if self.training and self.dropout:
+            splats = splats._replace(opacities=dropped_out(splats.opacities, self.dropout, self._generator("dropout")))
+        return self._render(splats, camera, background, observe)
+
+    def _render(
+        self, splats: SplatTensors, camera: Camera, background: Tensor | None, observe: Tensor | None = None
+    ) -> Render:
         degree = min(self.active_sh_degree, sh_degree_of(splats.shN))
-        return render(splats, camera, sh_degree=degree, background=background, backend=self.backend)
+        return render(splats, camera, sh_degree=degree, background=background, observe=observe, backend=self.backend)
 
     def _phase_splats(self, camera: Camera) -> RawSplats:
         raw = self.splats.raw()
@@ -351,12 +370,15 @@ class SplatModule(LightningModule):
         self.stopwatch.start()
 
     def on_train_batch_start(self, batch: View, batch_idx: int) -> None:
-        """Set the position's learning rate of this iteration."""
+        """Set the learning rates of this iteration."""
         self._micro_batch = batch_idx % self.trainer.accumulate_grad_batches
         if self._micro_batch == 0:
             self._updates = True
-        rate = position_lr(self.global_step + 1, self.extent, self._step_rates, self.schedule.position_decay_end)
-        set_lr(self.trainer.optimizers[0], "means", rate)
+        position = position_lr(self.global_step + 1, self.extent, self._step_rates, self.schedule.position_decay_end)
+        for group in self.trainer.optimizers[0].param_groups:
+            name = group["name"]
+            rate = position if name == "means" else group_lr(name, self._step_rates, self.extent)
+            group["lr"] = rate * self._rate_factors.pop(name, 1.0)
 
     def training_step(self, batch: View, batch_idx: int) -> dict[str, Any] | None:
         """Loss of one view: (1 - w)·L1 + w·(1 - SSIM) + λ·Σ opacity (paper, section 3.3).
@@ -367,7 +389,7 @@ class SplatModule(LightningModule):
             loss.
         """
         edits = self.splats.edits
-        rendered = self(batch.camera)
+        rendered = self(batch.camera, self.pixel_map)
         if self.wants_screen_gradients:
             rendered.means2d.retain_grad()
         loss = photometric_loss(rendered.image, batch.image, self.dssim_weight)

@@ -44,9 +44,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Phase", "Schedule", "log_interval", "next_iteration"]
 
-POSITION_DECAY_END = 30_000
-"""The position's learning rate decays until here in the paper's run, then stays constant."""
-
 
 class Phase(IntEnum):
     """Phase of a run (paper, section 4.1)."""
@@ -74,6 +71,7 @@ class Schedule:
         warmup_end: Last iteration of the warm-up phase, in the reference run.
         prune_end: Last iteration of the prune phase, in the reference run.
         quantize_end: Last iteration of the quantize phase, in the reference run; fine-tuning takes the rest.
+        position_decay: Iteration of the reference run from which the position's learning rate is constant.
         min_density_interval: Lower limit of the interval of density control, in iterations of this run.
         min_reset_interval: Lower limit of the interval of opacity resets, in iterations of this run.
         min_replacement_interval: Lower limit of the window of code replacement and of the interval of refits, in
@@ -92,6 +90,7 @@ class Schedule:
     warmup_end: int = 15_000
     prune_end: int = 20_000
     quantize_end: int = 43_000
+    position_decay: int = 30_000
     min_density_interval: int = 50
     min_reset_interval: int = 300
     min_replacement_interval: int = 50
@@ -114,6 +113,8 @@ class Schedule:
                 f"fine-tuning needs a quantize phase of at least one iteration to place its codebooks in, got "
                 f"prune_end = quantize_end = {self.prune_end}; raise quantize_end or set it to reference_total"
             )
+        if self.position_decay < 1:
+            raise ValueError(f"position_decay must be at least 1, got {self.position_decay}")
         for name in ("min_density_interval", "min_reset_interval", "min_replacement_interval", "min_finetune"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1 iteration, got {getattr(self, name)}")
@@ -222,7 +223,7 @@ class Schedule:
     @property
     def position_decay_end(self) -> int:
         """Iteration from which the position's learning rate is constant."""
-        return self.iteration(POSITION_DECAY_END)
+        return self.iteration(self.position_decay)
 
 
 @lru_cache

@@ -1,0 +1,190 @@
+"""Density control with a budget: where the photos have edges, along the longest axis."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from torch import Tensor
+
+from nsvq_lightning.data.edges import edge_strength
+from nsvq_lightning.random import generator
+from nsvq_lightning.rendering.rasterize import Render
+from nsvq_lightning.splats.splats import RawSplats
+from nsvq_lightning.training.edit import append_rows, keep_rows, replace_attribute, reset_moments
+from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.optim import raw_optimizer
+from nsvq_lightning.training.replicas import check_replicas
+from nsvq_lightning.training.schedule import Phase
+
+from .densification import Densification
+from .density_rules import lower_opacities
+from .growth_rules import GrowthRules, budget_at, draw_rows, lowest_share, split_longest, view_statistics
+
+__all__ = ["BudgetedGrowth"]
+
+log = logging.getLogger(__name__)
+
+GRADIENTS, VIEWS, EDGES = "gradient_sum", "view_count", "edge_sum"
+
+
+class BudgetedGrowth(Densification):
+    """Splits splats where the photos have edges, up to a budget: fewer splats for the same quality.
+
+    During warm-up each view adds, in its own backward pass, the absolute screen-space gradient of every splat (AbsGS,
+    Ye et al. 2024) and its blending weight times the strength of the photo's edges. At the scheduled iterations as many
+    splats as the budget allows are drawn, in proportion to their edge weight, from those whose gradient reaches a
+    threshold, and each is split along its longest axis (Improved-GS, Deng et al. 2025). Transparent splats are pruned,
+    and opacities reset. Growth ends with the warm-up phase; non-finite splats are dropped in every phase.
+
+    Args:
+        growth: All thresholds, intervals and limits.
+        budget: How many splats the scene is to have in the end; None for the module's
+            (:class:`nsvq_lightning.callbacks.SplatBudget`).
+        overshoot: Growth may reach this many times the budget: more than 1 is for a run that selects the best of them
+            afterwards (:class:`nsvq_lightning.callbacks.OpacitySelection`).
+        finite_every: Iterations between two searches for non-finite splats; a step whose loss is not finite always
+            causes one.
+
+    Raises:
+        ValueError: ``budget`` is below ``growth.min_splats``, ``overshoot`` below 1, or ``finite_every`` below 1.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import BudgetedGrowth, standard
+        >>> callbacks = standard(density=BudgetedGrowth(budget=100_000))  # --callbacks.density=BudgetedGrowth ...
+        >>> [callback.budget for callback in callbacks if isinstance(callback, BudgetedGrowth)]
+        [100000]
+    """
+
+    tables: ClassVar[tuple[str, ...]] = (GRADIENTS, VIEWS, EDGES)
+
+    def __init__(
+        self,
+        growth: GrowthRules = GrowthRules(),  # noqa: B008  frozen
+        budget: int | None = None,
+        overshoot: float = 2.0,
+        finite_every: int = 100,
+    ) -> None:
+        super().__init__(finite_every)
+        if budget is not None and budget < growth.min_splats:
+            raise ValueError(f"budget must be at least min_splats={growth.min_splats}, got {budget}")
+        if not overshoot >= 1.0:
+            raise ValueError(f"overshoot must be at least 1, got {overshoot}")
+        self.growth = growth
+        self.budget = budget
+        self.overshoot = overshoot
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Remove splats if there are already more than growth may reach.
+
+        Raises:
+            ValueError: There is no budget; or there are more splats, and the trainer has no data module whose views
+                show which ones matter.
+        """
+        super().on_train_start(trainer, pl_module)
+        host = as_host(pl_module)
+        self.keep_at_most(trainer, host, self.limit(host), "the budget")
+
+    def limit(self, host: SplatHost) -> int:
+        """How many splats growth may reach.
+
+        Raises:
+            ValueError: Neither the callback nor the module has a budget.
+        """
+        budget = host.splat_budget if self.budget is None else self.budget
+        if budget is None:
+            raise ValueError(
+                "growth needs a budget: list SplatBudget before it (--callbacks.budget=SplatBudget), or set "
+                "--callbacks.density.budget to a number of splats"
+            )
+        return int(self.overshoot * budget)
+
+    def ask(self, host: SplatHost, iteration: int, batch: Any) -> None:
+        """Ask for absolute gradients and edge weights during warm-up."""
+        growing = host.schedule.phase_at(iteration) is Phase.WARMUP
+        host.pixel_map = edge_strength(batch.image) if growing else None
+
+    def has_asked(self, host: SplatHost) -> bool:
+        """Whether a map of edges was asked for."""
+        return host.pixel_map is not None
+
+    def add(self, tables: Sequence[Tensor], render: Render, micro_batches: int) -> None:
+        """Add a view's absolute gradients and edge weights, and count it."""
+        if render.observed is None or render.observed.grad is None:
+            return
+        height, width = render.alpha.shape
+        # Gradient accumulation divides the loss by the number of micro-batches; each is a separate view here.
+        size = width * micro_batches, height * micro_batches
+        for table, values in zip(tables, view_statistics(render.observed.grad, render.radii, *size), strict=True):
+            table.add_(values)
+
+    def act(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
+        """Split, prune and reset when due."""
+        rules, schedule = self.growth, host.schedule
+        if schedule.phase_at(iteration) is not Phase.WARMUP:
+            return
+        if rules.first_prune and iteration == schedule.iteration(rules.first_prune):
+            self._prune(trainer, host, host.splats.opacities.sigmoid() < rules.first_opacity)
+        last = schedule.ends[Phase.WARMUP]
+        times = schedule.density_times(rules.start + rules.every, round(last / schedule.scale), rules.every)
+        if iteration in times:
+            added = self._grow(trainer, host, iteration)
+            pruned = 0
+            if iteration != times[-1]:
+                pruned = self._prune(trainer, host, host.splats.opacities.sigmoid() < rules.min_opacity)
+            check_replicas(trainer, "growth")
+            log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(host.splats))
+        resets = schedule.reset_times(rules.reset_last, rules.reset_every)
+        if iteration in resets:
+            self._reset_opacities(trainer, host)
+            check_replicas(trainer, "the opacity reset")
+        if iteration in (reset + schedule.iteration(rules.recovery) for reset in resets[: rules.recoveries]):
+            self._prune(trainer, host, lowest_share(host.splats.opacities, rules.recovery_share))
+
+    @torch.no_grad()
+    def _grow(self, trainer: Trainer, host: SplatHost, iteration: int) -> int:
+        """Split as many splats as the budget allows; returns how many were added. Resets the statistics."""
+        splats, rules, schedule = host.splats, self.growth, host.schedule
+        gradients, views, edges = (splats.add_table(name) for name in self.tables)
+        statistic = gradients / views.clamp(min=1)
+        reference = iteration / schedule.scale
+        late = reference > rules.full
+        weight = statistic if late else edges
+        threshold = rules.late_threshold if late else rules.grad_threshold
+        candidates = torch.where(statistic >= threshold, weight, torch.zeros_like(weight))
+        room = budget_at((reference - rules.start) / (rules.full - rules.start), self.limit(host)) - len(splats)
+        divided = draw_rows(candidates, room, generator(host.seed, iteration, "grow"))
+        before = len(splats)
+        parents = RawSplats(*(tensor.detach()[divided] for tensor in splats.raw()))
+        append_rows(splats, raw_optimizer(trainer), split_longest(parents)._asdict())
+        keep_rows(splats, raw_optimizer(trainer), torch.cat([~divided, divided.new_ones(len(splats) - before)]))
+        for name in self.tables:
+            splats.add_table(name).zero_()
+        return len(splats) - before
+
+    @torch.no_grad()
+    def _prune(self, trainer: Trainer, host: SplatHost, mask: Tensor) -> int:
+        """Remove the splats of ``mask [N]``; returns how many."""
+        count = int(mask.sum())
+        if len(host.splats) - count < self.growth.min_splats:
+            log.warning(
+                "iteration %d: pruning %d of %d splats would leave fewer than min_splats=%d; skipped. Opacities have "
+                "collapsed: lower the learning rates, or check the camera poses",
+                trainer.global_step,
+                count,
+                len(host.splats),
+                self.growth.min_splats,
+            )
+            return 0
+        keep_rows(host.splats, raw_optimizer(trainer), ~mask)
+        return count
+
+    @torch.no_grad()
+    def _reset_opacities(self, trainer: Trainer, host: SplatHost) -> None:
+        optimizer = raw_optimizer(trainer)
+        lowered = lower_opacities(host.splats.opacities, self.growth.reset_opacity)
+        replace_attribute(host.splats, optimizer, "opacities", lowered)
+        reset_moments(optimizer, "opacities")

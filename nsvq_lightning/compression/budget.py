@@ -1,0 +1,69 @@
+"""How many splats photos support, and how many fit into a number of bytes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from nsvq_lightning.splats.sh_degree import sh_coefficients
+
+__all__ = ["splats_for_bytes", "splats_for_photos"]
+
+SPLATS_PER_PIXEL = 0.09
+"""Splats for each detailed pixel of a photo, times the root of the number of photos."""
+
+LEAST = 1000
+"""A scene of fewer splats is no scene."""
+
+GEOMETRY_BITS = 25.5
+"""Bits of a splat's position and opacity at level ``compact``, between 23 and 28 on the measured scenes."""
+ROW_BITS = {"scales": 0.0, "quats": 0.3, "sh0": -1.3, "shN": -1.4}
+"""Bits of a code beyond log2 of the number of codes: colours of neighbours are alike."""
+CODE_BITS = {"scales": 6.0, "quats": 5.7, "sh0": 5.9, "shN": 5.5}
+"""Bits of a number in a codebook at level ``compact``."""
+HEADER = 2048
+"""Bytes of the header."""
+FULL_BITS = 32
+"""Bits of each number of an attribute without a codebook."""
+
+
+def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:
+    """A default for the number of splats: quality · 0.09 · √photos · detail.
+
+    Detail asks for splats; more photos of it show more of its sides, and support more without fitting the noise.
+
+    Args:
+        photos: Number of train photos.
+        detail: Detailed pixels of a photo (:func:`nsvq_lightning.data.edges.detailed_pixels`).
+        quality: Factor.
+    """
+    return max(LEAST, round(quality * SPLATS_PER_PIXEL * math.sqrt(photos) * detail))
+
+
+def splats_for_bytes(size: int, codebooks: Mapping[str, Sequence[int]], sh_degree: int) -> int:
+    """Number of splats in a file of level ``compact``, within a tenth.
+
+    Args:
+        size: Bytes of the file.
+        codebooks: Codes and dimension of each codebook by attribute.
+        sh_degree: Of the splats.
+
+    Raises:
+        ValueError: There is no room for splats beside the codebooks.
+    """
+    fixed, bits = 8.0 * HEADER, GEOMETRY_BITS
+    numbers = {"scales": 3, "quats": 4, "sh0": 3, "shN": 3 * sh_coefficients(sh_degree)}
+    for name, count in numbers.items():
+        if name in codebooks:
+            codes, dim = codebooks[name]
+            fixed += codes * dim * CODE_BITS[name]
+            bits += math.log2(codes) + ROW_BITS[name]
+        else:
+            bits += FULL_BITS * count
+    splats = int((8 * size - fixed) / bits)
+    if splats < LEAST:
+        raise ValueError(
+            f"{size} bytes leave room for {max(splats, 0)} splats beside codebooks of {round(fixed / 8)} bytes; allow "
+            "more, or take smaller codebooks (--model.codebooks=0.5k)"
+        )
+    return splats

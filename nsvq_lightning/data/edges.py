@@ -1,0 +1,52 @@
+"""Where photos have detail: the strength of their edges, and how many pixels have one."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nsvq_lightning.data.scene import Scene
+
+__all__ = ["detailed_pixels", "edge_strength"]
+
+HIGH_PASS = np.array([[-1, -1, -1], [-1, 8, -1], [-1, -1, -1]], np.float32)
+"""Eight times a pixel less its neighbours."""
+DETAIL = 20.0
+"""High-pass value, of grey values up to 255, from which a pixel counts as detailed: well above the noise of a photo."""
+SAMPLE = 32
+"""Photos that are looked at for the detail of a scene."""
+
+
+def _high_pass(image: Tensor) -> NDArray[np.float32]:
+    grey = cv2.cvtColor(image.cpu().numpy(), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    return np.asarray(cv2.filter2D(grey, -1, HIGH_PASS))
+
+
+def edge_strength(image: Tensor) -> Tensor:
+    """Edge strength ``[H, W]`` of a photo, in [0, 1]: the positive part of a high-pass filter of its grey values.
+
+    The strongest edge has strength 1; a photo without any edge is 0 everywhere.
+
+    Args:
+        image: ``[H, W, 3]`` uint8 RGB.
+    """
+    edges = np.clip(_high_pass(image), 0, 255)
+    low, high = float(edges.min()), float(edges.max())
+    return torch.from_numpy((edges - low) / max(high - low, 1.0)).to(image.device)
+
+
+def detailed_pixels(scene: Scene) -> float:
+    """Pixels of a train photo that differ clearly from their neighbours, on average over the photos.
+
+    Args:
+        scene: At most 32 of its photos, evenly spaced, are decoded.
+
+    Raises:
+        SceneError: An image cannot be decoded.
+    """
+    step = -(-len(scene.train) // SAMPLE)
+    counts = [int((np.abs(_high_pass(scene.images[index])) > DETAIL).sum()) for index in scene.train[::step]]
+    return sum(counts) / len(counts)
