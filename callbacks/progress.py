@@ -55,8 +55,8 @@ class SplatProgressBar(TQDMProgressBar):
 
     @property
     def total_train_batches(self) -> int | float:
-        """Micro-batches of the whole run; the epoch of an endless sampler never ends."""
-        return self.trainer.max_steps * self.trainer.accumulate_grad_batches
+        """Iterations of the whole run, however many views each has; the epoch of an endless sampler never ends."""
+        return self.trainer.max_steps
 
     @property
     def is_disabled(self) -> bool:
@@ -75,7 +75,7 @@ class SplatProgressBar(TQDMProgressBar):
     def on_train_start(self, trainer: Trainer, *args: Any) -> None:
         """Start the bar at the current iteration."""
         super().on_train_start(trainer, *args)
-        done = trainer.global_step * trainer.accumulate_grad_batches
+        done = trainer.global_step
         self.train_progress_bar.reset(total=self.total_train_batches)
         self.train_progress_bar.initial = self.train_progress_bar.n = done  # (n - initial) / time is the speed
         self._started, self._compiled_before = time.time(), compile_seconds()
@@ -89,7 +89,7 @@ class SplatProgressBar(TQDMProgressBar):
     ) -> None:
         """Refresh the bar, or write a line."""
         # A resumed run counts batches from zero; its bar does not.
-        done = trainer.global_step * trainer.accumulate_grad_batches
+        done = trainer.global_step
         if not self._should_update(done, int(self.total_train_batches)):
             return
         text = self._text(trainer, pl_module)
@@ -125,7 +125,7 @@ class SplatProgressBar(TQDMProgressBar):
     def _line(self, trainer: Trainer) -> str:
         step, total = trainer.global_step, trainer.max_steps
         seconds = time.time() - self._start_without_compilation()
-        done = self.train_progress_bar.initial / trainer.accumulate_grad_batches
+        done = self.train_progress_bar.initial
         left = seconds * (total - step) / max(1.0, step - done)
         elapsed, remaining = Tqdm.format_interval(seconds), Tqdm.format_interval(left)
         return f"iteration {step} of {total} ({100 * step // total} %), {elapsed} elapsed, {remaining} left"

@@ -113,8 +113,8 @@ class ColmapDataModule(LightningDataModule):
 
     @property
     def draw(self) -> int:
-        """Number of train views that each process had drawn before the trainer's current step."""
-        return self.trainer.global_step * self.trainer.accumulate_grad_batches if self.trainer is not None else 0
+        """Number of train views that each process had drawn when the trainer's current state was reached."""
+        return self.trainer.fit_loop.epoch_loop.batch_progress.total.ready if self.trainer is not None else 0
 
     def _check_share(self, count: int, views: str) -> None:
         if count < self.process[1]:

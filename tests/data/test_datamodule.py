@@ -46,7 +46,9 @@ class _Recorder(LightningModule):
 
 def _on(data: ColmapDataModule, step: int, rank: int, world_size: int) -> ColmapDataModule:
     """The data module as it is on one of several processes."""
-    trainer = SimpleNamespace(global_step=step, accumulate_grad_batches=1, global_rank=rank, world_size=world_size)
+    progress = SimpleNamespace(total=SimpleNamespace(ready=step))
+    loop = SimpleNamespace(epoch_loop=SimpleNamespace(batch_progress=progress))
+    trainer = SimpleNamespace(fit_loop=loop, global_rank=rank, world_size=world_size)
     data.trainer = cast(Trainer, trainer)
     return data
 
