@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
@@ -30,6 +31,9 @@ log = logging.getLogger(__name__)
 
 GRADIENTS, VIEWS, EDGES = "gradient_sum", "view_count", "edge_sum"
 
+IDLE = 0.01
+"""Growth is idle if it adds at most this share of what it may add, or of what there is."""
+
 
 class BudgetedGrowth(Densification):
     """Splits splats where the photos have edges, up to a budget: fewer splats for the same quality.
@@ -38,7 +42,8 @@ class BudgetedGrowth(Densification):
     Ye et al. 2024) and its blending weight times the strength of the photo's edges. At the scheduled iterations as many
     splats as the budget allows are drawn, in proportion to their edge weight, from those whose gradient reaches a
     threshold, and each is split along its longest axis (Improved-GS, Deng et al. 2025). Transparent splats are pruned,
-    and opacities reset. Growth ends with the warm-up phase; non-finite splats are dropped in every phase.
+    and opacities reset. Growth ends with the warm-up phase, or ends that phase early if hardly any splat needs to be
+    split; non-finite splats are dropped in every phase.
 
     Args:
         growth: All thresholds, intervals and limits.
@@ -76,6 +81,26 @@ class BudgetedGrowth(Densification):
         self.growth = growth
         self.budget = budget
         self.overshoot = overshoot
+        self._idle = 0
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Forget an earlier fit; reject strategies that would lose the replaced parameters.
+
+        Raises:
+            ValueError: The strategy wraps the module in ``DistributedDataParallel``.
+        """
+        super().setup(trainer, pl_module, stage)
+        if stage == "fit":
+            self._idle = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """The last iteration acted on, and for how long growth has been idle."""
+        return {**super().state_dict(), "idle": self._idle}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from there."""
+        super().load_state_dict(state_dict)
+        self._idle = state_dict["idle"]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Remove splats if there are already more than growth may reach.
@@ -131,22 +156,32 @@ class BudgetedGrowth(Densification):
         last = schedule.ends[Phase.WARMUP]
         times = schedule.density_times(rules.start + rules.every, round(last / schedule.scale), rules.every)
         if iteration in times:
-            added = self._grow(trainer, host, iteration)
+            room, added = self._grow(trainer, host, iteration)
             pruned = 0
             if iteration != times[-1]:
                 pruned = self._prune(trainer, host, host.splats.opacities.sigmoid() < rules.min_opacity)
             check_replicas(trainer, "growth")
             log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(host.splats))
+            self._idle = self._idle + 1 if added <= IDLE * min(room, len(host.splats)) else 0
+            if self._idle >= rules.patience > 0:
+                host.schedule = replace(schedule, saved=schedule.saved + last - iteration)
+                log.info(
+                    "iteration %d: growth ends with %d splats, as hardly any needs to be split; the run will be %d "
+                    "iterations shorter",
+                    iteration,
+                    len(host.splats),
+                    last - iteration,
+                )
         resets = schedule.reset_times(rules.reset_last, rules.reset_every)
         if iteration in resets:
             self._reset_opacities(trainer, host)
             check_replicas(trainer, "the opacity reset")
-        if iteration in (reset + schedule.iteration(rules.recovery) for reset in resets[: rules.recoveries]):
+        if iteration in (reset + schedule.interval(rules.recovery) for reset in resets[: rules.recoveries]):
             self._prune(trainer, host, lowest_share(host.splats.opacities, rules.recovery_share))
 
     @torch.no_grad()
-    def _grow(self, trainer: Trainer, host: SplatHost, iteration: int) -> int:
-        """Split as many splats as the budget allows; returns how many were added. Resets the statistics."""
+    def _grow(self, trainer: Trainer, host: SplatHost, iteration: int) -> tuple[int, int]:
+        """Split as many splats as the budget allows; returns how many that was, and were. Resets the statistics."""
         splats, rules, schedule = host.splats, self.growth, host.schedule
         gradients, views, edges = (splats.add_table(name) for name in self.tables)
         statistic = gradients / views.clamp(min=1)
@@ -163,7 +198,7 @@ class BudgetedGrowth(Densification):
         keep_rows(splats, raw_optimizer(trainer), torch.cat([~divided, divided.new_ones(len(splats) - before)]))
         for name in self.tables:
             splats.add_table(name).zero_()
-        return len(splats) - before
+        return room, len(splats) - before
 
     @torch.no_grad()
     def _prune(self, trainer: Trainer, host: SplatHost, mask: Tensor) -> int:

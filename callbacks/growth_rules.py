@@ -46,6 +46,8 @@ class GrowthRules:
         recovery: Iterations after a reset at which those with the lowest opacity are pruned.
         recoveries: After how many resets, from the first, that is done.
         recovery_share: Share of the splats that this prunes.
+        patience: After so many times at which there is room, but hardly a splat over the threshold, the warm-up phase
+            ends; 0 for never.
         min_splats: A pruning that would leave fewer splats is skipped with a warning.
 
     Raises:
@@ -71,13 +73,14 @@ class GrowthRules:
     recovery: int = 300
     recoveries: int = 2
     recovery_share: float = 0.2
+    patience: int = 5
     min_splats: int = 10
 
     def __post_init__(self) -> None:
         for name in ("every", "reset_every", "recovery", "min_splats"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("start", "first_prune", "recoveries", "grad_threshold", "late_threshold"):
+        for name in ("start", "first_prune", "recoveries", "patience", "grad_threshold", "late_threshold"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
         if self.full <= self.start:

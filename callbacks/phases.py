@@ -61,6 +61,7 @@ class PhaseSchedule(HostedCallback):
     ) -> None:
         self.total = total
         self.reference_total = reference_total
+        self._steps = -1
         self.rules = {
             "warmup_end": warmup_end,
             "prune_end": prune_end,
@@ -89,6 +90,7 @@ class PhaseSchedule(HostedCallback):
         if stage != "fit":
             return
         host = as_host(pl_module)
+        self._steps = trainer.max_steps
         total = self.total if self.total is not None else trainer.max_steps
         if total < 1:
             raise ValueError(
@@ -131,6 +133,8 @@ class PhaseSchedule(HostedCallback):
         )
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Write the phase of the iteration that starts."""
+        """Write the phase of the iteration that starts; end the run earlier by what its warm-up has saved."""
         host = as_host(pl_module)
+        if self._steps > 0:
+            trainer.fit_loop.epoch_loop.max_steps = self._steps - host.schedule.saved
         host.phase = host.schedule.phase_at(next_iteration(trainer))

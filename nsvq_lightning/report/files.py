@@ -103,7 +103,7 @@ def write_curve(path: Path, history: Sequence[Mapping[str, Any]], schedule: Sche
         start = end
     quality.plot(iterations, [entry["psnr"] for entry in history], "o-", color="#1f4e9c", markersize=3)
     count.plot(iterations, [entry["splats"] for entry in history], "-", color="#b5651d")
-    quality.set(xlabel="iteration", xlim=(0, max(schedule.total, 1)))
+    quality.set(xlabel="iteration", xlim=(0, max(schedule.ends[-1], 1)))
     quality.set_ylabel("test PSNR, dB", color="#1f4e9c")
     count.set_ylabel("splats", color="#b5651d")
     count.set_ylim(bottom=0)

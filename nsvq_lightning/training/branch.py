@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from torch import Tensor, nn
@@ -20,6 +20,7 @@ __all__ = [
     "can_branch",
     "changed_schedule",
     "check_continuation",
+    "continued_schedule",
 ]
 
 QUANTIZE_RULES = ("quantize_end", "min_finetune", "min_replacement_interval")
@@ -88,6 +89,13 @@ def branch_optimizer_state(stored: Mapping[str, Any], fresh: Mapping[str, Any]) 
     return merged
 
 
+def continued_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> Schedule:
+    """The schedule with the iterations that the checkpoint's run has saved in the same warm-up phase."""
+    stored = Schedule(**checkpoint["schedule"])
+    same = all(getattr(stored, name) == getattr(schedule, name) for name in ("total", "reference_total", "warmup_end"))
+    return replace(schedule, saved=stored.saved) if same else schedule
+
+
 def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str | None:
     """What to report on a run that continues from a checkpoint with this schedule; None if nothing changes."""
     stored = Schedule(**checkpoint["schedule"])
@@ -97,7 +105,7 @@ def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str |
             "control and learning rates follow the new length; pass "
             f"--trainer.max_steps={stored.total} to continue that run as it was"
         )
-    own, without_effect = asdict(schedule), QUANTIZE_RULES if _is_unquantized(checkpoint) else ()
+    own, without_effect = asdict(schedule), ("saved", *(QUANTIZE_RULES if _is_unquantized(checkpoint) else ()))
     changed = {name: v for name, v in asdict(stored).items() if v != own[name] and name not in without_effect}
     if not changed:
         return None

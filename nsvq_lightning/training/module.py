@@ -37,6 +37,7 @@ from nsvq_lightning.training.branch import (
     can_branch,
     changed_schedule,
     check_continuation,
+    continued_schedule,
 )
 from nsvq_lightning.training.checkpoints import plain
 from nsvq_lightning.training.edit import finite_splats
@@ -342,8 +343,10 @@ class SplatModule(LightningModule):
             if "schedule" in checkpoint:
                 self.schedule = Schedule(**checkpoint["schedule"])
             return
-        if "schedule" in checkpoint and (change := changed_schedule(checkpoint, self.schedule)) is not None:
-            log.warning(change)
+        if "schedule" in checkpoint:
+            self.schedule = continued_schedule(checkpoint, self.schedule)
+            if (change := changed_schedule(checkpoint, self.schedule)) is not None:
+                log.warning(change)
         if can_branch(checkpoint, self.codebooks):
             branch_checkpoint(checkpoint, self.codebooks, self.configure_optimizers())
         check_continuation(checkpoint, self.state_dict(), self.quantizer_settings)

@@ -78,6 +78,8 @@ class Schedule:
             iterations of this run.
         min_finetune: Lower limit of the length of the fine-tune phase, in iterations of this run; it never takes more
             than half of the iterations after the prune phase.
+        saved: Iterations of the warm-up phase that this run leaves out, as nothing was left to do in them; all that
+            follows comes so much earlier.
 
     To give ends in iterations of this run, set ``reference_total`` to ``total``: then nothing scales.
 
@@ -95,6 +97,7 @@ class Schedule:
     min_reset_interval: int = 300
     min_replacement_interval: int = 50
     min_finetune: int = 300
+    saved: int = 0
 
     def __post_init__(self) -> None:
         if self.total < 1 or self.reference_total < 1:
@@ -118,6 +121,8 @@ class Schedule:
         for name in ("min_density_interval", "min_reset_interval", "min_replacement_interval", "min_finetune"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1 iteration, got {getattr(self, name)}")
+        if self.saved < 0 or (self.saved and self.ends[0] < 1):
+            raise ValueError(f"a run cannot save {self.saved} iterations of its warm-up phase")
 
     @cached_property
     def scale(self) -> float:
@@ -138,7 +143,7 @@ class Schedule:
         warmup, prune, quantize, finetune = (max(end, 0) for end in ends)
         if exists[Phase.QUANTIZE] and quantize == prune:
             quantize = finetune  # a run of one iteration: codes must be placed before they are tuned
-        return warmup, prune, quantize, finetune
+        return warmup - self.saved, prune - self.saved, quantize - self.saved, finetune - self.saved
 
     def _end(self, phase: int, reference: int, before: int) -> int:
         """Where a phase that starts after iteration ``before`` ends in this run, before the rounding of tiny runs."""
@@ -162,6 +167,10 @@ class Schedule:
 
     def iteration(self, reference: float) -> int:
         """The iteration of this run that corresponds to iteration ``reference`` of the reference run, at least 1."""
+        return self.interval(reference) - (self.saved if reference > self.warmup_end else 0)
+
+    def interval(self, reference: float) -> int:
+        """How many iterations of this run correspond to ``reference`` of the reference run, at least 1."""
         return max(1, round(reference * self.scale))
 
     def stride(self, reference: int, minimum: int) -> float:
@@ -206,11 +215,11 @@ class Schedule:
     @property
     def _quantized(self) -> float:
         """Where the quantize phase of this run ends, in iterations of the reference run."""
-        return self.ends[Phase.QUANTIZE] / self.scale
+        return (self.ends[Phase.QUANTIZE] + self.saved) / self.scale
 
     def sh_degree_at(self, iteration: int, every: int, highest: int) -> int:
         """SH degree in use at a 1-based iteration: one more every ``every`` reference iterations."""
-        return min(highest, iteration // self.iteration(every))
+        return min(highest, iteration // self.interval(every))
 
     def strength(self, reference: float) -> float:
         """The weight of a loss term whose effect adds up over a phase, from its weight in the reference run.

@@ -200,3 +200,23 @@ def test_a_shorthand_replaces_the_configs_budget(tmp_path: Path, demo_scene: Pat
     written = (tmp_path / "run" / "config.yaml").read_text()
     assert "splats: 60" in written
     assert "quality: null" in written
+
+
+def test_growth_that_has_nothing_to_split_ends_the_warm_up_and_shortens_the_run(
+    run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
+) -> None:
+    idle = GrowthRules(start=0, full=20, every=4, grad_threshold=1e3, late_threshold=1e3, first_prune=0, patience=2)
+    chosen = options(density=BudgetedGrowth(idle), checkpoint=CheckpointAt(10, 13, 30))
+    with caplog.at_level(logging.INFO):
+        trainer, module = run(recipe(**chosen).values())
+    assert "iteration 12: growth ends with 500 splats" in caplog.text
+    assert module.schedule.saved == 12
+    assert module.schedule.ends == (12, 28, 38, 48)
+    assert trainer.global_step == 48
+    assert trainer.max_steps == 48
+    for interrupted_at in (10, 13, 30):
+        path = run_folder(trainer) / "checkpoints" / f"step-{interrupted_at}.ckpt"
+        again = options(density=BudgetedGrowth(idle), checkpoint=RunCheckpoint(every=0))
+        resumed, _ = run(recipe(**again).values(), ckpt_path=path)
+        assert resumed.global_step == 48
+        assert scene_bytes(resumed) == scene_bytes(trainer)
