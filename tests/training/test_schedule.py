@@ -125,3 +125,21 @@ def test_impossible_schedules_are_refused(settings: dict[str, int], message: str
 def test_terms_that_add_up_are_stronger_in_a_shorter_run() -> None:
     assert Schedule().strength(1e-7) == 1e-7
     assert Schedule(total=4500).strength(1e-7) == pytest.approx(1e-6)
+
+
+def test_what_the_warm_up_saves_moves_all_that_follows() -> None:
+    whole, shorter = Schedule(total=4500), Schedule(total=4500, saved=300)
+    assert shorter.ends == tuple(end - 300 for end in whole.ends)
+    assert shorter.iteration(12_000) == whole.iteration(12_000)
+    assert shorter.iteration(18_500) == whole.iteration(18_500) - 300
+    assert shorter.times(16_000, 20_000, 1000) == tuple(time - 300 for time in whole.times(16_000, 20_000, 1000))
+    assert shorter.refit_times(500) == tuple(time - 300 for time in whole.refit_times(500))
+    replaced = whole.replacement_times(20_100, 22_000, 100, 40_000, 500)
+    assert shorter.replacement_times(20_100, 22_000, 100, 40_000, 500) == tuple(time - 300 for time in replaced)
+    assert [shorter.sh_degree_at(iteration, 1000, 3) for iteration in (99, 100, 300)] == [0, 1, 3]
+
+
+@pytest.mark.parametrize("saved", [-1, 1500])
+def test_a_run_cannot_save_more_than_its_warm_up(saved: int) -> None:
+    with pytest.raises(ValueError, match=f"a run cannot save {saved} iterations of its warm-up phase"):
+        Schedule(total=4500, saved=saved)
