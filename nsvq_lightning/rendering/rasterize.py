@@ -98,7 +98,7 @@ def render(
     if name == "gsplat":
         raise ValueError("back-end 'gsplat' cannot observe its backward pass; use backend='auto'")
     observed = means.new_zeros(means.shape[0], 3).requires_grad_()
-    pixel_map = observe.to(means).contiguous()
+    pixel_map = observe.detach().to(means).contiguous()
     return Render(*_rasterizer(name)(splats, camera, degree, background, pixel_map, observed), observed)
 
 

@@ -174,8 +174,8 @@ class _WatchOffsets(torch.autograd.Function):
         return offsets.view_as(offsets)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        return gradient, gradient.abs().sum(0)
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor | None]:
+        return gradient, gradient.abs().sum(0) if ctx.needs_input_grad[1] else None
 
 
 class _WatchWeights(torch.autograd.Function):
@@ -187,9 +187,9 @@ class _WatchWeights(torch.autograd.Function):
         return weights.view_as(weights)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, Tensor]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, Tensor | None]:
         weights, pixel_map = ctx.saved_tensors
-        return gradient, None, pixel_map @ weights
+        return gradient, None, pixel_map @ weights if ctx.needs_input_grad[2] else None
 
 
 def _blend(
@@ -202,7 +202,8 @@ def _blend(
     observed: Tensor,
 ) -> Tensor:
     """Front-to-back blend of sorted splats at ``pixels [P, 2]``: Σ w·feature and the transmittance left ``[P, 5]``."""
-    dx, dy = _WatchOffsets.apply(pixels[:, None] - centres[None], observed[:, :2]).unbind(-1)
+    offsets: Tensor = _WatchOffsets.apply(pixels[:, None] - centres[None], observed[:, :2])  # type: ignore[no-untyped-call]
+    dx, dy = offsets.unbind(-1)
     power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy
     alpha = (opacities * power.clamp_max(0).exp()).clamp_max(ALPHA_MAX)
     alpha = torch.where(alpha >= ALPHA_MIN, alpha, torch.zeros_like(alpha))
@@ -210,5 +211,6 @@ def _blend(
         running = (1 - alpha).cumprod(1) >= TRANSMITTANCE_MIN
     alpha = torch.where(running, alpha, torch.zeros_like(alpha))
     transmittance = torch.cat([pixels.new_ones(pixels.shape[0], 1), (1 - alpha).cumprod(1)], 1)
-    weights = _WatchWeights.apply(alpha * transmittance[:, :-1], pixel_map, observed[:, 2])
+    weights = alpha * transmittance[:, :-1]
+    weights = _WatchWeights.apply(weights, pixel_map, observed[:, 2])  # type: ignore[no-untyped-call]
     return torch.cat([weights @ features, transmittance[:, -1:]], 1)

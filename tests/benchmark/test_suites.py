@@ -171,6 +171,19 @@ def test_less_accuracy_costs_what_the_rows_say(scene: Path) -> None:
     assert rows["cpu, quarter size"]["mean error"] > rows["cpu, half size"]["mean error"] > 100 * by_degree[0]
 
 
+def test_an_observed_pass_has_the_same_gradients_at_a_price(scene: Path) -> None:
+    rows = _run("render", scene)
+    (observed,) = [row for row in rows if row.method == "cpu, observed"]
+    (alone,) = [
+        row
+        for row in rows
+        if (row.workload, row.method, row.operation) == (observed.workload, "cpu", "forward + backward")
+    ]
+    assert observed.operation == alone.operation
+    price = observed.timing.median / alone.timing.median
+    assert observed.values == alone.values | {"times unobserved": pytest.approx(price)}
+
+
 def test_crop_is_the_largest_that_the_oracle_can_do() -> None:
     workload = synthetic_workload("A20k")
     pairs = {crop.camera.height: render._pairs(crop) for crop in (workload.crop(36, 24), workload.crop(48, 32))}

@@ -51,6 +51,12 @@ def test_background_has_its_gradient() -> None:
 
 
 @pytest.mark.usefixtures("standin")
+def test_its_backward_pass_cannot_be_observed() -> None:
+    with pytest.raises(ValueError, match="'gsplat' cannot observe its backward pass; use backend='auto'"):
+        render(random_splats(12, seed=3), front_camera(16, 12), observe=torch.ones(12, 16), backend="gsplat")
+
+
+@pytest.mark.usefixtures("standin")
 def test_splats_behind_and_beside_the_camera() -> None:
     splats = random_splats(40, seed=8)
     means = splats.means.clone()

@@ -33,6 +33,10 @@ NEAREST, NOISE, SUMS, SUBSTITUTION = (f"quantize.cuda.{name}" for name in ("near
     [
         [f"{BLEND}:blend_backward_kernel"],
         pytest.param([f"{BLEND}:blend_kernel", f"{BLEND}:total_kernel"], marks=pytest.mark.slow),
+        # Most steps are observed by nobody.
+        pytest.param(
+            [f"{BLEND}:{name}_kernel:WITH_MAP=0" for name in ("blend_backward", "total")], marks=pytest.mark.slow
+        ),
         pytest.param([f"{PROJECTION}:project_kernel"], marks=pytest.mark.slow),
         pytest.param([f"{PROJECTION}:project_backward_kernel"], marks=pytest.mark.slow),
         # Some with an argument that is 1, of which Triton makes a constant.

@@ -16,11 +16,12 @@ import oracle
 import pytest
 import torch
 from oracle import run
-from splat_scenes import front_camera, random_splats
+from splat_scenes import front_camera, pixel_map, random_splats, uneven_splats
 from triton.runtime.interpreter import InterpreterBuilder
 
+from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda.binning import list_tiles
-from nsvq_lightning.rendering.cuda.blend import blend, tile_grid
+from nsvq_lightning.rendering.cuda.blend import SLOTS, blend, tile_grid
 from nsvq_lightning.rendering.cuda.projection import Lens, project
 from nsvq_lightning.rendering.rasterize import render, resolve_backend, visible
 from nsvq_lightning.splats.splats import RawSplats
@@ -162,10 +163,55 @@ def test_visible_is_radii() -> None:
 
 def test_backward_twice_gives_the_same_bits() -> None:
     leaves = on_device(random_splats(12))
-    loss = render(leaves, front_camera(20, 12), backend="cuda").image.square().sum()
-    first = torch.autograd.grad(loss, leaves, retain_graph=True)
-    second = torch.autograd.grad(loss, leaves)
+    result = render(leaves, front_camera(20, 12), observe=torch.ones(12, 20), backend="cuda")
+    loss, inputs = result.image.square().sum(), [*leaves, result.observed]
+    first = torch.autograd.grad(loss, inputs, retain_graph=True)
+    second = torch.autograd.grad(loss, inputs)
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("splats", "camera"),
+    [
+        (random_splats(24, seed=2), front_camera(40, 28)),
+        (random_splats(24, seed=2), front_camera(17, 3)),
+        (random_splats(80, seed=5, log_scale=0.5), front_camera(16, 12)),
+        (uneven_splats(24), front_camera(20, 16)),
+    ],
+    ids=["plain", "small", "saturated", "uneven"],
+)
+def test_what_is_observed_is_that_of_the_oracle(splats: RawSplats, camera: Camera) -> None:
+    _, gradients = assert_same(splats, camera, observe=pixel_map(camera))
+    assert all(gradients[name].any() for name in oracle.OBSERVED)
+
+
+def test_a_splat_of_many_tiles_is_observed_in_all_of_them() -> None:
+    splats = random_splats(2, seed=2, log_scale=0.5)
+    assert_same(splats, camera := front_camera(70, 36), observe=pixel_map(camera))
+    lens = Lens.of(camera, torch.device(DEVICE))
+    boxes = project(lens, tuple(tensor.to(DEVICE) for tensor in splats), 3).boxes
+    assert int((boxes[:, 2] * boxes[:, 3]).max()) > SLOTS
+
+
+def test_observing_changes_nothing_else() -> None:
+    splats, camera = random_splats(24, seed=5), front_camera(20, 12)
+    alone, gradients = run(splats, camera, "cuda", torch.float32)
+    assert alone.observed is None
+    result, observed = run(splats, camera, "cuda", torch.float32, observe=pixel_map(camera))
+    torch.testing.assert_close(result, alone, atol=0, rtol=0)
+    for name in oracle.OBSERVED:
+        assert observed.pop(name).any()
+    # The compiler of a GPU may fuse other products and sums where there are more of them.
+    rtol = 1e-5 if DEVICE == "cuda" else 0
+    for name, gradient in gradients.items():
+        assert (observed[name] - gradient).norm() <= rtol * gradient.norm(), name
+
+
+def test_nothing_is_observed_where_nothing_is_in_view() -> None:
+    splats, camera = random_splats(20), front_camera(20, 9)
+    behind = splats._replace(means=splats.means - torch.tensor([0.0, 0.0, 50.0]))
+    _, gradients = run(behind, camera, "cuda", torch.float32, observe=pixel_map(camera))
+    assert not any(gradients[name].any() for name in oracle.OBSERVED)
 
 
 @pytest.mark.parametrize("output", ["means2d", "image", "alpha", "depth"])

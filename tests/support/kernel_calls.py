@@ -161,14 +161,17 @@ def _pictures(kind: torch.dtype = torch.float32) -> dict[str, Any]:
 
 
 def _render() -> dict[str, Any]:
-    return {"splats": _splats(), "camera": _camera(), "sh_degree": 1, "background": _tensor(3)}
+    return {
+        "splats": _splats(), "camera": _camera(), "sh_degree": 1, "background": _tensor(3), "pixel_map": _tensor(28, 36)
+    }  # fmt: skip
 
 
 def _render_and_back(function: Callable[..., Any], splats: RawSplats, **arguments: Any) -> list[Any]:
-    """The picture and the gradients."""
+    """The picture, the gradients and what was observed."""
     leaves = RawSplats(*(tensor.detach().requires_grad_() for tensor in splats))
-    image, alpha, radii, means2d, depth = function(leaves, **arguments)
-    gradients = torch.autograd.grad(image.sum() + alpha.sum() + depth.sum(), leaves)
+    observed = torch.zeros(len(splats.means), 3, requires_grad=True)
+    image, alpha, radii, means2d, depth = function(leaves, observed=observed, **arguments)
+    gradients = torch.autograd.grad(image.sum() + alpha.sum() + depth.sum(), [*leaves, observed])
     return [image.detach(), radii, means2d.detach(), *gradients]
 
 
@@ -312,7 +315,10 @@ def _blending_backward() -> dict[str, Any]:
     del arguments["background"]
     gradients = _Pictures(_tensor(12, 16, 3), _tensor(12, 16, seed=1), _tensor(12, 16, seed=2))
     outputs = _Pictures(image, transmittance, depth)
-    return arguments | {"ids": _projected().ids, "n": 70, "ends": ends, "outputs": outputs, "gradients": gradients}
+    return arguments | {
+        "ids": _projected().ids, "n": 70, "ends": ends, "outputs": outputs, "gradients": gradients,
+        "pixel_map": _tensor(12, 16, seed=3),
+    }  # fmt: skip
 
 
 def _projection_backward() -> dict[str, Any]:

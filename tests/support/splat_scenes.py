@@ -25,6 +25,15 @@ def random_splats(n: int, seed: int = 0, sh_degree: int = 3, log_scale: float = 
     )
 
 
+def uneven_splats(n: int) -> RawSplats:
+    """Four parts of equally many splats: tiny ones, long ones, needles and plain ones; the first is huge."""
+    splats = random_splats(n, seed=6)
+    scales = splats.scales.clone()
+    tiny, long, thin = (slice(k * n // 4, (k + 1) * n // 4) for k in range(3))
+    scales[tiny], scales[long, 0], scales[thin, 1:], scales[0] = -12.0, 0.5, -9.0, 1.0
+    return splats._replace(scales=scales)
+
+
 def front_camera(width: int = 70, height: int = 45, cx: float | None = None, cy: float | None = None) -> Camera:
     """A camera four units in front of the origin, slightly turned."""
     focal = 0.9 * width
@@ -41,3 +50,8 @@ def front_camera(width: int = 70, height: int = 45, cx: float | None = None, cy:
     viewmat[0, 2], viewmat[2, 0] = angle.sin(), -angle.sin()
     viewmat[:3, 3] = torch.tensor([0.1, -0.05, 4.0])
     return Camera(K, viewmat, width, height)
+
+
+def pixel_map(camera: Camera) -> torch.Tensor:
+    """A strength for each pixel, of both signs."""
+    return torch.randn(camera.height, camera.width, generator=torch.Generator().manual_seed(1))

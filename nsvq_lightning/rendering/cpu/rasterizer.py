@@ -213,19 +213,19 @@ class _Blend(torch.autograd.Function):
             work.rows("blend", frame.threads, FORWARD_SCRATCH), is_on("blocks"), is_on("saturated"),
             np.zeros(1, np.int64),
         )  # fmt: skip
-        ctx.frame, ctx.pixel_map = frame, pixel_map
+        ctx.frame = frame
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(image, transmittance, depth)
+        ctx.save_for_backward(image, transmittance, depth, pixel_map)
         return image, torch.sub(1, transmittance, out=alpha), depth
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, g_depth: Tensor | None) -> tuple[Any, ...]:
         frame: _Frame = ctx.frame
-        image, transmittance, depth = ctx.saved_tensors
-        # Placeholders that are never read stand in for missing gradients.
-        with_alpha, with_depth, with_map = g_alpha is not None, g_depth is not None, ctx.pixel_map is not None
-        pixel_map = ctx.pixel_map if with_map else transmittance
+        image, transmittance, depth, pixel_map = ctx.saved_tensors
+        # Placeholders that are never read stand in for missing gradients and a missing map.
+        with_alpha, with_depth, with_map = g_alpha is not None, g_depth is not None, pixel_map is not None
+        pixel_map = flat_checked("pixel_map", pixel_map if with_map else depth, (frame.height, frame.width))
         g_image = torch.zeros_like(image) if g_image is None else g_image
         g_alpha = transmittance if g_alpha is None else g_alpha
         g_depth = depth if g_depth is None else g_depth
@@ -235,9 +235,9 @@ class _Blend(torch.autograd.Function):
         blend_backward(
             frame.threads, frame.records, frame.integers, frame.entries, frame.offsets, frame.ends,
             frame.group_columns, frame.width, frame.height, _GRID, frame.touched,
-            *(flat(tensor) for tensor in (image, transmittance, depth, g_image, g_alpha, g_depth, pixel_map)),
-            with_alpha, with_depth, with_map, frame.sums, frame.slots, work.rows("blend_backward", frame.threads,
-            BACKWARD_SCRATCH), np.zeros(1, np.int64),
+            *(flat(tensor) for tensor in (image, transmittance, depth, g_image, g_alpha, g_depth)), pixel_map,
+            with_alpha, with_depth, with_map, frame.sums, frame.slots,
+            work.rows("blend_backward", frame.threads, BACKWARD_SCRATCH), np.zeros(1, np.int64),
         )  # fmt: skip
         total_slots(
             frame.threads, frame.ids, frame.count, frame.slots, frame.records, frame.integers, frame.sums,

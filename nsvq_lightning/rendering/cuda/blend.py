@@ -29,12 +29,17 @@ from nsvq_lightning.rendering.cuda.records import (
     LN2,
     LOG2_ALPHA_MIN,
     LOG2_OPACITY,
+    OBSERVED_FIELDS,
+    OBSERVED_SLOT,
     RECORD,
     RED,
+    SUM_ABS_X,
+    SUM_ABS_Y,
     SUM_BLUE,
     SUM_DEPTH,
     SUM_GREEN,
     SUM_H,
+    SUM_MAP,
     SUM_RED,
     SUM_U,
     SUM_UU,
@@ -132,8 +137,8 @@ def blend_kernel(
 
 @triton.jit
 def blend_backward_kernel(
-    records, ranks, slots, offsets, ends, image, transmittance, depth, g_image, g_alpha, g_depth, sums,
-    columns, width, height, WITH_ALPHA: tl.constexpr, WITH_DEPTH: tl.constexpr,
+    records, ranks, slots, offsets, ends, image, transmittance, depth, g_image, g_alpha, g_depth, pixel_map,
+    sums, columns, width, height, WITH_ALPHA: tl.constexpr, WITH_DEPTH: tl.constexpr, WITH_MAP: tl.constexpr,
 ):  # fmt: skip
     """Write the sums of every splat of a tile to its slot."""
     tile = tl.program_id(0)
@@ -152,6 +157,8 @@ def blend_backward_kernel(
     if WITH_DEPTH:
         g_far = tl.load(g_depth + pixel, mask=inside, other=0.0)
         rest += g_far * tl.load(depth + pixel, mask=inside, other=0.0)
+    if WITH_MAP:
+        strength = tl.load(pixel_map + pixel, mask=inside, other=0.0)
     t = tl.where(inside, 1.0, 0.0)
     for j in range(tl.load(offsets + tile), tl.load(ends + tile)):
         record = records + tl.load(ranks + j).to(tl.int64) * RECORD
@@ -164,7 +171,7 @@ def blend_backward_kernel(
             h = tl.where(is_open & (raw <= ALPHA_MAX), alpha / (1 - alpha) * (t * d - rest), 0.0)
             rest = tl.fma(-weight, d, rest)
             hu, hv = h * u, h * v
-            slot = sums + tl.load(slots + j).to(tl.int64) * RECORD
+            slot = sums + tl.load(slots + j).to(tl.int64) * (OBSERVED_SLOT if WITH_MAP else RECORD)
             tl.store(slot + SUM_RED, tl.sum(weight * g_red, 0))
             tl.store(slot + SUM_GREEN, tl.sum(weight * g_green, 0))
             tl.store(slot + SUM_BLUE, tl.sum(weight * g_blue, 0))
@@ -176,12 +183,30 @@ def blend_backward_kernel(
             tl.store(slot + SUM_VV, tl.sum(hv * v, 0))
             if WITH_DEPTH:
                 tl.store(slot + SUM_DEPTH, tl.sum(weight * g_far, 0))
+            if WITH_MAP:
+                along_y = tl.fma(hu, tl.load(record + B), hv * tl.load(record + C))
+                tl.store(slot + SUM_ABS_X, tl.sum(tl.abs(hu), 0))
+                tl.store(slot + SUM_ABS_Y, tl.sum(tl.abs(along_y), 0))
+                tl.store(slot + SUM_MAP, tl.sum(weight * strength, 0))
         t = after
 
 
 @triton.jit
-def total_kernel(sums, slot_ends, ids, records, totals, g_means2d, SLOTS: tl.constexpr, LANES: tl.constexpr):
-    """Add up the slots of a splat, and derive the gradient of its projected centre."""
+def field_of(total, field):
+    """One field of the sums of a splat ``[LANES]``."""
+    lane = tl.arange(0, total.shape[0])
+    return tl.sum(tl.where(lane == field, total, 0.0), 0)
+
+
+@triton.jit
+def total_kernel(
+    sums, slot_ends, ids, records, totals, g_means2d, observed,
+    WITH_MAP: tl.constexpr, SLOTS: tl.constexpr, LANES: tl.constexpr,
+):  # fmt: skip
+    """Add up the slots of a splat, and derive the gradient of its projected centre.
+
+    ``WITH_MAP`` also writes what the pass observed: Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · map over pixels.
+    """
     rank = tl.program_id(0).to(tl.int64)
     end = tl.load(slot_ends + rank)
     begin = tl.load(slot_ends + rank - 1, mask=rank > 0, other=0)
@@ -189,17 +214,22 @@ def total_kernel(sums, slot_ends, ids, records, totals, g_means2d, SLOTS: tl.con
     acc = tl.zeros([SLOTS, LANES], tl.float32)
     for start in range(begin, end, SLOTS):
         slot = start + tl.arange(0, SLOTS)[:, None]
-        mask = (slot < end) & (field < FIELDS)
-        acc += tl.load(sums + slot.to(tl.int64) * RECORD + field, mask=mask, other=0.0)
+        mask = (slot < end) & (field < (OBSERVED_FIELDS if WITH_MAP else FIELDS))
+        place = slot.to(tl.int64) * (OBSERVED_SLOT if WITH_MAP else RECORD) + field
+        acc += tl.load(sums + place, mask=mask, other=0.0)
     total = tl.sum(acc, 0)
     lane = tl.arange(0, LANES)
     tl.store(totals + rank * RECORD + lane, total, mask=lane < FIELDS)
-    u, v = tl.sum(tl.where(lane == SUM_U, total, 0.0), 0), tl.sum(tl.where(lane == SUM_V, total, 0.0), 0)
+    u, v = field_of(total, SUM_U), field_of(total, SUM_V)
     record = records + rank * RECORD
     a, b, c = tl.load(record + A), tl.load(record + B), tl.load(record + C)
-    centre = g_means2d + 2 * tl.load(ids + rank)
-    tl.store(centre, a * u * (2 * LN2))
-    tl.store(centre + 1, (b * u + c * v) * (2 * LN2))
+    row = tl.load(ids + rank)
+    tl.store(g_means2d + 2 * row, a * u * (2 * LN2))
+    tl.store(g_means2d + 2 * row + 1, (b * u + c * v) * (2 * LN2))
+    if WITH_MAP:
+        tl.store(observed + 3 * row, tl.abs(a) * field_of(total, SUM_ABS_X) * (2 * LN2))
+        tl.store(observed + 3 * row + 1, field_of(total, SUM_ABS_Y) * (2 * LN2))
+        tl.store(observed + 3 * row + 2, field_of(total, SUM_MAP))
 
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:
@@ -250,8 +280,11 @@ def blend_backward(
     ends: Tensor,
     outputs: tuple[Tensor, Tensor, Tensor],
     gradients: tuple[Tensor | None, Tensor | None, Tensor | None],
-) -> tuple[Tensor, Tensor]:
-    """Moments ``[V, RECORD]`` of the splats in view, and the gradient of all projected centres ``[n, 2]``.
+    pixel_map: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Moments ``[V, RECORD]`` of the splats in view; of all splats the gradient of the centres and what was observed.
+
+    The gradient is ``[n, 2]``. Observed are Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · map ``[n, 3]``; None without a map.
 
     Args:
         lens: As in :func:`blend`.
@@ -262,6 +295,7 @@ def blend_backward(
         ends: What :func:`blend` returned, as are ``outputs``: image, transmittance and depth.
         outputs: See ``ends``.
         gradients: Of image, alpha and depth, contiguous; None for those on which nothing depends.
+        pixel_map: Strength of each pixel ``[H, W]``, contiguous; None if nobody observes.
 
     Raises:
         ValueError: The tensors do not fit together.
@@ -277,20 +311,26 @@ def blend_backward(
         check_tensor(name, value, shape, records.device)
         if gradient is not None:
             check_tensor(f"gradient of {name}", gradient, shape, records.device)
+    with_map = pixel_map is not None
+    if pixel_map is not None:
+        check_tensor("pixel_map", pixel_map, size, records.device)
     image, transmittance, depth = outputs
     g_image, g_alpha, g_depth = gradients
     totals, g_means2d = torch.zeros_like(records), records.new_zeros(n, 2)
+    observed = records.new_zeros(n, 3) if with_map else None
     if len(ids):
-        sums = records.new_zeros(len(tiles.slots), RECORD.value)
+        sums = records.new_zeros(len(tiles.slots), (OBSERVED_SLOT if with_map else RECORD).value)
         blend_backward_kernel[(columns * rows,)](
             records, tiles.ranks, tiles.slots, tiles.offsets, ends, image, transmittance, depth,
             torch.zeros_like(image) if g_image is None else g_image,
-            # Placeholders that are never read stand in for missing gradients.
-            depth if g_alpha is None else g_alpha, depth if g_depth is None else g_depth,
+            # Placeholders that are never read stand in for missing gradients and a missing map.
+            *(depth if given is None else given for given in (g_alpha, g_depth, pixel_map)),
             sums, columns, lens.width, lens.height,
-            WITH_ALPHA=g_alpha is not None, WITH_DEPTH=g_depth is not None, num_warps=WARPS, **COMPILE,
+            WITH_ALPHA=g_alpha is not None, WITH_DEPTH=g_depth is not None, WITH_MAP=with_map,
+            num_warps=WARPS, **COMPILE,
         )  # fmt: skip
         total_kernel[(len(ids),)](
-            sums, tiles.ends, ids, records, totals, g_means2d, SLOTS=SLOTS, LANES=LANES, num_warps=1, **COMPILE
-        )
-    return totals, g_means2d
+            sums, tiles.ends, ids, records, totals, g_means2d, g_means2d if observed is None else observed,
+            WITH_MAP=with_map, SLOTS=SLOTS, LANES=LANES, num_warps=1, **COMPILE,
+        )  # fmt: skip
+    return totals, g_means2d, observed

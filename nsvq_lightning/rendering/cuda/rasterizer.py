@@ -52,32 +52,45 @@ class _Blend(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, lens: Lens, means2d: Tensor, ids: Tensor, records: Tensor, boxes: Tensor, background: Tensor
+        ctx: Any,
+        lens: Lens,
+        means2d: Tensor,
+        ids: Tensor,
+        records: Tensor,
+        boxes: Tensor,
+        background: Tensor,
+        pixel_map: Tensor | None,
+        observed: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         tiles = list_tiles(boxes, *tile_grid(lens.width, lens.height))
         image, transmittance, depth, ends = blend(lens, records, tiles, background.contiguous())
         ctx.lens, ctx.n = lens, len(means2d)
-        ctx.save_for_backward(ids, records, ends, image, transmittance, depth, *tiles)
+        ctx.save_for_backward(ids, records, ends, image, transmittance, depth, pixel_map, *tiles)
         ctx.set_materialize_grads(False)
         return image, 1 - transmittance, depth
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> Any:
-        ids, records, ends, image, transmittance, depth, *tiles = ctx.saved_tensors
+        ids, records, ends, image, transmittance, depth, pixel_map, *tiles = ctx.saved_tensors
         from_image, from_alpha, from_depth = (None if g is None else g.contiguous() for g in gradients)
-        moments, g_means2d = blend_backward(
+        moments, g_means2d, g_observed = blend_backward(
             ctx.lens, records, ids, ctx.n, Tiles(*tiles), ends, (image, transmittance, depth),
-            (from_image, from_alpha, from_depth),
+            (from_image, from_alpha, from_depth), pixel_map,
         )  # fmt: skip
         g_background = None
         if ctx.needs_input_grad[5] and from_image is not None:
             g_background = (from_image * transmittance[..., None]).sum((0, 1))
-        return None, g_means2d, None, moments, None, g_background
+        return None, g_means2d, None, moments, None, g_background, None, g_observed
 
 
 def render_cuda(
-    splats: SplatTensors, camera: Camera, sh_degree: int, background: Tensor
+    splats: SplatTensors,
+    camera: Camera,
+    sh_degree: int,
+    background: Tensor,
+    pixel_map: Tensor | None = None,
+    observed: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
 
@@ -87,7 +100,7 @@ def render_cuda(
     with torch.cuda.device_of(attributes[0]):
         lens = Lens.of(camera, attributes[0].device)
         means2d, radii, ids, records, boxes = _Project.apply(lens, sh_degree, *attributes)
-        image, alpha, depth = _Blend.apply(lens, means2d, ids, records, boxes, background)
+        image, alpha, depth = _Blend.apply(lens, means2d, ids, records, boxes, background, pixel_map, observed)
     return image, alpha, radii, means2d, depth
 
 

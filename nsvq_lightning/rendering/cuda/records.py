@@ -31,12 +31,17 @@ __all__ = [
     "LOG2_ALPHA_MIN",
     "LOG2_E",
     "LOG2_OPACITY",
+    "OBSERVED_FIELDS",
+    "OBSERVED_SLOT",
     "RECORD",
     "RED",
+    "SUM_ABS_X",
+    "SUM_ABS_Y",
     "SUM_BLUE",
     "SUM_DEPTH",
     "SUM_GREEN",
     "SUM_H",
+    "SUM_MAP",
     "SUM_RED",
     "SUM_U",
     "SUM_UU",
@@ -56,13 +61,18 @@ RECORD = tl.constexpr(12)
 """Stride between records, or slots, in floats: whole 16-byte words."""
 FIELDS = tl.constexpr(10)
 """Floats used in a record or slot."""
+OBSERVED_SLOT = tl.constexpr(16)
+"""Stride between slots, in floats, if somebody observes the pass."""
+OBSERVED_FIELDS = tl.constexpr(13)
+"""Floats used in such a slot."""
 
 # Fields of a record.
 X, Y, A, B, C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH = (tl.constexpr(field) for field in range(10))
 
-# Fields of a slot: with h = α·dL/dα, sums over pixels of w·g (colour), h, h·u, h·v, h·u², h·u·v, h·v², w·g (depth).
-SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_DEPTH = (
-    tl.constexpr(field) for field in range(10)
+# Fields of a slot: with h = α·dL/dα, sums over pixels of w·g (colour), h, h·u, h·v, h·u², h·u·v, h·v², w·g (depth) and,
+# if somebody observes the pass, |h·u|, |B·h·u + C·h·v|, w·map.
+SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_DEPTH, SUM_ABS_X, SUM_ABS_Y, SUM_MAP = (
+    tl.constexpr(field) for field in range(13)
 )
 
 TILE = tl.constexpr(16)

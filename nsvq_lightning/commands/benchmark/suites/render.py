@@ -1,7 +1,8 @@
 """Back-ends of :func:`nsvq_lightning.render`, and what can be saved by asking for less, against its float64 oracle.
 
 The oracle has everything: all SH bands, every pixel. So the error of a lower SH degree is that of the colours it leaves
-out, and the error of a smaller picture, blown up to the full size, that of the detail it does not have.
+out, and the error of a smaller picture, blown up to the full size, that of the detail it does not have. What an
+observed backward pass costs is a multiple of the same pass that nobody observes.
 
 Where the oracle would take minutes for the whole view, errors are measured on a crop in its middle, whose pixels see
 the same splats. Where two splats are equally deep, or α is 1/255, to rounding, float32 decides
@@ -69,14 +70,16 @@ class Accuracy(NamedTuple):
         label: Name in the tables, behind that of the back-end.
         sh_degree: Highest SH degree; None for all.
         shrink: The picture is rendered this many times smaller, and blown up.
+        observe: The backward pass is observed, see :func:`nsvq_lightning.render`.
     """
 
     label: str = ""
     sh_degree: int | None = None
     shrink: int = 1
+    observe: bool = False
 
 
-FULL = Accuracy()
+FULL, OBSERVED = Accuracy(), Accuracy(", observed", observe=True)
 
 
 class Method(NamedTuple):
@@ -92,8 +95,14 @@ class Method(NamedTuple):
         """Image ``[H, W, 3]`` of the workload's view."""
         camera, background = workload.camera, workload.background.to(splats.means)
         view = _smaller(camera, self.accuracy.shrink)
+        observe = splats.means.new_ones(view.height, view.width) if self.accuracy.observe else None
         image = render(
-            splats, view, sh_degree=self.accuracy.sh_degree, background=background, backend=self.backend
+            splats,
+            view,
+            sh_degree=self.accuracy.sh_degree,
+            background=background,
+            observe=observe,
+            backend=self.backend,
         ).image
         if self.accuracy.shrink == 1:
             return image
@@ -146,7 +155,9 @@ def _rows(workload: Workload, scope: Scope) -> list[Measurement]:
     small = len(workload.splats.means) <= REFERENCE_SPLATS
     crop = crop_for_oracle(workload, ORACLE_PAIRS[scope.quick])
     asked = accuracies(sh_degree_of(workload.splats.shN))
-    fast = [Method(name, accuracy) for name in fast_backends(workload.splats.means) for accuracy in asked]
+    names = fast_backends(workload.splats.means)
+    fast = [Method(name, accuracy) for name in names for accuracy in asked]
+    fast += [Method(name, OBSERVED) for name in names if name != "gsplat"]
     plain = Method(REFERENCE)
     # In a quick run even 20k splats are too much for plain torch: it is compared on the crop.
     jobs = [(workload, [*fast, plain] if small and not scope.quick else fast)]
@@ -158,15 +169,22 @@ def _rows(workload: Workload, scope: Scope) -> list[Measurement]:
     rows = []
     for threads in scope.threads:
         for where, methods in jobs:
-            keys = [(method, operation) for method in methods for operation in (FORWARD, BOTH)]
+            keys = [(method, operation) for method in methods for operation in _operations(method)]
             leaves = leaves_of(where)
             cases = [case_of(where, leaves, *key) for key in keys]
-            for key, timing in zip(keys, measure(cases, scope, threads).values(), strict=True):
-                method, operation = key
-                rows.append(
-                    Measurement("render", str(where), str(method), operation, threads, timing, errors[key], note)
-                )
+            timings = dict(zip(keys, measure(cases, scope, threads).values(), strict=True))
+            for (method, operation), timing in timings.items():
+                values = errors[method, operation]
+                if method.accuracy.observe:
+                    alone = timings[Method(method.backend), operation]
+                    values = values | {"times unobserved": timing.median / alone.median}
+                rows.append(Measurement("render", str(where), str(method), operation, threads, timing, values, note))
     return rows
+
+
+def _operations(method: Method) -> tuple[str, ...]:
+    """What is timed of a method: only backward passes are observed."""
+    return (BOTH,) if method.accuracy.observe else (FORWARD, BOTH)
 
 
 def leaves_of(workload: Workload) -> RawSplats:
