@@ -76,8 +76,8 @@ class SplatBudget(HostedCallback):
             detail = detailed_pixels(scene)
             host.splat_budget = splats_for_photos(len(scene.train), detail, self.quality)
             reason = (
-                f"quality {self.quality:g} times what {len(scene.train)} photos with {detail:,.0f} detailed pixels each "
-                "support; --quality changes it"
+                f"quality {self.quality:g} times what {len(scene.train)} photos with {detail:,.0f} detailed pixels "
+                "each support; --quality changes it"
             )
         if host.splat_budget is not None:
             log.info("budget: %d splats, %s", host.splat_budget, reason)

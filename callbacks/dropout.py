@@ -15,8 +15,7 @@ __all__ = ["SplatDropout"]
 
 
 class SplatDropout(HostedCallback):
-    """Leaves out random splats in each training view, and makes the others more opaque (DropGaussian, Park et al.
-    2025).
+    """Leaves out random splats in each training view; the others get more opaque (DropGaussian, Park et al. 2025).
 
     With few photos splats close to a camera are trained by that one alone. Where some are missing, those behind them
     get gradients, too. The share of missing splats grows linearly from 0 at the start of the run.

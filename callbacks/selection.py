@@ -136,12 +136,15 @@ class OpacitySelection(LatchedCallback):
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
         """Add the gradient of the pressure when due; the same on every process, after their gradients were averaged."""
         host, iteration = as_host(pl_module), next_iteration(trainer)
-        opacities = host.splats.opacities
-        if opacities.grad is None or not self._is_selecting(host, iteration):
+        if not self._is_selecting(host, iteration):
             return
         since, length = self._place(host, iteration)
-        if since % self._every(length) == 0:
-            self._follow_line(host, since, length)
+        if since % self._every(length) != 0:
+            return
+        # Also in a step that will not update, which processes learn of at different times.
+        self._follow_line(host, since, length)
+        opacities = host.splats.opacities
+        if opacities.grad is not None:
             opacities.grad += pressure(opacities.detach(), self.strength, gentle=since < self.gentle * length)
 
     def on_train_batch_end(

@@ -141,6 +141,36 @@ def test_two_processes_train_what_one_process_with_two_views_trains(one: Finishe
     assert (two.folder / "scene.nsvq").read_bytes() == (one.folder / "scene.nsvq").read_bytes()
 
 
+def grown(scene: Path, root: Path, *more: str) -> list[str]:
+    """The same run with budgeted growth, selection and dropout in place of the paper's density control."""
+    growth = {"start": 0, "full": 20, "every": 4, "grad_threshold": 1e-6, "reset_every": 9, "reset_last": 9}
+    growth |= {"first_prune": 3, "recovery": 3}
+    paper = ("--callbacks.density", "--callbacks.phases.min_reset_interval")
+    return [
+        *(argument for argument in arguments(scene, root) if not argument.startswith(paper)),
+        *("--callbacks.phases.min_reset_interval=1", "--callbacks.phases.reference_total=60"),
+        *("--callbacks.phases.warmup_end=24", "--callbacks.phases.prune_end=40", "--callbacks.phases.quantize_end=50"),
+        *("--callbacks.density=BudgetedGrowth", "--callbacks.density.finite_every=7"),
+        *(f"--callbacks.density.growth.{name}={value}" for name, value in growth.items()),
+        *("--splats=500", "--callbacks.selection.strength=0.01", "--callbacks.dropout.share=0.1", *more),
+    ]
+
+
+def test_growth_and_selection_are_the_same_on_two_processes(demo_scene: Path, tmp_path: Path) -> None:
+    single = grown(demo_scene, tmp_path / "one", "--trainer.devices=1", "--trainer.accumulate_grad_batches=2")
+    assert main(single) == 0
+    status, printed = run_command(grown(demo_scene, tmp_path / "two", *TWO))
+    assert status == 0, printed
+    one, two = (
+        Finished(tmp_path / name / demo_scene.name / "version_0", tmp_path / name / "notes") for name in ("one", "two")
+    )
+    assert two.lines() == two.lines(1) == one.lines()
+    counts = [int(line.split()[2]) for line in two.lines()]
+    assert max(counts) > 500 == counts[41]
+    assert counts[-1] == 499  # one has met a gradient that was not finite
+    assert (two.folder / "scene.nsvq").read_bytes() == (one.folder / "scene.nsvq").read_bytes()
+
+
 def test_test_views_that_cannot_be_shared_evenly_score_the_same(one: Finished, two: Finished) -> None:
     assert (two.folder / "views.csv").read_text() == (one.folder / "views.csv").read_text()
     ours, theirs = two.metrics(), one.metrics()
