@@ -23,7 +23,7 @@ from nsvq_lightning.training.schedule import Phase
 
 from .densification import Densification
 from .density_rules import lower_opacities
-from .growth_rules import GrowthRules, budget_at, draw_rows, lowest_share, split_longest, view_statistics
+from .growth_rules import GrowthRules, add_observed, budget_at, draw_rows, lowest_share, split_longest
 
 __all__ = ["BudgetedGrowth"]
 
@@ -143,8 +143,8 @@ class BudgetedGrowth(Densification):
         height, width = render.alpha.shape
         # Gradient accumulation divides the loss by the number of micro-batches; each is a separate view here.
         size = width * micro_batches, height * micro_batches
-        for table, values in zip(tables, view_statistics(render.observed.grad, render.radii, *size), strict=True):
-            table.add_(values)
+        gradients, views, edges = tables
+        add_observed(gradients, views, edges, render.observed.grad, render.radii, *size)
 
     def act(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
         """Split, prune and reset when due."""

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.rendering.reference import rotation_matrices
 from nsvq_lightning.splats.splats import RawSplats
 
-__all__ = ["GrowthRules", "budget_at", "draw_rows", "lowest_share", "split_longest", "view_statistics"]
+__all__ = ["GrowthRules", "add_observed", "budget_at", "draw_rows", "lowest_share", "split_longest"]
 
 CHILD_OFFSET = 1.35
 """Distance of a child from its parent's centre, in units of the parent's longest axis (Improved-GS, section 3.2)."""
@@ -92,24 +93,33 @@ class GrowthRules:
             raise ValueError(f"recovery_share must be in [0, 1), got {self.recovery_share}")
 
 
-def view_statistics(observed: Tensor, radii: Tensor, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:
-    """What one view adds to each splat's statistics, three tensors ``[N]``.
+def add_observed(
+    gradients: Tensor, views: Tensor, weights: Tensor, observed: Tensor, radii: Tensor, width: int, height: int
+) -> None:
+    """Add what one view has observed to the statistics ``[N]`` of the splats that it saw, in place.
 
     Args:
+        gradients: Sum over the views of the norm of the two absolute sums, in normalised device coordinates, in which
+        an
+            image is 2 wide and 2 high.
+        views: Number of views.
+        weights: Sum over the views of the edge weight, divided by the mean of those in the view that are positive.
         observed: Gradient of ``Render.observed``: Σ |∂L/∂x|, Σ |∂L/∂y| per pixel, Σ weight · edge strength ``[N, 3]``.
         radii: Radius on the screen ``[N]``, 0 for splats that were not seen.
-        width: Image width in pixels; gradients are scaled to normalised device coordinates, in which it is 2.
+        width: Image width in pixels.
         height: Image height in pixels.
-
-    Returns:
-        The norm of the two absolute sums, 1 or 0, and the edge weight divided by the mean of those that are positive.
     """
+    if kernels_for(observed) == "cpu":
+        from nsvq_lightning.rendering.cpu.statistics import add_observed as add_observed_cpu
+
+        add_observed_cpu(gradients, views, weights, observed, radii, (0.5 * width, 0.5 * height))
+        return
     seen = (radii > 0).to(observed)
-    norms = torch.hypot(observed[:, 0] * (0.5 * width), observed[:, 1] * (0.5 * height))
     edges = observed[:, 2].clamp_min(0)
-    positive = edges > 0
-    mean = edges.sum() / positive.sum().clamp_min(1)
-    return norms * seen, seen, edges / mean.clamp_min(torch.finfo(edges.dtype).tiny)
+    mean = edges.sum() / (edges > 0).sum().clamp_min(1)
+    gradients.add_(torch.hypot(observed[:, 0] * (0.5 * width), observed[:, 1] * (0.5 * height)) * seen)
+    views.add_(seen)
+    weights.add_(edges / mean.clamp_min(torch.finfo(edges.dtype).tiny) * seen)
 
 
 def budget_at(progress: float, budget: int) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import torch
@@ -14,15 +16,15 @@ __all__ = ["detailed_pixels", "edge_strength"]
 
 HIGH_PASS = np.array([[-1, -1, -1], [-1, 8, -1], [-1, -1, -1]], np.float32)
 """Eight times a pixel less its neighbours."""
-DETAIL = 20.0
+DETAIL = 20
 """High-pass value, of grey values up to 255, from which a pixel counts as detailed: well above the noise of a photo."""
 SAMPLE = 32
 """Photos that are looked at for the detail of a scene."""
 
 
-def _high_pass(image: Tensor) -> NDArray[np.float32]:
-    grey = cv2.cvtColor(image.cpu().numpy(), cv2.COLOR_RGB2GRAY).astype(np.float32)
-    return np.asarray(cv2.filter2D(grey, -1, HIGH_PASS))
+def _high_pass(image: Tensor, depth: int) -> NDArray[Any]:
+    grey = cv2.cvtColor(image.cpu().numpy(), cv2.COLOR_RGB2GRAY)
+    return np.asarray(cv2.filter2D(grey, depth, HIGH_PASS))
 
 
 def edge_strength(image: Tensor) -> Tensor:
@@ -33,9 +35,9 @@ def edge_strength(image: Tensor) -> Tensor:
     Args:
         image: ``[H, W, 3]`` uint8 RGB.
     """
-    edges = np.clip(_high_pass(image), 0, 255)
-    low, high = float(edges.min()), float(edges.max())
-    return torch.from_numpy((edges - low) / max(high - low, 1.0)).to(image.device)
+    edges = torch.from_numpy(_high_pass(image, cv2.CV_8U))  # which also clips to 0..255
+    low, high = int(edges.min()), int(edges.max())
+    return ((edges.float() - low) / max(high - low, 1)).to(image.device)
 
 
 def detailed_pixels(scene: Scene) -> float:
@@ -48,5 +50,7 @@ def detailed_pixels(scene: Scene) -> float:
         SceneError: An image cannot be decoded.
     """
     step = -(-len(scene.train) // SAMPLE)
-    counts = [int((np.abs(_high_pass(scene.images[index])) > DETAIL).sum()) for index in scene.train[::step]]
+    counts = [
+        int((np.abs(_high_pass(scene.images[index], cv2.CV_16S)) > DETAIL).sum()) for index in scene.train[::step]
+    ]
     return sum(counts) / len(counts)

@@ -8,23 +8,44 @@ import pytest
 import torch
 
 from nsvq_lightning.callbacks import GrowthRules
-from nsvq_lightning.callbacks.growth_rules import budget_at, draw_rows, lowest_share, split_longest, view_statistics
+from nsvq_lightning.callbacks.growth_rules import add_observed, budget_at, draw_rows, lowest_share, split_longest
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.reference import rotation_matrices
 from nsvq_lightning.splats.splats import RawSplats
 
 
-def test_a_view_adds_gradients_in_device_coordinates_and_edge_weights_of_mean_one() -> None:
-    observed = torch.tensor([[3e-6, 4e-6, 2.0], [1e-6, 0.0, 0.0], [5e-6, 0.0, 6.0], [1.0, 1.0, 0.0]])
-    norms, seen, edges = view_statistics(observed, torch.tensor([3, 1, 9, 0]), width=800, height=600)
-    assert norms.tolist() == pytest.approx([math.hypot(3e-6 * 400, 4e-6 * 300), 4e-4, 2e-3, 0.0])
-    assert seen.tolist() == [1.0, 1.0, 1.0, 0.0]
-    assert edges.tolist() == pytest.approx([0.5, 0.0, 1.5, 0.0])  # the mean of the two that are positive is 4
+def tables(count: int, like: torch.Tensor) -> list[torch.Tensor]:
+    return [torch.ones(count, dtype=like.dtype) for _ in range(3)]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_view_adds_gradients_in_device_coordinates_and_edge_weights_of_mean_one(dtype: torch.dtype) -> None:
+    observed = torch.tensor([[3e-6, 4e-6, 2.0], [1e-6, 0.0, 0.0], [5e-6, 0.0, 6.0], [1.0, 1.0, 0.0]], dtype=dtype)
+    gradients, views, edges = tables(4, observed)
+    radii = torch.tensor([3, 1, 9, 0], dtype=torch.int32)
+    add_observed(gradients, views, edges, observed, radii, width=800, height=600)
+    assert gradients.tolist() == pytest.approx([1 + math.hypot(3e-6 * 400, 4e-6 * 300), 1 + 4e-4, 1 + 2e-3, 1.0])
+    assert views.tolist() == [2.0, 2.0, 2.0, 1.0]
+    assert edges.tolist() == pytest.approx([1.5, 1.0, 2.5, 1.0])  # the mean of the two that are positive is 4
+
+
+@pytest.mark.parametrize("count", [0, 1, 63, 1000])
+def test_the_kernel_adds_what_plain_torch_adds(count: int) -> None:
+    draw = torch.Generator().manual_seed(count)
+    observed = torch.rand(count, 3, generator=draw) - torch.tensor([0.0, 0.0, 0.3])
+    radii = torch.randint(0, 3, (count,), generator=draw, dtype=torch.int32)
+    fast, exact = tables(count, observed), tables(count, observed.double())
+    add_observed(*fast, observed, radii, width=80, height=60)
+    add_observed(*exact, observed.double(), radii, width=80, height=60)
+    for ours, theirs in zip(fast, exact, strict=True):
+        torch.testing.assert_close(ours.double(), theirs, rtol=1e-6, atol=1e-6)
 
 
 def test_a_view_without_edges_adds_no_weight() -> None:
-    _, _, edges = view_statistics(torch.zeros(5, 3), torch.ones(5), width=8, height=6)
-    assert edges.tolist() == [0.0] * 5
+    gradients, views, edges = tables(5, torch.zeros(1))
+    add_observed(gradients, views, edges, torch.zeros(5, 3), torch.ones(5, dtype=torch.int32), width=8, height=6)
+    assert edges.tolist() == [1.0] * 5
+    assert views.tolist() == [2.0] * 5
 
 
 def test_the_budget_opens_with_the_root_of_time() -> None:

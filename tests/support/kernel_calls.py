@@ -154,6 +154,13 @@ def _statistics() -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _observed() -> dict[str, Any]:
+    names = ("gradients", "views", "weights")
+    tables = {name: _tensor(70, seed=seed) for seed, name in enumerate(names)}
+    radii = torch.from_numpy(_codes(70, 3).astype(np.int32))
+    return tables | {"observed": _tensor(70, 3, seed=3), "radii": radii, "factors": (2.0, 3.0)}
+
+
 def _pictures(kind: torch.dtype = torch.float32) -> dict[str, Any]:
     target = (255 * _tensor(30, 40, 3, seed=1).abs().clamp(max=1)).to(torch.uint8)
     target = target if kind == torch.uint8 else target / 255
@@ -202,6 +209,7 @@ NUMBA: dict[str, list[Case]] = {
         )
     ],
     f"{_CPU}.statistics.add_view": [Case(_statistics)],
+    f"{_CPU}.statistics.add_observed": [Case(_observed)],
     f"{_Q}.box_search.box_search": [Case(_box_search, rows=("x", "rows"), numbers=("rows",))],
     f"{_Q}.boxes.build_boxes": [
         Case(lambda: {"codebook": _normal(300, 3)}, rows=("codebook",), columns=("codebook",)),
