@@ -311,7 +311,7 @@ def _build_config(folder: Path) -> list[Path]:
     from nsvq_lightning.commands.configs import find_config
 
     files = []
-    for name in ("nsvq_4k", "better_4k", "demo"):
+    for name in ("nsvq_4k", "best", "demo"):
         files.append(folder / f"{name}.yaml")
         files[-1].write_bytes(Path(find_config(name)).read_bytes())
     return files

@@ -261,10 +261,13 @@ def test_options_are_reached_from_the_command_line(capsys: pytest.CaptureFixture
     assert (found["phases"]["quantize_end"], found["phases"]["reference_total"]) == (30_000, 32_000)
 
 
-def test_the_shipped_config_runs(demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("name", ["fast", "best", "small"])
+def test_the_shipped_configs_run(
+    name: str, demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     arguments = [f"--data.root={demo_scene}", "--data.factor=2", f"--trainer.default_root_dir={tmp_path}"]
     quiet = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
-    assert main(["fit", "--config=better_4k", *arguments, *quiet, "--trainer.max_steps=30", "--model.sh_degree=1"]) == 0
+    assert main(["fit", f"--config={name}", *arguments, *quiet, "--trainer.max_steps=30", "--model.sh_degree=1"]) == 0
     assert "rendered from the decoded file" in capsys.readouterr().out
     config = yaml.safe_load(next(tmp_path.rglob("config.yaml")).read_text())
     assert config["model"]["quantizer"]["init_args"]["start"] == "spread"
