@@ -29,9 +29,9 @@ class SplatDropout(HostedCallback):
 
     Example:
         >>> from nsvq_lightning.callbacks import SplatDropout, standard
-        >>> callbacks = standard(dropout=SplatDropout(share=0.05))  # --callbacks.dropout.share=0.05
-        >>> [callback.share for callback in callbacks if isinstance(callback, SplatDropout)]
-        [0.05]
+        >>> callbacks = [*standard(), SplatDropout(share=0.05)]  # --trainer.callbacks+=SplatDropout
+        >>> callbacks[-1].share
+        0.05
     """
 
     def __init__(self, share: float = 0.0, end: int | None = None) -> None:

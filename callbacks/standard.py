@@ -10,7 +10,6 @@ from .checkpoint import RunCheckpoint
 from .codebooks import CodebookInit, CodebookReplacement
 from .contribution import ContributionPruning
 from .density import DensityControl
-from .dropout import SplatDropout
 from .export import ExportScene
 from .finite import FiniteCodes
 from .freeze import FreezeCodes
@@ -23,7 +22,6 @@ from .rates import RateDecay
 from .refit import CodebookRefit
 from .selection import OpacitySelection
 from .sh_degree import ShDegreeSchedule
-from .views import ViewsPerStep
 
 __all__ = ["STANDARD", "standard"]
 
@@ -31,8 +29,6 @@ STANDARD: dict[str, type[Callback]] = {
     "phases": PhaseSchedule,
     "sh_degree": ShDegreeSchedule,
     "rate_decay": RateDecay,
-    "views": ViewsPerStep,
-    "dropout": SplatDropout,
     "budget": SplatBudget,
     "density": DensityControl,
     "selection": OpacitySelection,

@@ -34,9 +34,9 @@ class ViewsPerStep(HostedCallback):
 
     Example:
         >>> from nsvq_lightning.callbacks import ViewsPerStep, standard
-        >>> callbacks = standard(views=ViewsPerStep(views=5))  # --callbacks.views.views=5
-        >>> [callback.views for callback in callbacks if isinstance(callback, ViewsPerStep)]
-        [5]
+        >>> callbacks = [*standard(), ViewsPerStep(views=5)]  # --trainer.callbacks+=ViewsPerStep
+        >>> callbacks[-1].views
+        5
     """
 
     def __init__(self, views: int = 1, start: int | None = None) -> None:

@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 
 import docstring_parser
 
+from nsvq_lightning.commands.shorthands import SHORTHANDS
+
 __all__ = ["class_help", "command_help", "first_sentence"]
 
 WIDEST = 100
@@ -46,10 +48,12 @@ def command_help(parser: ArgumentParser, command: str, classes: Mapping[str, typ
         if name and group in groups and name not in groups and not name.endswith((".help", "model.splats")):
             default = inspect.Parameter.empty if action.default == SUPPRESS else action.default
             groups[group].append(Option(name, default, first_sentence(action.help)))
+    budget = [Option(name, inspect.Parameter.empty, text) for name, text in SHORTHANDS.items()]
     return "\n".join(
         [
             f"usage: nsvq {command} [--config NAME] [--OPTION=VALUE ...]\n\n{parser.description}\n",
             _section("run", groups["run"]),
+            *([_section("budget", budget)] if command == "fit" else []),
             *(class_help(prefix, kind) for prefix, kind in classes.items()),
             _section("model", groups["model"]),
             _section("skips", groups["skips"]),

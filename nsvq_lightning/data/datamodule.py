@@ -114,7 +114,10 @@ class ColmapDataModule(LightningDataModule):
     @property
     def draw(self) -> int:
         """Number of train views that each process had drawn when the trainer's current state was reached."""
-        return self.trainer.fit_loop.epoch_loop.batch_progress.total.ready if self.trainer is not None else 0
+        if self.trainer is None:
+            return 0
+        total = self.trainer.fit_loop.epoch_loop.batch_progress.total
+        return int(total.processed)  # type: ignore[attr-defined]  # Lightning types the base of its counters
 
     def _check_share(self, count: int, views: str) -> None:
         if count < self.process[1]:

@@ -46,7 +46,7 @@ class _Recorder(LightningModule):
 
 def _on(data: ColmapDataModule, step: int, rank: int, world_size: int) -> ColmapDataModule:
     """The data module as it is on one of several processes."""
-    progress = SimpleNamespace(total=SimpleNamespace(ready=step))
+    progress = SimpleNamespace(total=SimpleNamespace(processed=step))
     loop = SimpleNamespace(epoch_loop=SimpleNamespace(batch_progress=progress))
     trainer = SimpleNamespace(fit_loop=loop, global_rank=rank, world_size=world_size)
     data.trainer = cast(Trainer, trainer)

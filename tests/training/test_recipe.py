@@ -44,11 +44,14 @@ def options(**replaced: Callback) -> dict[str, Callback]:
         "budget": SplatBudget(splats=BUDGET),
         "density": BudgetedGrowth(growth),
         "selection": OpacitySelection(strength=1e-2),
-        "views": ViewsPerStep(views=3, start=45),
         "rate_decay": RateDecay(final=0.1),
-        "dropout": SplatDropout(share=0.1, end=30),
         **replaced,
     }
+
+
+def more() -> list[Callback]:
+    """Callbacks that no run has by default."""
+    return [ViewsPerStep(views=3, start=45), SplatDropout(share=0.1, end=30)]
 
 
 def scene_bytes(trainer: Trainer) -> bytes:
@@ -82,7 +85,7 @@ def witness() -> Witness:
 
 @pytest.fixture(scope="module")
 def finished(run: RunFactory, recipe: Recipe, witness: Witness) -> Trainer:
-    trainer, _ = run([*recipe(**options(checkpoint=CheckpointAt(*INTERRUPTED))).values(), witness])
+    trainer, _ = run([*recipe(**options(checkpoint=CheckpointAt(*INTERRUPTED))).values(), *more(), witness])
     return trainer
 
 
@@ -97,7 +100,7 @@ def test_a_resumed_run_is_the_run_not_interrupted(
     finished: Trainer, run: RunFactory, recipe: Recipe, interrupted_at: int
 ) -> None:
     path = run_folder(finished) / "checkpoints" / f"step-{interrupted_at}.ckpt"
-    resumed, _ = run(recipe(**options(checkpoint=RunCheckpoint(every=0))).values(), ckpt_path=path)
+    resumed, _ = run([*recipe(**options(checkpoint=RunCheckpoint(every=0))).values(), *more()], ckpt_path=path)
     assert scene_bytes(resumed) == scene_bytes(finished)
 
 
@@ -124,15 +127,10 @@ def test_the_trainer_gets_its_own_number_of_views_back(finished: Trainer) -> Non
 
 
 def test_neutral_options_are_the_run_without_them(run: RunFactory, recipe: Recipe) -> None:
-    neutral = {
-        "budget": SplatBudget(),
-        "selection": OpacitySelection(),
-        "views": ViewsPerStep(),
-        "rate_decay": RateDecay(),
-        "dropout": SplatDropout(),
-    }
-    without = dict.fromkeys(neutral)
-    assert scene_bytes(run(recipe(**neutral).values())[0]) == scene_bytes(run(recipe(**without).values())[0])
+    neutral = {"budget": SplatBudget(), "selection": OpacitySelection(), "rate_decay": RateDecay()}
+    without = recipe(**dict.fromkeys(neutral)).values()
+    present = [*recipe(**neutral).values(), ViewsPerStep(), SplatDropout()]
+    assert scene_bytes(run(present)[0]) == scene_bytes(run(without)[0])
 
 
 def test_a_finished_scene_is_selected_down(
@@ -164,7 +162,7 @@ def test_a_budget_from_photos_or_bytes_is_explained(
 
 
 def test_dropout_changes_training_alone(run: RunFactory, recipe: Recipe) -> None:
-    _, module = run(recipe(dropout=SplatDropout(share=0.5, end=1)).values(), max_steps=2)
+    _, module = run([*recipe().values(), SplatDropout(share=0.5, end=1)], max_steps=2)
     assert module.dropout == 0.5
     camera = module.trainer.datamodule.scene.cameras[0]  # type: ignore[attr-defined]
     module.eval()

@@ -152,7 +152,8 @@ def grown(scene: Path, root: Path, *more: str) -> list[str]:
         *("--callbacks.phases.warmup_end=24", "--callbacks.phases.prune_end=40", "--callbacks.phases.quantize_end=50"),
         *("--callbacks.density=BudgetedGrowth", "--callbacks.density.finite_every=7"),
         *(f"--callbacks.density.growth.{name}={value}" for name, value in growth.items()),
-        *("--splats=500", "--callbacks.selection.strength=0.01", "--callbacks.dropout.share=0.1", *more),
+        *("--splats=500", "--callbacks.selection.strength=0.01", *more),
+        *("--trainer.callbacks+=SplatDropout", "--trainer.callbacks.share=0.1"),
     ]
 
 
