@@ -10,6 +10,7 @@ from lightning.pytorch import LightningModule, Trainer
 from nsvq_lightning.compression.budget import splats_for_bytes, splats_for_photos
 from nsvq_lightning.data.edges import detailed_pixels
 from nsvq_lightning.training.host import as_host
+from nsvq_lightning.training.train_views import scene_of
 
 from .hosted import HostedCallback
 
@@ -41,8 +42,8 @@ class SplatBudget(HostedCallback):
     """
 
     def __init__(self, quality: float | None = None, splats: int | None = None, bytes: int | None = None) -> None:
-        given = {name: value for name, value in locals().items() if name in ("quality", "splats", "bytes")}
-        given = {name: value for name, value in given.items() if value is not None}
+        numbers = {"quality": quality, "splats": splats, "bytes": bytes}
+        given = {name: value for name, value in numbers.items() if value is not None}
         if len(given) > 1:
             raise ValueError(f"a budget is one number, got {' and '.join(given)}; leave all but one out")
         for name, value in given.items():
@@ -67,7 +68,7 @@ class SplatBudget(HostedCallback):
             host.splat_budget = splats_for_bytes(self.bytes, codebooks, host.splats.sh_degree)
             reason = f"for a file of {self.bytes} bytes"
         elif self.quality is not None:
-            scene = getattr(getattr(trainer, "datamodule", None), "scene", None)
+            scene = scene_of(trainer)
             if scene is None:
                 raise ValueError(
                     "a budget from the photos needs them: fit with a data module that has a scene, or give a number of "

@@ -7,19 +7,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
+import torch
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 
 from nsvq_lightning.compression.importance import most_contributing
 from nsvq_lightning.rendering.rasterize import Render
-from nsvq_lightning.training.edit import keep_rows
+from nsvq_lightning.training.edit import keep_rows, replace_attribute, reset_moments
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.replicas import check_replicas, sum_over_processes
 from nsvq_lightning.training.schedule import Phase, next_iteration
 from nsvq_lightning.training.train_views import train_contributions
 
+from .density_rules import lower_opacities
 from .finite import FiniteSearch, keep_finite_splats
 from .latch import LatchedCallback
 
@@ -132,6 +134,30 @@ class Densification(LatchedCallback, ABC):
         keep_rows(host.splats, raw_optimizer(trainer), kept)
         check_replicas(trainer, "the limit of splats")
         log.info("kept %d of %d splats, those that contribute most to the train views", limit, count)
+
+    @torch.no_grad()
+    def prune(self, trainer: Trainer, host: SplatHost, mask: Tensor, min_splats: int) -> int:
+        """Remove the splats of ``mask [N]``, unless fewer than ``min_splats`` would be left; returns how many."""
+        count = int(mask.sum())
+        if len(host.splats) - count < min_splats:
+            log.warning(
+                "iteration %d: pruning %d of %d splats would leave fewer than min_splats=%d; skipped. Opacities or "
+                "scales have collapsed: lower the learning rates, or check the camera poses",
+                trainer.global_step,
+                count,
+                len(host.splats),
+                min_splats,
+            )
+            return 0
+        keep_rows(host.splats, raw_optimizer(trainer), ~mask)
+        return count
+
+    @torch.no_grad()
+    def reset_opacities(self, trainer: Trainer, host: SplatHost, ceiling: float) -> None:
+        """Lower all opacities to at most ``ceiling``, and forget their moments."""
+        optimizer = raw_optimizer(trainer)
+        replace_attribute(host.splats, optimizer, "opacities", lower_opacities(host.splats.opacities, ceiling))
+        reset_moments(optimizer, "opacities")
 
     def _view(self, trainer: Trainer, host: SplatHost, outputs: Mapping[str, Any]) -> Render | None:
         """The step's rendering; None if there is none, or if the splats have changed since."""

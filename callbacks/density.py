@@ -13,7 +13,7 @@ from torch import Tensor
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training.edit import append_rows, keep_rows, replace_attribute, reset_moments
+from nsvq_lightning.training.edit import append_rows, keep_rows
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.replicas import check_replicas
@@ -25,7 +25,6 @@ from .density_rules import (
     add_view,
     clone_mask,
     limit_growth,
-    lower_opacities,
     prune_mask,
     split,
     split_mask,
@@ -122,12 +121,12 @@ class DensityControl(Densification):
         if iteration in schedule.density_times(rules.start, rules.last, rules.every):
             added = self._grow(trainer, host, iteration)
             huge = iteration > schedule.iteration(rules.huge_after)
-            pruned = self._prune(trainer, host, iteration, huge)
+            pruned = self._prune_marked(trainer, host, huge)
             check_replicas(trainer, "density control")
             log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(host.splats))
         white = host.background == "white" and rules.white_reset and iteration == schedule.iteration(rules.white_reset)
         if white or iteration in schedule.reset_times(rules.reset_last, rules.reset_every):
-            self._reset_opacities(trainer, host)
+            self.reset_opacities(trainer, host, rules.reset_opacity)
             check_replicas(trainer, "the opacity reset")
 
     def _prune_step(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
@@ -135,7 +134,7 @@ class DensityControl(Densification):
         if not rules.prune_every:
             return
         if iteration in host.schedule.times(rules.prune_start, rules.prune_last, rules.prune_every):
-            pruned = self._prune(trainer, host, iteration, huge=False)
+            pruned = self._prune_marked(trainer, host, huge=False)
             check_replicas(trainer, "pruning")
             level = logging.INFO if pruned else logging.DEBUG
             log.log(level, "iteration %d: pruned %d splats, %d remain", iteration, pruned, len(host.splats))
@@ -162,31 +161,10 @@ class DensityControl(Densification):
             splats.add_table(table).zero_()
         return len(splats) - before
 
-    @torch.no_grad()
-    def _prune(self, trainer: Trainer, host: SplatHost, iteration: int, huge: bool) -> int:
-        """Prune; returns how many splats were removed."""
-        splats, rules = host.splats, self.rules
-        prune = prune_mask(splats.opacities, splats.scales, host.extent, rules, huge)
-        count = int(prune.sum())
-        if len(splats) - count < rules.min_splats:
-            log.warning(
-                "iteration %d: pruning %d of %d splats would leave fewer than min_splats=%d; skipped. Opacities or "
-                "scales have collapsed: lower the learning rates, or check the camera poses",
-                iteration,
-                count,
-                len(splats),
-                rules.min_splats,
-            )
-            return 0
-        keep_rows(splats, raw_optimizer(trainer), ~prune)
-        return count
-
-    @torch.no_grad()
-    def _reset_opacities(self, trainer: Trainer, host: SplatHost) -> None:
-        optimizer = raw_optimizer(trainer)
-        lowered = lower_opacities(host.splats.opacities, self.rules.reset_opacity)
-        replace_attribute(host.splats, optimizer, "opacities", lowered)
-        reset_moments(optimizer, "opacities")
+    def _prune_marked(self, trainer: Trainer, host: SplatHost, huge: bool) -> int:
+        """Prune what the rules mark; returns how many splats were removed."""
+        marked = prune_mask(host.splats.opacities, host.splats.scales, host.extent, self.rules, huge)
+        return self.prune(trainer, host, marked, self.rules.min_splats)
 
 
 def _rows(splats: RawSplats, mask: Tensor) -> RawSplats:

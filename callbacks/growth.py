@@ -15,14 +15,13 @@ from nsvq_lightning.data.edges import edge_strength
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training.edit import append_rows, keep_rows, replace_attribute, reset_moments
+from nsvq_lightning.training.edit import append_rows, keep_rows
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.replicas import check_replicas
 from nsvq_lightning.training.schedule import Phase
 
 from .densification import Densification
-from .density_rules import lower_opacities
 from .growth_rules import GrowthRules, add_observed, budget_at, draw_rows, lowest_share, split_longest
 
 __all__ = ["BudgetedGrowth"]
@@ -152,14 +151,16 @@ class BudgetedGrowth(Densification):
         if schedule.phase_at(iteration) is not Phase.WARMUP:
             return
         if rules.first_prune and iteration == schedule.iteration(rules.first_prune):
-            self._prune(trainer, host, host.splats.opacities.sigmoid() < rules.first_opacity)
+            self.prune(trainer, host, host.splats.opacities.sigmoid() < rules.first_opacity, rules.min_splats)
         last = schedule.ends[Phase.WARMUP]
         times = schedule.density_times(rules.start + rules.every, round(last / schedule.scale), rules.every)
         if iteration in times:
             room, added = self._grow(trainer, host, iteration)
             pruned = 0
             if iteration != times[-1]:
-                pruned = self._prune(trainer, host, host.splats.opacities.sigmoid() < rules.min_opacity)
+                pruned = self.prune(
+                    trainer, host, host.splats.opacities.sigmoid() < rules.min_opacity, rules.min_splats
+                )
             check_replicas(trainer, "growth")
             log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(host.splats))
             self._idle = self._idle + 1 if added <= IDLE * min(room, len(host.splats)) else 0
@@ -174,10 +175,10 @@ class BudgetedGrowth(Densification):
                 )
         resets = schedule.reset_times(rules.reset_last, rules.reset_every)
         if iteration in resets:
-            self._reset_opacities(trainer, host)
+            self.reset_opacities(trainer, host, rules.reset_opacity)
             check_replicas(trainer, "the opacity reset")
         if iteration in (reset + schedule.interval(rules.recovery) for reset in resets[: rules.recoveries]):
-            self._prune(trainer, host, lowest_share(host.splats.opacities, rules.recovery_share))
+            self.prune(trainer, host, lowest_share(host.splats.opacities, rules.recovery_share), rules.min_splats)
 
     @torch.no_grad()
     def _grow(self, trainer: Trainer, host: SplatHost, iteration: int) -> tuple[int, int]:
@@ -199,27 +200,3 @@ class BudgetedGrowth(Densification):
         for name in self.tables:
             splats.add_table(name).zero_()
         return room, len(splats) - before
-
-    @torch.no_grad()
-    def _prune(self, trainer: Trainer, host: SplatHost, mask: Tensor) -> int:
-        """Remove the splats of ``mask [N]``; returns how many."""
-        count = int(mask.sum())
-        if len(host.splats) - count < self.growth.min_splats:
-            log.warning(
-                "iteration %d: pruning %d of %d splats would leave fewer than min_splats=%d; skipped. Opacities have "
-                "collapsed: lower the learning rates, or check the camera poses",
-                trainer.global_step,
-                count,
-                len(host.splats),
-                self.growth.min_splats,
-            )
-            return 0
-        keep_rows(host.splats, raw_optimizer(trainer), ~mask)
-        return count
-
-    @torch.no_grad()
-    def _reset_opacities(self, trainer: Trainer, host: SplatHost) -> None:
-        optimizer = raw_optimizer(trainer)
-        lowered = lower_opacities(host.splats.opacities, self.growth.reset_opacity)
-        replace_attribute(host.splats, optimizer, "opacities", lowered)
-        reset_moments(optimizer, "opacities")

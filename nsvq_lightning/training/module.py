@@ -51,6 +51,7 @@ from nsvq_lightning.training.optim import (
 )
 from nsvq_lightning.training.schedule import Phase, Schedule, log_interval
 from nsvq_lightning.training.state import RunState, Stopwatch
+from nsvq_lightning.training.train_views import scene_of
 from nsvq_lightning.version import __version__
 
 __all__ = ["SplatModule"]
@@ -295,7 +296,7 @@ class SplatModule(LightningModule):
         self.evaluation_splats = None
         if stage != "fit":
             return
-        scene = getattr(getattr(self.trainer, "datamodule", None), "scene", None)
+        scene = scene_of(self.trainer)
         if scene is not None and self.extent == 0.0:
             self.state.extent = scene.extent
         if len(self.splats) == 0:

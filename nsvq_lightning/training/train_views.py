@@ -8,11 +8,18 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nsvq_lightning.compression.importance import contributions
+from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.training.host import SplatHost
 from nsvq_lightning.training.replicas import sum_over_processes
 
-__all__ = ["train_cameras", "train_contributions"]
+__all__ = ["scene_of", "train_cameras", "train_contributions"]
+
+
+def scene_of(trainer: Trainer) -> Scene | None:
+    """The scene of the trainer's data module; None if it has none."""
+    scene: Scene | None = getattr(getattr(trainer, "datamodule", None), "scene", None)
+    return scene
 
 
 def train_cameras(trainer: Trainer, host: SplatHost, *, share: bool = False) -> Iterator[Camera]:
@@ -21,7 +28,7 @@ def train_cameras(trainer: Trainer, host: SplatHost, *, share: bool = False) -> 
     Raises:
         ValueError: The trainer has no data module with a scene.
     """
-    scene = getattr(getattr(trainer, "datamodule", None), "scene", None)
+    scene = scene_of(trainer)
     if scene is None:
         raise ValueError(
             "contributions of splats and the floor of scales need the train views: fit with a data module that has a "
