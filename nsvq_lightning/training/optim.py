@@ -23,7 +23,6 @@ __all__ = [
     "param_groups",
     "position_lr",
     "raw_optimizer",
-    "set_lr",
 ]
 
 BETAS = 0.9, 0.999
@@ -164,11 +163,6 @@ def build_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
     parameters: list[Tensor] = [parameter for group in groups for parameter in group["params"]]
     fused = all(p.device.type in FUSED_DEVICES and p.is_floating_point() for p in parameters)
     return torch.optim.Adam(groups, eps=EPS, fused=True if fused else None)
-
-
-def set_lr(optimizer: torch.optim.Optimizer, name: str, rate: float) -> None:
-    """Set the learning rate of the group ``name``."""
-    find_group(optimizer, name)["lr"] = rate
 
 
 def find_group(optimizer: torch.optim.Optimizer, name: str) -> dict[str, Any]:

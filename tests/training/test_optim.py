@@ -14,9 +14,9 @@ from nsvq_lightning.training.optim import (
     LearningRates,
     apply_rates,
     build_adam,
+    find_group,
     param_groups,
     position_lr,
-    set_lr,
 )
 
 
@@ -148,12 +148,11 @@ def test_a_codebook_without_gradient_is_left_alone() -> None:
     assert book.codebook not in optimizer.state
 
 
-def test_set_lr_finds_the_group_by_name() -> None:
+def test_groups_are_found_by_name() -> None:
     optimizer = build_adam(param_groups(splats(), {}, LearningRates(), extent=1.0))
-    set_lr(optimizer, "means", 0.5)
-    assert [group["lr"] for group in optimizer.param_groups if group["name"] == "means"] == [0.5]
-    with pytest.raises(ValueError, match="no parameter group 'albedo'"):
-        set_lr(optimizer, "albedo", 0.5)
+    assert find_group(optimizer, "means") is optimizer.param_groups[0]
+    with pytest.raises(ValueError, match="no parameter group 'albedo', only: means"):
+        find_group(optimizer, "albedo")
 
 
 @pytest.mark.parametrize("bad", [{"means": 0.0}, {"opacities": -1.0}, {"shN": math.nan}])

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from nsvq_lightning.commands.doctor.finding import Finding, good, note
 from nsvq_lightning.commands.doctor.machine import available_memory, readable_bytes
+from nsvq_lightning.compression.budget import splats_for_photos
+from nsvq_lightning.data.edges import detailed_pixels
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render
@@ -18,12 +20,13 @@ from nsvq_lightning.splats.splats import Splats
 
 __all__ = ["check_budget", "grown"]
 
-SPLATS = 150_000
-"""Number of splats that scenes of some tens of photos grow to in a run of a tenth of the paper's length."""
+FAST, FAST_SPLATS = 4500, 1.3
+"""Iterations of ``fast.yaml``, and splats over its iterations, on average, as a multiple of the default for the
+photos."""
+PAPER, PAPER_SPLATS = 45_000, 4.0
+"""The same for the paper's run."""
 RENDERS_A_STEP = 2.0
 """Ratio of a training step's time to that of rendering forward and backward; the rest is loss, optimiser, codebooks."""
-SHORT, FULL = 4500, 45_000
-"""Iterations of a tenth of the paper's run, and of the whole run."""
 BYTES_A_SPLAT = 59 * 4 * 6
 """Bytes per splat: 59 float32, each with gradient, two moments, and copies while quantizing or editing."""
 BYTES_A_PIXEL = 100
@@ -36,12 +39,14 @@ REPEATS = 3
 
 
 def check_budget(scene: Scene) -> Iterator[Finding]:
-    """Memory against what is available; time from a measured render of the scene grown to a usual size."""
+    """Memory against what is available; time from renders of the scene grown as two recipes grow it."""
+    default = splats_for_photos(len(scene.train), detailed_pixels(scene))
+    fast, paper = (round(factor * default) for factor in (FAST_SPLATS, PAPER_SPLATS))
     pixels = max(camera.width * camera.height for camera in scene.cameras)
     photos = sum(source.nbytes for source in scene.images.sources)
-    needed = BASE + min(photos, CACHE) + BYTES_A_SPLAT * SPLATS + BYTES_A_PIXEL * pixels
+    needed = BASE + min(photos, CACHE) + BYTES_A_SPLAT * paper + BYTES_A_PIXEL * pixels
     free = available_memory()
-    text = f"about {readable_bytes(needed)} with {SPLATS:,} splats and {readable_bytes(min(photos, CACHE))} of photos"
+    text = f"about {readable_bytes(needed)} with {paper:,} splats and {readable_bytes(min(photos, CACHE))} of photos"
     if photos > CACHE:
         text += f" (all would take {readable_bytes(photos)}; the others are decoded each time)"
     if free is not None and needed > free:
@@ -49,9 +54,12 @@ def check_budget(scene: Scene) -> Iterator[Finding]:
         yield note("run memory", f"{text}, {readable_bytes(free)} are available: {help_}", bytes=needed)
     else:
         yield good("run memory", text, bytes=needed)
-    step = RENDERS_A_STEP * _render_seconds(scene)
-    text = f"about {_duration(SHORT * step)} for {SHORT:,} steps, {_duration(FULL * step)} for the paper's {FULL:,}"
-    yield good("run time", f"{text}, with {SPLATS:,} splats and the machine as busy as now", step_seconds=step)
+    step, paper_step = (RENDERS_A_STEP * _render_seconds(scene, count) for count in (fast, paper))
+    text = (
+        f"about {_duration(FAST * step)} for fast.yaml ({FAST:,} steps, {fast:,} splats on average), "
+        f"{_duration(PAPER * paper_step)} for the paper's run ({PAPER:,}, {paper:,}), with the machine as busy as now"
+    )
+    yield good("run time", text, step_seconds=step, paper_step_seconds=paper_step)
 
 
 def grown(scene: Scene, count: int) -> Splats:
@@ -68,9 +76,9 @@ def grown(scene: Scene, count: int) -> Splats:
     return Splats.from_tensors(**tensors)
 
 
-def _render_seconds(scene: Scene) -> float:
-    """Median over views of the shortest time to render forward and backward."""
-    splats = grown(scene, SPLATS)
+def _render_seconds(scene: Scene, count: int) -> float:
+    """Median over views of the shortest time to render ``count`` splats forward and backward."""
+    splats = grown(scene, count)
     chosen = [scene.train[i * len(scene.train) // REPEATS] for i in range(REPEATS)]
     times = [min(_seconds(splats, scene, view) for _ in range(REPEATS)) for view in chosen]
     return sorted(times)[len(times) // 2]
