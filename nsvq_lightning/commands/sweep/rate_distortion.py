@@ -1,7 +1,8 @@
-"""The rate–distortion picture of a sweep."""
+"""The picture of a sweep: quality over the size of the file, and over the time of training."""
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,20 @@ __all__ = ["draw_sweep"]
 
 PANEL_HEIGHT = 4.6
 """Inches."""
+BELOW = 2.0
+"""The picture over the time starts this many dB below the worst run: what comes before is steep and the same for
+all."""
+WIDE = 4.0
+"""Ratio of the longest to the shortest training from which on the time is drawn in logarithms."""
 
 
 def draw_sweep(path: Path, rows: Sequence[RunResult]) -> None:
-    """Draw PSNR over file size: a panel and a marker for each scene, a colour for each quantizer or configuration.
+    """Draw PSNR over file size, and beside it over training time: a row and a marker for each scene.
 
-    A point is the mean over the seeds, its whiskers the standard deviation; lines join the codebook sizes. Runs without
-    codebooks, whose files are many times as large, are dashed lines that say their size.
+    The colour tells quantizers or configurations apart. Over the size, a point is the mean over the seeds, its whiskers
+    the standard deviation; lines join the codebook sizes. Runs without codebooks, whose files are many times as large,
+    are dashed lines that say their size. Over the time, a line is the test PSNR of a run while it trains, and the point
+    at its end that of the decoded file.
 
     Args:
         path: PNG file, replaced atomically.
@@ -35,13 +43,15 @@ def draw_sweep(path: Path, rows: Sequence[RunResult]) -> None:
     series = series_of(rows)
     colours = colours_of(list(dict.fromkeys(map(series, rows))))
     markers = markers_of(list(dict.fromkeys(row.scene for row in rows)))
-    figure, axes = panels(len(markers), PANEL_HEIGHT, max(len(colours), len(markers)))
-    for axis, (scene, marker) in zip(axes, markers.items(), strict=True):
+    figure, axes = panels(2 * len(markers), PANEL_HEIGHT, max(len(colours), len(markers)))
+    for (scene, marker), over_size, over_time in zip(markers.items(), axes[::2], axes[1::2], strict=True):
+        shown = [row for row in rows if row.scene == scene]
         curves: dict[str, list[Group]] = {}
-        for group in grouped([row for row in rows if row.scene == scene]):
+        for group in grouped(shown):
             curves.setdefault(series(group.rows[0]), []).append(group)
-        _draw_scene(axis, {name: (groups, colours[name]) for name, groups in curves.items()}, marker)
-        axis.set_title(scene, fontsize="medium")
+        _draw_scene(over_size, {name: (groups, colours[name]) for name, groups in curves.items()}, marker)
+        over_size.set_title(scene, fontsize="medium")
+        _draw_times(over_time, [(row, colours[series(row)]) for row in shown], marker)
     draw_keys(figure, colours, markers)
     write_figure(path, figure)
 
@@ -87,3 +97,29 @@ def _draw_level(axis: Any, group: Group, colour: Any) -> None:
     text = f"{group.mean('bytes', 1e-6):.3g} MB"
     place = {"xy": (0, psnr), "xycoords": ("axes fraction", "data"), "xytext": (3, 3), "textcoords": "offset points"}
     axis.annotate(text, **place, fontsize=7, color=colour)
+
+
+def _draw_times(axis: Any, rows: Sequence[tuple[RunResult, Any]], marker: str) -> None:
+    """Test PSNR over the minutes of training, a line for each run."""
+    times = [row.seconds / 60 for row, _ in rows if row.seconds]
+    for row, colour in rows:
+        points = _curve(row.folder / "curve.csv")
+        axis.plot(*points, color=colour, linewidth=1)
+        if row.seconds:
+            axis.plot([row.seconds / 60], [row.psnr], marker, color=colour, markersize=5)
+    axis.set_ylim(bottom=min(row.psnr or 0.0 for row, _ in rows) - BELOW)
+    axis.grid(alpha=0.3)
+    axis.set(xlabel="training, minutes", ylabel="test PSNR, dB")
+    if times and max(times) > WIDE * min(times):
+        axis.set_xscale("log")
+        axis.set_xlim(left=0.2 * min(times))
+        axis.xaxis.set_major_formatter("{x:g}")
+
+
+def _curve(path: Path) -> tuple[list[float], list[float]]:
+    """Minutes and test PSNR of a run's evaluations; none where the run left no curve."""
+    if not path.is_file():
+        return [], []
+    with path.open(encoding="utf-8", newline="") as file:
+        points = [(float(row["seconds"]) / 60, float(row["psnr"])) for row in csv.DictReader(file)]
+    return [minutes for minutes, _ in points], [psnr for _, psnr in points]
