@@ -9,6 +9,7 @@ from lightning.pytorch import LightningModule, Trainer
 
 from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.schedule import Phase, Schedule, next_iteration
+from nsvq_lightning.training.train_views import scene_of
 
 from .hosted import HostedCallback
 
@@ -34,9 +35,12 @@ class PhaseSchedule(HostedCallback):
         min_reset_interval: Lower limit of the interval of opacity resets in this run.
         min_replacement_interval: Lower limit of the window of code replacement and of the interval of refits.
         min_finetune: Lower limit of the length of the fine-tune phase, up to half of what follows the prune phase.
+        iterations_per_photo: The run is not longer than so many iterations for each train photo, where
+            ``trainer.max_steps`` would allow more: few photos are learned by heart long before many are seen. None for
+            no such limit; ``total`` goes before it.
 
     Raises:
-        ValueError: See :class:`~nsvq_lightning.training.schedule.Schedule`.
+        ValueError: ``iterations_per_photo`` is below 1; or see :class:`~nsvq_lightning.training.schedule.Schedule`.
 
     Example:
         >>> from nsvq_lightning.callbacks import PhaseSchedule
@@ -58,8 +62,12 @@ class PhaseSchedule(HostedCallback):
         min_reset_interval: int = Schedule.min_reset_interval,
         min_replacement_interval: int = Schedule.min_replacement_interval,
         min_finetune: int = Schedule.min_finetune,
+        iterations_per_photo: int | None = None,
     ) -> None:
+        if iterations_per_photo is not None and iterations_per_photo < 1:
+            raise ValueError(f"iterations_per_photo must be at least 1, got {iterations_per_photo}")
         self.total = total
+        self.iterations_per_photo = iterations_per_photo
         self.reference_total = reference_total
         self._steps = -1
         self.rules = {
@@ -84,12 +92,15 @@ class PhaseSchedule(HostedCallback):
         """Set the module's schedule.
 
         Raises:
-            ValueError: ``trainer.max_steps`` is not set and neither is ``total``.
+            ValueError: ``trainer.max_steps`` is not set and neither is ``total``; or the limit for each photo needs a
+                data module with a scene.
         """
         super().setup(trainer, pl_module, stage)
         if stage != "fit":
             return
         host = as_host(pl_module)
+        if self.iterations_per_photo is not None and self.total is None:
+            _limit_steps(trainer, self.iterations_per_photo)
         self._steps = trainer.max_steps
         total = self.total if self.total is not None else trainer.max_steps
         if total < 1:
@@ -138,3 +149,17 @@ class PhaseSchedule(HostedCallback):
         if self._steps > 0:
             trainer.fit_loop.epoch_loop.max_steps = self._steps - host.schedule.saved
         host.phase = host.schedule.phase_at(next_iteration(trainer))
+
+
+def _limit_steps(trainer: Trainer, per_photo: int) -> None:
+    """End the run after ``per_photo`` iterations for each train photo, if it would be longer."""
+    scene = scene_of(trainer)
+    if scene is None:
+        raise ValueError(
+            "a number of iterations for each photo needs the photos: fit with a data module that has a scene, or leave "
+            "iterations_per_photo unset"
+        )
+    limit = per_photo * len(scene.train)
+    if not 0 < trainer.max_steps <= limit:
+        trainer.fit_loop.epoch_loop.max_steps = limit
+        log.info("iterations: %d, %d for each of %d photos", limit, per_photo, len(scene.train))

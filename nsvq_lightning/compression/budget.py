@@ -9,8 +9,8 @@ from nsvq_lightning.splats.sh_degree import sh_coefficients
 
 __all__ = ["splats_for_bytes", "splats_for_photos"]
 
-SPLATS_PER_PIXEL = 0.09
-"""Splats for each detailed pixel of a photo, times the root of the number of photos."""
+SPLATS_PER_PIXEL = 0.165
+"""Splats for each detailed pixel of a photo, times the cube root of the number of photos."""
 
 LEAST = 1000
 """A scene of fewer splats is no scene."""
@@ -28,7 +28,7 @@ FULL_BITS = 32
 
 
 def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:
-    """A default for the number of splats: quality · 0.09 · √photos · detail.
+    """A default for the number of splats: quality · 0.165 · ∛photos · detail.
 
     Detail asks for splats; more photos of it show more of its sides, and support more without fitting the noise.
 
@@ -37,7 +37,7 @@ def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:
         detail: Detailed pixels of a photo (:func:`nsvq_lightning.data.edges.detailed_pixels`).
         quality: Factor.
     """
-    return max(LEAST, round(quality * SPLATS_PER_PIXEL * math.sqrt(photos) * detail))
+    return max(LEAST, round(quality * SPLATS_PER_PIXEL * math.cbrt(photos) * detail))
 
 
 def splats_for_bytes(size: int, codebooks: Mapping[str, Sequence[int]], sh_degree: int) -> int:

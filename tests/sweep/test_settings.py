@@ -110,6 +110,7 @@ def test_a_trunk_depends_on_everything_else(standard: Settings, path: str, value
     [
         ("callbacks.phases.init_args.prune_end", 43_000),  # nothing is quantized
         ("callbacks.phases.init_args.total", 60_000),  # the run ends before the prune phase does
+        ("callbacks.phases.init_args.iterations_per_photo", 100),  # the photos are not looked at
         ("callbacks.phases", None),
         ("callbacks.freeze.class_path", "mine.Freeze"),
         ("trainer.callbacks", [{"class_path": "mine.Callback"}]),

@@ -161,6 +161,17 @@ def test_a_budget_from_photos_or_bytes_is_explained(
     assert ("quality 2 times what 7 photos with" if budget == "quality" else "for a file of 60000 bytes") in line
 
 
+def test_few_photos_shorten_the_run(run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture) -> None:
+    phases = PhaseSchedule(reference_total=60, iterations_per_photo=2, **ENDS)
+    with caplog.at_level(logging.INFO):
+        trainer, module = run(recipe(phases=phases).values())
+    assert "iterations: 14, 2 for each of 7 photos" in caplog.text
+    assert trainer.global_step == module.schedule.total == trainer.max_steps == 14
+    assert module.phase is Phase.FINETUNE  # which ends with it
+    plenty = PhaseSchedule(reference_total=60, iterations_per_photo=2, **ENDS)
+    assert run(recipe(phases=plenty).values(), max_steps=3)[0].global_step == 3
+
+
 def test_dropout_changes_training_alone(run: RunFactory, recipe: Recipe) -> None:
     _, module = run([*recipe().values(), SplatDropout(share=0.5, end=1)], max_steps=2)
     assert module.dropout == 0.5
@@ -177,6 +188,7 @@ def test_dropout_changes_training_alone(run: RunFactory, recipe: Recipe) -> None
     [
         (lambda: SplatBudget(quality=1.0, splats=5), "a budget is one number, got quality and splats"),
         (lambda: SplatBudget(bytes=0), "bytes must be finite and above 0, got 0"),
+        (lambda: PhaseSchedule(iterations_per_photo=0), "iterations_per_photo must be at least 1, got 0"),
         (lambda: ViewsPerStep(views=0), "views must be at least 1, got 0"),
         (lambda: RateDecay(final=0.0), "final must be above 0 and at most 1, got 0.0"),
         (lambda: SplatDropout(share=1.0), "share must be at least 0 and below 1, got 1.0"),

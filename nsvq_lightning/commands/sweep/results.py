@@ -23,7 +23,7 @@ class RunResult:
         quantizer: Class of the quantizer; empty without codebooks.
         codebooks: Sizes of the codebooks; empty without.
         seed: Seed.
-        steps: Iterations.
+        steps: Iterations that were asked for; a run may end earlier.
         psnr: Of the decoded file on the test views, dB; None also where it is infinite.
         ssim: Of the decoded file on the test views.
         bytes: Size of the file.

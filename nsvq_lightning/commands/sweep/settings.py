@@ -105,6 +105,8 @@ def trunk_of(settings: Settings) -> Settings | None:
     if in_one_piece or callbacks["phases"] is None or not all(map(_is_known, drivers)):
         return None
     phases = PhaseSchedule(**callbacks["phases"]["init_args"])
+    if phases.total is None and phases.iterations_per_photo is not None:
+        return None  # its length follows from the photos
     total = phases.total or trainer["max_steps"]
     if total < 1:
         return None
