@@ -20,7 +20,7 @@ from nsvq_lightning.splats.splats import Splats
 
 __all__ = ["check_budget", "grown"]
 
-FAST, FAST_SPLATS = 4500, 1.3
+FAST, FAST_SPLATS = 4000, 1.3
 """Iterations of ``fast.yaml``, and splats over its iterations, on average, as a multiple of the default for the
 photos."""
 PAPER, PAPER_SPLATS = 45_000, 4.0
