@@ -10,7 +10,7 @@ from lightning.pytorch import LightningModule, Trainer
 from nsvq_lightning.compression.budget import splats_for_bytes, splats_for_photos
 from nsvq_lightning.data.edges import detailed_pixels
 from nsvq_lightning.training.host import as_host
-from nsvq_lightning.training.train_views import scene_of
+from nsvq_lightning.training.train_views import needed_scene
 
 from .hosted import HostedCallback
 
@@ -68,12 +68,11 @@ class SplatBudget(HostedCallback):
             host.splat_budget = splats_for_bytes(self.bytes, codebooks, host.splats.sh_degree)
             reason = f"for a file of {self.bytes} bytes"
         elif self.quality is not None:
-            scene = scene_of(trainer)
-            if scene is None:
-                raise ValueError(
-                    "a budget from the photos needs them: fit with a data module that has a scene, or give a number of "
-                    "splats (--splats) or bytes (--bytes)"
-                )
+            scene = needed_scene(
+                trainer,
+                "a budget from the photos needs them",
+                "give a number of splats (--splats) or bytes (--bytes)",
+            )
             detail = detailed_pixels(scene)
             host.splat_budget = splats_for_photos(len(scene.train), detail, self.quality)
             reason = (

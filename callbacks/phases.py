@@ -9,7 +9,7 @@ from lightning.pytorch import LightningModule, Trainer
 
 from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.schedule import Phase, Schedule, next_iteration
-from nsvq_lightning.training.train_views import scene_of
+from nsvq_lightning.training.train_views import needed_scene
 
 from .hosted import HostedCallback
 
@@ -153,12 +153,9 @@ class PhaseSchedule(HostedCallback):
 
 def _limit_steps(trainer: Trainer, per_photo: int) -> None:
     """End the run after ``per_photo`` iterations for each train photo, if it would be longer."""
-    scene = scene_of(trainer)
-    if scene is None:
-        raise ValueError(
-            "a number of iterations for each photo needs the photos: fit with a data module that has a scene, or leave "
-            "iterations_per_photo unset"
-        )
+    scene = needed_scene(
+        trainer, "a number of iterations for each photo needs the photos", "leave iterations_per_photo unset"
+    )
     limit = per_photo * len(scene.train)
     if not 0 < trainer.max_steps <= limit:
         trainer.fit_loop.epoch_loop.max_steps = limit

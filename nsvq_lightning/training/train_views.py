@@ -13,12 +13,29 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.training.host import SplatHost
 from nsvq_lightning.training.replicas import sum_over_processes
 
-__all__ = ["scene_of", "train_cameras", "train_contributions"]
+__all__ = ["needed_scene", "scene_of", "train_cameras", "train_contributions"]
 
 
 def scene_of(trainer: Trainer) -> Scene | None:
     """The scene of the trainer's data module; None if it has none."""
     scene: Scene | None = getattr(getattr(trainer, "datamodule", None), "scene", None)
+    return scene
+
+
+def needed_scene(trainer: Trainer, need: str, otherwise: str) -> Scene:
+    """The scene of the trainer's data module.
+
+    Args:
+        trainer: The trainer.
+        need: What needs it, for the error.
+        otherwise: What to do where there is none.
+
+    Raises:
+        ValueError: The trainer has no data module with a scene.
+    """
+    scene = scene_of(trainer)
+    if scene is None:
+        raise ValueError(f"{need}: fit with a data module that has a scene, or {otherwise}")
     return scene
 
 
@@ -28,12 +45,11 @@ def train_cameras(trainer: Trainer, host: SplatHost, *, share: bool = False) -> 
     Raises:
         ValueError: The trainer has no data module with a scene.
     """
-    scene = scene_of(trainer)
-    if scene is None:
-        raise ValueError(
-            "contributions of splats and the floor of scales need the train views: fit with a data module that has a "
-            "scene, or leave contribution pruning, weights by contribution and the floor off"
-        )
+    scene = needed_scene(
+        trainer,
+        "contributions of splats and the floor of scales need the train views",
+        "leave contribution pruning, weights by contribution and the floor off",
+    )
     indices = scene.train[trainer.global_rank :: trainer.world_size] if share else scene.train
     return (scene.cameras[index].to(host.device) for index in indices)
 
