@@ -100,8 +100,7 @@ def add_observed(
 
     Args:
         gradients: Sum over the views of the norm of the two absolute sums, in normalised device coordinates, in which
-        an
-            image is 2 wide and 2 high.
+            an image is 2 wide and 2 high.
         views: Number of views.
         weights: Sum over the views of the edge weight, divided by the mean of those in the view that are positive.
         observed: Gradient of ``Render.observed``: Σ |∂L/∂x|, Σ |∂L/∂y| per pixel, Σ weight · edge strength ``[N, 3]``.
