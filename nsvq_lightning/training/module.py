@@ -51,7 +51,7 @@ from nsvq_lightning.training.optim import (
 )
 from nsvq_lightning.training.schedule import Phase, Schedule, log_interval
 from nsvq_lightning.training.state import RunState, Stopwatch
-from nsvq_lightning.training.train_views import scene_of
+from nsvq_lightning.training.train_views import needed_scene, scene_of
 from nsvq_lightning.version import __version__
 
 __all__ = ["SplatModule"]
@@ -300,13 +300,13 @@ class SplatModule(LightningModule):
         if scene is not None and self.extent == 0.0:
             self.state.extent = scene.extent
         if len(self.splats) == 0:
-            self.splats = self._first_splats(scene).to(self.device)
+            self.splats = self._first_splats().to(self.device)
         if self.extent <= 0.0 and scene is not None:
             raise ValueError(f"the {len(scene.train)} train photos of {scene.root} {ONE_PLACE}")
         if self.extent <= 0.0:
             raise ValueError("the extent of the scene is unknown; fit with a data module that has a scene")
 
-    def _first_splats(self, scene: Any) -> Splats:
+    def _first_splats(self) -> Splats:
         if self.init_from is not None:
             loaded = load(self.init_from)
             if loaded.sh_degree != self.splats.sh_degree:
@@ -316,8 +316,7 @@ class SplatModule(LightningModule):
                 )
             self.active_sh_degree = loaded.sh_degree
             return finite_splats(loaded, self.init_from)
-        if scene is None:
-            raise ValueError("no splats to start from: fit with a data module that has a scene, or set init_from")
+        scene = needed_scene(self.trainer, "no splats to start from", "set init_from")
         return Splats.from_points(scene.points, scene.colors, self.splats.sh_degree)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
