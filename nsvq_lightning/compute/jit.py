@@ -8,6 +8,7 @@ from typing import Any
 import numba
 import numpy as np
 import torch
+from numba.core import event
 
 from nsvq_lightning.compute.stamp import KernelStore
 
@@ -22,12 +23,37 @@ _OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "boundscheck": False,
     "nogil": True,
+    "no_cfunc_wrapper": True,
 }
+
+
+class _HelperLevel(event.Listener):
+    """Has LLVM optimise helpers at a low level.
+
+    It optimises them again, with the kernel they are inlined into, whose level decides about speed. Helpers are most of
+    what is compiled: at this level, and without a wrapper for Python, all takes half of the time.
+    """
+
+    LEVEL = 1
+
+    def __init__(self) -> None:
+        self._before: list[int] = []
+
+    def on_start(self, compilation: Any) -> None:
+        self._before.append(numba.config.OPT)
+        if compilation.data["dispatcher"].targetoptions.get("forceinline"):
+            numba.config.OPT = type(numba.config.OPT)(min(numba.config.OPT, self.LEVEL))
+
+    def on_end(self, _: Any) -> None:
+        numba.config.OPT = self._before.pop()
+
+
+event.register("numba:compile", _HelperLevel())
 
 
 def inline(function: Callable[..., Any]) -> Any:
     """Compile a helper that only other kernels call."""
-    return numba.njit(forceinline=True, **_OPTIONS)(function)
+    return numba.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)(function)
 
 
 def kernel(function: Callable[..., Any], parallel: bool = True, allocates: bool = True) -> Any:
