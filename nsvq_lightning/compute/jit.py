@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +13,7 @@ from numba.core import event
 
 from nsvq_lightning.compute.stamp import KernelStore
 
-__all__ = ["F", "inline", "kernel", "thread_count"]
+__all__ = ["F", "inline", "kernel", "kernels_ready", "thread_count"]
 
 F = np.float32
 """Type of the numeric literals in kernels; Python floats would promote their operands to float64."""
@@ -25,6 +26,10 @@ _OPTIONS: dict[str, Any] = {
     "nogil": True,
     "no_cfunc_wrapper": True,
 }
+
+
+_kernels: list[Any] = []
+"""Every kernel of the modules that are loaded."""
 
 
 class _HelperLevel(event.Listener):
@@ -51,6 +56,22 @@ class _HelperLevel(event.Listener):
 event.register("numba:compile", _HelperLevel())
 
 
+class _Store(KernelStore):
+    """Its first question to the disk is the first that happens when a kernel is called."""
+
+    def _load_overload(self, sig: Any, target_context: Any) -> Any:
+        _start_threads()
+        return super()._load_overload(sig, target_context)
+
+
+@functools.cache
+def _start_threads() -> None:
+    """Start Numba's threads, which tells OpenMP to use all cores, and give torch its own setting back."""
+    count = torch.get_num_threads()
+    numba.set_num_threads(numba.get_num_threads())
+    torch.set_num_threads(count)
+
+
 def inline(function: Callable[..., Any]) -> Any:
     """Compile a helper that only other kernels call."""
     return numba.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)(function)
@@ -66,12 +87,19 @@ def kernel(function: Callable[..., Any], parallel: bool = True, allocates: bool 
     A cached kernel is compiled again when anything it is built from has changed (:mod:`nsvq_lightning.compute.stamp`).
     """
     dispatcher = numba.njit(parallel=parallel, _nrt=allocates, **_OPTIONS)(function)
-    dispatcher._cache = KernelStore(function)
+    dispatcher._cache = _Store(function)
+    _kernels.append(dispatcher)
     return dispatcher
+
+
+def kernels_ready() -> tuple[int, int]:
+    """How many kernels are compiled or read from the disk, and how many this process may need as far as is known."""
+    return sum(bool(dispatcher.overloads) for dispatcher in _kernels), len(_kernels)
 
 
 def thread_count() -> int:
     """Number of threads that kernels use: torch's setting, so that one setting controls both."""
+    _start_threads()
     count = max(1, min(torch.get_num_threads(), int(numba.config.NUMBA_NUM_THREADS)))
     numba.set_num_threads(count)
     return count
