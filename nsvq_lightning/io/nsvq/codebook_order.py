@@ -56,6 +56,7 @@ def sibling_distance(ordered: NDArray[np.float32]) -> float:
 
 @partial(kernel, parallel=False)
 def _cut(rows, order):  # type: ignore[no-untyped-def]
+    # Plain loops: every expression of whole arrays would be a kernel of its own, compiled for a second.
     dim = rows.shape[1]
     starts, ends = np.empty(128, np.int64), np.empty(128, np.int64)
     starts[0], ends[0], waiting = 0, len(rows), 1
@@ -67,12 +68,15 @@ def _cut(rows, order):  # type: ignore[no-untyped-def]
             continue
         center[:] = 0
         for i in range(start, end):
-            center += rows[order[i]]
-        center /= end - start
+            for j in range(dim):
+                center[j] += rows[order[i], j]
+        for j in range(dim):
+            center[j] /= end - start
         # The search for the direction starts from the column that varies most.
         product[:] = 0
         for i in range(start, end):
-            product += (rows[order[i]] - center) ** 2
+            for j in range(dim):
+                product[j] += (rows[order[i], j] - center[j]) ** 2
         direction[:] = 0
         direction[np.argmax(product)] = 1
         for _ in range(_ITERATIONS):
@@ -83,17 +87,24 @@ def _cut(rows, order):  # type: ignore[no-untyped-def]
                     along += (rows[order[i], j] - center[j]) * direction[j]
                 for j in range(dim):
                     product[j] += (rows[order[i], j] - center[j]) * along
-            length = np.sqrt((product**2).sum())
+            squared = 0.0
+            for j in range(dim):
+                squared += product[j] ** 2
+            length = np.sqrt(squared)
             if not length > 0:
                 break
-            direction[:] = product / length
+            for j in range(dim):
+                direction[j] = product[j] / length
         projections = np.empty(end - start)
         for i in range(start, end):
             along = 0.0
             for j in range(dim):
                 along += rows[order[i], j] * direction[j]
             projections[i - start] = along
-        order[start:end] = order[start:end][np.argsort(projections, kind="mergesort")]
+        places = np.argsort(projections, kind="mergesort")
+        before = order[start:end].copy()
+        for i in range(end - start):
+            order[start + i] = before[places[i]]
         middle = start + (end - start + 1) // 2
         starts[waiting], ends[waiting] = start, middle
         starts[waiting + 1], ends[waiting + 1] = middle, end

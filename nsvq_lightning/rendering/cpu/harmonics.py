@@ -72,16 +72,11 @@ def clear_bands(columns, degree, evaluated):
 def gather_sh(shN, ids, start, stride, count, columns):
     """Gather the first ``count`` coefficients of 16 rows, one vector per column, into the scratch array ``columns``."""
     if stride == SH_ROW:
-        rows = gather_columns(shN, ids, start, stride, 0)
-        for k in range(16):
-            store(columns, 16 * k, rows[k])
-        if count > 16:
-            rows = gather_columns(shN, ids, start, stride, 16)
+        for block in range(3 if count > 16 else 1):  # one copy of the code instead of three
+            first = min(16 * block, SH_ROW - 16)
+            rows = gather_columns(shN, ids, start, stride, first)
             for k in range(16):
-                store(columns, 16 * (16 + k), rows[k])
-            rows = gather_columns(shN, ids, start, stride, SH_ROW - 16)
-            for k in range(16):
-                store(columns, 16 * (SH_ROW - 16 + k), rows[k])
+                store(columns, 16 * (first + k), rows[k])
     else:
         for lane in range(16):
             row = np.int64(get(ids, start + lane)) * stride
