@@ -17,6 +17,7 @@ from .finite import FiniteCodes
 from .freeze import FreezeCodes
 from .growth import BudgetedGrowth
 from .growth_rules import GrowthRules
+from .kernels import CompileAhead
 from .metric_report import MetricReport
 from .opacity import OpacityRegularization
 from .phases import PhaseSchedule
@@ -36,6 +37,7 @@ __all__ = [
     "CodebookInit",
     "CodebookRefit",
     "CodebookReplacement",
+    "CompileAhead",
     "ContributionPruning",
     "DensityControl",
     "DensityRules",

@@ -145,10 +145,10 @@ class SplatProgressBar(TQDMProgressBar):
             parts.append(f"test {host.history[-1]['psnr']:.2f}")
         return " ".join(parts)
 
-    def _show_compilation(self, compiling: bool) -> None:
+    def _show_compilation(self, line: str) -> None:
         bar = self._train_progress_bar
-        if compiling and bar is not None and not bar.disable:
-            bar.set_postfix_str("compiling kernels")  # the next refresh removes it
+        if bar is not None and not bar.disable:
+            bar.set_postfix_str(line)  # the next refresh removes it
 
 
 def _shows_bars() -> bool:

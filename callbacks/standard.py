@@ -13,6 +13,7 @@ from .density import DensityControl
 from .export import ExportScene
 from .finite import FiniteCodes
 from .freeze import FreezeCodes
+from .kernels import CompileAhead
 from .metric_report import MetricReport
 from .opacity import OpacityRegularization
 from .phases import PhaseSchedule
@@ -44,6 +45,7 @@ STANDARD: dict[str, type[Callback]] = {
     "export": ExportScene,
     "predictions": RenderWriter,
     "checkpoint": RunCheckpoint,
+    "kernels": CompileAhead,
     "progress": SplatProgressBar,
 }
 """Callback by name. The order matters in three places: density control comes before the canonical form, which may act

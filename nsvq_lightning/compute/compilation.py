@@ -14,12 +14,14 @@ from typing import Any
 
 from numba.core import event
 
+from nsvq_lightning.compute.jit import kernels_ready
+
 __all__ = ["compile_seconds", "compile_watcher"]
 
 log = logging.getLogger(__name__)
 
-Watcher = Callable[[bool], None]
-"""Called with True when a compilation begins, with False when it has ended."""
+Watcher = Callable[[str], None]
+"""Called when a compilation begins, with a line that says how many kernels there are and how many are ready."""
 
 
 class _Clock(event.Listener):
@@ -44,17 +46,16 @@ class _Clock(event.Listener):
         self._since = time.perf_counter()
         if not self._announced:
             self._announced = True
-            log.info("compiling kernels as they are needed, once on this machine: one to three minutes in all")
+            log.info("compiling kernels as they are needed, once on this machine: half a minute to two in all")
+        ready, known = kernels_ready()
         for watcher in self.watchers:
-            watcher(True)
+            watcher(f"compiling kernels {ready + 1}/{known}, once on this machine")
 
     def on_end(self, _: Any) -> None:
         self._depth -= 1
         if self._depth:
             return
         self._seconds += time.perf_counter() - self._since
-        for watcher in self.watchers:
-            watcher(False)
 
 
 _clock = _Clock()
@@ -68,7 +69,7 @@ def compile_seconds() -> float:
 
 @contextmanager
 def compile_watcher(watcher: Watcher) -> Iterator[None]:
-    """Call ``watcher`` whenever a compilation begins or ends within the block."""
+    """Call ``watcher`` whenever a compilation begins within the block."""
     _clock.watchers.append(watcher)
     try:
         yield

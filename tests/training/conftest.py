@@ -31,7 +31,7 @@ def recipe() -> Recipe:
             ),
             "density": DensityControl(DensityRules(grad_threshold=5e-6)),
             "report": MetricReport(every=20),
-            **dict.fromkeys(("predictions", "checkpoint", "progress")),
+            **dict.fromkeys(("predictions", "checkpoint", "kernels", "progress")),
             **replaced,
         }
         names = [name for name in STANDARD if name not in chosen or chosen[name] is not None]

@@ -23,7 +23,7 @@ from nsvq_lightning.training.schedule import Phase
 
 __all__ = ["Step", "StepClock", "fit", "one_phase", "quiet", "quiet_trainer", "training_callbacks"]
 
-WATCHING = frozenset({"report", "export", "predictions", "checkpoint", "progress"})
+WATCHING = frozenset({"report", "export", "predictions", "checkpoint", "kernels", "progress"})
 """Callbacks of ``nsvq fit`` that write files or lines but train nothing; the benchmark measures by itself."""
 
 

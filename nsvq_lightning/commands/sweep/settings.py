@@ -79,7 +79,7 @@ def resolve(arguments: Sequence[str]) -> Settings:
     for name in ("default_root_dir", "run_folder"):
         del settings["trainer"][name]
     settings["trainer"]["logger"] = False
-    del settings["callbacks"]["progress"]
+    del settings["callbacks"]["progress"], settings["callbacks"]["kernels"]
     return settings
 
 

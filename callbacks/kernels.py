@@ -1,0 +1,90 @@
+"""Compile the kernels of the later phases while the first ones compile and train."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from nsvq_lightning.compute.compilation import compile_watcher
+from nsvq_lightning.training import rehearsal
+from nsvq_lightning.training.module import SplatModule
+
+__all__ = ["CompileAhead"]
+
+log = logging.getLogger(__name__)
+
+
+class CompileAhead(Callback):
+    """Lets a second process compile what quantization and the file need, on a machine that has not compiled it yet.
+
+    The first kernel that the fit compiles starts it: where all kernels are cached, nothing happens. It goes through the
+    later phases on a handful of splats (:mod:`nsvq_lightning.training.rehearsal`) at a low priority, and leaves its
+    kernels in Numba's cache. If it fails, the fit compiles them itself when it needs them. It ends with the fit.
+
+    It does nothing on a single core, on a GPU, without codebooks, or with a module that is not
+    :class:`nsvq_lightning.SplatModule`.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import STANDARD, CompileAhead
+        >>> STANDARD["kernels"] is CompileAhead  # --callbacks.kernels=null leaves it out
+        True
+    """
+
+    def __init__(self) -> None:
+        self._watching = ExitStack()
+        self._process: Any = None
+        self._settings: bytes | None = None
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Wait for the first compilation."""
+        if not isinstance(pl_module, SplatModule) or not pl_module.quantizers or pl_module.device.type != "cpu":
+            return
+        if trainer.is_global_zero and _cores() > 1:
+            self._settings = rehearsal.settings_of(pl_module)
+            self._watching.enter_context(compile_watcher(self._start))
+
+    def _start(self, _: str) -> None:
+        if self._settings is None:
+            return
+        settings, self._settings = self._settings, None
+        command = [sys.executable, "-m", rehearsal.__name__]
+        pipe, silence = subprocess.PIPE, subprocess.DEVNULL
+        try:
+            self._process = subprocess.Popen(command, stdin=pipe, stdout=silence, stderr=silence, env=_environment())
+            self._process.stdin.write(settings)
+            self._process.stdin.close()
+        except OSError as error:
+            log.info("the kernels of later phases are compiled when they are needed: %s", error)
+
+    def _stop(self) -> None:
+        self._watching.close()
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait()
+            self._process = None
+
+    def on_fit_end(self, *_: Any) -> None:
+        """End the process."""
+        self._stop()
+
+    def on_exception(self, *_: Any) -> None:
+        """End the process."""
+        self._stop()
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _environment() -> dict[str, str]:
+    """That of this process; the package is found where this process has found it, and one thread is enough."""
+    root = str(Path(rehearsal.__file__).parents[2])
+    paths = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
+    return os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
