@@ -20,6 +20,7 @@ HOSTED = [
     if isinstance(kind := getattr(callbacks, name), type)
     and issubclass(kind, Callback)
     and kind is not callbacks.RenderWriter  # it works with any module that predicts pictures
+    and kind is not callbacks.CompileAhead  # it does nothing with other modules
     and kind is not SplatProgressBar  # it edits no parameters
 ]
 
