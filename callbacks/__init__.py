@@ -27,6 +27,7 @@ from .rates import RateDecay
 from .refit import CodebookRefit
 from .selection import OpacitySelection
 from .sh_degree import ShDegreeSchedule
+from .sh_penalty import ShPenalty
 from .standard import STANDARD, standard
 from .views import ViewsPerStep
 
@@ -53,6 +54,7 @@ __all__ = [
     "RenderWriter",
     "RunCheckpoint",
     "ShDegreeSchedule",
+    "ShPenalty",
     "SplatBudget",
     "SplatDropout",
     "SplatProgressBar",

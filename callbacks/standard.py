@@ -23,6 +23,7 @@ from .rates import RateDecay
 from .refit import CodebookRefit
 from .selection import OpacitySelection
 from .sh_degree import ShDegreeSchedule
+from .sh_penalty import ShPenalty
 
 __all__ = ["STANDARD", "standard"]
 
@@ -34,6 +35,7 @@ STANDARD: dict[str, type[Callback]] = {
     "density": DensityControl,
     "selection": OpacitySelection,
     "opacity": OpacityRegularization,
+    "sh_penalty": ShPenalty,
     "contribution": ContributionPruning,
     "canonical": CanonicalCovariance,
     "codebook_init": CodebookInit,
