@@ -50,7 +50,11 @@ def test_the_estimate_of_a_run_is_measured(demo_scene: Path, monkeypatch: pytest
     assert len(grown) == 2000
     memory, time = budget.check_budget(scene)
     assert 1e9 < memory.values["bytes"] < 2e9
-    assert 0 < time.values["step_seconds"] < time.values["paper_step_seconds"] < 10
+    assert min(time.values["step_seconds"], time.values["paper_step_seconds"]) > 0
+    # With a second for each splat, instead of what a busy machine takes:
+    monkeypatch.setattr(budget, "_seconds", lambda splats, scene, view: len(splats))
+    _, time = budget.check_budget(scene)
+    assert 100 < time.values["step_seconds"] < time.values["paper_step_seconds"]
     monkeypatch.setattr(budget, "available_memory", lambda: 10**9)
     assert "max_width" in next(iter(budget.check_budget(scene))).text
 
