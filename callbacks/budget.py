@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 
 class SplatBudget(HostedCallback):
-    """Decides how many splats the scene is to have, for the callbacks that keep to it, and says why.
+    """Decides how many splats the scene is to have, and says why.
 
     :class:`~nsvq_lightning.callbacks.BudgetedGrowth` grows up to it,
     :class:`~nsvq_lightning.callbacks.OpacitySelection` removes what is above it. Give one of the three numbers, or none

@@ -41,7 +41,7 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
 
     Args:
         every: Iterations between two checkpoints; None is a tenth of the schedule, 0 saves only at the end of the run.
-        keep: Also keep each checkpoint as ``step-<iteration>.ckpt``, instead of only the last.
+        keep: Also keep each checkpoint as ``step-<iteration>.ckpt``.
         folder: Where; None is ``checkpoints`` in the folder of the run.
 
     Raises:

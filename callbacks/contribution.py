@@ -32,9 +32,9 @@ class ContributionPruning(LatchedCallback):
     PSNR; 0.003, 18 % and 0.11 dB; 0.01, 30 % and 0.38 dB.
 
     Args:
-        share: Share of the total contribution to remove: that of the least contributing splats together is at most
-            this. 0 removes nothing, as in the paper.
-        at: Iteration of the reference run, before the quantize phase; leave some iterations to close the gaps.
+        share: The least contributing splats go that together have at most this share of the total contribution.
+            0 removes nothing, as in the paper.
+        at: Iteration of the reference run; leave some before the quantize phase to close the gaps.
 
     Raises:
         ValueError: ``share`` is not in [0, 1), or ``at`` is below 1.

@@ -22,11 +22,12 @@ log = logging.getLogger(__name__)
 
 
 class CompileAhead(Callback):
-    """Lets a second process compile what quantization and the file need, on a machine that has not compiled it yet.
+    """Compiles the kernels of quantization and of the file in a second process.
 
-    The first kernel that the fit compiles starts it: where all kernels are cached, nothing happens. It goes through the
-    later phases on a handful of splats (:mod:`nsvq_lightning.training.rehearsal`) at a low priority, and leaves its
-    kernels in Numba's cache. If it fails, the fit compiles them itself when it needs them. It ends with the fit.
+    The first kernel that the fit compiles starts that process: where all kernels are cached, nothing happens. It goes
+    through the later phases on a handful of splats (:mod:`nsvq_lightning.training.rehearsal`) at a low priority, and
+    leaves its kernels in Numba's cache. If it fails, the fit compiles them itself when it needs them. It ends with the
+    fit.
 
     It does nothing on a single core, on a GPU, without codebooks, or with a module that is not
     :class:`nsvq_lightning.SplatModule`.

@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 class PhaseSchedule(HostedCallback):
-    """Gives the module its schedule, and writes the phase of each iteration into its buffer.
+    """Gives the module its schedule, and its buffer the phase of each iteration.
 
     The ends of the phases are iterations of a reference run, the paper's of 45 000 iterations by default; a run of any
     other length is that run, scaled (:mod:`nsvq_lightning.training.schedule` says how).
@@ -35,9 +35,8 @@ class PhaseSchedule(HostedCallback):
         min_reset_interval: Lower limit of the interval of opacity resets in this run.
         min_replacement_interval: Lower limit of the window of code replacement and of the interval of refits.
         min_finetune: Lower limit of the length of the fine-tune phase, up to half of what follows the prune phase.
-        iterations_per_photo: The run is not longer than so many iterations for each train photo, where
-            ``trainer.max_steps`` would allow more: few photos are learned by heart long before many are seen. None for
-            no such limit; ``total`` goes before it.
+        iterations_per_photo: The run has at most so many iterations for each train photo: few photos are soon
+            learned by heart. None is ``trainer.max_steps`` whatever the photos; ``total`` goes before it.
 
     Raises:
         ValueError: ``iterations_per_photo`` is below 1; or see :class:`~nsvq_lightning.training.schedule.Schedule`.

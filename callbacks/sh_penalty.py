@@ -16,11 +16,11 @@ __all__ = ["ShPenalty"]
 
 
 class ShPenalty(HostedCallback):
-    """Adds ``weight`` / 2N · Σ ``shN``² to the loss: half the mean squared norm of the splats' SH coefficients.
+    """Adds ``weight`` / 2N · Σ ``shN``² to the loss, so that colours depend on the direction only where it shows.
 
-    45 of the 59 numbers of a splat describe how its colour changes with the direction. With few photos each splat is
-    seen from few directions, and between them its colour is whatever the noise of the photos made of it. Coefficients
-    that the photos do not need go to zero, which also makes a file without SH codebook smaller.
+    With few photos each splat is seen from few directions, and between them its colour is whatever the noise of the
+    photos made of it. Coefficients that the photos do not need go to zero, which also makes a file without SH codebook
+    smaller.
 
     Its gradient is added after that of the loss, so it costs no backward pass. It ends when the codes are frozen: from
     then on only codebooks are trained.
