@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numba.core import event
 
-from nsvq_lightning.compute.stamp import KernelStore
+from nsvq_lightning.compute.store import KernelStore
 
 __all__ = ["F", "inline", "kernel", "kernels_ready", "thread_count"]
 
@@ -78,16 +78,16 @@ def inline(function: Callable[..., Any]) -> Any:
 
 
 def kernel(function: Callable[..., Any], parallel: bool = True, allocates: bool = True) -> Any:
-    """Compile a kernel once per machine and cache it on disk.
+    """Compile a kernel once per machine, and keep it on the disk (:mod:`nsvq_lightning.compute.store`).
 
     Small kernels pass ``parallel=False``: waking the threads costs more than they take. A kernel that allocates no
     arrays may pass ``allocates=False``: the arrays that it passes to inlined helpers are then not reference-counted,
     with atomic operations, at every call, and a loop of few instructions becomes seven times as fast.
 
-    A cached kernel is compiled again when anything it is built from has changed (:mod:`nsvq_lightning.compute.stamp`).
+    It is compiled again when anything that it is built from has changed.
     """
     dispatcher = numba.njit(parallel=parallel, _nrt=allocates, **_OPTIONS)(function)
-    dispatcher._cache = _Store(function)
+    dispatcher._cache = _Store(function, {**dispatcher.targetoptions, "helpers": _HelperLevel.LEVEL})
     _kernels.append(dispatcher)
     return dispatcher
 

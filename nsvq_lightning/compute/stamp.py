@@ -19,48 +19,13 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.dispatcher import Dispatcher
 from numba.extending import lower_builtin
 
-__all__ = ["KernelStore", "digest"]
+__all__ = ["closure_digest", "digest", "template_digest"]
 
 LIBRARIES = frozenset({"llvmlite", "numba", "numpy", "torch", *sys.stdlib_module_names})
-"""Not looked into: a kernel depends on these only through Numba's version, which Numba's own stamp holds."""
-
-
-class _Layout(CompileResultCacheImpl):
-    """Names files after the kernel alone; Numba's own names contain its line number."""
-
-    def get_filename_base(self, fullname: str, abiflags: str) -> str:
-        kept = fullname.replace("<", "").replace(">", "")
-        return f"{kept}.py{sys.version_info[0]}{sys.version_info[1]}{abiflags}"
-
-
-class KernelStore(FunctionCache):
-    """Numba's disk cache of one kernel, stale when its :func:`digest` has changed."""
-
-    _impl_class = _Layout
-
-    @functools.cached_property
-    def _stamp(self) -> str:
-        # Not before the first call: a kernel may refer to helpers that its module defines after it.
-        return digest(_Template(self._py_func))
-
-    def _load_overload(self, sig: Any, target_context: Any) -> Any:
-        self._cache_file._source_stamp = self._stamp
-        return super()._load_overload(sig, target_context)
-
-    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
-        # Kernels made by one function differ only in what they close over, and share a file.
-        return sig, codegen.magic_tuple(), digest(_cells(self._py_func))
-
-
-class _Template:
-    """A function without the values that it closes over."""
-
-    def __init__(self, function: FunctionType) -> None:
-        self.function = function
+"""Not looked into: a kernel depends on these only through Numba's version, which names the folder of kernels."""
 
 
 def digest(thing: Any) -> str:
@@ -74,6 +39,20 @@ def digest(thing: Any) -> str:
     found = hashlib.sha256()
     _Walk(found).add(thing)
     return found.hexdigest()
+
+
+def template_digest(function: FunctionType, options: dict[str, Any]) -> str:
+    """Digest of a kernel and the options that it is compiled with, without the values that it closes over."""
+    found = hashlib.sha256()
+    walk = _Walk(found)
+    walk.add(options)
+    walk.function(function)
+    return found.hexdigest()
+
+
+def closure_digest(function: FunctionType) -> str:
+    """Digest of the values that a kernel closes over."""
+    return digest(_cells(function))
 
 
 class _Walk:
@@ -111,15 +90,13 @@ class _Walk:
         elif isinstance(thing, Dispatcher):
             self._say("kernel")
             self._each((thing.targetoptions, thing.py_func))
-        elif isinstance(thing, _Template):
-            self._function(thing.function)
         elif isinstance(thing, types.Type | ir.Type | ir.Value | np.dtype):
             self._say(type(thing).__name__, thing)
         elif isinstance(thing, ModuleType) or _is_foreign(thing):
             # What a kernel uses of our own modules is added with the code that refers to it.
             self._say(getattr(thing, "__module__", ""), getattr(thing, "__qualname__", getattr(thing, "__name__", "")))
         elif isinstance(thing, FunctionType):
-            self._function(thing)
+            self.function(thing)
             self._each(_cells(thing))
         elif isinstance(thing, CodeType):
             self._code(thing, None)
@@ -134,7 +111,8 @@ class _Walk:
         else:
             raise TypeError(f"a kernel refers to {thing!r}; changes to a {type(thing).__name__} cannot be detected")
 
-    def _function(self, function: FunctionType) -> None:
+    def function(self, function: FunctionType) -> None:
+        """Add what a function refers to, except for what it closes over."""
         self._say("function", function.__qualname__)
         self._each((function.__defaults__, function.__kwdefaults__))
         self._code(function.__code__, function.__doc__)

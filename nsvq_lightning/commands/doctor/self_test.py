@@ -12,6 +12,7 @@ from nsvq_lightning.commands.benchmark.error_measures import relative_l2
 from nsvq_lightning.commands.benchmark.workloads import Workload, synthetic_workload
 from nsvq_lightning.commands.doctor.backends import usable_backends
 from nsvq_lightning.commands.doctor.finding import Finding, good, problem
+from nsvq_lightning.compute.store import kernel_folder
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats
 
@@ -48,7 +49,7 @@ def _judge(backend: str, errors: dict[str, float], ms: float, first: float) -> F
     if wrong:
         listed = ", ".join(f"{name} {errors[name]:.1e}" for name in wrong)
         help_ = (
-            "do not trust a run; remove the __pycache__ folders of the package, then report it with nsvq doctor --json"
+            f"do not trust a run; remove {kernel_folder()}, and if that does not help report it with nsvq doctor --json"
         )
         return problem(
             "self-test", f"{backend}: relative error against the float64 oracle: {listed}; {help_}", **values
