@@ -7,11 +7,13 @@ import fnmatch
 import pkgutil
 from pathlib import Path
 
+import numba
 import pytest
 import torch
 
 from nsvq_lightning import save
-from nsvq_lightning.commands.benchmark import suites, timing
+from nsvq_lightning.commands.benchmark import step_profile, suites, timing
+from nsvq_lightning.commands.benchmark.cores import core_rows, serial_share
 from nsvq_lightning.commands.benchmark.error_measures import relative_l2, worst_first
 from nsvq_lightning.commands.benchmark.measurement import Measurement
 from nsvq_lightning.commands.benchmark.scope import Scope
@@ -259,22 +261,22 @@ def test_parts_add_up_to_the_step_and_every_pattern_finds_its_functions(
     scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found: dict[str, set[str]] = {}
-    part_of = profile.part_of
+    part_of = step_profile.part_of
 
     def noted(function: str) -> str:
         found.setdefault(part_of(function), set()).add(function)
         return part_of(function)
 
-    monkeypatch.setattr(profile, "part_of", noted)
+    monkeypatch.setattr(step_profile, "part_of", noted)
     rows = _run("profile", scene)
-    for part, patterns in profile.PARTS.items():
+    for part, patterns in step_profile.PARTS.items():
         idle = [pattern for pattern in patterns if not fnmatch.filter(found.get(part, ()), pattern)]
         assert not idle, f"no function belongs to {part} by {idle}: have they been renamed or moved?"
     operations = [f"{phase.name.lower()} step" for phase in Phase]
     assert list(dict.fromkeys(row.operation for row in rows)) == operations
     for operation in operations:
         whole, *parts = [row for row in rows if row.operation == operation]
-        assert whole.method == profile.WHOLE
+        assert whole.method == step_profile.WHOLE
         assert sum(row.values["share %"] for row in parts) == pytest.approx(100)
         calls = {row.method: row.values["calls"] for row in parts if "calls" in row.values}
         once = ("sort", "blend", "projection backward")
@@ -284,7 +286,7 @@ def test_parts_add_up_to_the_step_and_every_pattern_finds_its_functions(
         quantizing = [name in calls for name in ("quantizer: noise", "quantizer: noise backward", "quantizer: count")]
         assert quantizing == [operation == "quantize step"] * 3
         assert ("quantizer: decode" in calls) == (operation in ("quantize step", "finetune step"))
-        (outside,) = (row.values["share %"] for row in parts if row.method == profile.OUTSIDE)
+        (outside,) = (row.values["share %"] for row in parts if row.method == step_profile.OUTSIDE)
         assert -1 < outside < 10
 
 
@@ -295,9 +297,45 @@ def test_functions_belong_to_the_first_part_that_fits() -> None:
         "nsvq_lightning.rendering.cpu.rasterizer._Blend.forward": "rasterizer, its Python",
         "nsvq_lightning.callbacks.phases.PhaseSchedule.setup": "other callbacks",
         "nsvq_lightning.training.module.SplatModule.training_step": "module, its Python",
-        "/somewhere/else.py.function": profile.OTHER,
+        "/somewhere/else.py.function": step_profile.OTHER,
     }
-    assert {function: profile.part_of(function) for function in expected} == expected
+    assert {function: step_profile.part_of(function) for function in expected} == expected
+
+
+def test_serial_share_is_amdahls() -> None:
+    assert serial_share(1, 10.0, 2, 5.0) == 0
+    assert serial_share(1, 10.0, 2, 10.0) == 1
+    assert serial_share(1, 10.0, 2, 5.5) == pytest.approx(0.1)  # 10 · (0.1 + 0.9 / 2)
+    assert serial_share(2, 5.5, 4, 3.25) == pytest.approx(0.1)
+    assert serial_share(1, 10.0, 2, 4.0) == 0  # a cache more
+    assert serial_share(1, 10.0, 2, 12.0) == 1
+
+
+@pytest.mark.skipif(int(numba.config.NUMBA_NUM_THREADS) < 2, reason="needs two threads")
+def test_threads_are_compared_part_by_part_on_the_steps_of_a_run() -> None:
+    scope = dataclasses.replace(TINY, threads=(1, 2), steps=24)
+    rows = core_rows(scope)
+    phases, parts = (
+        [row for row in rows if row.operation == f"{what} with 1 and 2 threads"] for what in ("phases", "parts")
+    )
+    assert [row.method for row in phases] == ["all steps", *(f"{phase.name.lower()} step" for phase in Phase)]
+    assert {"blend", "blend backward", "Adam", "quantizer: search"} < {row.method for row in parts}
+    assert {row.workload for row in rows} == {"demo, demo.yaml, 24 steps"}
+    for row in rows:
+        values = row.values
+        assert values["times faster"] == pytest.approx(values["ms, 1"] / values["ms, 2"])
+        assert 0 <= values["serial %"] <= 100
+        assert values["ms, 16 expected"] <= values["ms, 8 expected"] <= 1.01 * max(values["ms, 1"], values["ms, 2"])
+
+
+def test_steps_of_a_config_are_profiled_in_the_run_that_it_makes() -> None:
+    rows = load_suite("profile")(dataclasses.replace(TINY, config="demo.yaml", steps=24))
+    assert [row.method for row in rows].count(step_profile.WHOLE) == len(Phase)
+    for phase in Phase:
+        methods = {row.method for row in rows if row.operation == f"{phase.name.lower()} step"}
+        assert {"blend", "Adam"} < methods
+        assert "quantizer: search" in methods or phase is not Phase.QUANTIZE
+        assert "quantizer: noise" not in methods  # its quantizer is another
 
 
 def test_files_of_level_paper_and_ply_lose_nothing(scene: Path) -> None:

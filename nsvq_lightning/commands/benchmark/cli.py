@@ -97,6 +97,11 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="scene file whose splats are used with the photos of the COLMAP folder, instead of its points",
     )
+    what.add_argument(
+        "--config",
+        metavar="NAME",
+        help="config whose run profile and the threads of train are about (fast.yaml, without photos demo.yaml)",
+    )
     what.add_argument("--steps", type=int, metavar="N", help="iterations of each run of train (1000; quick 40)")
     what.add_argument(
         "--switches", type=_switches, metavar="NAME,NAME", help="switches that train inverts one by one, or all"
@@ -129,6 +134,7 @@ def _scope(options: argparse.Namespace) -> Scope:
         init_from=options.init_from,
         steps=options.steps,
         switches=options.switches,
+        config=options.config,
     )
 
 

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from nsvq_lightning.commands.benchmark.cores import core_rows
 from nsvq_lightning.commands.benchmark.fitting import Step, StepClock, fit, quiet, training_callbacks
 from nsvq_lightning.commands.benchmark.measurement import Measurement, Timing
 from nsvq_lightning.commands.benchmark.scope import Scope
@@ -80,7 +81,8 @@ class Trained(NamedTuple):
 def run(scope: Scope) -> list[Measurement]:
     """Train with every variant, then time single steps with every number of threads."""
     with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder:
-        return [*_run_rows(scope, Path(folder)), *_step_rows(scope, Path(folder))]
+        rows = [*_run_rows(scope, Path(folder)), *_step_rows(scope, Path(folder))]
+    return [*rows, *core_rows(scope)] if len(set(scope.threads)) > 1 else rows
 
 
 # Whole runs

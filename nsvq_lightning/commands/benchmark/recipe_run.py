@@ -1,0 +1,82 @@
+"""Whole runs of a config, as ``nsvq fit`` makes them, watched step by step."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import Trainer
+
+from nsvq_lightning.commands.benchmark.fitting import WATCHING, Step, StepClock, quiet
+from nsvq_lightning.commands.benchmark.scope import Scope
+from nsvq_lightning.commands.benchmark.timing import use_threads
+from nsvq_lightning.commands.configs import find_config
+from nsvq_lightning.commands.fit import SplatCLI
+from nsvq_lightning.data.scene import View
+
+__all__ = ["recipe_name", "recipe_run"]
+
+QUICK_DEMO = ("--data.views=9", "--data.width=96", "--data.height=72")
+
+
+def recipe_run(scope: Scope, threads: int, between: Callable[[Any, View, Step], None]) -> None:
+    """Train ``scope.steps`` iterations of the config on the scene, or on the demo scene if that is no folder of photos.
+
+    Args:
+        scope: Says which config, scene and length.
+        threads: Of torch and of the kernels.
+        between: Called after every step, see :class:`~nsvq_lightning.commands.benchmark.fitting.StepClock`.
+
+    Raises:
+        ValueError: A run cannot be made from the config.
+    """
+    with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder, use_threads(threads), quiet():
+        _Run([*_arguments(scope, Path(folder))], StepClock(between))
+
+
+def recipe_name(scope: Scope) -> str:
+    """The run in the tables."""
+    scene = scope.scene.resolve().name if _photographed(scope) and scope.scene is not None else "demo"
+    return f"{scene}, {Path(_config(scope)).name}, {scope.steps} steps"
+
+
+def _photographed(scope: Scope) -> bool:
+    return scope.scene is not None and scope.scene.is_dir()
+
+
+def _config(scope: Scope) -> str:
+    return scope.config or ("fast.yaml" if _photographed(scope) else "demo.yaml")
+
+
+def _arguments(scope: Scope, folder: Path) -> list[str]:
+    data = ["--data=ColmapDataModule", f"--data.root={scope.scene}"]
+    if not _photographed(scope):
+        data = ["--data=DemoDataModule", f"--data.root={folder / 'demo'}", *(QUICK_DEMO if scope.quick else ())]
+    return [
+        "fit",
+        f"--config={find_config(_config(scope))}",
+        *data,
+        f"--trainer.default_root_dir={folder}",
+        f"--trainer.max_steps={scope.steps}",
+        "--trainer.enable_progress_bar=false",
+        "--trainer.enable_checkpointing=false",
+        *(f"--callbacks.{name}=null" for name in sorted(WATCHING)),
+    ]
+
+
+class _Run(SplatCLI):
+    """``nsvq fit`` with a clock, and without what follows the last step."""
+
+    def __init__(self, arguments: list[str], clock: StepClock) -> None:
+        self._clock = clock
+        super().__init__(arguments)
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        trainer = super().instantiate_trainer(**kwargs)
+        trainer.callbacks.append(self._clock)  # type: ignore[attr-defined]  # Lightning does not type it
+        return trainer
+
+    def after_fit(self) -> None:
+        """Nothing: the steps are all that is asked for."""
