@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -97,9 +98,20 @@ def kernels_ready() -> tuple[int, int]:
     return sum(bool(dispatcher.overloads) for dispatcher in _kernels), len(_kernels)
 
 
+class _Threads(threading.local):
+    """What Numba was told last; it keeps the number of threads by calling thread."""
+
+    torch = count = 0
+
+
+_threads = _Threads()
+
+
 def thread_count() -> int:
     """Number of threads that kernels use: torch's setting, so that one setting controls both."""
-    _start_threads()
-    count = max(1, min(torch.get_num_threads(), int(numba.config.NUMBA_NUM_THREADS)))
-    numba.set_num_threads(count)
-    return count
+    asked = torch.get_num_threads()
+    if asked != _threads.torch:
+        _start_threads()
+        _threads.torch, _threads.count = asked, max(1, min(asked, int(numba.config.NUMBA_NUM_THREADS)))
+        numba.set_num_threads(_threads.count)
+    return _threads.count

@@ -142,6 +142,14 @@ class SplatModule(LightningModule):
         self._updates = True
         self._micro_batch = 0
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        # Lightning writes it before and after each of some thirty hooks of a step; nn.Module would look for a
+        # parameter.
+        if name == "_current_fx_name":
+            object.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
+
     @property
     def quantizers(self) -> Mapping[str, Quantizer]:
         """Quantizer by attribute."""

@@ -8,6 +8,7 @@ from typing import Any
 
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch import Trainer
+from lightning.pytorch.profilers import PassThroughProfiler
 from lightning.pytorch.strategies import DDPStrategy
 
 from nsvq_lightning.io.formats import save
@@ -18,6 +19,25 @@ from nsvq_lightning.training.strategies import ViewParallelStrategy  # noqa: F40
 __all__ = ["SplatTrainer"]
 
 log = logging.getLogger(__name__)
+
+
+class _Nothing:
+    """A context that does nothing; ``contextlib`` has slower ones."""
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+class _NoProfiler(PassThroughProfiler):
+    """Lightning's default, without the generator that it makes for each of the hundred hooks and actions of a step."""
+
+    _nothing: Any = _Nothing()
+
+    def profile(self, action_name: str) -> Any:
+        return self._nothing
 
 
 class SplatTrainer(Trainer):
@@ -34,6 +54,8 @@ class SplatTrainer(Trainer):
     """
 
     def __init__(self, *args: Any, run_folder: str | None = None, **kwargs: Any) -> None:
+        if kwargs.get("profiler") is None:
+            kwargs["profiler"] = _NoProfiler()
         super().__init__(*args, **kwargs)
         if kwargs.get("strategy", "auto") == "auto" and isinstance(self.strategy, DDPStrategy):
             super().__init__(*args, **(kwargs | {"strategy": "view_parallel"}))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -37,7 +38,19 @@ MAX_SIDE = TILE * (2**15 - 1)
 """Largest image side in pixels: a record has 16 bits, one of them the sign, for a tile's column or row."""
 
 
+_packed: WeakKeyDictionary[Camera, tuple[int, Array]] = WeakKeyDictionary()
+"""Cameras as kernels read them, and the version of the matrix that it was made from."""
+
+
 def _pack_camera(camera: Camera) -> Array:
+    version, packed = _packed.get(camera, (-1, np.empty(0)))
+    if version != camera.viewmat._version:
+        packed = _packed_now(camera)
+        _packed[camera] = camera.viewmat._version, packed
+    return packed
+
+
+def _packed_now(camera: Camera) -> Array:
     if max(camera.width, camera.height) > MAX_SIDE:
         raise ValueError(
             f"an image may have {MAX_SIDE} pixels along a side, got {camera.width}x{camera.height}; render it in parts"
