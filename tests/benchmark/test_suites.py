@@ -36,7 +36,7 @@ from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.schedule import Phase
 
 TINY = Scope((1,), quick=True, repeats=2, seconds=0.01, workloads=("A20k",), steps=8)
-BY_STEP = ("train", "gpu")
+BY_STEP = ("train", "gpu", "size")
 """Suites that time steps instead of repeated calls, or besides."""
 
 
@@ -82,9 +82,18 @@ def test_every_suite_is_a_file_and_every_file_a_suite() -> None:
         suite_names("train,lose")
 
 
-@pytest.mark.parametrize("name", [name for name in SUITES if name not in ("gpu", "profile")])
+@pytest.mark.parametrize("name", [name for name in SUITES if name not in ("gpu", "profile", "size")])
 def test_rows_are_complete(name: str, scene: Path) -> None:
     _check_rows(name, _run(name, scene))
+
+
+@pytest.mark.slow
+def test_sizes_are_measured_in_processes_of_their_own(scene: Path) -> None:
+    rows = _run("size", scene)
+    _check_rows("size", rows)
+    assert [row.operation for row in rows] == ["step by splats", "step by pixels"]
+    for row in rows:
+        assert 100 < row.values["peak MB"] < 3000
 
 
 def _check_rows(name: str, rows: list[Measurement]) -> None:

@@ -21,12 +21,14 @@ class Suite(NamedTuple):
 
     Attributes:
         about: One line for the help.
-        picture: ``errors`` draws values against milliseconds, ``shares`` a bar for each part.
+        picture: ``errors`` draws values against milliseconds, ``shares`` a bar for each part, ``growth`` milliseconds
+        and
+            memory against what grows.
         drawn: Values that ``errors`` draws, a line of panels each; by default the first one of the rows.
     """
 
     about: str
-    picture: Literal["errors", "shares"] = "errors"
+    picture: Literal["errors", "shares", "growth"] = "errors"
     drawn: tuple[str, ...] = ()
 
 
@@ -48,6 +50,7 @@ SUITES = {
     "kmeans": Suite("the k-means that starts the codebooks", drawn=("distortion",)),
     "codec": Suite("writing and reading scene files", drawn=("bytes a splat", "image error")),
     "train": Suite("whole runs, with switches on and off, and a step beside its own render", drawn=("PSNR dB",)),
+    "size": Suite("how time and memory of a step grow with splats and pixels", picture="growth"),
     "profile": Suite("where the time of a training step goes, phase by phase", picture="shares"),
 }
 """The suites by name, which is that of their module in :mod:`nsvq_lightning.commands.benchmark.suites`."""

@@ -27,6 +27,9 @@ def draw_suite(path: Path, rows: Sequence[Measurement], suite: Suite) -> None:
 
     ``shares``: a panel for each operation, a bar for each method.
 
+    ``growth``: for each operation a panel of milliseconds and one of memory against the first value, all logarithmic. A
+    dashed line through the last point is what is proportional to it.
+
     Args:
         path: PNG file, replaced atomically.
         rows: Those of one suite; at least one has a value.
@@ -43,6 +46,11 @@ def draw_suite(path: Path, rows: Sequence[Measurement], suite: Suite) -> None:
         figure, axes = panels(len(operations), PANEL_HEIGHT)
         for axis, operation in zip(axes, operations, strict=True):
             _draw_bars(axis, [row for row in rows if row.operation == operation])
+    elif suite.picture == "growth":
+        operations = _distinct(rows, "operation")
+        figure, axes = panels(2 * len(operations), PANEL_HEIGHT)
+        for place, operation in enumerate(operations):
+            _draw_growth(axes[2 * place : 2 * place + 2], [row for row in rows if row.operation == operation])
     else:
         figure = _draw_values(rows, suite.drawn)
     write_figure(path, figure)
@@ -129,6 +137,23 @@ def _draw_bars(axis: Any, rows: Sequence[Measurement]) -> None:
     axis.set_xlim(0, 1.35 * max(shares, default=1.0))
     axis.tick_params(axis="y", labelsize=8)
     axis.set(xlabel="share of the step, %")
+
+
+def _draw_growth(axes: Sequence[Any], rows: Sequence[Measurement]) -> None:
+    """Time and memory against the first value, each in a panel."""
+    grows = next(iter(rows[0].values))
+    sizes = [row.values[grows] for row in rows]
+    for axis, name, values in (
+        (axes[0], "ms", [row.timing.median for row in rows]),
+        (axes[1], "peak MB", [row.values["peak MB"] for row in rows]),
+    ):
+        axis.plot(sizes, [values[-1] * size / sizes[-1] for size in sizes], "--", color="0.6", label="proportional")
+        axis.plot(sizes, values, "o-", color="C0", label="measured")
+        axis.set(xscale="log", yscale="log", xlabel=grows, ylabel=name)
+        axis.set_ylim(*_decades(values))
+        axis.set_title(f"{rows[0].suite}: {rows[0].operation}, {rows[0].workload}", fontsize="medium")
+        axis.grid(alpha=0.3, which="major")
+        axis.legend(fontsize=8)
 
 
 def _decades(values: Sequence[float]) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from nsvq_lightning.commands.benchmark.fitting import Step, StepClock, fit, one_phase, quiet, training_callbacks
 from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.views import write_views
-from nsvq_lightning.commands.benchmark.workloads import single_workload
+from nsvq_lightning.commands.benchmark.workloads import Workload, single_workload
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.quantize import NSVQ
@@ -18,7 +18,7 @@ from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
-__all__ = ["Trainee", "trainee"]
+__all__ = ["Trainee", "photographed", "trainee"]
 
 
 class Trainee(NamedTuple):
@@ -72,9 +72,17 @@ def trainee(scope: Scope, folder: Path, full: str = "B100k") -> Trainee:
         SceneError: The COLMAP folder cannot be used.
     """
     workload = single_workload(scope, full)
-    photographed = scope.scene is not None and scope.scene.is_dir()
-    root = scope.scene if photographed else write_views(workload, folder / "scene")
-    data = ColmapDataModule(str(root))
+    own = scope.scene is not None and scope.scene.is_dir()
+    return _with_photos(workload, scope.scene if own else write_views(workload, folder / "scene"))
+
+
+def photographed(workload: Workload, folder: Path, views: int) -> Trainee:
+    """A workload and photos that are rendered of it."""
+    return _with_photos(workload, write_views(workload, folder / "scene", views))
+
+
+def _with_photos(workload: Workload, root: Path | None) -> Trainee:
+    data = ColmapDataModule(str(root), max_width=None)
     with quiet():
         for index in data.scene.train:
             data.scene.view(index)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nsvq_lightning.commands.benchmark.scope import Scope
-from nsvq_lightning.commands.benchmark.sizes import SIZES
+from nsvq_lightning.commands.benchmark.sizes import SIZES, Size
 from nsvq_lightning.compression.pictures import look_at, middle_of
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.formats import load
@@ -20,7 +20,15 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats.finite import finite_rows
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
-__all__ = ["Workload", "folder_workload", "scene_workload", "single_workload", "synthetic_workload", "workloads"]
+__all__ = [
+    "Workload",
+    "folder_workload",
+    "scene_workload",
+    "single_workload",
+    "sized_workload",
+    "synthetic_workload",
+    "workloads",
+]
 
 Floats = NDArray[np.float64]
 
@@ -114,7 +122,12 @@ def synthetic_workload(name: str, seed: int = SEED) -> Workload:
     """
     if name not in SIZES:
         raise ValueError(f"unknown workload {name!r}; choose one of {', '.join(SIZES)}")
-    n, width, height, scale = SIZES[name]
+    return sized_workload(name, SIZES[name], seed)
+
+
+def sized_workload(name: str, size: Size, seed: int = SEED) -> Workload:
+    """A synthetic scene of any size, see :func:`synthetic_workload`."""
+    n, width, height, scale = size
     # One stream, so the order of the draws is part of the definition.
     rng = np.random.default_rng(seed)
     means = _positions(n, rng)
