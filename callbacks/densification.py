@@ -15,6 +15,7 @@ from torch import Tensor
 from nsvq_lightning.compression.importance import most_contributing
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.training.edit import keep_rows, replace_attribute, reset_moments
+from nsvq_lightning.training.footprint import say_footprint
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.replicas import check_replicas, sum_over_processes
@@ -115,6 +116,8 @@ class Densification(LatchedCallback, ABC):
     def keep_at_most(self, trainer: Trainer, host: SplatHost, limit: int, name: str) -> None:
         """Remove splats if there are more than ``limit``: those that contribute least to the train views.
 
+        On a CPU this also says how much memory the run will take.
+
         Args:
             trainer: The trainer.
             host: The module.
@@ -125,6 +128,8 @@ class Densification(LatchedCallback, ABC):
             ValueError: There are more, and the trainer has no data module whose views show which ones matter.
         """
         count = len(host.splats)
+        if host.device.type == "cpu" and trainer.is_global_zero:
+            say_footprint(trainer, limit)
         if count <= limit:
             return
         if host.phase > Phase.PRUNE:

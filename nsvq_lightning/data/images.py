@@ -195,6 +195,8 @@ class ImageStore:
         if cache_bytes < 0:
             raise ValueError(f"cache_bytes must be at least 0, got {cache_bytes}")
         self.sources = tuple(sources)
+        self.nbytes = sum(source.nbytes for source in self.sources)
+        """Bytes of all pictures, decoded."""
         self._free = cache_bytes
         self._kept: dict[int, Tensor] = {}
         self._coming: dict[int, Future[Tensor]] = {}

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.commands.doctor.finding import Finding, good, note
-from nsvq_lightning.commands.doctor.machine import available_memory, readable_bytes
 from nsvq_lightning.compression.budget import splats_for_photos
 from nsvq_lightning.data.edges import detailed_pixels
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.training.footprint import CACHE_BYTES, available_memory, readable_bytes, run_bytes
 
 __all__ = ["check_budget", "grown"]
 
@@ -27,14 +27,6 @@ PAPER, PAPER_SPLATS = 45_000, 4.0
 """The same for the paper's run."""
 RENDERS_A_STEP = 2.0
 """Ratio of a training step's time to that of rendering forward and backward; the rest is loss, optimiser, codebooks."""
-BYTES_A_SPLAT = 59 * 4 * 6
-"""Bytes per splat: 59 float32, each with gradient, two moments, and copies while quantizing or editing."""
-BYTES_A_PIXEL = 100
-"""Bytes per pixel: buffers of the renderer, the loss and the picture itself."""
-BASE = 1.2e9
-"""Bytes for Python, torch, Lightning and compiled kernels."""
-CACHE = 4 << 30
-"""Default of ``--data.cache_bytes``."""
 REPEATS = 3
 
 
@@ -42,12 +34,12 @@ def check_budget(scene: Scene) -> Iterator[Finding]:
     """Memory against what is available; time from renders of the scene grown as two recipes grow it."""
     default = splats_for_photos(len(scene.train), detailed_pixels(scene))
     fast, paper = (round(factor * default) for factor in (FAST_SPLATS, PAPER_SPLATS))
-    pixels = max(camera.width * camera.height for camera in scene.cameras)
-    photos = sum(source.nbytes for source in scene.images.sources)
-    needed = BASE + min(photos, CACHE) + BYTES_A_SPLAT * paper + BYTES_A_PIXEL * pixels
+    photos, needed = scene.images.nbytes, run_bytes(scene, paper)
     free = available_memory()
-    text = f"about {readable_bytes(needed)} with {paper:,} splats and {readable_bytes(min(photos, CACHE))} of photos"
-    if photos > CACHE:
+    text = (
+        f"about {readable_bytes(needed)} with {paper:,} splats and {readable_bytes(min(photos, CACHE_BYTES))} of photos"
+    )
+    if photos > CACHE_BYTES:
         text += f" (all would take {readable_bytes(photos)}; the others are decoded each time)"
     if free is not None and needed > free:
         help_ = "lower --data.max_width or --data.cache_bytes"

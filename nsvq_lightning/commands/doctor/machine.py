@@ -15,15 +15,14 @@ import torch
 from nsvq_lightning.commands.benchmark.hardware import describe_machine, usable_cores
 from nsvq_lightning.commands.doctor.finding import Finding, good, note, problem
 from nsvq_lightning.compute.jit import thread_count
+from nsvq_lightning.training.footprint import available_memory, readable_bytes
 
 __all__ = [
-    "available_memory",
     "check_disk",
     "check_memory",
     "check_opencv",
     "check_threads",
     "check_versions",
-    "readable_bytes",
 ]
 
 PACKAGES = ("lightning", "torchmetrics", "jsonargparse", "scipy", "pycolmap")
@@ -111,30 +110,6 @@ def check_memory() -> Iterator[Finding]:
         yield good("memory", f"{readable_bytes(free)} available", available=free)
 
 
-def available_memory() -> int | None:
-    """Bytes that this process may still allocate: of the machine, or of its control group if less."""
-    limits = [_meminfo_available(), _group_available()]
-    return min((limit for limit in limits if limit is not None), default=None)
-
-
-def _meminfo_available() -> int | None:
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")), None)
-
-
-def _group_available() -> int | None:
-    """What the container may still allocate; its usage includes page cache, which is reclaimable."""
-    group = Path("/sys/fs/cgroup")
-    try:
-        limit, used = ((group / name).read_text(encoding="ascii").strip() for name in ("memory.max", "memory.current"))
-        return None if limit == "max" else max(0, int(limit) - int(used))
-    except (OSError, ValueError):
-        return None
-
-
 def check_disk(folder: Path) -> Iterator[Finding]:
     """Disk space for checkpoints, report and exports where runs are written."""
     free = shutil.disk_usage(folder).free
@@ -145,8 +120,3 @@ def check_disk(folder: Path) -> Iterator[Finding]:
         yield note("disk", f"{text}, which is read-only: give --trainer.default_root_dir", free=free)
     else:
         yield good("disk", text, free=free)
-
-
-def readable_bytes(count: float) -> str:
-    """A number of bytes in readable form."""
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"

@@ -1,0 +1,93 @@
+"""The memory that a run takes, before it takes it."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from lightning.pytorch import Trainer
+
+from nsvq_lightning.data.scene import Scene
+from nsvq_lightning.training.train_views import scene_of
+
+__all__ = ["CACHE_BYTES", "available_memory", "readable_bytes", "run_bytes", "say_footprint"]
+
+log = logging.getLogger(__name__)
+
+BASE = 1.2e9
+"""Bytes for Python, torch, Lightning, compiled kernels and evaluations."""
+BYTES_A_SPLAT = 59 * 4 * 6
+"""Bytes per splat: 59 float32, each with gradient, two moments, and copies while quantizing or editing."""
+BYTES_A_PIXEL = 100
+"""Bytes per pixel of a photo: buffers of the renderer, the loss and the picture itself."""
+CACHE_BYTES = 4 << 30
+"""Default of ``--data.cache_bytes``."""
+
+
+def run_bytes(scene: Scene, splats: int, cache_bytes: int = CACHE_BYTES) -> float:
+    """Most memory that a run on a CPU takes.
+
+    Args:
+        scene: What it is trained on.
+        splats: Most splats that it has at a time.
+        cache_bytes: Memory for decoded photos.
+    """
+    pixels = max(camera.width * camera.height for camera in scene.cameras)
+    return BASE + min(scene.images.nbytes, cache_bytes) + BYTES_A_SPLAT * splats + BYTES_A_PIXEL * pixels
+
+
+def say_footprint(trainer: Trainer, splats: int) -> None:
+    """Log how much memory a run of at most so many splats will take; warn if the machine has not got it."""
+    scene = scene_of(trainer)
+    if scene is None:
+        return
+    needed = run_bytes(scene, splats, getattr(trainer.datamodule, "cache_bytes", CACHE_BYTES))  # type: ignore[attr-defined]
+    free, own = available_memory(), _resident()
+    said = f"memory: at most about {readable_bytes(needed)} with up to {splats:,} splats"
+    if free is None or needed <= free + own:
+        log.info(said)
+    else:
+        log.warning(
+            "%s, but only %s are available: ask for fewer (--quality, --splats), or lower --data.max_width or "
+            "--data.cache_bytes",
+            said,
+            readable_bytes(free + own),
+        )
+
+
+def readable_bytes(count: float) -> str:
+    """A number of bytes in readable form."""
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
+
+
+def available_memory() -> int | None:
+    """Bytes that this process may still allocate: of the machine, or of its control group if less."""
+    limits = [_meminfo_available(), _group_available()]
+    return min((limit for limit in limits if limit is not None), default=None)
+
+
+def _meminfo_available() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")), None)
+
+
+def _group_available() -> int | None:
+    """What the container may still allocate; its usage includes page cache, which is reclaimable."""
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit, used = ((group / name).read_text(encoding="ascii").strip() for name in ("memory.max", "memory.current"))
+        return None if limit == "max" else max(0, int(limit) - int(used))
+    except (OSError, ValueError):
+        return None
+
+
+def _resident() -> int:
+    """Bytes that this process occupies already."""
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return 0
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("VmRSS:")), 0)
