@@ -197,7 +197,7 @@ class OpacitySelection(LatchedCallback):
         budget = self.limit(host)
         assert budget is not None
         opacities = host.splats.opacities.detach()
-        last = float(opacities.sigmoid().topk(min(budget, len(opacities))).values[-1])
+        last = float(opacities.kthvalue(max(1, len(opacities) - budget + 1)).values.sigmoid())
         if self.line is None:
             self.line = START_OF_LINE * last
         elif since % (2 * self._every(length)) == 0:
