@@ -327,7 +327,11 @@ def test_threads_are_compared_part_by_part_on_the_steps_of_a_run() -> None:
     phases, parts = (
         [row for row in rows if row.operation == f"{what} with 1 and 2 threads"] for what in ("phases", "parts")
     )
-    assert [row.method for row in phases] == ["all steps", *(f"{phase.name.lower()} step" for phase in Phase)]
+    assert [row.method for row in phases] == [
+        "all steps",
+        *(f"{phase.name.lower()} step" for phase in Phase),
+        timing.sgemm().name,
+    ]
     assert {"blend", "blend backward", "Adam", "quantizer: search"} < {row.method for row in parts}
     assert {row.workload for row in rows} == {"demo, demo.yaml, 24 steps"}
     for row in rows:

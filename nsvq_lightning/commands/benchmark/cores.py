@@ -9,6 +9,7 @@ from nsvq_lightning.commands.benchmark.measurement import Measurement, Timing
 from nsvq_lightning.commands.benchmark.recipe_run import recipe_name, recipe_run
 from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.step_profile import OTHER, PARTS, WHOLE, Own, StepSampler
+from nsvq_lightning.commands.benchmark.timing import sgemm
 from nsvq_lightning.training.schedule import Phase
 
 __all__ = ["core_rows", "serial_share"]
@@ -17,8 +18,9 @@ EXTRAPOLATED = 8, 16
 NOTE = (
     "means of the same steps with the fewest and the most threads, without the tenth of them with the lowest and the "
     "tenth with the highest speed-up; whole steps are without cProfile, parts with it. serial % is what Amdahl's law "
-    "leaves undivided of the time with one thread; times with more threads follow from it, if every core comes with as "
-    "much memory bandwidth and cache as here and no loop has too few turns for them"
+    "leaves undivided of the time with one thread: compare it with that of the matrix product, which has nothing serial, "
+    "so that its share is what the cores of this machine take from each other; times with more threads follow from it, if "
+    "every core comes with as much memory bandwidth and cache as here and no loop has too few turns for them"
 )
 
 
@@ -38,6 +40,7 @@ def core_rows(scope: Scope) -> list[Measurement]:
     by_phase = {"all steps": parts[WHOLE]}
     for phase in Phase:
         by_phase[f"{phase.name.lower()} step"] = _plain_pairs(few_steps, many_steps, phase)
+    by_phase[sgemm().name] = list(zip(few_steps.products, many_steps.products, strict=False))
     products = few_steps.products + many_steps.products
     return [*_rows(scope, "phases", by_phase, products), *_rows(scope, "parts", parts, products)]
 
