@@ -18,9 +18,9 @@ EXTRAPOLATED = 8, 16
 NOTE = (
     "means of the same steps with the fewest and the most threads, without the tenth of them with the lowest and the "
     "tenth with the highest speed-up; whole steps are without cProfile, parts with it. serial % is what Amdahl's law "
-    "leaves undivided of the time with one thread: compare it with that of the matrix product, which has nothing serial, "
-    "so that its share is what the cores of this machine take from each other; times with more threads follow from it, if "
-    "every core comes with as much memory bandwidth and cache as here and no loop has too few turns for them"
+    "leaves undivided of the time with one thread: compare it with that of the matrix product, which has nothing "
+    "serial, so that its share is what the cores of this machine take from each other; times with more threads follow "
+    "from it, if every core comes with as much memory bandwidth and cache as here and no loop has too few turns for them"
 )
 
 
