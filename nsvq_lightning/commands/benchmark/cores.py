@@ -20,7 +20,7 @@ NOTE = (
     "tenth with the highest speed-up; whole steps are without cProfile, parts with it. serial % is what Amdahl's law "
     "leaves undivided of the time with one thread: compare it with that of the matrix product, which has nothing "
     "serial, so that its share is what the cores of this machine take from each other; times with more threads follow "
-    "from it, if every core comes with as much memory bandwidth and cache as here and no loop has too few turns for them"
+    "from it, if every core comes with as much memory bandwidth and cache as here and no loop is too short for them"
 )
 
 
