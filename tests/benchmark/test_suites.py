@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import fnmatch
 import pkgutil
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numba
 import pytest
@@ -66,9 +68,13 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "STEPS", {True: 4})
 
 
-def _run(name: str, scene: Path) -> list[Measurement]:
+def _run(name: str, scene: Path | None = None, **options: Any) -> list[Measurement]:
+    return _rows(load_suite(name), dataclasses.replace(TINY, scene=scene, **options))
+
+
+def _rows(measure: Callable[[Scope], Sequence[Measurement]], scope: Scope) -> list[Measurement]:
     try:
-        return list(load_suite(name)(dataclasses.replace(TINY, scene=scene)))
+        return list(measure(scope))
     except Unavailable as reason:
         pytest.skip(str(reason))
 
@@ -322,8 +328,7 @@ def test_serial_share_is_amdahls() -> None:
 
 @pytest.mark.skipif(int(numba.config.NUMBA_NUM_THREADS) < 2, reason="needs two threads")
 def test_threads_are_compared_part_by_part_on_the_steps_of_a_run() -> None:
-    scope = dataclasses.replace(TINY, threads=(1, 2), steps=24)
-    rows = core_rows(scope)
+    rows = _rows(core_rows, dataclasses.replace(TINY, threads=(1, 2), steps=24))
     phases, parts = (
         [row for row in rows if row.operation == f"{what} with 1 and 2 threads"] for what in ("phases", "parts")
     )
@@ -342,7 +347,7 @@ def test_threads_are_compared_part_by_part_on_the_steps_of_a_run() -> None:
 
 
 def test_steps_of_a_config_are_profiled_in_the_run_that_it_makes() -> None:
-    rows = load_suite("profile")(dataclasses.replace(TINY, config="demo.yaml", steps=24))
+    rows = _run("profile", config="demo.yaml", steps=24)
     assert [row.method for row in rows].count(step_profile.WHOLE) == len(Phase)
     for phase in Phase:
         methods = {row.method for row in rows if row.operation == f"{phase.name.lower()} step"}
