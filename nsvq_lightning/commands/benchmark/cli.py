@@ -45,8 +45,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         0, or 1 after a one-line error if the scene cannot be read or the results not be written. Wrong arguments end
         the process with status 2.
     """
-    # Read when Numba is loaded: from Python 3.12 on, its kernels show in a profile only with it.
-    os.environ.setdefault("NUMBA_ENABLE_SYS_MONITORING", "1")
+    if "numba" not in sys.modules:
+        # From Python 3.12 on, kernels show in a profile only with it. Later, some would show and others not.
+        os.environ.setdefault("NUMBA_ENABLE_SYS_MONITORING", "1")
     parser = _parser()
     options = parser.parse_args(argv)
     try:
