@@ -13,6 +13,7 @@ from typing import Any
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.compute.compilation import compile_watcher
+from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.training import rehearsal
 from nsvq_lightning.training.module import SplatModule
 
@@ -47,7 +48,7 @@ class CompileAhead(Callback):
         """Wait for the first compilation."""
         if not isinstance(pl_module, SplatModule) or not pl_module.quantizers or pl_module.device.type != "cpu":
             return
-        if trainer.is_global_zero and _cores() > 1:
+        if trainer.is_global_zero and usable_cores() > 1:
             self._settings = rehearsal.settings_of(pl_module)
             self._watching.enter_context(compile_watcher(self._start))
 
@@ -78,10 +79,6 @@ class CompileAhead(Callback):
     def on_exception(self, *_: Any) -> None:
         """End the process."""
         self._stop()
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _environment() -> dict[str, str]:

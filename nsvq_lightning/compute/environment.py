@@ -1,11 +1,11 @@
-"""Environment variables that torch and OpenMP read when they are loaded."""
+"""Environment variables that torch and OpenMP read when they are loaded, and the cores that there are."""
 
 from __future__ import annotations
 
 import os
 import sys
 
-__all__ = ["set_defaults", "threads_spin"]
+__all__ = ["set_defaults", "threads_spin", "usable_cores"]
 
 DEFAULTS = {
     # Idle OpenMP threads otherwise spin: as soon as anything else runs on the machine, the threads that have work
@@ -29,3 +29,8 @@ def set_defaults() -> None:
 def threads_spin() -> bool:
     """Whether idle threads spin because torch was loaded before :func:`set_defaults`."""
     return _came_late
+
+
+def usable_cores() -> int:
+    """Cores this process may run on, which containers and ``taskset`` make fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -75,7 +75,7 @@ def processes(monkeypatch: pytest.MonkeyPatch) -> list[Process]:
         return started[-1]
 
     monkeypatch.setattr(callback_module.subprocess, "Popen", start)
-    monkeypatch.setattr(callback_module, "_cores", lambda: 2)
+    monkeypatch.setattr(callback_module, "usable_cores", lambda: 2)
     return started
 
 
@@ -120,7 +120,7 @@ def test_nothing_is_started_where_it_is_of_no_use(
     compiles: bool,
 ) -> None:
     run(recipe().values(), max_steps=3, module=module)  # from here on all kernels of these steps are compiled
-    monkeypatch.setattr(callback_module, "_cores", lambda: cores)
+    monkeypatch.setattr(callback_module, "usable_cores", lambda: cores)
     more: list[Callback] = [Compiles()] if compiles else []
     run([*recipe(kernels=CompileAhead()).values(), *more], max_steps=3, module=module)
     assert not processes
@@ -130,6 +130,6 @@ def test_a_process_that_cannot_start_does_not_stop_the_fit(
     recipe: Recipe, run: RunFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(callback_module.subprocess, "Popen", refuse)
-    monkeypatch.setattr(callback_module, "_cores", lambda: 2)
+    monkeypatch.setattr(callback_module, "usable_cores", lambda: 2)
     trainer, _ = run([*recipe(kernels=CompileAhead()).values(), Compiles()], max_steps=3)
     assert trainer.global_step == 3

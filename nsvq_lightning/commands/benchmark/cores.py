@@ -71,8 +71,7 @@ def _pairs(few: StepSampler, many: StepSampler) -> dict[str, list[tuple[float, f
     profiled = {step.iteration: parts for step, parts in many.profiled}
     both = [(parts, profiled[step.iteration]) for step, parts in few.profiled if step.iteration in profiled]
     for name in (*PARTS, OTHER):
-        times = [tuple(parts.get(name, Own()).milliseconds for parts in pair) for pair in both]
-        pairs[name] = [(one, other) for one, other in times]
+        pairs[name] = [(one.get(name, Own()).milliseconds, other.get(name, Own()).milliseconds) for one, other in both]
     return pairs
 
 

@@ -11,9 +11,10 @@ from typing import Any
 import torch
 from llvmlite import binding
 
+from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.version import __version__
 
-__all__ = ["describe_machine", "usable_cores"]
+__all__ = ["describe_machine"]
 
 SIMD_BITS = (("avx512f", 512), ("avx2", 256), ("avx", 256), ("neon", 128), ("sse2", 128))
 """Widest vectors by the feature that gives them, widest first."""
@@ -53,11 +54,6 @@ def describe_machine() -> dict[str, Any]:
             **{name: importlib.metadata.version(name) for name in ("numpy", "torch", "numba", "llvmlite")},
         },
     }
-
-
-def usable_cores() -> int:
-    """Cores this process may run on, which containers and ``taskset`` make fewer than the machine has."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _cpu_features() -> set[str]:

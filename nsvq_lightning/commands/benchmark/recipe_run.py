@@ -38,21 +38,17 @@ def recipe_run(scope: Scope, threads: int, between: Callable[[Any, View, Step], 
 
 def recipe_name(scope: Scope) -> str:
     """The run in the tables."""
-    scene = scope.scene.resolve().name if _photographed(scope) and scope.scene is not None else "demo"
+    scene = "demo" if scope.photos is None else scope.photos.resolve().name
     return f"{scene}, {Path(_config(scope)).name}, {scope.steps} steps"
 
 
-def _photographed(scope: Scope) -> bool:
-    return scope.scene is not None and scope.scene.is_dir()
-
-
 def _config(scope: Scope) -> str:
-    return scope.config or ("fast.yaml" if _photographed(scope) else "demo.yaml")
+    return scope.config or ("fast.yaml" if scope.photos else "demo.yaml")
 
 
 def _arguments(scope: Scope, folder: Path) -> list[str]:
-    data = ["--data=ColmapDataModule", f"--data.root={scope.scene}"]
-    if not _photographed(scope):
+    data = ["--data=ColmapDataModule", f"--data.root={scope.photos}"]
+    if scope.photos is None:
         data = ["--data=DemoDataModule", f"--data.root={folder / 'demo'}", *(QUICK_DEMO if scope.quick else ())]
     return [
         "fit",

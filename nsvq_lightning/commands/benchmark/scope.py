@@ -65,8 +65,13 @@ class Scope:
         unknown = [name for name in self.switches if name not in SKIPS]
         if unknown:
             raise ValueError(f"switches must be some of {', '.join(SKIPS)}, got {', '.join(unknown)}")
-        if self.init_from is not None and (self.scene is None or not self.scene.is_dir()):
+        if self.init_from is not None and self.photos is None:
             raise ValueError("init-from needs a COLMAP folder as scene, whose cameras look at its splats")
+
+    @property
+    def photos(self) -> Path | None:
+        """The COLMAP folder, if the scene is one."""
+        return self.scene if self.scene is not None and self.scene.is_dir() else None
 
     @property
     def codebooks(self) -> str:

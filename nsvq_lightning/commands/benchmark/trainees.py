@@ -72,17 +72,15 @@ def trainee(scope: Scope, folder: Path, full: str = "B100k") -> Trainee:
         SceneError: The COLMAP folder cannot be used.
     """
     workload = single_workload(scope, full)
-    own = scope.scene is not None and scope.scene.is_dir()
-    return _with_photos(workload, scope.scene if own else write_views(workload, folder / "scene"))
+    return _with_photos(workload, ColmapDataModule(str(scope.photos or write_views(workload, folder / "scene"))))
 
 
 def photographed(workload: Workload, folder: Path, views: int) -> Trainee:
     """A workload and photos that are rendered of it."""
-    return _with_photos(workload, write_views(workload, folder / "scene", views))
+    return _with_photos(workload, ColmapDataModule(str(write_views(workload, folder / "scene", views)), max_width=None))
 
 
-def _with_photos(workload: Workload, root: Path | None) -> Trainee:
-    data = ColmapDataModule(str(root), max_width=None)
+def _with_photos(workload: Workload, data: ColmapDataModule) -> Trainee:
     with quiet():
         for index in data.scene.train:
             data.scene.view(index)

@@ -52,20 +52,14 @@ def run(scope: Scope) -> list[Measurement]:
     for count in SPLATS[quick]:
         timing, peak = _measured(count, SIDE[quick], threads)
         values = {"splats": count, "µs a splat": 1000 * timing.median / count, "peak MB": peak / 1e6}
-        rows.append(
-            _row("step by splats", f"{SIDE[quick]}x{SIDE[quick]}", f"{count:,} splats", threads, timing, values)
-        )
+        workload, method = f"{SIDE[quick]}x{SIDE[quick]}", f"{count:,} splats"
+        rows.append(Measurement("size", workload, method, "step by splats", threads, timing, values))
     for side in SIDES[quick]:
         timing, peak = _measured(FIXED[quick], side, threads)
         values = {"megapixels": side**2 / 1e6, "ns a pixel": 1e6 * timing.median / side**2, "peak MB": peak / 1e6}
-        rows.append(_row("step by pixels", f"{FIXED[quick]:,} splats", f"{side}x{side}", threads, timing, values))
+        workload, method = f"{FIXED[quick]:,} splats", f"{side}x{side}"
+        rows.append(Measurement("size", workload, method, "step by pixels", threads, timing, values))
     return rows
-
-
-def _row(
-    operation: str, workload: str, method: str, threads: int, timing: Timing, values: dict[str, float]
-) -> Measurement:
-    return Measurement("size", workload, method, operation, threads, timing, values)
 
 
 def _measured(splats: int, side: int, threads: int) -> tuple[Timing, int]:

@@ -115,8 +115,8 @@ def _run_rows(scope: Scope, folder: Path) -> list[Measurement]:
 
 def _photos(scope: Scope, folder: Path) -> ColmapDataModule:
     """New at every run: some switches are about how photos are loaded."""
-    if scope.scene is not None and scope.scene.is_dir():
-        return ColmapDataModule(str(scope.scene))
+    if scope.photos is not None:
+        return ColmapDataModule(str(scope.photos))
     demo = DemoDataModule(str(folder / "demo"), **DEMO[scope.quick])
     with quiet():
         demo.prepare_data()
