@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import threading
+from bisect import bisect_left
 from typing import Any
 
 import numpy as np
@@ -128,6 +129,7 @@ class Workspace:
 
 
 _BUFFERS: list[Array] = []
+"""By size."""
 _LOCK = threading.Lock()
 _SLACK = 4
 """A buffer of up to this many times the requested size is reused."""
@@ -140,6 +142,11 @@ def _is_idle(index: int) -> bool:
     return sys.getrefcount(_BUFFERS[index]) == 2
 
 
+def _place(size: float) -> int:
+    """Where the buffers of at least this size begin."""
+    return bisect_left(_BUFFERS, size, key=len)
+
+
 def recycled(shape: tuple[int, ...]) -> Tensor:
     """A float32 tensor with unspecified content, in memory whose previous tensor is gone.
 
@@ -148,18 +155,18 @@ def recycled(shape: tuple[int, ...]) -> Tensor:
     """
     size = math.prod(shape)
     with _LOCK:
-        best = -1
-        for i in range(len(_BUFFERS)):
-            if size <= _BUFFERS[i].size <= _SLACK * size + _PAGE and _is_idle(i):
-                best = i if best < 0 or _BUFFERS[i].size < _BUFFERS[best].size else best
-        if best < 0:
+        fitting = range(_place(size), _place(_SLACK * size + _PAGE + 1))
+        smallest = next(filter(_is_idle, fitting), None)
+        if smallest is None:
             # The number of splats grows: a buffer that is a little too small now will not be requested again.
-            outgrown = [i for i in range(len(_BUFFERS)) if size / 2 <= _BUFFERS[i].size < size and _is_idle(i)]
-            for i in reversed(outgrown):
-                del _BUFFERS[i]
-            _BUFFERS.append(torch.empty(size + size // 8 + _PAGE, dtype=torch.float32).numpy())
+            for outgrown in filter(_is_idle, reversed(range(_place(size / 2), _place(size)))):
+                del _BUFFERS[outgrown]
+            new = torch.empty(size + size // 8 + _PAGE, dtype=torch.float32).numpy()
+            smallest = _place(new.size)
+            _BUFFERS.insert(smallest, new)
+            del new
         # The tensor keeps the view alive, the view its buffer.
-        return torch.from_numpy(_BUFFERS[best][:size].reshape(shape))
+        return torch.from_numpy(_BUFFERS[smallest][:size].reshape(shape))
 
 
 def check_tensor(
