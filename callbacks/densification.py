@@ -49,11 +49,17 @@ class Densification(LatchedCallback, ABC):
 
     tables: ClassVar[tuple[str, ...]]
     """Names of the side tables ``[N]`` of the splats that hold the statistics."""
+    limit_name: ClassVar[str]
+    """What sets :meth:`limit`, for messages."""
 
     def __init__(self, finite_every: int = 100) -> None:
         super().__init__()
         self._search = FiniteSearch(finite_every, "finite_every")
         self._warned = False
+
+    @abstractmethod
+    def limit(self, host: SplatHost) -> int | None:
+        """How many splats there may be; None without a limit."""
 
     @abstractmethod
     def ask(self, host: SplatHost, iteration: int, batch: Any) -> None:
@@ -95,6 +101,22 @@ class Densification(LatchedCallback, ABC):
                 "device (--trainer.devices=1)"
             )
 
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say on a CPU how much memory the run will take, and remove splats if there are already too many.
+
+        Raises:
+            ValueError: There are more than :meth:`limit`, and the trainer has no data module whose views show which
+                ones matter.
+        """
+        super().on_train_start(trainer, pl_module)
+        host = as_host(pl_module)
+        limit = self.limit(host)
+        if limit is None:
+            return
+        if host.device.type == "cpu" and trainer.is_global_zero:
+            say_footprint(trainer, limit)
+        self._keep_at_most(trainer, host, limit)
+
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         """Ask for what the statistics need while they are needed."""
         self.ask(as_host(pl_module), next_iteration(trainer), batch)
@@ -113,27 +135,15 @@ class Densification(LatchedCallback, ABC):
             keep_finite_splats(trainer, host)
         self.act(trainer, host, iteration)
 
-    def keep_at_most(self, trainer: Trainer, host: SplatHost, limit: int, name: str) -> None:
-        """Remove splats if there are more than ``limit``: those that contribute least to the train views.
-
-        On a CPU this also says how much memory the run will take.
-
-        Args:
-            trainer: The trainer.
-            host: The module.
-            limit: How many may stay.
-            name: What sets the limit, for messages.
-
-        Raises:
-            ValueError: There are more, and the trainer has no data module whose views show which ones matter.
-        """
+    def _keep_at_most(self, trainer: Trainer, host: SplatHost, limit: int) -> None:
+        """Remove splats if there are more than ``limit``: those that contribute least to the train views."""
         count = len(host.splats)
-        if host.device.type == "cpu" and trainer.is_global_zero:
-            say_footprint(trainer, limit)
         if count <= limit:
             return
         if host.phase > Phase.PRUNE:
-            log.warning("%s=%d comes too late for %d splats with codebooks; all are kept", name, limit, count)
+            log.warning(
+                "%s=%d comes too late for %d splats with codebooks; all are kept", self.limit_name, limit, count
+            )
             return
         kept = most_contributing(train_contributions(trainer, host), limit)
         keep_rows(host.splats, raw_optimizer(trainer), kept)

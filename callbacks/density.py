@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.edit import append_rows, keep_rows
-from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.host import SplatHost
 from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.replicas import check_replicas
 from nsvq_lightning.training.schedule import Phase
@@ -67,6 +67,7 @@ class DensityControl(Densification):
     """
 
     tables: ClassVar[tuple[str, ...]] = (GRADIENTS, VIEWS)
+    limit_name: ClassVar[str] = "max_splats"
 
     def __init__(
         self,
@@ -80,15 +81,9 @@ class DensityControl(Densification):
         self.rules = rules
         self.max_splats = max_splats
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Remove splats if there are already more than ``max_splats``.
-
-        Raises:
-            ValueError: There are more, and the trainer has no data module whose views show which ones matter.
-        """
-        super().on_train_start(trainer, pl_module)
-        if self.max_splats is not None:
-            self.keep_at_most(trainer, as_host(pl_module), self.max_splats, "max_splats")
+    def limit(self, host: SplatHost) -> int | None:
+        """``max_splats``."""
+        return self.max_splats
 
     def ask(self, host: SplatHost, iteration: int, batch: Any) -> None:
         """Ask for screen-space gradients while they are needed."""

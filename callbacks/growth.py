@@ -16,7 +16,7 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.edit import append_rows, keep_rows
-from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.host import SplatHost
 from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.replicas import check_replicas
 from nsvq_lightning.training.schedule import Phase
@@ -64,6 +64,7 @@ class BudgetedGrowth(Densification):
     """
 
     tables: ClassVar[tuple[str, ...]] = (GRADIENTS, VIEWS, EDGES)
+    limit_name: ClassVar[str] = "the budget"
 
     def __init__(
         self,
@@ -100,17 +101,6 @@ class BudgetedGrowth(Densification):
         """Go on from there."""
         super().load_state_dict(state_dict)
         self._idle = state_dict["idle"]
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Remove splats if there are already more than growth may reach.
-
-        Raises:
-            ValueError: There is no budget; or there are more splats, and the trainer has no data module whose views
-                show which ones matter.
-        """
-        super().on_train_start(trainer, pl_module)
-        host = as_host(pl_module)
-        self.keep_at_most(trainer, host, self.limit(host), "the budget")
 
     def limit(self, host: SplatHost) -> int:
         """How many splats growth may reach.
