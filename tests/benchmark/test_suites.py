@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from nsvq_lightning import save
-from nsvq_lightning.commands.benchmark import step_profile, suites, timing
+from nsvq_lightning.commands.benchmark import recipe_run, step_profile, suites, timing
 from nsvq_lightning.commands.benchmark.cores import core_rows, serial_share
 from nsvq_lightning.commands.benchmark.error_measures import relative_l2, worst_first
 from nsvq_lightning.commands.benchmark.measurement import Measurement
@@ -61,7 +61,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quantize, "CHECKED_ROWS", 500)
     monkeypatch.setattr(kmeans, "CHECKED_ROWS", 500)
     monkeypatch.setattr(kmeans, "CHECKED_CODES", 20)
-    monkeypatch.setattr(train, "DEMO", {True: {"views": 9, "width": 48, "height": 36}})
+    monkeypatch.setattr(recipe_run, "QUICK_DEMO", ("--data.views=9", "--data.width=48", "--data.height=36"))
     monkeypatch.setattr(gpu, "COPIED", 2**16)
     for module in (train, profile, gpu):
         monkeypatch.setattr(module, "WARM_STEPS", {True: 2})
@@ -261,7 +261,7 @@ def test_variants_of_runs() -> None:
     names = [variant.name for variant in train.variants(Scope((1, 2), switches=("sh_bands", "metrics")))]
     assert names == ["as shipped", "1 thread", "no skip of sh_bands", "no skip of metrics"]
     plain = train.variants(Scope((2,)))
-    assert [variant.options["codebooks"] for variant in plain] == ["1k", None]
+    assert [variant.options for variant in plain] == [(), ("--model.codebooks=null",)]
 
 
 def test_different_numbers_are_counted_by_their_bits() -> None:

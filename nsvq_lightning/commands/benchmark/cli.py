@@ -101,7 +101,7 @@ def _parser() -> argparse.ArgumentParser:
     what.add_argument(
         "--config",
         metavar="NAME",
-        help="config whose run profile and the threads of train are about (fast.yaml, without photos demo.yaml)",
+        help="config of the runs of profile and train (fast.yaml, without photos demo.yaml)",
     )
     what.add_argument("--steps", type=int, metavar="N", help="iterations of each run of train (1000; quick 40)")
     what.add_argument(

@@ -31,9 +31,8 @@ class Scope:
             points.
         steps: Iterations of each run of ``train``, at least 4: a phase has one at least.
         switches: Names of :data:`nsvq_lightning.skips.SKIPS` that ``train`` inverts one by one.
-        config: Config whose steps ``profile`` and the threads of ``train`` are about; by default ``profile`` trains
-        each
-            phase by itself, and ``train`` takes ``fast.yaml``, or ``demo.yaml`` without photos.
+        config: Config of the runs of ``profile`` and ``train``; by default ``profile`` trains each phase by itself, and
+            ``train`` takes ``fast.yaml``, or ``demo.yaml`` without photos.
 
     Raises:
         ValueError: A number is out of range, a name is unknown, or there is nothing to measure.

@@ -1,9 +1,9 @@
 """Whole runs, PSNR against seconds, and one step beside the render it contains.
 
-Runs are those of ``nsvq fit``: its module, data, callbacks, loggers and trainer. What only watches a run (reports,
-checkpoints, the progress bar) is left out, and test views are compared while the clock is stopped. Every run has the
-same number of steps. Variants differ from the first one in one thing. Where one promises the same bits, the column
-``other numbers`` checks it: it counts the trained numbers that are not those of the first row.
+Runs are those of ``nsvq fit`` with a config: its module, data, callbacks, loggers and trainer. What only watches a run
+(reports, checkpoints, the progress bar) is left out, and test views are compared while the clock is stopped. Every run
+has the same number of steps. Variants differ from the first one in one thing. Where one promises the same bits, the
+column ``other numbers`` checks it: it counts the trained numbers that are not those of the first row.
 """
 
 from __future__ import annotations
@@ -13,18 +13,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean, median
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from nsvq_lightning.commands.benchmark.cores import core_rows
-from nsvq_lightning.commands.benchmark.fitting import Step, StepClock, fit, quiet, training_callbacks
+from nsvq_lightning.commands.benchmark.fitting import Step
 from nsvq_lightning.commands.benchmark.measurement import Measurement, Timing
+from nsvq_lightning.commands.benchmark.recipe_run import recipe_name, recipe_run
 from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.timing import Case, milliseconds, sgemm, use_threads
 from nsvq_lightning.commands.benchmark.trainees import Trainee, trainee
-from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
+from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.nsvq.file import write_nsvq
 from nsvq_lightning.rendering.rasterize import render
@@ -35,9 +36,6 @@ from nsvq_lightning.training.schedule import Phase
 
 __all__ = ["Trained", "Variant", "different_numbers", "run", "variants"]
 
-DEMO = {True: {"views": 9, "width": 96, "height": 72}, False: {}}
-"""Size of the demo scene, quick and full; the full one is that of ``configs/demo.yaml``."""
-CODEBOOKS = {True: "0.5k", False: "1k"}
 ROUNDS = {True: 1, False: 2}
 """Runs of every variant; their order turns, their steps are counted together."""
 EVALUATIONS = 16
@@ -52,10 +50,10 @@ SHIPPED = "as shipped"
 
 
 class Variant(NamedTuple):
-    """One way to run: options of the module, switches that are inverted, threads."""
+    """One way to run: options of ``nsvq fit``, switches that are inverted, threads."""
 
     name: str
-    options: Mapping[str, Any]
+    options: tuple[str, ...]
     switches: Mapping[str, bool]
     threads: int
 
@@ -90,13 +88,13 @@ def run(scope: Scope) -> list[Measurement]:
 
 def variants(scope: Scope) -> list[Variant]:
     """What is compared: threads, the run without codebooks, and each switch that is asked for, inverted."""
-    most, codebooks = max(scope.threads), {"codebooks": CODEBOOKS[scope.quick]}
-    chosen = [Variant(SHIPPED, codebooks, {}, most)]
-    chosen += [Variant(f"{n} thread{'s' * (n > 1)}", codebooks, {}, n) for n in scope.threads if n != most]
+    most = max(scope.threads)
+    chosen = [Variant(SHIPPED, (), {}, most)]
+    chosen += [Variant(f"{n} thread{'s' * (n > 1)}", (), {}, n) for n in scope.threads if n != most]
     if not scope.switches:
-        chosen.append(Variant("without codebooks", {"codebooks": None}, {}, most))
+        chosen.append(Variant("without codebooks", ("--model.codebooks=null",), {}, most))
     for name in scope.switches:
-        chosen.append(Variant(f"no skip of {name}", codebooks, {name: False}, most))
+        chosen.append(Variant(f"no skip of {name}", (), {name: False}, most))
     return chosen
 
 
@@ -108,26 +106,8 @@ def _run_rows(scope: Scope, folder: Path) -> list[Measurement]:
     for turn in range(ROUNDS[scope.quick]):
         for variant in chosen[turn:] + chosen[:turn]:
             trained[variant.name].append(_train(variant, scope, folder))
-    workload = f"{_described(_photos(scope, folder))}, {scope.steps} steps"
     shipped = trained[SHIPPED]
-    return [_run_row(workload, variant, trained[variant.name], shipped) for variant in chosen]
-
-
-def _photos(scope: Scope, folder: Path) -> ColmapDataModule:
-    """New at every run: some switches are about how photos are loaded."""
-    if scope.photos is not None:
-        return ColmapDataModule(str(scope.photos))
-    demo = DemoDataModule(str(folder / "demo"), **DEMO[scope.quick])
-    with quiet():
-        demo.prepare_data()
-    return demo
-
-
-def _described(data: ColmapDataModule) -> str:
-    with quiet():
-        scene = data.scene
-    camera = scene.cameras[0]
-    return f"{Path(data.root).resolve().name}, {len(scene.train)} photos of {camera.width}x{camera.height}"
+    return [_run_row(recipe_name(scope), variant, trained[variant.name], shipped) for variant in chosen]
 
 
 def _train(variant: Variant, scope: Scope, folder: Path) -> Trained:
@@ -141,15 +121,12 @@ def _train(variant: Variant, scope: Scope, folder: Path) -> Trained:
         steps.append(step)
         # Between the round numbers: opacities are reset at those, and just then a picture says nothing.
         if step.iteration in module.schedule.ends or step.iteration % every == every // 2:
-            course.append((_seconds(steps), _test_psnr(module, data)))
+            course.append((_seconds(steps), _test_psnr(module)))
         if step.iteration % product_every == 0:
             products.append(milliseconds(product))
 
-    init_from = None if scope.init_from is None else str(scope.init_from)
-    with use_threads(variant.threads), switched(**variant.switches):
-        data = _photos(scope, folder)
-        module = SplatModule(**variant.options, init_from=init_from)
-        fit(module, data, [*training_callbacks(), StepClock(between)], scope.steps)
+    with switched(**variant.switches):
+        module = recipe_run(scope, variant.threads, between, variant.options)
         file_bytes = write_nsvq(folder / "scene.nsvq", module.compressed())
     numbers = {name: tensor.detach() for name, tensor in module.named_parameters()}
     return Trained(steps, course, numbers, file_bytes, products)
@@ -159,7 +136,8 @@ def _seconds(steps: Sequence[Step]) -> float:
     return sum(step.milliseconds for step in steps) / 1000
 
 
-def _test_psnr(module: SplatModule, data: ColmapDataModule) -> float:
+def _test_psnr(module: SplatModule) -> float:
+    data: ColmapDataModule = module.trainer.datamodule  # type: ignore[attr-defined]  # Lightning does not type it
     with torch.no_grad():
         splats = module.hard_splats(module.phase)
         return evaluate(
