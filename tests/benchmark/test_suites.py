@@ -33,8 +33,10 @@ from nsvq_lightning.commands.benchmark.suites import (
     train,
 )
 from nsvq_lightning.commands.benchmark.workloads import synthetic_workload
+from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.splats.splats import RawSplats
+from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
 TINY = Scope((1,), quick=True, repeats=2, seconds=0.01, workloads=("A20k",), steps=8)
@@ -238,9 +240,17 @@ def test_distortion_is_a_share_of_the_variance() -> None:
     assert kmeans.distortion(rows[:1], rows[1:2]) == 4
 
 
-def test_runs_with_and_without_a_switch(scene: Path) -> None:
-    switched = dataclasses.replace(TINY, scene=scene, switches=("sh_bands", "metrics"))
+def test_runs_with_and_without_a_switch(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    switches, seen, measured = ("sh_bands", "metrics"), set(), train._test_psnr
+
+    def seeing_switches(module: SplatModule) -> float:
+        seen.add(tuple(is_on(name) for name in switches))
+        return measured(module)
+
+    monkeypatch.setattr(train, "_test_psnr", seeing_switches)
+    switched = dataclasses.replace(TINY, scene=scene, switches=switches)
     rows = {row.method: row for row in train.run(switched)}
+    assert seen == {(True, True), (False, True), (True, False)}
     shipped, exact = rows["as shipped"], rows["no skip of sh_bands"]
     assert shipped.values["other numbers"] == exact.values["other numbers"] == 0
     assert shipped.values["PSNR dB"] == exact.values["PSNR dB"] > 5

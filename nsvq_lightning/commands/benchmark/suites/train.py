@@ -30,7 +30,6 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.nsvq.file import write_nsvq
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.report.evaluation import evaluate
-from nsvq_lightning.skips import switched
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
@@ -50,12 +49,12 @@ SHIPPED = "as shipped"
 
 
 class Variant(NamedTuple):
-    """One way to run: options of ``nsvq fit``, switches that are inverted, threads."""
+    """One way to run: threads, further options of ``nsvq fit``, and the switch that is off, if one is."""
 
     name: str
-    options: tuple[str, ...]
-    switches: Mapping[str, bool]
     threads: int
+    options: tuple[str, ...] = ()
+    off: str | None = None
 
 
 class Trained(NamedTuple):
@@ -89,12 +88,12 @@ def run(scope: Scope) -> list[Measurement]:
 def variants(scope: Scope) -> list[Variant]:
     """What is compared: threads, the run without codebooks, and each switch that is asked for, inverted."""
     most = max(scope.threads)
-    chosen = [Variant(SHIPPED, (), {}, most)]
-    chosen += [Variant(f"{n} thread{'s' * (n > 1)}", (), {}, n) for n in scope.threads if n != most]
+    chosen = [Variant(SHIPPED, most)]
+    chosen += [Variant(f"{n} thread{'s' * (n > 1)}", n) for n in scope.threads if n != most]
     if not scope.switches:
-        chosen.append(Variant("without codebooks", ("--model.codebooks=null",), {}, most))
+        chosen.append(Variant("without codebooks", most, ("--model.codebooks=null",)))
     for name in scope.switches:
-        chosen.append(Variant(f"no skip of {name}", (), {name: False}, most))
+        chosen.append(Variant(f"no skip of {name}", most, (f"--skips.{name}=false",), off=name))
     return chosen
 
 
@@ -125,9 +124,8 @@ def _train(variant: Variant, scope: Scope, folder: Path) -> Trained:
         if step.iteration % product_every == 0:
             products.append(milliseconds(product))
 
-    with switched(**variant.switches):
-        module = recipe_run(scope, variant.threads, between, variant.options)
-        file_bytes = write_nsvq(folder / "scene.nsvq", module.compressed())
+    module = recipe_run(scope, variant.threads, between, variant.options)
+    file_bytes = write_nsvq(folder / "scene.nsvq", module.compressed())
     numbers = {name: tensor.detach() for name, tensor in module.named_parameters()}
     return Trained(steps, course, numbers, file_bytes, products)
 
@@ -161,7 +159,7 @@ def _run_row(workload: str, variant: Variant, runs: Sequence[Trained], shipped: 
         "file bytes": float(first.file_bytes),
         "other numbers": float(different_numbers(first.numbers, shipped[0].numbers)),
     }
-    if variant.switches:
+    if variant.off is not None:
         values["saves %"] = 100 * (1 - 1 / ratio)
     note = "times are of whole steps, those that start a phase included; PSNR is that of the test views"
     return Measurement(
