@@ -23,6 +23,7 @@ from .opacity import OpacityRegularization
 from .phases import PhaseSchedule
 from .predictions import RenderWriter
 from .progress import SplatProgressBar
+from .rate_distortion import RateDistortion
 from .rates import RateDecay
 from .refit import CodebookRefit
 from .selection import OpacitySelection
@@ -51,6 +52,7 @@ __all__ = [
     "OpacitySelection",
     "PhaseSchedule",
     "RateDecay",
+    "RateDistortion",
     "RenderWriter",
     "RunCheckpoint",
     "ShDegreeSchedule",

@@ -9,6 +9,7 @@ from typing import Any
 from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor
 
+from nsvq_lightning.quantize.scene import held_codes
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.replicas import check_replicas, from_first_process
 from nsvq_lightning.training.schedule import Phase, next_iteration
@@ -22,7 +23,7 @@ log = logging.getLogger(__name__)
 
 
 class FreezeCodes(LatchedCallback):
-    """At the first iteration of fine-tuning, finds the nearest code of every splat and freezes it.
+    """At the first iteration of fine-tuning, freezes the code of every splat: the one it holds, or else the nearest.
 
     If a quantizer has an attribute ``fitted`` (whether its codebook has been placed), it must be true by then.
 
@@ -95,7 +96,8 @@ class FreezeCodes(LatchedCallback):
         keep_finite_splats(trainer, host)
         for name in names:
             quantizer = host.quantizers[name]
-            codes = quantizer.encode(host.rows(name))
+            held = held_codes(quantizer, len(host.splats))
+            codes = quantizer.encode(host.rows(name)) if held is None else held
             # Only now: some quantizers place their codebooks when rows are encoded.
             if not getattr(quantizer, "fitted", True):
                 raise RuntimeError(

@@ -19,6 +19,7 @@ from .opacity import OpacityRegularization
 from .phases import PhaseSchedule
 from .predictions import RenderWriter
 from .progress import SplatProgressBar
+from .rate_distortion import RateDistortion
 from .rates import RateDecay
 from .refit import CodebookRefit
 from .selection import OpacitySelection
@@ -42,6 +43,7 @@ STANDARD: dict[str, type[Callback]] = {
     "codebook_refit": CodebookRefit,
     "codebook_replacement": CodebookReplacement,
     "codebook_finite": FiniteCodes,
+    "rate_distortion": RateDistortion,
     "freeze": FreezeCodes,
     "report": MetricReport,
     "export": ExportScene,

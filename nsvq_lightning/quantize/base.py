@@ -9,7 +9,16 @@ from torch import Tensor, nn
 
 from nsvq_lightning.protocols import missing_members
 
-__all__ = ["Mendable", "Quantizer", "Refittable", "as_quantizer", "is_mendable", "is_refittable"]
+__all__ = [
+    "Holding",
+    "Mendable",
+    "Quantizer",
+    "Refittable",
+    "as_quantizer",
+    "is_holding",
+    "is_mendable",
+    "is_refittable",
+]
 
 
 class Quantizer(Protocol):
@@ -72,6 +81,21 @@ class Refittable(Protocol):
         """Fit the codebook to the rows ``x [N, D]`` by ``steps`` k-means steps from its current state; K stays."""
 
 
+class Holding(Protocol):
+    """Quantizer whose rows can be given other codes than the nearest ones while they are trained.
+
+    :class:`nsvq_lightning.callbacks.RateDistortion` uses it, and leaves other quantizers alone.
+    """
+
+    codebook: Tensor
+    """Codebook ``[K, D]`` in the raw space of the attribute."""
+    held: Tensor
+    """Codes ``[N]`` int64 that rows have in training, or empty; they count only while the scene has N rows."""
+
+    def hold(self, codes: Tensor) -> None:
+        """Set :attr:`held`."""
+
+
 class Mendable(Protocol):
     """Quantizer that can repair codes that have become non-finite.
 
@@ -106,6 +130,11 @@ def as_quantizer(module: object) -> Quantizer:
 def is_refittable(quantizer: object) -> TypeGuard[Refittable]:
     """Whether a quantizer has all members of :class:`Refittable`."""
     return not missing_members(quantizer, Refittable)
+
+
+def is_holding(quantizer: object) -> TypeGuard[Holding]:
+    """Whether a quantizer has all members of :class:`Holding`."""
+    return not missing_members(quantizer, Holding)
 
 
 def is_mendable(quantizer: object) -> TypeGuard[Mendable]:

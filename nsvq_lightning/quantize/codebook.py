@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
@@ -40,6 +39,7 @@ class CodebookQuantizer(nn.Module, ABC):
         usage: Iterations of the window in which each code was hit at least once, ``[K]`` int64.
         window: Iterations in the window, scalar int64.
         codes: Frozen codes ``[N]`` int64, empty until :meth:`freeze`.
+        held: Codes ``[N]`` int64 that rows have in training in place of the nearest ones, see :meth:`hold`; or empty.
         fitted: Whether the codebook has been placed, scalar bool.
 
     Raises:
@@ -50,6 +50,7 @@ class CodebookQuantizer(nn.Module, ABC):
     usage: Tensor
     window: Tensor
     codes: Tensor
+    held: Tensor
     fitted: Tensor
 
     def __init__(
@@ -68,6 +69,7 @@ class CodebookQuantizer(nn.Module, ABC):
         self.register_buffer("usage", torch.zeros(num_codes, dtype=torch.int64))
         self.register_buffer("window", torch.zeros((), dtype=torch.int64))
         self.register_buffer("codes", torch.zeros(0, dtype=torch.int64))
+        self.register_buffer("held", torch.zeros(0, dtype=torch.int64))
         self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
 
     @abstractmethod
@@ -140,7 +142,10 @@ class CodebookQuantizer(nn.Module, ABC):
             if not is_on("frozen_search"):
                 self._search(x, rows)
             return self.decode(codes), codes
-        codes = self._search(x, rows)
+        if 0 < len(self.held) == len(x):
+            codes = self.held if rows is None else self.held[rows]
+        else:
+            codes = self._search(x, rows)
         if not self.training:
             return self.decode(codes), codes
         if generator is None:
@@ -248,6 +253,22 @@ class CodebookQuantizer(nn.Module, ABC):
             ValueError: There is no code, or one is not in [0, K).
             TypeError: The codes are not int64.
         """
+        self._check_codes(codes)
+        self.codes = codes.detach().clone().to(self.codebook.device)
+        self.held = self.held.new_zeros(0)
+
+    def hold(self, codes: Tensor) -> None:
+        """Give rows the codes ``[N]`` int64 in training and in files, as long as there are N rows; empty ends that.
+
+        Raises:
+            ValueError: A code is not in [0, K).
+            TypeError: The codes are not int64.
+        """
+        if codes.numel() > 0:
+            self._check_codes(codes)
+        self.held = codes.detach().clone().to(self.codebook.device)
+
+    def _check_codes(self, codes: Tensor) -> None:
         if codes.dtype != torch.int64:
             raise TypeError(f"codes must be int64, got {codes.dtype}")
         if codes.dim() != 1 or codes.numel() == 0:
@@ -255,7 +276,6 @@ class CodebookQuantizer(nn.Module, ABC):
         low, high = int(codes.min()), int(codes.max())
         if low < 0 or high >= self.num_codes:
             raise ValueError(f"codes must be in [0, {self.num_codes}), got {low} to {high}")
-        self.codes = codes.detach().clone().to(self.codebook.device)
 
     def _search(self, x: Tensor, rows: Tensor | None) -> Tensor:
         """Nearest codes ``[V]`` of the rows ``rows [V]`` of ``x [N, D]``."""
@@ -278,11 +298,13 @@ class CodebookQuantizer(nn.Module, ABC):
             self.usage = self.usage.new_zeros(num_codes)
         self.codebook.grad = None
 
-    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Resize to the stored number of codes and rows before the values are copied."""
         stored = state_dict.get(f"{prefix}codebook")
         if stored is not None and stored.dim() == 2 and stored.shape[1] == self.dim:
             self._resize(stored.shape[0])
+        held = state_dict.setdefault(f"{prefix}held", self.held.new_zeros(0))  # checkpoints of older releases have none
+        self.held = self.held.new_zeros(held.shape)
         codes = state_dict.get(f"{prefix}codes")
         if codes is not None:
             self.codes = self.codes.new_zeros(codes.shape)

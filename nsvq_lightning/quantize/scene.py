@@ -14,7 +14,7 @@ from nsvq_lightning.quantize.base import Quantizer, as_quantizer
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
-__all__ = ["attribute_rows", "build_quantizers", "codes_of", "decoded", "noisy_rows"]
+__all__ = ["attribute_rows", "build_quantizers", "codes_of", "decoded", "held_codes", "noisy_rows"]
 
 
 def build_quantizers(
@@ -53,8 +53,17 @@ def attribute_rows(splats: RawSplats, attribute: str) -> Tensor:
     return QUANTIZED[attribute].rows(getattr(splats, attribute).detach())
 
 
+def held_codes(quantizer: object, count: int) -> Tensor | None:
+    """Codes ``[count]`` that rows hold in training (:class:`~nsvq_lightning.quantize.base.Holding`), if they do."""
+    held: Tensor | None = getattr(quantizer, "held", None)
+    return held if held is not None and held.shape[0] == count > 0 else None
+
+
 def codes_of(splats: RawSplats, attribute: str, quantizer: Quantizer) -> Tensor:
-    """Codes ``[N]`` of an attribute: the frozen ones, or the nearest ones now."""
+    """Codes ``[N]`` of an attribute: the frozen ones, those that are held, or the nearest ones now."""
+    held = held_codes(quantizer, splats.means.shape[0])
+    if held is not None:
+        return held
     frozen = quantizer.codes.shape[0] == splats.means.shape[0]
     if frozen and is_on("frozen_search"):
         return quantizer.codes

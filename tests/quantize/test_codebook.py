@@ -223,3 +223,43 @@ def test_codes_are_not_mended_by_rows_that_they_do_not_belong_to() -> None:
     quantizer.freeze(torch.tensor([0, 1, 2, 2]))
     with pytest.raises(ValueError, match="codes are frozen for 4 rows, got 3"):
         quantizer.mend(torch.tensor([1]), torch.zeros(3, 2), generator(0))
+
+
+def test_held_codes_replace_the_nearest_ones_until_they_are_frozen() -> None:
+    quantizer, x = fitted()
+    held = torch.arange(100) % 8
+    quantizer.hold(held)
+    rows = torch.tensor([3, 10, 50])
+    _, codes = quantizer(x, generator(0), rows)
+    assert torch.equal(codes, held[rows])
+    quantizer.eval()
+    values, codes = quantizer(x)
+    assert torch.equal(codes, held)
+    assert torch.equal(values, quantizer.codebook[held])
+    assert torch.equal(quantizer.encode(x), fitted()[0].encode(x))
+    # A scene of another size has other rows.
+    assert torch.equal(quantizer(x[:50])[1], quantizer.encode(x[:50]))
+    quantizer.freeze(held)
+    assert len(quantizer.held) == 0
+
+
+def test_held_codes_are_in_checkpoints_and_old_ones_have_none() -> None:
+    quantizer, x = fitted()
+    quantizer.hold(torch.arange(100) % 8)
+    stored = quantizer.state_dict()
+    loaded = NSVQ(8, 3)
+    loaded.load_state_dict(stored)
+    assert torch.equal(loaded.held, quantizer.held)
+    del stored["held"]
+    loaded.load_state_dict(stored)
+    assert len(loaded.held) == 0
+    assert torch.equal(loaded.eval()(x)[1], quantizer.encode(x))
+
+
+def test_only_codes_of_the_codebook_can_be_held() -> None:
+    quantizer, _ = fitted()
+    with pytest.raises(ValueError, match=r"codes must be in \[0, 8\), got 0 to 8"):
+        quantizer.hold(torch.arange(9))
+    with pytest.raises(TypeError, match="int64"):
+        quantizer.hold(torch.zeros(3))
+    quantizer.hold(torch.zeros(0, dtype=torch.int64))

@@ -98,6 +98,11 @@ def _box_search() -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _priced() -> dict[str, Any]:
+    table = {"x": _tensor(70, 3), "codebook": _tensor(50, 3, seed=1)}
+    return table | {"rates": _tensor(50, seed=2).abs(), "prices": _tensor(70, seed=3).abs()}
+
+
 def _score_search() -> dict[str, Any]:
     from nsvq_lightning.quantize.scores import centre_codes
 
@@ -219,6 +224,7 @@ NUMBA: dict[str, list[Case]] = {
             numbers=("order",),
         ),
     ],
+    f"{_Q}.cheapest.cheapest": [Case(_priced, rows=("x", "prices"), types=("x", "codebook"))],
     f"{_Q}.kmeans.distinct_rows": [Case(lambda: {"x": _tensor(70, 3)}, rows=("x",), columns=("x",), types=("x",))],
     f"{_Q}.noise.normal_vectors": [Case(lambda: {"seed": 5, "vectors": 4})],
     f"{_Q}.scores.centre_codes": [
