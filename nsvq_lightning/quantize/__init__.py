@@ -2,7 +2,7 @@
 
 from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.quantize.attributes import QUANTIZED, QuantizedAttribute, codebook_sizes
-from nsvq_lightning.quantize.base import Quantizer, Refittable
+from nsvq_lightning.quantize.base import Holding, Quantizer, Refittable
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize.diveq import DiVeQ
 from nsvq_lightning.quantize.kmeans import kmeans
@@ -17,6 +17,7 @@ __all__ = [
     "QUANTIZED",
     "CodebookQuantizer",
     "DiVeQ",
+    "Holding",
     "PostHoc",
     "QuantizedAttribute",
     "Quantizer",
