@@ -11,7 +11,7 @@ from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor, nn
 
 from nsvq_lightning.compression.importance import row_weights
-from nsvq_lightning.quantize.attributes import QUANTIZED
+from nsvq_lightning.quantize.attributes import check_attributes
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.random import generator
 from nsvq_lightning.training.edit import reset_moments
@@ -68,8 +68,7 @@ class CodebookInit(LatchedCallback):
         super().__init__()
         if weights not in ("none", "contribution"):
             raise ValueError(f"weights must be 'none' or 'contribution', got {weights!r}")
-        if not set(weighted) <= set(QUANTIZED):
-            raise ValueError(f"weighted must be among {', '.join(QUANTIZED)}, got {', '.join(weighted)}")
+        check_attributes("weighted", weighted)
         self.weights, self.weighted = weights, weighted
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor
 
-from nsvq_lightning.quantize.scene import held_codes
+from nsvq_lightning.quantize.base import held_codes
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.replicas import check_replicas, from_first_process
 from nsvq_lightning.training.schedule import Phase, next_iteration

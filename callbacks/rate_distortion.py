@@ -9,14 +9,14 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor
 
+from nsvq_lightning.compression.importance import row_weights
 from nsvq_lightning.compression.sensitivity import sensitivity
 from nsvq_lightning.quality.metrics import eight_bit
-from nsvq_lightning.quantize.attributes import QUANTIZED
+from nsvq_lightning.quantize.attributes import QUANTIZED, check_attributes
 from nsvq_lightning.quantize.base import Holding, is_holding
 from nsvq_lightning.quantize.cheapest import cheapest, code_rates
-from nsvq_lightning.quantize.scene import codes_of, decoded
+from nsvq_lightning.quantize.scene import codes_of
 from nsvq_lightning.random import generator
-from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.replicas import sum_over_processes
 from nsvq_lightning.training.schedule import Phase, next_iteration
@@ -68,8 +68,7 @@ class RateDistortion(LatchedCallback):
         super().__init__()
         if not 0.0 <= strength < float("inf"):
             raise ValueError(f"strength must be a finite number, at least 0, got {strength}")
-        if not set(attributes) <= set(QUANTIZED):
-            raise ValueError(f"attributes must be among {', '.join(QUANTIZED)}, got {', '.join(attributes)}")
+        check_attributes("attributes", attributes)
         self.strength = strength
         self.attributes = tuple(attributes)
         self._prices: dict[str, Tensor] = {}
@@ -115,7 +114,8 @@ class RateDistortion(LatchedCallback):
         if not self._fits(host) or not self._turn.first_time(iteration):
             return
         start, end = host.schedule.ends[Phase.PRUNE], host.schedule.ends[Phase.QUANTIZE]
-        due = (iteration - start) % -((start - end) // MEASUREMENTS) == 0
+        every = -(-(end - start) // MEASUREMENTS)
+        due = (iteration - start) % every == 0
         if due:
             self._measure(trainer, host, iteration)
         self._choose(host, slice(None) if due else slice(iteration % TURNS, None, TURNS))
@@ -127,11 +127,10 @@ class RateDistortion(LatchedCallback):
     def _measure(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
         scene = needed_scene(trainer, "codes are to be chosen by what shows in the train views", "set strength=0")
         taking_part = [name for name, q in host.quantizers.items() if name in self.attributes and is_holding(q)]
-        chosen = scene.train[:: -(-len(scene.train) // VIEWS)]
-        splats = decoded(RawSplats(*(tensor.detach() for tensor in host.splats.raw())), host.quantizers)
+        splats = host.hard_splats(Phase.QUANTIZE)
         shown = {name: torch.zeros_like(splats.opacities) for name in taking_part}
         error = torch.zeros((), dtype=torch.float64, device=host.device)
-        for index in chosen[trainer.global_rank :: trainer.world_size]:
+        for index in scene.some_train(VIEWS)[trainer.global_rank :: trainer.world_size]:
             view = scene.view(index).to(host.device)
             signs = generator(host.seed, iteration, "signs", index)
             squares, image = sensitivity(splats, view.camera, host.render_splats, signs)
@@ -142,9 +141,7 @@ class RateDistortion(LatchedCallback):
         a_bit = self.strength * float(error) / (BITS_A_SPLAT * len(host.splats))
         self._prices = {}
         for name, total in shown.items():
-            summed = sum_over_processes(trainer, total)
-            least = LEAST * summed.mean().clamp_min(torch.finfo(summed.dtype).tiny)
-            self._prices[name] = a_bit / (summed + least)
+            self._prices[name] = a_bit / row_weights(sum_over_processes(trainer, total), LEAST)
 
     def _choose(self, host: SplatHost, part: slice) -> None:
         for name, price in self._prices.items():

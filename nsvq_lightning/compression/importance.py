@@ -67,9 +67,9 @@ def most_contributing(contribution: Tensor, count: int) -> Tensor:
     return mask
 
 
-def row_weights(contribution: Tensor) -> Tensor:
-    """k-means weights ``[N]`` of splats with ``contribution [N]``: never 0, as test views may see what no photo saw.
+def row_weights(contribution: Tensor, least: float = 0.01) -> Tensor:
+    """Weights ``[N]`` of splats with ``contribution [N]``: never 0, as test views may see what no photo saw.
 
-    The smallest weight is a hundredth of the mean.
+    The smallest weight is ``least`` times the mean contribution.
     """
-    return contribution + (0.01 * contribution.mean()).clamp_min(torch.finfo(contribution.dtype).tiny)
+    return contribution + (least * contribution.mean()).clamp_min(torch.finfo(contribution.dtype).tiny)

@@ -49,8 +49,7 @@ def detailed_pixels(scene: Scene) -> float:
     Raises:
         SceneError: An image cannot be decoded.
     """
-    step = -(-len(scene.train) // SAMPLE)
     counts = [
-        int((np.abs(_high_pass(scene.images[index], cv2.CV_16S)) > DETAIL).sum()) for index in scene.train[::step]
+        int((np.abs(_high_pass(scene.images[index], cv2.CV_16S)) > DETAIL).sum()) for index in scene.some_train(SAMPLE)
     ]
     return sum(counts) / len(counts)

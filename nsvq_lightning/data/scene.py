@@ -96,6 +96,10 @@ class Scene:
     def __len__(self) -> int:
         return len(self.names)
 
+    def some_train(self, most: int) -> tuple[int, ...]:
+        """Indices of at most this many train views, evenly spaced."""
+        return self.train[:: -(-len(self.train) // most)]
+
     def view(self, index: int) -> View:
         """View ``index`` of all views.
 

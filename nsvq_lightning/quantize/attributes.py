@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from torch import Tensor
 
-__all__ = ["QUANTIZED", "QuantizedAttribute", "codebook_sizes"]
+__all__ = ["QUANTIZED", "QuantizedAttribute", "check_attributes", "codebook_sizes"]
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,16 @@ QUANTIZED = {
     )
 }
 """The quantized attributes by name. Positions and opacities are not vector quantized."""
+
+
+def check_attributes(name: str, attributes: Iterable[str]) -> None:
+    """Refuse the argument ``name`` if one of its attributes is not vector quantized.
+
+    Raises:
+        ValueError: One is not.
+    """
+    if not set(attributes) <= set(QUANTIZED):
+        raise ValueError(f"{name} must be among {', '.join(QUANTIZED)}, got {', '.join(attributes)}")
 
 
 def codebook_sizes(name: str) -> dict[str, int]:

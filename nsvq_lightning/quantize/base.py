@@ -15,6 +15,7 @@ __all__ = [
     "Quantizer",
     "Refittable",
     "as_quantizer",
+    "held_codes",
     "is_holding",
     "is_mendable",
     "is_refittable",
@@ -135,6 +136,12 @@ def is_refittable(quantizer: object) -> TypeGuard[Refittable]:
 def is_holding(quantizer: object) -> TypeGuard[Holding]:
     """Whether a quantizer has all members of :class:`Holding`."""
     return not missing_members(quantizer, Holding)
+
+
+def held_codes(quantizer: object, count: int) -> Tensor | None:
+    """The codes ``[count]`` that rows hold in training; None if they hold none, or are of another number."""
+    held: Tensor | None = getattr(quantizer, "held", None)
+    return held if held is not None and held.shape[0] == count > 0 else None
 
 
 def is_mendable(quantizer: object) -> TypeGuard[Mendable]:

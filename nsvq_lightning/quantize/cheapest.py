@@ -28,12 +28,10 @@ from nsvq_lightning.compute.lanes import (
     put,
     select,
 )
-from nsvq_lightning.quantize.nearest import check_rows
+from nsvq_lightning.quantize.nearest import check_rows, distance_parts, least
 
 __all__ = ["cheapest", "cheapest_reference", "code_rates"]
 
-_CHUNK = 1 << 22
-"""Costs that the plain version holds at once."""
 _UNSEEN = 0.3
 """Uses that a code counts beyond those it has: one that is not used costs bits, too, but finitely many."""
 
@@ -77,12 +75,8 @@ def cheapest(x: Tensor, codebook: Tensor, rates: Tensor, prices: Tensor) -> Tens
 @torch.no_grad()
 def cheapest_reference(x: Tensor, codebook: Tensor, rates: Tensor, prices: Tensor) -> Tensor:
     """:func:`cheapest` by the definition, on any device and in any floating-point type."""
-    size, mode = max(1, _CHUNK // len(codebook)), "donot_use_mm_for_euclid_dist"
-    costs = (
-        torch.cdist(part, codebook, compute_mode=mode).square() + price[:, None] * rates
-        for part, price in zip(torch.split(x, size), torch.split(prices, size), strict=True)
-    )
-    return torch.cat([part.nan_to_num(nan=torch.inf, posinf=torch.inf).argmin(1) for part in costs])
+    costs = (distances.square() + prices[part, None] * rates for part, distances in distance_parts(x, codebook))
+    return torch.cat([least(part) for part in costs])
 
 
 def _blocks(codebook: NDArray[np.float32], rates: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.graph import increment_version
 
+from nsvq_lightning.quantize.base import held_codes
 from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.quantize.replacement import copy_codes, inactive_codes, split_codes
@@ -142,10 +143,10 @@ class CodebookQuantizer(nn.Module, ABC):
             if not is_on("frozen_search"):
                 self._search(x, rows)
             return self.decode(codes), codes
-        if 0 < len(self.held) == len(x):
-            codes = self.held if rows is None else self.held[rows]
-        else:
-            codes = self._search(x, rows)
+        held = held_codes(self, len(x))
+        if held is not None and rows is not None:
+            held = held[rows]
+        codes = self._search(x, rows) if held is None else held
         if not self.training:
             return self.decode(codes), codes
         if generator is None:

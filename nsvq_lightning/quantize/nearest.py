@@ -6,6 +6,8 @@ or with a reduced matmul precision.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,7 +18,7 @@ from nsvq_lightning.quantize.box_search import MAX_DIM, box_search
 from nsvq_lightning.quantize.boxes import build_boxes
 from nsvq_lightning.quantize.scores import centre_codes, score_search
 
-__all__ = ["check_rows", "nearest", "nearest_reference"]
+__all__ = ["check_rows", "distance_parts", "least", "nearest", "nearest_reference"]
 
 _CPU_CHUNK, _DEVICE_CHUNK = 1 << 22, 1 << 26
 """Distances that the plain version holds at once: what fits the caches of a CPU, or enough to keep a GPU busy."""
@@ -52,12 +54,23 @@ def nearest_reference(x: Tensor, codebook: Tensor) -> Tensor:
         Codes ``[N]`` int64; of equally near codes the lowest.
     """
     check_rows(x, codebook)
+    return torch.cat([least(distances) for _, distances in distance_parts(x, codebook)])
+
+
+def distance_parts(x: Tensor, codebook: Tensor) -> Iterator[tuple[slice, Tensor]]:
+    """Rows of ``x [N, D]``, part by part, and their exact distances ``[rows, K]`` to the codes ``[K, D]``, detached."""
     rows = max(1, (_CPU_CHUNK if x.device.type == "cpu" else _DEVICE_CHUNK) // codebook.shape[0])
-    mode = "donot_use_mm_for_euclid_dist"
-    with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
-        distances = (torch.cdist(part, codebook, compute_mode=mode) for part in torch.split(x.detach(), rows))
-        # argmin would treat NaN as the smallest
-        return torch.cat([part.nan_to_num(nan=torch.inf, posinf=torch.inf).argmin(1) for part in distances])
+    for start in range(0, max(1, x.shape[0]), rows):
+        part = slice(start, start + rows)
+        with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+            distances = torch.cdist(x[part], codebook, compute_mode="donot_use_mm_for_euclid_dist")
+        yield part, distances
+
+
+def least(costs: Tensor) -> Tensor:
+    """Column ``[N]`` int64 of the least of the costs ``[N, K]`` of each row; NaN counts as the largest, as infinity."""
+    # argmin would treat NaN as the smallest
+    return costs.nan_to_num(nan=torch.inf, posinf=torch.inf).argmin(1)
 
 
 def nearest(x: Tensor, codebook: Tensor) -> Tensor:

@@ -10,11 +10,11 @@ from torch import Tensor, nn
 
 from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.quantize.attributes import QUANTIZED, codebook_sizes
-from nsvq_lightning.quantize.base import Quantizer, as_quantizer
+from nsvq_lightning.quantize.base import Quantizer, as_quantizer, held_codes
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
-__all__ = ["attribute_rows", "build_quantizers", "codes_of", "decoded", "held_codes", "noisy_rows"]
+__all__ = ["attribute_rows", "build_quantizers", "codes_of", "decoded", "noisy_rows"]
 
 
 def build_quantizers(
@@ -51,12 +51,6 @@ def build_quantizers(
 def attribute_rows(splats: RawSplats, attribute: str) -> Tensor:
     """Rows ``[N, D]`` of a quantized attribute, detached."""
     return QUANTIZED[attribute].rows(getattr(splats, attribute).detach())
-
-
-def held_codes(quantizer: object, count: int) -> Tensor | None:
-    """Codes ``[count]`` that rows hold in training (:class:`~nsvq_lightning.quantize.base.Holding`), if they do."""
-    held: Tensor | None = getattr(quantizer, "held", None)
-    return held if held is not None and held.shape[0] == count > 0 else None
 
 
 def codes_of(splats: RawSplats, attribute: str, quantizer: Quantizer) -> Tensor:
