@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import kernel, thread_count
 from nsvq_lightning.compute.memory import INT64, check_array
+from nsvq_lightning.io.powers import power_above, power_below
 
 __all__ = ["AXIS_BITS", "Grid", "morton_keys", "nearest_before", "spatial_order", "unmorton"]
 
@@ -19,16 +20,22 @@ AXIS_BITS = 21
 _WINDOW = 16
 """Rows before a row that are searched for neighbours. 64 instead of 16 would save another 0.05 of 8 bits of codes."""
 
-_EXTENT_BITS = 20
-"""No step is finer than the extent times ½ to this power."""
+_EXTENT_BITS = AXIS_BITS - 1
+"""No step is finer than the extent times ½ to this power: the scene takes up to half of each side of the grid."""
+
+_BASE_BITS = AXIS_BITS - 2
+"""The first cell of a grid is a multiple of 2 to this power, so cells up to that wide lie on multiples of their own
+width, whichever scene the grid was made for."""
 
 
 @dataclass(frozen=True)
 class Grid:
     """A cube with 2^21 cells per side, in which position ``x`` is in cell ``floor(x / step) - base``.
 
+    A position in the middle of its cell stays there on every grid that gives its splat a cell of the same width.
+
     Attributes:
-        step: Side of the finest cell, scene units.
+        step: Side of the finest cell, scene units; a power of two.
         base: First cell along each axis, in cells from the scene's origin.
     """
 
@@ -46,9 +53,10 @@ class Grid:
             return cls(1.0, (0, 0, 0))
         low, high = np.quantile(means.astype(np.float64), (0.001, 0.999), axis=0)
         extent = max(float((high - low).max()), float(np.abs(means).max()) * 2.0**-40, 1e-30)
-        step = max(float(np.quantile(widest, 0.001)), extent * 2.0**-_EXTENT_BITS)
-        center = np.floor((low + high) / 2 / step)
-        return cls(step, tuple(int(c) - (1 << AXIS_BITS - 1) for c in center))  # type: ignore[arg-type]
+        finest = power_above(extent * 2.0**-_EXTENT_BITS)
+        step = power_below(max(float(np.quantile(widest, 0.001)), finest))
+        first = np.rint(((low + high) / 2 / step - (1 << AXIS_BITS - 1)) / (1 << _BASE_BITS))
+        return cls(step, tuple(int(cell) << _BASE_BITS for cell in first))  # type: ignore[arg-type]
 
     def cells(self, means: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Cell of each position ``[N, 3]``, 0 for those outside; and which ``[N]`` are inside."""

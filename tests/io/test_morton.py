@@ -48,7 +48,7 @@ def test_far_splats_do_not_make_the_grid_coarse() -> None:
     grid = Grid.around(means, np.full(5000, 1e-3))
     _, inside = grid.cells(means)
     assert np.flatnonzero(~inside).tolist() == [7, 8]
-    assert grid.step == near.step == 1e-3
+    assert grid.step == near.step == 2.0**-10
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 400])

@@ -72,10 +72,12 @@ def test_compact_keeps_every_splat_where_it_promises(tmp_path: Path) -> None:
         distance, nearest = cKDTree(stored.means).query(arrays.means, p=np.inf)
         # Steps follow the sizes as stored, which have an error of their own.
         size = np.exp(np.maximum(arrays.scales.mean(1, dtype=np.float64), stored.scales[nearest].mean(1)))
+        opacity = 1 / (1 + np.exp(-arrays.opacities.astype(np.float64)))
+        size /= np.sqrt(np.maximum(opacity - precision.opacity, precision.opacity))
         rounding = 4 * np.finfo(np.float32).eps * np.abs(arrays.means).max()
-        bound = np.maximum(precision.position * size, extent * 2.0**-21)
+        bound = np.maximum(precision.position * size, extent * 2.0**-20)
         # The grid is as fine as all but the smallest thousandth of the splats ask for.
-        assert (distance > 1.01 * bound + rounding).sum() <= np.ceil(len(scene) / 1000), f"seed {seed}"
+        assert (distance > 1.07 * bound + rounding).sum() <= np.ceil(len(scene) / 1000), f"seed {seed}"
 
 
 @pytest.mark.parametrize("suffix", sorted(FORMATS))

@@ -30,7 +30,9 @@ from nsvq_lightning.io.nsvq.header import Header
 __all__ = ["MAGIC", "VERSION", "frame", "read_frame", "read_header", "unframe", "with_origin"]
 
 MAGIC = b"\x89NSVQ\r\n\x1a"
-VERSION = 1
+VERSION = 2
+READABLE = (1, 2)
+"""Versions that are read; the header of version 1 spells out the columns of its tables in every row."""
 _PREFIX = struct.Struct("<8s16sII")
 _DIGEST_START, _DIGEST_END = 8, 24
 
@@ -75,22 +77,23 @@ def unframe(data: bytes) -> tuple[Header, dict[str, memoryview]]:
     _, digest, version, json_bytes = _PREFIX.unpack_from(data)
     if blake2b(memoryview(data)[_DIGEST_END:], digest_size=len(digest)).digest() != digest:
         raise FormatError("truncated or altered: the checksum does not fit the content")
-    if version != VERSION:
+    if version not in READABLE:
         raise FormatError(
-            f"version {version} of the format; this release reads version {VERSION}", "update nsvq-lightning"
+            f"version {version} of the format; this release reads {' and '.join(map(str, READABLE))}",
+            "update nsvq-lightning",
         )
     payload = memoryview(data)[_PREFIX.size + json_bytes :]
     if _PREFIX.size + json_bytes > len(data):
         raise FormatError(f"damaged: a header of {json_bytes} bytes in a file of {len(data)}")
     header = Header.from_json(data[_PREFIX.size : _PREFIX.size + json_bytes])
+    streams: dict[str, memoryview] = {}
     end = 0
     for stream in header.streams:
-        if stream.offset != end:
-            raise FormatError(f"damaged: stream {stream.name!r} starts at {stream.offset} instead of {end}")
+        streams[stream.name] = payload[end : end + stream.length]
         end += stream.length
     if end != len(payload):
         raise FormatError(f"damaged: the streams have {end} bytes, the file holds {len(payload)}")
-    return header, {s.name: payload[s.offset : s.offset + s.length] for s in header.streams}
+    return header, streams
 
 
 def read_frame(path: str | os.PathLike[str]) -> tuple[Header, dict[str, memoryview]]:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, astuple, dataclass, field, fields
 from typing import Any, TypeVar
 
 from nsvq_lightning.io.errors import FormatError
 
-__all__ = ["PREFIX_BYTES", "AttributeEntry", "Header", "StreamEntry", "tile"]
+__all__ = ["PREFIX_BYTES", "AttributeEntry", "Header", "StreamEntry"]
 
 PREFIX_BYTES = 32
 """Bytes before the JSON, see :mod:`nsvq_lightning.io.nsvq.frame`."""
@@ -29,7 +28,6 @@ class AttributeEntry:
         storage: ``raw`` (float32, one row per splat), ``codes`` (rows of a codebook), ``steps`` (integers, one row per
             splat), ``levels`` (equal steps of [0, 1]), or ``grid`` (cells of a grid).
         codes: Rows of the codebook K, or number of levels; 0 where there are none.
-        bits: Bits of one code before entropy coding; 0 without codes.
         step: Step of which the integers of this attribute, or of its codebook, are multiples; 0 for float32.
     """
 
@@ -37,8 +35,12 @@ class AttributeEntry:
     dim: int
     storage: str
     codes: int = 0
-    bits: int = 0
     step: float = 0.0
+
+    @property
+    def bits(self) -> int:
+        """Bits of one code before entropy coding; 0 without codes."""
+        return max(0, self.codes - 1).bit_length()
 
 
 @dataclass(frozen=True)
@@ -47,13 +49,11 @@ class StreamEntry:
 
     Attributes:
         name: What it holds.
-        offset: First byte, counted from the end of the header.
         length: Number of bytes.
         encoding: How to read it, for example ``float32`` or ``bits``.
     """
 
     name: str
-    offset: int
     length: int
     encoding: str
 
@@ -100,6 +100,8 @@ class Header:
         """
         try:
             table = asdict(self)
+            table["attributes"] = [astuple(entry) for entry in self.attributes]
+            table["streams"] = [astuple(stream) for stream in self.streams]
             table["metrics"] = {name: _finite_or_none(value) for name, value in self.metrics.items()}
             text = json.dumps(table, sort_keys=True, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
             return text.encode()
@@ -122,8 +124,8 @@ class Header:
             splats=_size(table, "splats"),
             sh_degree=_size(table, "sh_degree"),
             origin=_origin(table),
-            attributes=tuple(_attribute(entry) for entry in _items(table, "attributes", (dict,))),
-            streams=tuple(_stream(entry) for entry in _items(table, "streams", (dict,))),
+            attributes=tuple(_attribute(row) for row in _rows(table, "attributes", AttributeEntry)),
+            streams=tuple(_stream(row) for row in _rows(table, "streams", StreamEntry)),
             config=_entry(table, "config", dict),
             metrics=_metrics(table),
         )
@@ -134,34 +136,26 @@ class Header:
         return header
 
 
-def tile(streams: Sequence[tuple[str, int, str]]) -> tuple[StreamEntry, ...]:
-    """Stream table for streams given as (name, length, encoding), back to back."""
-    entries: list[StreamEntry] = []
-    offset = 0
-    for name, length, encoding in streams:
-        entries.append(StreamEntry(name, offset, length, encoding))
-        offset += length
-    return tuple(entries)
+def _rows(table: object, key: str, kind: type[AttributeEntry | StreamEntry]) -> list[dict[str, Any]]:
+    """The entries of a table; version 1 of the format wrote dictionaries, which hold more than what is used."""
+    rows, columns = _items(table, key, (dict, list)), [column.name for column in fields(kind)]
+    if any(isinstance(row, list) and len(row) != len(columns) for row in rows):
+        raise FormatError(f"damaged: a row of header entry {key!r} does not hold {', '.join(columns)}")
+    return [row if isinstance(row, dict) else dict(zip(columns, row, strict=True)) for row in rows]
 
 
-def _attribute(table: dict[str, Any]) -> AttributeEntry:
+def _attribute(row: dict[str, Any]) -> AttributeEntry:
     return AttributeEntry(
-        name=_entry(table, "name", str),
-        dim=_size(table, "dim"),
-        storage=_entry(table, "storage", str),
-        codes=_size(table, "codes"),
-        bits=_size(table, "bits"),
-        step=_finite(table, "step"),
+        name=_entry(row, "name", str),
+        dim=_size(row, "dim"),
+        storage=_entry(row, "storage", str),
+        codes=_size(row, "codes"),
+        step=_finite(row, "step"),
     )
 
 
-def _stream(table: dict[str, Any]) -> StreamEntry:
-    return StreamEntry(
-        name=_entry(table, "name", str),
-        offset=_size(table, "offset"),
-        length=_size(table, "length"),
-        encoding=_entry(table, "encoding", str),
-    )
+def _stream(row: dict[str, Any]) -> StreamEntry:
+    return StreamEntry(_entry(row, "name", str), _size(row, "length"), _entry(row, "encoding", str))
 
 
 def _entry(table: object, key: str, kind: type[_T]) -> _T:

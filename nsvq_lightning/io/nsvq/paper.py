@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.compressed import QUANTIZABLE, CompressedScene, attribute_dims
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.io.nsvq.bits import code_bits, pack_fields, packed_bytes, unpack_fields
-from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, tile
+from nsvq_lightning.io.nsvq.bits import pack_fields, packed_bytes, unpack_fields
+from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
 
 __all__ = ["decode_paper", "encode_paper", "paper_header"]
 
@@ -41,7 +41,7 @@ def paper_header(scene: CompressedScene) -> Header:
         sh_degree=scene.sh_degree,
         origin=(float(scene.origin[0]), float(scene.origin[1]), float(scene.origin[2])),
         attributes=attributes,
-        streams=tile(_layout(len(scene), attributes)),
+        streams=_layout(len(scene), attributes),
         config=dict(scene.config),
         metrics=dict(scene.metrics),
     )
@@ -91,18 +91,17 @@ def decode_paper(header: Header, streams: Mapping[str, memoryview]) -> Compresse
 def _attribute(scene: CompressedScene, name: str, dim: int) -> AttributeEntry:
     if name in scene.raw:
         return AttributeEntry(name, dim, "raw")
-    rows = len(scene.codebooks[name])
-    return AttributeEntry(name, dim, "codes", rows, code_bits(rows))
+    return AttributeEntry(name, dim, "codes", len(scene.codebooks[name]))
 
 
-def _layout(n: int, attributes: tuple[AttributeEntry, ...]) -> list[tuple[str, int, str]]:
-    """Name, bytes and encoding of the streams: raw attributes, codes, codebooks."""
+def _layout(n: int, attributes: tuple[AttributeEntry, ...]) -> tuple[StreamEntry, ...]:
+    """The streams: raw attributes, codes, codebooks."""
     coded = [entry for entry in attributes if entry.storage == "codes"]
-    return [
-        *((entry.name, 4 * n * entry.dim, _FLOATS) for entry in attributes if entry.storage == "raw"),
-        *([("codes", packed_bytes(n, [entry.bits for entry in coded]), _BITS)] if coded else []),
-        *((f"{entry.name}.codebook", 4 * entry.codes * entry.dim, _FLOATS) for entry in coded),
-    ]
+    return (
+        *(StreamEntry(entry.name, 4 * n * entry.dim, _FLOATS) for entry in attributes if entry.storage == "raw"),
+        *([StreamEntry("codes", packed_bytes(n, [entry.bits for entry in coded]), _BITS)] if coded else []),
+        *(StreamEntry(f"{entry.name}.codebook", 4 * entry.codes * entry.dim, _FLOATS) for entry in coded),
+    )
 
 
 def _check_tables(header: Header) -> None:
@@ -111,11 +110,11 @@ def _check_tables(header: Header) -> None:
     if [(entry.name, entry.dim) for entry in header.attributes] != list(dims.items()):
         raise FormatError(f"damaged: the attribute table must list {dims}, got {header.attributes}")
     for entry in header.attributes:
-        raw = entry.storage == "raw" and entry.codes == entry.bits == 0
+        raw = entry.storage == "raw" and entry.codes == 0
         coded = entry.name in QUANTIZABLE and entry.storage == "codes" and 1 <= entry.codes <= 1 << 32
-        if entry.step or (not raw and not (coded and entry.bits == code_bits(entry.codes))):
+        if entry.step or not (raw or coded):
             raise FormatError(f"damaged: impossible attribute {entry}")
-    if header.streams != tile(_layout(header.splats, header.attributes)):
+    if header.streams != _layout(header.splats, header.attributes):
         raise FormatError("damaged: the stream table does not fit the attribute table and the number of splats")
 
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import itertools
 import json
 import struct
 from collections.abc import Callable
@@ -14,6 +15,8 @@ import pytest
 
 from nsvq_lightning import io
 from nsvq_lightning.io import CompressedScene, FormatError, read_header, read_nsvq
+from nsvq_lightning.io.nsvq.file import LEVELS
+from nsvq_lightning.io.nsvq.frame import VERSION
 
 write_nsvq = partial(io.write_nsvq, level="paper")
 
@@ -87,12 +90,17 @@ def test_an_independent_reader_understands_the_file(tmp_path: Path) -> None:
     write_nsvq(path, original)
     data = path.read_bytes()
     magic, digest, version, json_bytes = struct.unpack_from("<8s16sII", data)
-    assert (magic, version) == (b"\x89NSVQ\r\n\x1a", 1)
+    assert (magic, version) == (b"\x89NSVQ\r\n\x1a", 2)
     assert digest == hashlib.blake2b(data[24:], digest_size=16).digest()
     header = json.loads(data[32 : 32 + json_bytes])
-    start = {s["name"]: 32 + json_bytes + s["offset"] for s in header["streams"]}
-    fields = [(a["name"], a["codes"], a["bits"], a["dim"]) for a in header["attributes"] if a["storage"] == "codes"]
-    length = next(s["length"] for s in header["streams"] if s["name"] == "codes")
+    lengths = {name: length for name, length, _ in header["streams"]}
+    start = dict(zip(lengths, itertools.accumulate(lengths.values(), initial=32 + json_bytes), strict=False))
+    length = lengths["codes"]
+    fields = [
+        (name, codes, (codes - 1).bit_length(), dim)
+        for name, dim, storage, codes, _ in header["attributes"]
+        if storage == "codes"
+    ]
     stream = int.from_bytes(data[start["codes"] : start["codes"] + length], "little")
     for row in range(50):
         assert struct.unpack_from("<3f", data, start["means"] + 12 * row) == tuple(original.means[row])
@@ -153,7 +161,7 @@ def _forge(path: Path, change: Callable[[dict[str, Any]], object], tail: bytes =
     header = json.loads(data[32 : 32 + size])
     change(header)
     text = json.dumps(header).encode()
-    body = struct.pack("<II", 1, len(text)) + text + data[32 + size :] + tail
+    body = struct.pack("<II", VERSION, len(text)) + text + data[32 + size :] + tail
     path.write_bytes(data[:8] + hashlib.blake2b(body, digest_size=16).digest() + body)
 
 
@@ -164,8 +172,8 @@ def test_forged_headers_are_refused_before_anything_is_allocated(tmp_path: Path)
     header = json.loads(good[32 : 32 + struct.unpack_from("<I", good, 28)[0]])
     wrong: list[Any] = [None, -1, 10**15, 10**400, 1.5, "x", True, [], {}, [[]], 0]
     places = [*([key] for key in header if key not in ("config", "metrics"))]
-    places += [["attributes", i, key] for i in range(6) for key in header["attributes"][i]]
-    places += [["streams", i, key] for i in range(7) for key in header["streams"][i]]
+    places += [["attributes", i, key] for i in range(6) for key in range(5)]
+    places += [["streams", i, key] for i in range(7) for key in range(3)]
     for place in places:
         for value in wrong:
 
@@ -187,10 +195,11 @@ def test_forged_headers_are_refused_before_anything_is_allocated(tmp_path: Path)
     [
         (lambda h: h.update(level="compact+"), "compression level 'compact\\+'"),
         (lambda h: h["streams"].append(copy.deepcopy(h["streams"][-1])), "same name"),
-        (lambda h: h["streams"].reverse(), "starts at"),
+        (lambda h: h["streams"].reverse(), "stream table"),
         (lambda h: h["attributes"].reverse(), "attribute table"),
-        (lambda h: h["attributes"][2].update(bits=5), "impossible attribute"),
-        (lambda h: h["attributes"][0].update(storage="codes", codes=3, bits=2), "impossible attribute"),
+        (lambda h: h["attributes"][2].__setitem__(4, 0.5), "impossible attribute"),
+        (lambda h: h["attributes"][0].__setitem__(slice(2, 4), ["codes", 3]), "impossible attribute"),
+        (lambda h: h["attributes"][0].append(1), "does not hold name, dim, storage, codes, step"),
         (lambda h: h.update(config=[]), "config"),
         (lambda h: h.update(metrics={"psnr": "good"}), "numbers only"),
         (lambda h: h.update(origin=[0, 0]), "origin"),
@@ -218,9 +227,9 @@ def test_a_code_beyond_its_codebook_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.nsvq"
     write_nsvq(path, scene(4, {"quats": 3}))
     header = read_header(path)
-    codes = next(stream for stream in header.streams if stream.name == "codes")
+    names = [stream.name for stream in header.streams]
     data = bytearray(path.read_bytes())
-    data[header.size + codes.offset] = 0xFF
+    data[header.size + sum(stream.length for stream in header.streams[: names.index("codes")])] = 0xFF
     path.write_bytes(data[:8] + hashlib.blake2b(data[24:], digest_size=16).digest() + data[24:])
     with pytest.raises(FormatError, match=r"codes\['quats'\] must be in 0\.\.2, got \d\.\.3"):
         read_nsvq(path)
@@ -229,9 +238,9 @@ def test_a_code_beyond_its_codebook_is_refused(tmp_path: Path) -> None:
 def test_a_newer_version_says_so(tmp_path: Path) -> None:
     path = tmp_path / "x.nsvq"
     write_nsvq(path, scene(4, {}))
-    body = struct.pack("<I", 2) + path.read_bytes()[28:]
+    body = struct.pack("<I", VERSION + 1) + path.read_bytes()[28:]
     path.write_bytes(path.read_bytes()[:8] + hashlib.blake2b(body, digest_size=16).digest() + body)
-    with pytest.raises(FormatError, match="reads version 1; update"):
+    with pytest.raises(FormatError, match="version 3 of the format; this release reads 1 and 2; update"):
         read_nsvq(path)
 
 
@@ -275,3 +284,15 @@ def test_settings_must_be_json_and_metrics_may_be_infinite(tmp_path: Path) -> No
     assert read_nsvq(path).metrics == {"psnr": None, "ssim": 1.0}
     with pytest.raises(ValueError, match="unknown compression level 'tiny'; there are compact, paper"):
         write_nsvq(path, scene(2, {}), level="tiny")
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_files_of_version_1_still_open(level: str) -> None:
+    """Oracle: what the release that wrote them read from them."""
+    folder = Path(__file__).parent / "version_1"
+    read = read_nsvq(folder / f"{level}.nsvq")
+    assert (read.config, read.metrics, read.origin) == ({"seed": 1}, {"psnr": 30.0}, (1.0, 2.0, 3.0))
+    arrays = read.arrays()
+    with np.load(folder / f"{level}.npz") as expected:
+        for name, values in expected.items():
+            np.testing.assert_array_equal(getattr(arrays, name), values, err_msg=name)

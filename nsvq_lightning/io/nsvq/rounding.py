@@ -1,0 +1,202 @@
+"""A scene as integers: what level ``compact`` rounds it to before anything is coded.
+
+Steps of positions and of codebooks are powers of two. So rounding is idempotent: a scene read from a file is written
+again without another error, and what training has rounded (:class:`nsvq_lightning.callbacks.RoundToFile`) is stored as
+it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nsvq_lightning.io.compressed import CompressedScene, attribute_dims
+from nsvq_lightning.io.morton import AXIS_BITS, Grid
+from nsvq_lightning.io.nsvq.codebook_order import sibling_distance, tree_order
+from nsvq_lightning.io.nsvq.header import AttributeEntry
+from nsvq_lightning.io.nsvq.precision import Precision
+from nsvq_lightning.io.nsvq.tasks import all_of
+from nsvq_lightning.io.opacity import opacity_of
+from nsvq_lightning.io.powers import coarsest_power, nearest_power
+
+__all__ = [
+    "Stored",
+    "cell_widths",
+    "codebook_step",
+    "doublings_of",
+    "logits_of_levels",
+    "position_grid",
+    "rounded",
+    "unit_quats",
+]
+
+_MOST_DOUBLINGS = 500.0
+"""Largest base-2 logarithm of a width in scene units whose multiples float64 still holds."""
+_FINER = 4
+"""A codebook on a lattice this much finer than necessary is stored on it, without an error."""
+_SMALLEST_STEP = 2.0**-16
+"""Step of a codebook whose rows do not differ."""
+
+
+class Stored(NamedTuple):
+    """One attribute as integers.
+
+    Attributes:
+        entry: Its line in the header.
+        values: Codes ``[N]`` (row of the codebook, or level) or integers ``[N, D]``, one row per splat.
+        codebook: Integers ``[K, D]`` of the codebook; None if there is none.
+    """
+
+    entry: AttributeEntry
+    values: NDArray[np.int64]
+    codebook: NDArray[np.int64] | None = None
+
+    def rows(self) -> NDArray[np.int64]:
+        """Integers ``[N, D]`` of the splats."""
+        return self.values if self.codebook is None else self.codebook[self.values]
+
+    def floats(self) -> NDArray[np.float32]:
+        """The codebook ``[K, D]``, or the rows ``[N, D]`` where there is none."""
+        return ((self.values if self.codebook is None else self.codebook) * self.entry.step).astype(np.float32)
+
+    def in_order(self, order: NDArray[np.int64]) -> Stored:
+        """The same with the splats in another order."""
+        return self._replace(values=self.values[order])
+
+
+def rounded(scene: CompressedScene, precision: Precision) -> dict[str, Stored]:
+    """All attributes but the positions, as integers.
+
+    Raises:
+        ValueError: A value is not finite, or too large for its step.
+    """
+    _check_finite({"means": scene.means, "opacities": scene.opacities, **scene.raw})
+    dims = attribute_dims(scene.sh_degree)
+    stored = all_of({name: partial(_stored, scene, name, dim, precision) for name, dim in dims.items()})
+    stored["opacities"] = _levels(scene.opacities, precision.opacity_levels)
+    return stored
+
+
+def _check_finite(arrays: Mapping[str, NDArray[np.float32]]) -> None:
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(
+                f"{name}: {int((~np.isfinite(array)).sum())} numbers are not finite; drop those splats, or use level "
+                "'paper', which stores float32 as it is"
+            )
+
+
+def _stored(scene: CompressedScene, name: str, dim: int, precision: Precision) -> Stored:
+    if name in scene.raw:
+        step = 2 * getattr(precision, name)
+        rows = unit_quats(scene.raw[name]) if name == "quats" else scene.raw[name]
+        return Stored(AttributeEntry(name, dim, "steps", step=step), _integers(name, rows, step))
+    codes, codebook = scene.codes[name], scene.codebooks[name]
+    used = np.bincount(codes, minlength=len(codebook)) > 0
+    rows = codebook[used] if len(codes) else np.zeros_like(codebook[:1])
+    _check_finite({f"codebook of {name}": rows})
+    step = codebook_step(name, rows, precision.codebook)
+    if name == "quats" and not _on_lattice(rows, step):
+        rows = unit_quats(rows)
+    integers, merged = np.unique(_integers(name, rows, step), axis=0, return_inverse=True)
+    order = tree_order((integers * step).astype(np.float32))
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    entry = AttributeEntry(name, dim, "codes", len(integers), step)
+    return Stored(entry, place[merged.reshape(-1)[np.cumsum(used)[codes] - 1]], integers[order])
+
+
+def codebook_step(name: str, rows: NDArray[np.float32], error: float) -> float:
+    """Step of the codebook of an attribute, a power of two.
+
+    It is that lattice which all values lie on already, unless it is much finer than ``error`` asks for.
+
+    Args:
+        name: The attribute.
+        rows: The rows ``[K, D]`` in use.
+        error: Largest error, as a share of how much neighbouring codes typically differ.
+    """
+    lattice = coarsest_power(rows)
+    distinct = np.unique(unit_quats(rows) if name == "quats" else rows, axis=0)
+    wanted = nearest_power(2 * error * sibling_distance(distinct[tree_order(distinct)]) or _SMALLEST_STEP)
+    return lattice if lattice * _FINER >= wanted else wanted
+
+
+def _on_lattice(rows: NDArray[np.float32], step: float) -> bool:
+    lattice = coarsest_power(rows)
+    return lattice >= step or lattice == 0
+
+
+def unit_quats(quats: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Unit quaternions ``[N, 4]`` of the same rotations; zero becomes the identity, as in rendering."""
+    rows = quats.astype(np.float64)
+    norm = np.linalg.norm(rows, axis=1, keepdims=True)
+    identity = np.array([1.0, 0.0, 0.0, 0.0])
+    return np.where(norm > 0, rows / np.where(norm > 0, norm, 1), identity).astype(np.float32)
+
+
+def _integers(name: str, rows: NDArray[np.float32], step: float) -> NDArray[np.int64]:
+    values = np.rint(rows.astype(np.float64) / step)
+    if not (np.abs(values) < 2.0**52).all():
+        raise ValueError(f"{name}: {np.abs(rows).max():.3g} is too large for steps of {step:.3g}; use level 'paper'")
+    return values.astype(np.int64)
+
+
+# Opacities
+
+
+def _levels(logits: NDArray[np.float32], count: int) -> Stored:
+    shares = opacity_of(logits)
+    values = np.minimum((shares * count).astype(np.int64), count - 1)
+    return Stored(AttributeEntry("opacities", 1, "levels", count), values)
+
+
+def logits_of_levels(count: int) -> NDArray[np.float32]:
+    """Logit ``[count]`` of the middle of each level."""
+    shares = (np.arange(count) + 0.5) / count
+    return (np.log(shares) - np.log1p(-shares)).astype(np.float32)
+
+
+# Positions
+
+
+def position_grid(
+    means: NDArray[np.float32], stored: Mapping[str, Stored], precision: Precision
+) -> tuple[Grid, float, NDArray[np.int64]]:
+    """The grid of the positions ``[N, 3]``, the doublings of its step for a splat of size 1, and the depths ``[N]``."""
+    widest = np.minimum(doublings_of(stored, math.log2(2 * precision.position)), _MOST_DOUBLINGS)
+    grid = Grid.around(means, np.exp2(widest))
+    for_size_one = math.log2(2 * precision.position / grid.step)
+    return grid, for_size_one, grid.depths(doublings_of(stored, for_size_one))
+
+
+def doublings_of(stored: Mapping[str, Stored], for_size_one: float) -> NDArray[np.float64]:
+    """Base-2 logarithm ``[N]`` of the width of each splat's widest cell, in steps of the grid.
+
+    The width is in proportion to the size over the square root of the opacity: what is hardly seen may move further.
+    Only sums, products and quotients are used, whose rounding is the same everywhere: key depths depend on it.
+
+    Args:
+        stored: The log-scales, and the opacities where they count.
+        for_size_one: The result for an opaque splat of size 1.
+    """
+    scales, factor = stored["scales"], stored["scales"].entry.step / 3 / math.log(2.0)
+    doublings = scales.rows().sum(1).astype(np.float64) * factor + for_size_one
+    if "opacities" not in stored:
+        return doublings
+    levels = stored["opacities"]
+    # The logarithm, linear between powers of two.
+    mantissas, exponents = np.frexp((np.arange(levels.entry.codes) + 0.5) / levels.entry.codes)
+    return doublings - (0.5 * (2 * mantissas - 2 + exponents))[levels.values]
+
+
+def cell_widths(scene: CompressedScene, precision: Precision) -> NDArray[np.float64]:
+    """Width ``[N]`` of the cell in whose middle the file puts each position, scene units; 0 where it stays float32."""
+    grid, _, depths = position_grid(scene.means, rounded(scene, precision), precision)
+    _, inside = grid.cells(scene.means)
+    return np.where(inside, np.ldexp(grid.step, AXIS_BITS - depths), 0.0)
