@@ -23,10 +23,14 @@ __all__ = ["main"]
 log = logging.getLogger("nsvq_lightning.compress")
 
 DEFAULT_CODEBOOKS = "16k"
+DEFAULT_TUNING = 200
+VIEWS = 96
+"""Largest number of views in which a scene is tuned."""
 
 EPILOG = """\
 The error is the root mean square difference between pictures of the scene before and after, for channels in [0, 1]:
-0.01 is 40 dB, 0.003 is 50 dB. Pictures are the train views of --data.root, or views from around the scene.
+0.01 is 40 dB, 0.003 is 50 dB. Pictures are the train views of --data.root, or views from where the scene shows most
+detail, as it does where its photos were taken.
 Training with photos keeps to the limit: if the trained file misses it, OUT is the untrained file, and the trained one
 stays in the folder of the run.
 
@@ -56,6 +60,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("--max-steps trains with photos: give their COLMAP folder with --data.root")
     if options.max_steps is not None and options.max_steps < 0:
         parser.error(f"--max-steps must be at least 0, got {options.max_steps}")
+    if options.tune < 0:
+        parser.error(f"--tune must be at least 0, got {options.tune}")
     if options.max_steps and options.codebooks == "none":
         parser.error("--max-steps trains codebooks, and there are none with --codebooks=none")
     logging.basicConfig(format="%(message)s")
@@ -84,7 +90,8 @@ class Result:
 
 def _compress(options: argparse.Namespace) -> int:
     from nsvq_lightning.compression.ladder import Compressor
-    from nsvq_lightning.compression.pictures import decibels, measuring_cameras
+    from nsvq_lightning.compression.pictures import decibels
+    from nsvq_lightning.compression.viewpoints import views_of
     from nsvq_lightning.io.formats import read_scene
     from nsvq_lightning.io.nsvq.frame import with_origin
     from nsvq_lightning.training.run_folder import claim_version
@@ -94,8 +101,8 @@ def _compress(options: argparse.Namespace) -> int:
     arrays = scene.finite().arrays()
     if len(arrays) == 0:
         raise ValueError(f"{source} holds no finite splat; there is nothing to compress")
-    cameras = measuring_cameras(options.root, arrays.means)
-    candidate = _candidate(options, arrays, cameras, scene.origin)
+    cameras = views_of(arrays.to_splats(), options.root, VIEWS)
+    candidate, pictures = _candidate(options, arrays, cameras, scene.origin)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     result = Result(candidate.rung.name, candidate.data, candidate.error)
     if options.root is not None and options.max_steps != 0:
@@ -117,7 +124,7 @@ def _compress(options: argparse.Namespace) -> int:
     sys.stdout.write(
         f"{options.output}: {len(arrays):,} splats in {after:,} bytes, {before / after:.1f} times smaller than "
         f"{source.name}\n  {result.settings}, error {result.error:.4g} ({decibels(result.error):.2f} dB against the "
-        f"original in {len(cameras)} pictures)\n"
+        f"original in {pictures} pictures)\n"
     )
     return 0
 
@@ -139,16 +146,18 @@ def _within_aim(options: argparse.Namespace, untrained: Result, trained: Result,
 
 def _candidate(
     options: argparse.Namespace, arrays: SplatArrays, cameras: list[Camera], origin: tuple[float, float, float]
-) -> Candidate:
+) -> tuple[Candidate, int]:
+    """The scene as the options ask for it, and the number of pictures in which its error was measured."""
     from nsvq_lightning.compression.ladder import LADDER, PLAIN, Compressor, finest_within, smallest_within
 
-    compressor = Compressor(arrays, cameras, Storage(options.level), options.seed, origin)
+    compressor = Compressor(arrays, cameras, Storage(options.level), options.seed, origin, options.tune)
     if options.max_error is not None:
-        return smallest_within(compressor, options.max_error)
-    if options.target_bytes is not None:
-        return finest_within(compressor, options.target_bytes)
-    rungs = {rung.name: rung for rung in LADDER} | {"none": PLAIN}
-    return compressor.at(rungs[options.codebooks])
+        candidate = smallest_within(compressor, options.max_error)
+    elif options.target_bytes is not None:
+        candidate = finest_within(compressor, options.target_bytes)
+    else:
+        candidate = compressor.at(({rung.name: rung for rung in LADDER} | {"none": PLAIN})[options.codebooks])
+    return candidate, compressor.pictures
 
 
 def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> int:
@@ -214,6 +223,14 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="FOLDER",
         help="COLMAP folder with the photos: errors are those in its views, and its photos train the codebooks",
+    )
+    parser.add_argument(
+        "--tune",
+        type=int,
+        default=DEFAULT_TUNING,
+        metavar="N",
+        help=f"steps that make codebooks, opacities and positions fit the scene's own pictures: {DEFAULT_TUNING} by "
+        "default, 0 for none",
     )
     parser.add_argument(
         "--max-steps", type=int, metavar="N", help="training iterations: 3000 by default; 0 only measures"

@@ -83,13 +83,16 @@ def _errors(scene: CompressedScene, output: Path) -> str:
 
 
 def _measure(source: Path, output: Path, root: Path | None) -> None:
-    from nsvq_lightning.compression.pictures import decibels, measuring_cameras, picture_error, pictures
+    from nsvq_lightning.compression.ladder import MEASURED
+    from nsvq_lightning.compression.pictures import decibels, picture_error, pictures
+    from nsvq_lightning.compression.viewpoints import views_of
 
     original = read_scene(source).finite()
     if len(original) == 0:
         raise ValueError(f"{source} holds no finite splat; there is nothing to measure")
-    cameras = measuring_cameras(root, original.means)
-    error = picture_error(read_scene(output).decode(), cameras, pictures(original.decode(), cameras))
+    splats = original.decode()
+    cameras = views_of(splats, root, MEASURED)
+    error = picture_error(read_scene(output).decode(), cameras, pictures(splats, cameras))
     sys.stdout.write(
         f"  error {error:.4g} ({decibels(error):.2f} dB against {source.name} in {len(cameras)} pictures)\n"
     )

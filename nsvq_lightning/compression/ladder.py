@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
 
-import torch
 from torch import Tensor
 
 from nsvq_lightning.compression.covariance_error import form_errors
@@ -16,6 +15,7 @@ from nsvq_lightning.compression.importance import contributions, row_weights
 from nsvq_lightning.compression.pictures import decibels, picture_error, pictures
 from nsvq_lightning.compression.pixel_size import scale_floor
 from nsvq_lightning.compression.stored import compress
+from nsvq_lightning.compression.tuning import tuned
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import decode, encode
 from nsvq_lightning.io.nsvq.frame import frame, unframe
@@ -29,9 +29,22 @@ from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.splats.forms import canonical
 from nsvq_lightning.splats.splats import RawSplats
 
-__all__ = ["LADDER", "PLAIN", "PLAINS", "Candidate", "Compressor", "Rung", "finest_within", "smallest_within"]
+__all__ = [
+    "LADDER",
+    "MEASURED",
+    "PLAIN",
+    "PLAINS",
+    "Candidate",
+    "Compressor",
+    "Rung",
+    "finest_within",
+    "smallest_within",
+]
 
 log = logging.getLogger(__name__)
+
+MEASURED = 24
+"""Largest number of views in which errors are measured."""
 
 
 @dataclass(frozen=True)
@@ -94,14 +107,16 @@ class Compressor:
     """Compresses one scene at any rung, each at most once.
 
     Before k-means, scales too small to be visible are raised, and scales and rotations take the canonical form that
-    suits the scene; k-means weights rotations and colours by how much each splat contributes to the pictures.
+    suits the scene; k-means weights rotations and colours by how much each splat contributes to the pictures. After
+    it, the scene is tuned until its pictures resemble those of the original.
 
     Args:
         splats: The scene, finite.
-        cameras: Views in which errors and contributions are measured.
+        cameras: Views in which the scene is tuned; in some of them errors and contributions are measured.
         storage: Level, and the precision, which rungs make coarser or finer.
         seed: Seed of k-means.
         origin: World coordinates of the point (0, 0, 0) of the positions, stored in files.
+        tuning: Steps of tuning, 0 for none.
 
     Raises:
         ValueError: There are no splats, or no camera shows any of them.
@@ -114,15 +129,17 @@ class Compressor:
         storage: Storage,
         seed: int = 0,
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        tuning: int = 0,
     ) -> None:
         if len(splats) == 0 or not cameras:
             raise ValueError(f"cannot compress {len(splats)} splats seen by {len(cameras)} cameras")
         self._splats = RawSplats(*(tensor.detach() for tensor in splats.to_splats().raw()))
-        self._cameras, self._storage, self._seed, self._origin = cameras, storage, seed, origin
-        self._pictures = pictures(self._splats, cameras)
+        self._views, self._cameras = cameras, cameras[:: -(-len(cameras) // MEASURED) or 1]
+        self._storage, self._seed, self._origin, self._tuning = storage, seed, origin, tuning
+        self._pictures = pictures(self._splats, self._cameras)
         if not any(bool(picture.any()) for picture in self._pictures):
             raise ValueError(
-                f"all {len(cameras)} pictures of the scene are black, so no error can be measured: photos "
+                f"all {len(self._cameras)} pictures of the scene are black, so no error can be measured: photos "
                 "(--data.root) must be of this scene, in its coordinates"
             )
         self._done: dict[str, Candidate] = {}
@@ -145,6 +162,11 @@ class Compressor:
             log.info("%s: %s bytes, error %.4g (%.2f dB)", rung.name, f"{len(found.data):,}", found.error, found.psnr)
         return self._done[rung.name]
 
+    @property
+    def pictures(self) -> int:
+        """Number of pictures in which errors are measured."""
+        return len(self._pictures)
+
     def error(self, data: bytes) -> float:
         """Root mean square difference between the pictures of a ``.nsvq`` file and those of the scene."""
         splats = RawSplats(*(tensor.detach() for tensor in decode(*unframe(data)).decode().raw()))
@@ -159,7 +181,6 @@ class Compressor:
         data = b"".join(frame(*encode(scene, storage.level, storage.precision)))
         return Candidate(rung, scene, storage, data, self.error(data))
 
-    @torch.no_grad()
     def _quantized(self, codebooks: Mapping[str, int]) -> CompressedScene:
         splats = self._canonical(codebooks)
         quantizers: dict[str, Quantizer] = {}
@@ -174,7 +195,8 @@ class Compressor:
             quantizer.fit(rows, weight, generator(self._seed, 0, "kmeans", name))
             quantizers[name] = cast(Quantizer, quantizer)
         config = {"codebooks": {name: len(q.codebook) for name, q in quantizers.items()}}
-        return replace(compress(splats, quantizers), config=config, origin=self._origin)
+        scene = replace(compress(splats, quantizers), config=config, origin=self._origin)
+        return tuned(scene, splats, self._views, self._tuning, self._seed) if quantizers else scene
 
     def _canonical(self, codebooks: Mapping[str, int]) -> RawSplats:
         codes = {name: codebooks[name] for name in ("scales", "quats") if name in codebooks}

@@ -54,7 +54,7 @@ def _describe_nsvq(path: Path) -> dict[str, Any]:
         "sh_degree": header.sh_degree,
         "origin": list(header.origin),
         "bytes": total,
-        "attributes": [asdict(entry) for entry in header.attributes],
+        "attributes": [{**asdict(entry), "bits": entry.bits} for entry in header.attributes],
         "streams": [{"name": "header", "encoding": "json", "bytes": header_bytes}, *streams],
         "config": header.config,
         "metrics": header.metrics,

@@ -105,7 +105,7 @@ def test_the_version_of_spz_is_chosen(tmp_path: Path) -> None:
 def test_measuring_says_how_the_pictures_differ(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save(coded_scene(20, 1), tmp_path / "a.nsvq")
     assert main([str(tmp_path / "a.nsvq"), str(tmp_path / "b.ply"), "--measure"]) == 0
-    assert "error 0 (inf dB against a.nsvq in 8 pictures)" in capsys.readouterr().out
+    assert "error 0 (inf dB against a.nsvq in 24 pictures)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

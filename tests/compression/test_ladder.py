@@ -9,39 +9,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from ring import cameras_around
+from splat_scenes import ball
 
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.compression.ladder import LADDER, PLAINS, Compressor, finest_within, smallest_within
-from nsvq_lightning.compression.pictures import cameras_around, middle_of
+from nsvq_lightning.compression.pictures import middle_of
 from nsvq_lightning.io import CompressedScene, read_header, read_nsvq, write_ply
 from nsvq_lightning.io.formats import load, save
 from nsvq_lightning.io.nsvq.precision import Precision, Storage
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.arrays import SplatArrays
-
-
-def arrays(count: int = 1500, degree: int = 1) -> SplatArrays:
-    """A ball of splats."""
-    rng = np.random.default_rng(count)
-    coefficients = (degree + 1) ** 2 - 1
-    return SplatArrays(
-        means=rng.standard_normal((count, 3), np.float32),
-        quats=rng.standard_normal((count, 4), np.float32),
-        scales=(-2.5 + 0.5 * rng.standard_normal((count, 3))).astype(np.float32),
-        opacities=rng.standard_normal(count, np.float32),
-        sh0=rng.standard_normal((count, 1, 3), np.float32),
-        shN=(0.1 * rng.standard_normal((count, coefficients, 3))).astype(np.float32),
-    )
 
 
 @pytest.fixture(scope="module")
 def compressor() -> Compressor:
-    scene = arrays()
+    scene = ball()
     return Compressor(scene, cameras_around(scene.means, 2, 96, 64), Storage())
 
 
 def test_cameras_stand_around_and_look_at_the_middle() -> None:
-    means = arrays().means + np.float32(7)
+    means = ball().means + np.float32(7)
     middle, reach = middle_of(means)
     cameras = cameras_around(means, 5, 120, 80)
     places = []
@@ -59,9 +46,9 @@ def test_a_candidate_is_what_its_bytes_hold(compressor: Compressor, tmp_path: Pa
     """Oracle: the file, read and rendered here."""
     candidate = compressor.at(LADDER[-3])
     (tmp_path / "x.nsvq").write_bytes(candidate.data)
-    decoded, original = load(tmp_path / "x.nsvq"), arrays().to_splats()
+    decoded, original = load(tmp_path / "x.nsvq"), ball().to_splats()
     squares = []
-    for camera in cameras_around(arrays().means, 2, 96, 64):
+    for camera in cameras_around(ball().means, 2, 96, 64):
         with torch.no_grad():
             pair = [render(splats, camera).image.clamp(0, 1).double() for splats in (decoded, original)]
         squares.append(float((pair[0] - pair[1]).square().mean()))
@@ -71,7 +58,7 @@ def test_a_candidate_is_what_its_bytes_hold(compressor: Compressor, tmp_path: Pa
 
 
 def test_the_ladder_goes_from_exact_to_small() -> None:
-    scene = arrays(4000)
+    scene = ball(4000)
     ladder = Compressor(scene, cameras_around(scene.means, 2, 96, 64), Storage())
     found = [ladder.at(rung) for rung in LADDER]
     sizes, errors = [len(c.data) for c in found], [c.error for c in found]
@@ -93,7 +80,7 @@ def test_the_smallest_file_within_an_error_and_the_best_within_bytes(compressor:
 
 @pytest.mark.parametrize("scale", [1.0, 0.01, 100.0])
 def test_an_error_does_not_depend_on_the_unit_of_the_scene(scale: float) -> None:
-    scene, errors = arrays(300), []
+    scene, errors = ball(300), []
     for factor in (1.0, scale):
         means, scales = scene.means * np.float32(factor), scene.scales + np.float32(math.log(factor))
         scaled = replace(scene, means=means, scales=scales)
@@ -111,8 +98,8 @@ def test_what_cannot_be_reached_says_what_can(compressor: Compressor) -> None:
 
 def test_scenes_that_cannot_be_seen_are_refused() -> None:
     with pytest.raises(ValueError, match="cannot compress 5 splats seen by 0 cameras"):
-        Compressor(arrays(5), [], Storage())
-    scene = arrays(5)
+        Compressor(ball(5), [], Storage())
+    scene = ball(5)
     elsewhere = cameras_around(scene.means + np.float32(1e4), 2, 96, 64)
     with pytest.raises(ValueError, match="all 2 pictures of the scene are black"):
         Compressor(scene, elsewhere, Storage())
@@ -120,21 +107,21 @@ def test_scenes_that_cannot_be_seen_are_refused() -> None:
 
 def test_the_command_compresses_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, output = tmp_path / "scene.ply", tmp_path / "new" / "scene.nsvq"
-    scene = arrays(700)
+    scene = ball(700)
     scene.sh0[3] = np.nan
     write_ply(source, scene)
-    assert main(["compress", str(source), str(output), "--codebooks", "0.5k"]) == 0
+    assert main(["compress", str(source), str(output), "--codebooks", "0.5k", "--tune=2"]) == 0
     assert f"699 splats in {output.stat().st_size:,} bytes" in capsys.readouterr().out
     stored = read_nsvq(output)
     assert isinstance(stored, CompressedScene)
     assert {name: len(book) for name, book in stored.codebooks.items()}.keys() == {"quats", "scales", "sh0", "shN"}
     first = output.read_bytes()
-    assert main(["compress", str(source), str(output), "--codebooks", "0.5k"]) == 0
+    assert main(["compress", str(source), str(output), "--codebooks", "0.5k", "--tune=2"]) == 0
     assert output.read_bytes() == first
-    assert main(["compress", str(output), str(tmp_path / "again.nsvq"), "--codebooks", "none", "--level", "paper"]) == 0
+    assert main(["compress", str(output), str(tmp_path / "again.nsvq"), "--codebooks=none", "--level=paper"]) == 0
     assert read_header(tmp_path / "again.nsvq").level == "paper"
     capsys.readouterr()
-    assert main(["compress", str(source), str(output), "--target-bytes", "100"]) == 1
+    assert main(["compress", str(source), str(output), "--target-bytes", "100", "--tune=0"]) == 1
     assert "the smallest file of this scene has" in capsys.readouterr().err
     assert output.read_bytes() == first
 
@@ -149,7 +136,7 @@ def test_the_command_compresses_a_file(tmp_path: Path, capsys: pytest.CaptureFix
 def test_bad_files_are_one_line_and_status_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
-    write_ply(tmp_path / "empty.ply", arrays(0))
+    write_ply(tmp_path / "empty.ply", ball(0))
     assert main(["compress", *(str(tmp_path / name) for name in arguments)]) == 1
     error = capsys.readouterr().err
     assert error.startswith("nsvq compress: ")
@@ -163,6 +150,7 @@ def test_bad_files_are_one_line_and_status_1(
         (["a.ply", "b.ply"], "is a .nsvq file"),
         (["a.ply", "b.nsvq", "--max-steps", "5"], "--data.root"),
         (["a.ply", "b.nsvq", "--max-error", "0"], "must be above 0"),
+        (["a.ply", "b.nsvq", "--tune=-1"], "--tune must be at least 0, got -1"),
         (["a.ply", "b.nsvq", "--data.root=x", "--max-steps=-1"], "--max-steps must be at least 0, got -1"),
         (["a.ply", "b.nsvq", "--data.root=x", "--max-steps=5", "--codebooks=none"], "there are none"),
         (["a.ply", "b.nsvq", "--max-error", "1", "--target-bytes", "5"], "not allowed with"),
@@ -179,8 +167,8 @@ def test_wrong_options_end_with_status_2(
 
 def test_photos_train_the_codebooks(tmp_path: Path, demo_scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, output = tmp_path / "scene.ply", tmp_path / "out.nsvq"
-    write_ply(source, arrays(400, degree=0))
-    options = ["--codebooks", "0.5k", f"--data.root={demo_scene}", "--max-steps=4"]
+    write_ply(source, ball(400, degree=0))
+    options = ["--codebooks=0.5k", f"--data.root={demo_scene}", "--tune=2", "--max-steps=4"]
     assert main(["compress", str(source), str(output), *options]) == 0
     stored = read_nsvq(output)
     assert (len(stored), stored.sh_degree) == (400, 0)
@@ -191,8 +179,8 @@ def test_photos_train_the_codebooks(tmp_path: Path, demo_scene: Path, capsys: py
 @pytest.mark.parametrize("steps", ["0", "4"])
 def test_the_origin_of_the_positions_stays(steps: str, tmp_path: Path, demo_scene: Path) -> None:
     source, output, origin = tmp_path / "scene.nsvq", tmp_path / "out.nsvq", (500_000.0, 4.5e6, 30.0)
-    save(CompressedScene.from_arrays(arrays(300, degree=0), origin=origin), source)
-    options = ["--codebooks=0.5k", f"--data.root={demo_scene}", f"--max-steps={steps}"]
+    save(CompressedScene.from_arrays(ball(300, degree=0), origin=origin), source)
+    options = ["--codebooks=0.5k", f"--data.root={demo_scene}", "--tune=2", f"--max-steps={steps}"]
     assert main(["compress", str(source), str(output), *options]) == 0
     assert read_nsvq(output).origin == origin
 
@@ -212,12 +200,12 @@ def test_photos_keep_to_the_aim(
         "nsvq_lightning.compression.ladder.LADDER", tuple(rung for rung in LADDER if rung.name == "0.5k")
     )
     source, output = tmp_path / "scene.ply", tmp_path / "out.nsvq"
-    write_ply(source, arrays(400, degree=0))
+    write_ply(source, ball(400, degree=0))
 
     def compress(*options: str) -> tuple[str, float]:
         """How the summary says that the file was made, and what the aim is about: its bytes or its error."""
         caplog.clear()
-        assert main(["compress", str(source), str(output), f"--data.root={demo_scene}", *options]) == 0
+        assert main(["compress", str(source), str(output), f"--data.root={demo_scene}", "--tune=2", *options]) == 0
         size, made = capsys.readouterr().out.splitlines()[-2:]
         assert f"splats in {output.stat().st_size:,} bytes" in size
         settings, _, error = made.strip().partition(", error ")
@@ -244,7 +232,7 @@ def test_photos_keep_to_the_aim(
 
 
 def test_precision_of_a_rung_follows_that_of_the_user() -> None:
-    scene = arrays(200)
+    scene = ball(200)
     storage = Storage(precision=Precision(position=0.2, opacity=0.1))
     found = Compressor(scene, cameras_around(scene.means, 1, 40, 30), storage).at(LADDER[-1])
     assert found.storage.precision.position == pytest.approx(0.8)

@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from ring import cameras_around
 from viewer_scenes import angles, coded_scene, nearest_in, needs_zstd, plain_scene, sigmoid
 
 from nsvq_lightning.commands.info import main as info
-from nsvq_lightning.compression.pictures import cameras_around, decibels, picture_error, pictures
+from nsvq_lightning.compression.pictures import decibels, picture_error, pictures
 from nsvq_lightning.io import CompressedScene, FormatError, SplatArrays, load, read_scene, save
 from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.sog import write_sog

