@@ -32,6 +32,7 @@ examples:
   nsvq benchmark render --output results
   nsvq benchmark train --scene path/to/colmap/folder --switches all
   nsvq benchmark profile --scene path/to/colmap/folder --init-from scene.ply
+  nsvq benchmark compress --scene path/to/colmap/folder --init-from scene.ply --beside scene.sog,scene.spz
 """
 
 
@@ -99,6 +100,12 @@ def _parser() -> argparse.ArgumentParser:
         help="scene file whose splats are used with the photos of the COLMAP folder, instead of its points",
     )
     what.add_argument(
+        "--beside",
+        type=_paths,
+        metavar="FILE,FILE",
+        help="files of the same scene by other programs, which compress measures beside ours",
+    )
+    what.add_argument(
         "--config",
         metavar="NAME",
         help="config of the runs of profile and train (fast.yaml, without photos demo.yaml)",
@@ -115,6 +122,10 @@ def _parser() -> argparse.ArgumentParser:
     results.add_argument("--output", type=Path, metavar="FOLDER", help="write benchmark.json, benchmark.md, SUITE.png")
     results.add_argument("--json", action="store_true", help="print JSON instead of tables")
     return parser
+
+
+def _paths(text: str) -> tuple[Path, ...]:
+    return tuple(map(Path, names(text)))
 
 
 def _switches(text: str) -> tuple[str, ...]:
@@ -136,6 +147,7 @@ def _scope(options: argparse.Namespace) -> Scope:
         steps=options.steps,
         switches=options.switches,
         config=options.config,
+        beside=options.beside,
     )
 
 

@@ -33,6 +33,7 @@ class Scope:
         switches: Names of :data:`nsvq_lightning.skips.SKIPS` that ``train`` inverts one by one.
         config: Config of the runs of ``profile`` and ``train``; by default ``profile`` trains each phase by itself, and
             ``train`` takes ``fast.yaml``, or ``demo.yaml`` without photos.
+        beside: Files of the same scene by other programs, which ``compress`` measures, too.
 
     Raises:
         ValueError: A number is out of range, a name is unknown, or there is nothing to measure.
@@ -48,6 +49,7 @@ class Scope:
     steps: int = 1000
     switches: tuple[str, ...] = ()
     config: str | None = None
+    beside: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.threads or min(self.threads) < 1:

@@ -22,13 +22,12 @@ class Suite(NamedTuple):
     Attributes:
         about: One line for the help.
         picture: ``errors`` draws values against milliseconds, ``shares`` a bar for each part, ``growth`` milliseconds
-        and
-            memory against what grows.
+            and memory against what grows, ``curves`` the first value against the bytes.
         drawn: Values that ``errors`` draws, a line of panels each; by default the first one of the rows.
     """
 
     about: str
-    picture: Literal["errors", "shares", "growth"] = "errors"
+    picture: Literal["errors", "shares", "growth", "curves"] = "errors"
     drawn: tuple[str, ...] = ()
 
 
@@ -49,6 +48,7 @@ SUITES = {
     "quantize": Suite("a whole NSVQ step on all four attributes"),
     "kmeans": Suite("the k-means that starts the codebooks", drawn=("distortion",)),
     "codec": Suite("writing and reading scene files", drawn=("bytes a splat", "image error")),
+    "compress": Suite("a trained scene made small: bytes against quality, beside other formats", picture="curves"),
     "train": Suite("whole runs, with switches on and off, and a step beside its own render", drawn=("PSNR dB",)),
     "size": Suite("how time and memory of a step grow with splats and pixels", picture="growth"),
     "profile": Suite("where the time of a training step goes, phase by phase", picture="shares"),

@@ -30,6 +30,9 @@ def draw_suite(path: Path, rows: Sequence[Measurement], suite: Suite) -> None:
     ``growth``: for each operation a panel of milliseconds and one of memory against the first value, all logarithmic. A
     dashed line through the last point is what is proportional to it.
 
+    ``curves``: a panel for each workload, the first value against megabytes, a line for each
+    curve, the name of a method up to the colon.
+
     Args:
         path: PNG file, replaced atomically.
         rows: Those of one suite; at least one has a value.
@@ -51,6 +54,8 @@ def draw_suite(path: Path, rows: Sequence[Measurement], suite: Suite) -> None:
         figure, axes = panels(2 * len(operations), PANEL_HEIGHT)
         for place, operation in enumerate(operations):
             _draw_growth(axes[2 * place : 2 * place + 2], [row for row in rows if row.operation == operation])
+    elif suite.picture == "curves":
+        figure = _draw_curves(rows)
     else:
         figure = _draw_values(rows, suite.drawn)
     write_figure(path, figure)
@@ -154,6 +159,25 @@ def _draw_growth(axes: Sequence[Any], rows: Sequence[Measurement]) -> None:
         axis.set_title(f"{rows[0].suite}: {rows[0].operation}, {rows[0].workload}", fontsize="medium")
         axis.grid(alpha=0.3, which="major")
         axis.legend(fontsize=8)
+
+
+def _draw_curves(rows: Sequence[Measurement]) -> Any:
+    """A figure with a panel for each workload; the curve is the name of a method up to the colon."""
+    curves = list(dict.fromkeys(row.method.partition(":")[0] for row in rows))
+    scenes, colours = _distinct(rows, "workload"), colours_of(curves)
+    figure, axes = panels(len(scenes), PANEL_HEIGHT, len(colours))
+    for axis, scene in zip(axes, scenes, strict=True):
+        for curve, colour in colours.items():
+            shown = [row.values for row in rows if row.workload == scene and row.method.startswith(f"{curve}:")]
+            axis.plot([v["bytes"] / 1e6 for v in shown], [next(iter(v.values())) for v in shown], "o-", color=colour)
+        axis.set(xscale="log", xlabel="MB", ylabel=next(iter(rows[0].values)))
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_formatter("{x:g}")
+        axis.tick_params(axis="x", which="minor", labelsize=7)
+        axis.set_title(scene, fontsize="medium")
+        axis.grid(alpha=0.3, which="both")
+    draw_keys(figure, colours, {})
+    return figure
 
 
 def _decades(values: Sequence[float]) -> tuple[float, float]:

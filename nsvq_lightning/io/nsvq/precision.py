@@ -26,9 +26,9 @@ class Precision:
     """Largest errors of level ``compact``, each half a quantization step.
 
     Attributes:
-        position: Of each coordinate, as a share of the splat's size: the geometric mean of its axis lengths. Small
-            splats get finer positions than large ones, down to 2⁻²¹ of the extent of the scene; the smallest thousandth
-            of them gets none finer than the rest.
+        position: Of each coordinate, as a share of the splat's size, the geometric mean of its axis lengths, over the
+            square root of its opacity. Small opaque splats get the finest positions, down to 2⁻²⁰ of the extent of the
+            scene; the thousandth that asks for the finest gets none finer than the rest.
         opacity: Of the opacity, which is in [0, 1]; at least 2⁻²¹.
         codebook: Of the values of a codebook, as a share of how much neighbouring codes typically differ.
         scales: Of log-scales without a codebook; 0.01 is one per cent of the length.
@@ -41,7 +41,7 @@ class Precision:
     """
 
     position: float = 0.05
-    opacity: float = 1 / 256
+    opacity: float = 1 / 128
     codebook: float = 0.0625
     scales: float = 0.02
     quats: float = 0.005

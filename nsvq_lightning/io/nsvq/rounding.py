@@ -1,8 +1,7 @@
 """A scene as integers: what level ``compact`` rounds it to before anything is coded.
 
 Steps of positions and of codebooks are powers of two. So rounding is idempotent: a scene read from a file is written
-again without another error, and what training has rounded (:class:`nsvq_lightning.callbacks.RoundToFile`) is stored as
-it is.
+again without another error.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.compressed import CompressedScene, attribute_dims
-from nsvq_lightning.io.morton import AXIS_BITS, Grid
+from nsvq_lightning.io.morton import Grid
 from nsvq_lightning.io.nsvq.codebook_order import sibling_distance, tree_order
 from nsvq_lightning.io.nsvq.header import AttributeEntry
 from nsvq_lightning.io.nsvq.precision import Precision
@@ -26,13 +25,10 @@ from nsvq_lightning.io.powers import coarsest_power, nearest_power
 
 __all__ = [
     "Stored",
-    "cell_widths",
-    "codebook_step",
     "doublings_of",
     "logits_of_levels",
     "position_grid",
     "rounded",
-    "unit_quats",
 ]
 
 _MOST_DOUBLINGS = 500.0
@@ -94,15 +90,12 @@ def _check_finite(arrays: Mapping[str, NDArray[np.float32]]) -> None:
 def _stored(scene: CompressedScene, name: str, dim: int, precision: Precision) -> Stored:
     if name in scene.raw:
         step = 2 * getattr(precision, name)
-        rows = unit_quats(scene.raw[name]) if name == "quats" else scene.raw[name]
-        return Stored(AttributeEntry(name, dim, "steps", step=step), _integers(name, rows, step))
+        return Stored(AttributeEntry(name, dim, "steps", step=step), _integers(name, scene.raw[name], step))
     codes, codebook = scene.codes[name], scene.codebooks[name]
     used = np.bincount(codes, minlength=len(codebook)) > 0
     rows = codebook[used] if len(codes) else np.zeros_like(codebook[:1])
     _check_finite({f"codebook of {name}": rows})
-    step = codebook_step(name, rows, precision.codebook)
-    if name == "quats" and not _on_lattice(rows, step):
-        rows = unit_quats(rows)
+    step = _codebook_step(name, rows, precision.codebook)
     integers, merged = np.unique(_integers(name, rows, step), axis=0, return_inverse=True)
     order = tree_order((integers * step).astype(np.float32))
     place = np.empty_like(order)
@@ -111,7 +104,7 @@ def _stored(scene: CompressedScene, name: str, dim: int, precision: Precision) -
     return Stored(entry, place[merged.reshape(-1)[np.cumsum(used)[codes] - 1]], integers[order])
 
 
-def codebook_step(name: str, rows: NDArray[np.float32], error: float) -> float:
+def _codebook_step(name: str, rows: NDArray[np.float32], error: float) -> float:
     """Step of the codebook of an attribute, a power of two.
 
     It is that lattice which all values lie on already, unless it is much finer than ``error`` asks for.
@@ -122,17 +115,12 @@ def codebook_step(name: str, rows: NDArray[np.float32], error: float) -> float:
         error: Largest error, as a share of how much neighbouring codes typically differ.
     """
     lattice = coarsest_power(rows)
-    distinct = np.unique(unit_quats(rows) if name == "quats" else rows, axis=0)
+    distinct = np.unique(_unit(rows) if name == "quats" else rows, axis=0)
     wanted = nearest_power(2 * error * sibling_distance(distinct[tree_order(distinct)]) or _SMALLEST_STEP)
     return lattice if lattice * _FINER >= wanted else wanted
 
 
-def _on_lattice(rows: NDArray[np.float32], step: float) -> bool:
-    lattice = coarsest_power(rows)
-    return lattice >= step or lattice == 0
-
-
-def unit_quats(quats: NDArray[np.float32]) -> NDArray[np.float32]:
+def _unit(quats: NDArray[np.float32]) -> NDArray[np.float32]:
     """Unit quaternions ``[N, 4]`` of the same rotations; zero becomes the identity, as in rendering."""
     rows = quats.astype(np.float64)
     norm = np.linalg.norm(rows, axis=1, keepdims=True)
@@ -141,7 +129,10 @@ def unit_quats(quats: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _integers(name: str, rows: NDArray[np.float32], step: float) -> NDArray[np.int64]:
+    """The rows ``[N, D]`` as multiples of a step; quaternions are normalised first, unless they are multiples of it."""
     values = np.rint(rows.astype(np.float64) / step)
+    if name == "quats" and not np.array_equal((values * step).astype(np.float32), rows):
+        values = np.rint(_unit(rows).astype(np.float64) / step)
     if not (np.abs(values) < 2.0**52).all():
         raise ValueError(f"{name}: {np.abs(rows).max():.3g} is too large for steps of {step:.3g}; use level 'paper'")
     return values.astype(np.int64)
@@ -195,10 +186,3 @@ def doublings_of(stored: Mapping[str, Stored], for_size_one: float) -> NDArray[n
     logarithms = 2 * mantissas - 2 + exponents
     doublings -= 0.5 * logarithms[levels.values]
     return doublings
-
-
-def cell_widths(scene: CompressedScene, precision: Precision) -> NDArray[np.float64]:
-    """Width ``[N]`` of the cell in whose middle the file puts each position, scene units; 0 where it stays float32."""
-    grid, _, depths = position_grid(scene.means, rounded(scene, precision), precision)
-    _, inside = grid.cells(scene.means)
-    return np.where(inside, np.ldexp(grid.step, AXIS_BITS - depths), 0.0)

@@ -96,6 +96,19 @@ def test_small_scenes_of_every_degree_come_back(tmp_path: Path, n: int, degree: 
         assert set(read.codebooks) == set(sizes)
 
 
+@pytest.mark.parametrize("sizes", [SIZES, {}, {"quats": 1, "scales": 300}])
+def test_a_file_that_is_read_and_written_again_loses_nothing_more(tmp_path: Path, sizes: dict[str, int]) -> None:
+    once, twice = tmp_path / "once.nsvq", tmp_path / "twice.nsvq"
+    write_nsvq(once, scene(3000, sizes))
+    write_nsvq(twice, read_nsvq(once))
+    first, second = read_nsvq(once).arrays(), read_nsvq(twice).arrays()
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        np.testing.assert_array_equal(getattr(second, name), getattr(first, name), err_msg=name)
+    # A coarser precision rounds again.
+    write_nsvq(twice, read_nsvq(once), precision=Precision(position=0.4, opacity=1 / 16))
+    assert twice.stat().st_size < once.stat().st_size
+
+
 def test_finer_precision_is_nearer_and_larger(tmp_path: Path) -> None:
     original, path = scene(2000), tmp_path / "x.nsvq"
     sizes, errors = [], []
