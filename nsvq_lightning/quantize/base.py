@@ -11,12 +11,14 @@ from nsvq_lightning.protocols import missing_members
 
 __all__ = [
     "Holding",
+    "Limitable",
     "Mendable",
     "Quantizer",
     "Refittable",
     "as_quantizer",
     "held_codes",
     "is_holding",
+    "is_limitable",
     "is_mendable",
     "is_refittable",
 ]
@@ -97,6 +99,19 @@ class Holding(Protocol):
         """Set :attr:`held`."""
 
 
+class Limitable(Protocol):
+    """Quantizer whose next fit can be told to place fewer codes.
+
+    :class:`nsvq_lightning.callbacks.CodebookInit` uses it for scenes with few splats.
+    """
+
+    codebook: Tensor
+    """Codebook ``[K, D]`` in the raw space of the attribute."""
+
+    def limit(self, codes: int) -> None:
+        """Have at most ``codes`` codes, at least 1, from the next fit on."""
+
+
 class Mendable(Protocol):
     """Quantizer that can repair codes that have become non-finite.
 
@@ -136,6 +151,11 @@ def is_refittable(quantizer: object) -> TypeGuard[Refittable]:
 def is_holding(quantizer: object) -> TypeGuard[Holding]:
     """Whether a quantizer has all members of :class:`Holding`."""
     return not missing_members(quantizer, Holding)
+
+
+def is_limitable(quantizer: object) -> TypeGuard[Limitable]:
+    """Whether a quantizer has all members of :class:`Limitable`."""
+    return not missing_members(quantizer, Limitable)
 
 
 def held_codes(quantizer: object, count: int) -> Tensor | None:

@@ -122,6 +122,16 @@ class CodebookQuantizer(nn.Module, ABC):
         self.fitted.fill_(True)
         self.reset_usage()
 
+    def limit(self, codes: int) -> None:
+        """Have at most ``codes`` codes from the next :meth:`fit` on; those there are now are lost if they are more.
+
+        Raises:
+            ValueError: ``codes`` is below 1.
+        """
+        if codes < 1:
+            raise ValueError(f"a codebook needs at least 1 code, got {codes}")
+        self._resize(min(codes, self.num_codes))
+
     def forward(
         self, x: Tensor, generator: torch.Generator | None = None, rows: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:

@@ -35,6 +35,15 @@ class PostHoc(CodebookQuantizer):
         super().__init__(num_codes, dim, **settings)
         self.most_codes = num_codes
 
+    def limit(self, codes: int) -> None:
+        """Have at most ``codes`` codes from the next :meth:`fit` on.
+
+        Raises:
+            ValueError: ``codes`` is below 1.
+        """
+        super().limit(codes)
+        self.most_codes = self.num_codes
+
     def fit(self, x: Tensor, weight: Tensor | None = None, generator: torch.Generator | None = None) -> None:
         """Fit the codebook as :meth:`CodebookQuantizer.fit` does; K may grow again if earlier rows made it smaller."""
         self._resize(self.most_codes)

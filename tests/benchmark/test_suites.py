@@ -112,9 +112,19 @@ def _check_rows(name: str, rows: list[Measurement]) -> None:
         assert row.values
         assert all(value == value and value >= 0 for value in row.values.values())
         assert row.timing.ratio > 0
-        if name not in BY_STEP:
+        if name not in (*BY_STEP, "compress"):
             assert 1 <= len(row.timing.samples) <= TINY.repeats
             assert len(row.timing.sgemm) == TINY.repeats
+
+
+def test_files_of_other_programs_are_measured_in_the_photos(scene: Path, demo_scene: Path) -> None:
+    rows = _run("compress", demo_scene, init_from=scene, beside=(scene,))
+    found = {row.method: row.values for row in rows}
+    assert found[".ply of another program: small.ply"]["dB lost"] == 0
+    assert found[".ply of another program: small.ply"]["bytes"] == scene.stat().st_size
+    assert found["nsvq compress: 1k"]["bytes"] < found["nsvq compress: no codebooks"]["bytes"] < scene.stat().st_size
+    with pytest.raises(Unavailable, match="--init-from"):
+        load_suite("compress")(dataclasses.replace(TINY, scene=demo_scene))
 
 
 def test_rasterizer_is_as_exact_as_plain_torch(scene: Path) -> None:

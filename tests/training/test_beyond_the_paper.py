@@ -55,6 +55,24 @@ def all_options(run: RunFactory, recipe: Recipe) -> Trainer:
     return trainer
 
 
+def test_few_splats_get_few_codes(run: RunFactory, recipe: Recipe) -> None:
+    """Oracle: K·D is at most so many values a splat, K at least 1, and what was asked for where that is less."""
+    for share in (0.02, 0.05):
+        _, module = run(recipe(codebook_init=CodebookInit(values_per_splat=share)).values())
+        splats, asked = len(module.splats), {"scales": 24, "quats": 24, "sh0": 16, "shN": 16}
+        for name, quantizer in module.quantizers.items():
+            most = max(1, int(share * splats / quantizer.codebook.shape[1]))
+            assert len(quantizer.codebook) == min(most, asked[name])
+            assert int(quantizer.codes.max()) < len(quantizer.codebook)
+        assert len(module.quantizers["shN"].codebook) < asked["shN"]
+
+
+@pytest.mark.parametrize("share", [0.0, -1.0, float("nan"), float("inf")])
+def test_an_impossible_number_of_values_is_refused(share: float) -> None:
+    with pytest.raises(ValueError, match="values_per_splat must be a finite number above 0"):
+        CodebookInit(values_per_splat=share)
+
+
 def test_the_order_of_callbacks_matters_only_where_it_is_said_to(
     all_options: Trainer, run: RunFactory, recipe: Recipe
 ) -> None:
@@ -255,7 +273,7 @@ def test_options_are_reached_from_the_command_line(capsys: pytest.CaptureFixture
     assert config["model"]["quantizer"]["init_args"]["start"] == "spread"
     assert found["canonical"] == {"mode": "sign", "floor": 0.3}
     assert found["contribution"] == {"share": 0.25, "at": 18_500}
-    assert found["codebook_init"] == {"weights": "contribution", "weighted": ["quats", "sh0"]}
+    assert found["codebook_init"] == {"weights": "contribution", "weighted": ["quats", "sh0"], "values_per_splat": None}
     assert found["codebook_replacement"]["jitter"] == 0.25
     assert found["codebook_replacement"]["end"] == 40_000
     assert (found["phases"]["quantize_end"], found["phases"]["reference_total"]) == (30_000, 32_000)
