@@ -48,9 +48,8 @@ class CodebookInit(LatchedCallback):
         weighted: The weighted attributes. Scales are left out: small splats contribute little, but a small splat with
             the code of larger ones is visible. Weighting all four, right after k-means with 4k codes on 187 k splats,
             changed test PSNR by -0.37 dB for scales, +0.07 for rotations, +0.04 for colours and +0.15 for SH.
-        values_per_splat: Largest number of values K·D of a codebook for each splat: where there are fewer splats, there
-            are fewer codes. A value takes 2 to 5 bits in the file, so 1024 codes of 45 values for 36 000 splats take as
-            much as they save. None keeps all codes.
+        values_per_splat: Largest K·D of a codebook for each splat; None has no limit. A value takes 4 to 5 bits in the
+            file, so 1024 codes of 45 values for 36 000 splats take as much as they save.
 
     Raises:
         ValueError: Unknown weights or an unknown attribute, or ``values_per_splat`` is not above 0.
@@ -119,7 +118,7 @@ class CodebookReplacement(LatchedCallback):
         jitter: None copies random active codes, as in the paper. A number in (0, 1] splits the codes that distort most:
             a row of the scene is drawn with probability proportional to its squared distance to its code, and the new
             code is put this share of the way from that code to the row.
-        reset_moments: Set Adam's moments of replaced codes to zero, instead of keeping those of the previous codes.
+        reset_moments: Zero Adam's moments of replaced codes, instead of keeping the old ones.
 
     Raises:
         ValueError: The iterations are not in ascending order, an interval is below 1, or the jitter is not in (0, 1].

@@ -44,14 +44,13 @@ class RateDistortion(LatchedCallback):
     The error is that of the pictures: a code's squared distance times what it does to the train views
     (:func:`nsvq_lightning.compression.sensitivity.sensitivity`). The bits are −log2 of how many splats have the code.
     So a splat that is hardly seen, or nearly round, takes a code that many others have, which costs few bits once the
-    file is entropy-coded; and training, which renders these codes, makes up for them. The rest of the phase is as
+    file is entropy-coded; and training, which renders these codes, makes up for it. The rest of the phase is as
     before, and the codes that splats have in the end are frozen.
 
     Only quantizers that can hold codes (:class:`nsvq_lightning.quantize.base.Holding`) take part.
 
     Args:
-        strength: Relative increase of the squared error, before training makes up for it, that is accepted for each
-            relative decrease of the file; 0 chooses no codes.
+        strength: Per cent of squared error worth one per cent of the file; 0 is off.
         attributes: Those whose codes are chosen so; the others have their nearest codes.
 
     Raises:
