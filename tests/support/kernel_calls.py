@@ -272,6 +272,14 @@ NUMBA: dict[str, list[Case]] = {
             lambda: {"rows": _normal(60, 5), "weight": np.ones(60), "count": 7}, columns=("rows",), types=("weight",)
         )
     ],
+    f"{_IO}.morton.morton_keys": [
+        Case(
+            lambda: {"cells": _codes(60).reshape(20, 3), "depths": np.full(20, 18)},
+            rows=("cells", "depths"),
+            numbers=("depths",),
+        )
+    ],
+    f"{_IO}.morton.unmorton": [Case(lambda: {"keys": _codes(20).astype(np.uint64)}, rows=("keys",))],
     f"{_IO}.morton.nearest_before": [Case(lambda: {"cells": _codes(60).reshape(20, 3)}, rows=("cells",))],
 }  # fmt: skip
 

@@ -30,8 +30,8 @@ size alone, and the opacities come after the positions, with near splats as neig
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,7 @@ from nsvq_lightning.io.nsvq.entropy import (
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
 from nsvq_lightning.io.nsvq.precision import MOST_OPACITY_LEVELS, Precision
 from nsvq_lightning.io.nsvq.rounding import Stored, doublings_of, logits_of_levels, position_grid, rounded
-from nsvq_lightning.io.nsvq.tasks import all_of
+from nsvq_lightning.io.nsvq.tasks import workers
 
 __all__ = ["decode_compact", "encode_compact"]
 
@@ -64,6 +64,26 @@ _STREAMS = {"grid": _POSITIONS, "cells": _POSITIONS, "codes": ("{}.codebook", "{
 _ENCODINGS = {"means.grid": "grid", "means": "keys", "means.far": "float32"}
 _BEFORE_POSITIONS = {"cells": ("opacities", "scales"), "grid": ("scales",)}
 """Attributes whose streams come before those of the positions, by the storage of these."""
+_LARGEST_FIRST = ("shN", "quats", "sh0")
+"""The other attributes, by the time they take: the longest task should not begin last."""
+_FAR_BYTES = 12
+"""Three float32."""
+
+
+class _Places(NamedTuple):
+    """Where the splats are, but for the far ones, in the order of the file.
+
+    Attributes:
+        grid: The grid of the positions.
+        doublings: Of its step, for an opaque splat of size 1.
+        keys: Morton keys, ascending.
+        depths: Bits per axis of each.
+    """
+
+    grid: Grid
+    doublings: float
+    keys: NDArray[np.uint64]
+    depths: NDArray[np.int64]
 
 
 def encode_compact(scene: CompressedScene, precision: Precision | None = None) -> tuple[Header, dict[str, bytes]]:
@@ -77,30 +97,26 @@ def encode_compact(scene: CompressedScene, precision: Precision | None = None) -
         ValueError: A value is not finite, or too large for its step.
     """
     precision = precision or Precision()
-    stored = rounded(scene, precision)
-    grid, doublings, depths = position_grid(scene.means, stored, precision)
-    cells, inside = grid.cells(scene.means)
-    keys = morton_keys(cells, depths)
-    near = np.flatnonzero(inside)
-    near, far = near[np.argsort(keys[near], kind="stable")], np.flatnonzero(~inside)
-    order = np.concatenate([near, far])
-    stored = {name: attribute.in_order(order) for name, attribute in stored.items()}
-
-    before, first = _before(len(order)), _BEFORE_POSITIONS["cells"]
-    streams = {
-        "means.grid": _GRID.pack(*grid.base, doublings),
-        "means": encode_keys(keys[near], 3 * depths[near]),
-        "means.far": scene.means[far].astype("<f4", copy=False).tobytes(),
-    }
-    others = _neighbours(keys[near], depths[near], len(order))
-    tasks: dict[str, Callable[[], bytes]] = {}
-    for name, attribute in stored.items():
-        if attribute.codebook is not None:
-            tasks[f"{name}.codebook"] = partial(encode_integers, attribute.codebook)
-        tasks[name] = partial(_encode_values, attribute, before if name in first else others)
-    streams |= all_of(tasks)
-    entries = {name: attribute.entry for name, attribute in stored.items()}
-    entries["means"] = AttributeEntry("means", 3, "cells", step=grid.step)
+    early = _BEFORE_POSITIONS["cells"]
+    with workers() as pool:
+        # Positions follow two attributes. They give the order of the splats, in which all others are written.
+        rounding = {name: pool.submit(rounded, scene, name, precision) for name in (*early, _LARGEST_FIRST[0])}
+        placing = pool.submit(_places, scene.means, {name: rounding[name].result() for name in early}, precision)
+        rounding |= {name: pool.submit(rounded, scene, name, precision) for name in _LARGEST_FIRST[1:]}
+        places, order = placing.result()
+        before, near = _before(len(order)), pool.submit(_neighbours, places, len(order))
+        tasks = {"means": pool.submit(encode_keys, places.keys, 3 * places.depths)}
+        for name in (*early, *_LARGEST_FIRST):
+            neighbours = before if name in early else near.result()
+            attribute = rounding[name].result()
+            tasks[name] = pool.submit(_encode_values, attribute, order, neighbours)
+            if attribute.codebook is not None:
+                tasks[f"{name}.codebook"] = pool.submit(encode_integers, attribute.codebook)
+    streams = {name: task.result() for name, task in tasks.items()}
+    streams["means.grid"] = _GRID.pack(*places.grid.base, places.doublings)
+    streams["means.far"] = scene.means[order[len(places.keys) :]].astype("<f4", copy=False).tobytes()
+    entries = {name: task.result().entry for name, task in rounding.items()}
+    entries["means"] = AttributeEntry("means", 3, "cells", step=places.grid.step)
     attributes = tuple(entries[name] for name in _order("cells"))
     header = Header(
         level="compact",
@@ -122,15 +138,22 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
         FormatError: The tables do not belong to this level, or a stream does not hold what they say.
     """
     entries = _checked_tables(header)
-    before, first = _before(header.splats), _BEFORE_POSITIONS[entries["means"].storage]
-    stored = all_of({name: partial(_decode, entries[name], streams, before) for name in first})
-    means, others = _decode_means(entries["means"].step, stored, streams)
-    rest = [name for name in entries if name != "means" and name not in first]
-    stored |= all_of({name: partial(_decode, entries[name], streams, others) for name in rest})
+    early = _BEFORE_POSITIONS[entries["means"].storage]
+    late = [name for name in (*_LARGEST_FIRST, "opacities") if name not in early]
+    with workers() as pool:
+        before = _before(header.splats)
+        values = {name: pool.submit(_decode_values, entries[name], streams, before) for name in early}
+        codebooks = {name: pool.submit(_decode_codebook, entries[name], streams) for name in (*early, *late)}
+        stored = {name: Stored(entries[name], values[name].result(), codebooks[name].result()) for name in early}
+        places = _decode_places(entries["means"].step, stored, streams)
+        near = _neighbours(places, header.splats)
+        values |= {name: pool.submit(_decode_values, entries[name], streams, near) for name in late}
+        means = pool.submit(_decode_means, places, streams["means.far"])
+        stored |= {name: Stored(entries[name], values[name].result(), codebooks[name].result()) for name in late}
     levels = stored.pop("opacities")
     coded = {name: attribute for name, attribute in stored.items() if attribute.codebook is not None}
     return CompressedScene(
-        means=means,
+        means=means.result(),
         opacities=logits_of_levels(levels.entry.codes)[levels.values],
         codes={name: coded[name].values for name in QUANTIZABLE if name in coded},
         codebooks={name: coded[name].floats() for name in QUANTIZABLE if name in coded},
@@ -145,54 +168,69 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
 # Streams
 
 
+def _places(
+    means: NDArray[np.float32], stored: Mapping[str, Stored], precision: Precision
+) -> tuple[_Places, NDArray[np.int64]]:
+    """Where splats are, and the order ``[N]`` of the file: along the Morton curve, the far ones at the end."""
+    grid, doublings, depths = position_grid(means, stored, precision)
+    cells, inside = grid.cells(means)
+    keys = morton_keys(cells, depths)
+    near = np.flatnonzero(inside)
+    near = near[np.argsort(keys[near], kind="stable")]
+    return _Places(grid, doublings, keys[near], depths[near]), np.concatenate([near, np.flatnonzero(~inside)])
+
+
 def _before(count: int) -> NDArray[np.int32]:
     """The two rows ``[N, 2]`` before each row, -1 where there is none."""
     rows = np.arange(count, dtype=np.int32)[:, None] - np.array([1, 2], np.int32)
     return np.maximum(rows, np.int32(-1))
 
 
-def _neighbours(keys: NDArray[np.uint64], depths: NDArray[np.int64], count: int) -> NDArray[np.int32]:
-    """Two near rows ``[N, 2]`` before each row; for the far splats, which follow the keys, the two rows before."""
-    half = (np.int64(1) << (AXIS_BITS - depths)) >> 1
+def _neighbours(places: _Places, count: int) -> NDArray[np.int32]:
+    """Two near rows ``[N, 2]`` before each row; for the far splats, which come last, the two rows before."""
+    half = (np.int64(1) << (AXIS_BITS - places.depths)) >> 1
     neighbours = _before(count)
-    neighbours[: len(keys)] = nearest_before(unmorton(keys) + half[:, None])
+    neighbours[: len(places.keys)] = nearest_before(unmorton(places.keys) + half[:, None])
     return neighbours
 
 
-def _encode_values(attribute: Stored, neighbours: NDArray[np.int32]) -> bytes:
-    entry = attribute.entry
+def _encode_values(attribute: Stored, order: NDArray[np.int64], neighbours: NDArray[np.int32]) -> bytes:
+    entry, values = attribute.entry, attribute.values[order]
     if entry.storage == "steps":
-        return encode_integers(attribute.values)
-    return encode_paths(leaf_paths(entry.codes)[attribute.values], entry.bits, neighbours)
+        return encode_integers(values)
+    return encode_paths(leaf_paths(entry.codes)[values], entry.bits, neighbours)
 
 
-def _decode(entry: AttributeEntry, streams: Mapping[str, memoryview], neighbours: NDArray[np.int32]) -> Stored:
+def _decode_values(
+    entry: AttributeEntry, streams: Mapping[str, memoryview], neighbours: NDArray[np.int32]
+) -> NDArray[np.int64]:
     if entry.storage == "steps":
-        return Stored(entry, decode_integers(streams[entry.name], len(neighbours), entry.dim))
-    paths = decode_paths(streams[entry.name], entry.bits, neighbours)
+        return decode_integers(streams[entry.name], len(neighbours), entry.dim)
     leaf_of = np.full(1 << entry.bits, -1)
     leaf_of[leaf_paths(entry.codes)] = np.arange(entry.codes)
-    values = leaf_of[paths]
+    values = leaf_of[decode_paths(streams[entry.name], entry.bits, neighbours)]
     if (values < 0).any():
         raise FormatError(f"damaged: a code of {entry.name} is not one of {entry.codes}")
-    codebook = None
-    if entry.storage == "codes":
-        codebook = decode_integers(streams[f"{entry.name}.codebook"], entry.codes, entry.dim)
-    return Stored(entry, values, codebook)
+    return values
 
 
-def _decode_means(
-    step: float, stored: Mapping[str, Stored], streams: Mapping[str, memoryview]
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Positions ``[N, 3]``, and two near rows ``[N, 2]`` for each."""
+def _decode_codebook(entry: AttributeEntry, streams: Mapping[str, memoryview]) -> NDArray[np.int64] | None:
+    if entry.storage != "codes":
+        return None
+    return decode_integers(streams[f"{entry.name}.codebook"], entry.codes, entry.dim)
+
+
+def _decode_places(step: float, stored: Mapping[str, Stored], streams: Mapping[str, memoryview]) -> _Places:
     *base, doublings = _GRID.unpack(streams["means.grid"])
-    grid = Grid(step, (base[0], base[1], base[2]))
-    far = np.frombuffer(streams["means.far"], "<f4").astype(np.float32).reshape(-1, 3)
-    count = len(stored["scales"].values)
-    depths = grid.depths(doublings_of(stored, doublings))[: count - len(far)]
-    keys = decode_keys(streams["means"], 3 * depths)
-    means = np.concatenate([grid.centers(unmorton(keys), depths), far])
-    return means, _neighbours(keys, depths, count)
+    grid, far = Grid(step, (base[0], base[1], base[2])), len(streams["means.far"]) // _FAR_BYTES
+    depths = grid.depths(doublings_of(stored, doublings))
+    depths = depths[: len(depths) - far]
+    return _Places(grid, doublings, decode_keys(streams["means"], 3 * depths), depths)
+
+
+def _decode_means(places: _Places, far: memoryview) -> NDArray[np.float32]:
+    near = places.grid.centers(unmorton(places.keys), places.depths)
+    return np.concatenate([near, np.frombuffer(far, "<f4").astype(np.float32).reshape(-1, 3)])
 
 
 def _order(storage: str) -> tuple[str, ...]:
@@ -225,7 +263,11 @@ def _checked_tables(header: Header) -> dict[str, AttributeEntry]:
             raise FormatError(f"damaged: impossible attribute {entry}")
     if [(stream.name, stream.encoding) for stream in header.streams] != _stream_names(header.attributes):
         raise FormatError("damaged: the stream table does not fit the attribute table")
-    if lengths["means.grid"] != _GRID.size or lengths["means.far"] % 12 or lengths["means.far"] // 12 > header.splats:
+    if (
+        lengths["means.grid"] != _GRID.size
+        or lengths["means.far"] % _FAR_BYTES
+        or lengths["means.far"] // _FAR_BYTES > header.splats
+    ):
         raise FormatError("damaged: the streams of the positions do not have their sizes")
     if header.splats > _MOST_A_BYTE * sum(lengths.values()):
         raise FormatError(f"damaged: {header.splats} splats in {sum(lengths.values())} bytes")

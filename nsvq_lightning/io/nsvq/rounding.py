@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,12 +18,13 @@ from nsvq_lightning.io.morton import Grid
 from nsvq_lightning.io.nsvq.codebook_order import sibling_distance, tree_order
 from nsvq_lightning.io.nsvq.header import AttributeEntry
 from nsvq_lightning.io.nsvq.precision import Precision
-from nsvq_lightning.io.nsvq.tasks import all_of
 from nsvq_lightning.io.opacity import opacity_of
 from nsvq_lightning.io.powers import coarsest_power, nearest_power
 
 __all__ = [
     "Stored",
+    "cell_centers",
+    "check_finite",
     "doublings_of",
     "logits_of_levels",
     "position_grid",
@@ -52,9 +52,11 @@ class Stored(NamedTuple):
     values: NDArray[np.int64]
     codebook: NDArray[np.int64] | None = None
 
-    def rows(self) -> NDArray[np.int64]:
-        """Integers ``[N, D]`` of the splats."""
-        return self.values if self.codebook is None else self.codebook[self.values]
+    def row_sums(self) -> NDArray[np.int64]:
+        """Sum ``[N]`` of each splat's integers."""
+        sums: NDArray[np.int64]
+        sums = self.values.sum(1) if self.codebook is None else self.codebook.sum(1)[self.values]
+        return sums
 
     def floats(self) -> NDArray[np.float32]:
         """The codebook ``[K, D]``, or the rows ``[N, D]`` where there is none."""
@@ -65,42 +67,46 @@ class Stored(NamedTuple):
         return self._replace(values=self.values[order])
 
 
-def rounded(scene: CompressedScene, precision: Precision) -> dict[str, Stored]:
-    """All attributes but the positions, as integers.
+def rounded(scene: CompressedScene, name: str, precision: Precision) -> Stored:
+    """An attribute, but not the positions, as integers.
 
     Raises:
         ValueError: A value is not finite, or too large for its step.
     """
-    _check_finite({"means": scene.means, "opacities": scene.opacities, **scene.raw})
-    dims = attribute_dims(scene.sh_degree)
-    stored = all_of({name: partial(_stored, scene, name, dim, precision) for name, dim in dims.items()})
-    stored["opacities"] = _levels(scene.opacities, precision.opacity_levels)
-    return stored
-
-
-def _check_finite(arrays: Mapping[str, NDArray[np.float32]]) -> None:
-    for name, array in arrays.items():
-        if not np.isfinite(array).all():
-            raise ValueError(
-                f"{name}: {int((~np.isfinite(array)).sum())} numbers are not finite; drop those splats, or use level "
-                "'paper', which stores float32 as it is"
-            )
-
-
-def _stored(scene: CompressedScene, name: str, dim: int, precision: Precision) -> Stored:
+    if name == "opacities":
+        check_finite(name, scene.opacities)
+        return _levels(scene.opacities, precision.opacity_levels)
+    dim = attribute_dims(scene.sh_degree)[name]
     if name in scene.raw:
+        check_finite(name, scene.raw[name])
         step = 2 * getattr(precision, name)
         return Stored(AttributeEntry(name, dim, "steps", step=step), _integers(name, scene.raw[name], step))
-    codes, codebook = scene.codes[name], scene.codebooks[name]
+    return _coded(name, scene.codes[name], scene.codebooks[name], precision.codebook)
+
+
+def check_finite(name: str, array: NDArray[np.float32]) -> None:
+    """Refuse NaN and infinity.
+
+    Raises:
+        ValueError: A value is not finite.
+    """
+    if not np.isfinite(array).all():
+        raise ValueError(
+            f"{name}: {int((~np.isfinite(array)).sum())} numbers are not finite; drop those splats, or use level "
+            "'paper', which stores float32 as it is"
+        )
+
+
+def _coded(name: str, codes: NDArray[np.integer], codebook: NDArray[np.float32], error: float) -> Stored:
     used = np.bincount(codes, minlength=len(codebook)) > 0
     rows = codebook[used] if len(codes) else np.zeros_like(codebook[:1])
-    _check_finite({f"codebook of {name}": rows})
-    step = _codebook_step(name, rows, precision.codebook)
+    check_finite(f"codebook of {name}", rows)
+    step = _codebook_step(name, rows, error)
     integers, merged = np.unique(_integers(name, rows, step), axis=0, return_inverse=True)
     order = tree_order((integers * step).astype(np.float32))
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
-    entry = AttributeEntry(name, dim, "codes", len(integers), step)
+    entry = AttributeEntry(name, rows.shape[1], "codes", len(integers), step)
     return Stored(entry, place[merged.reshape(-1)[np.cumsum(used)[codes] - 1]], integers[order])
 
 
@@ -159,11 +165,33 @@ def logits_of_levels(count: int) -> NDArray[np.float32]:
 def position_grid(
     means: NDArray[np.float32], stored: Mapping[str, Stored], precision: Precision
 ) -> tuple[Grid, float, NDArray[np.int64]]:
-    """The grid of the positions ``[N, 3]``, the doublings of its step for a splat of size 1, and the depths ``[N]``."""
+    """The grid of the positions ``[N, 3]``, the doublings of its step for a splat of size 1, and the depths ``[N]``.
+
+    Args:
+        means: The positions.
+        stored: The log-scales and the opacities of their splats.
+        precision: The largest errors.
+
+    Raises:
+        ValueError: A position is not finite.
+    """
+    check_finite("means", means)
     widest = np.minimum(doublings_of(stored, math.log2(2 * precision.position)), _MOST_DOUBLINGS)
     grid = Grid.around(means, np.exp2(widest))
     for_size_one = math.log2(2 * precision.position / grid.step)
     return grid, for_size_one, grid.depths(doublings_of(stored, for_size_one))
+
+
+def cell_centers(scene: CompressedScene, precision: Precision) -> NDArray[np.float32]:
+    """Positions ``[N, 3]`` of the splats, in their order, as a file of level ``compact`` holds them.
+
+    Raises:
+        ValueError: A value is not finite, or too large for its step.
+    """
+    stored = {name: rounded(scene, name, precision) for name in ("scales", "opacities")}
+    grid, _, depths = position_grid(scene.means, stored, precision)
+    cells, inside = grid.cells(scene.means)
+    return np.where(inside[:, None], grid.centers(cells, depths), scene.means)
 
 
 def doublings_of(stored: Mapping[str, Stored], for_size_one: float) -> NDArray[np.float64]:
@@ -177,12 +205,12 @@ def doublings_of(stored: Mapping[str, Stored], for_size_one: float) -> NDArray[n
         for_size_one: The result for an opaque splat of size 1.
     """
     scales, factor = stored["scales"], stored["scales"].entry.step / 3 / math.log(2.0)
-    doublings: NDArray[np.float64] = scales.rows().sum(1).astype(np.float64) * factor + for_size_one
+    doublings: NDArray[np.float64] = scales.row_sums().astype(np.float64) * factor + for_size_one
     if "opacities" not in stored:
         return doublings
     levels = stored["opacities"]
     # The logarithm, linear between powers of two.
     mantissas, exponents = np.frexp((np.arange(levels.entry.codes) + 0.5) / levels.entry.codes)
     logarithms = 2 * mantissas - 2 + exponents
-    doublings -= 0.5 * logarithms[levels.values]
+    doublings -= (0.5 * logarithms)[levels.values]
     return doublings
