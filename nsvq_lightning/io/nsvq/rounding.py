@@ -23,7 +23,6 @@ from nsvq_lightning.io.powers import coarsest_power, nearest_power
 
 __all__ = [
     "Stored",
-    "cell_centers",
     "check_finite",
     "doublings_of",
     "logits_of_levels",
@@ -180,18 +179,6 @@ def position_grid(
     grid = Grid.around(means, np.exp2(widest))
     for_size_one = math.log2(2 * precision.position / grid.step)
     return grid, for_size_one, grid.depths(doublings_of(stored, for_size_one))
-
-
-def cell_centers(scene: CompressedScene, precision: Precision) -> NDArray[np.float32]:
-    """Positions ``[N, 3]`` of the splats, in their order, as a file of level ``compact`` holds them.
-
-    Raises:
-        ValueError: A value is not finite, or too large for its step.
-    """
-    stored = {name: rounded(scene, name, precision) for name in ("scales", "opacities")}
-    grid, _, depths = position_grid(scene.means, stored, precision)
-    cells, inside = grid.cells(scene.means)
-    return np.where(inside[:, None], grid.centers(cells, depths), scene.means)
 
 
 def doublings_of(stored: Mapping[str, Stored], for_size_one: float) -> NDArray[np.float64]:
