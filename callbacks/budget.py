@@ -13,6 +13,7 @@ from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.train_views import needed_scene
 
 from .hosted import HostedCallback
+from .rate_distortion import RateDistortion
 
 __all__ = ["SplatBudget"]
 
@@ -65,7 +66,10 @@ class SplatBudget(HostedCallback):
         host.splat_budget, reason = self.splats, "as asked"
         if self.bytes is not None:
             codebooks = {name: tuple(quantizer.codebook.shape) for name, quantizer in host.quantizers.items()}
-            host.splat_budget = splats_for_bytes(self.bytes, codebooks, host.splats.sh_degree)
+            choices = [c.strength for c in trainer.callbacks if isinstance(c, RateDistortion)]  # type: ignore[attr-defined]
+            host.splat_budget = splats_for_bytes(
+                self.bytes, codebooks, host.splats.sh_degree, host.storage.precision, max(choices, default=0.0)
+            )
             reason = f"for a file of {self.bytes} bytes"
         elif self.quality is not None:
             scene = needed_scene(

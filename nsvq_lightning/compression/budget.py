@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.splats.sh_degree import sh_coefficients
 
 __all__ = ["splats_for_bytes", "splats_for_photos"]
@@ -15,12 +16,14 @@ SPLATS_PER_PIXEL = 0.165
 LEAST = 1000
 """A scene of fewer splats is no scene."""
 
-GEOMETRY_BITS = 25.5
-"""Bits of a splat's position and opacity at level ``compact``, between 23 and 28 on the measured scenes."""
+GEOMETRY_BITS = 23.5
+"""Bits of a splat's position and opacity at the precision of level ``compact``, 22 to 25 on the measured scenes."""
 ROW_BITS = {"scales": 0.0, "quats": 0.3, "sh0": -1.3, "shN": -1.4}
 """Bits of a code beyond log2 of the number of codes: colours of neighbours are alike."""
 CODE_BITS = {"scales": 6.0, "quats": 5.7, "sh0": 5.9, "shN": 5.5}
 """Bits of a number in a codebook at level ``compact``."""
+RATE_DISTORTION = 0.28
+"""Codes and codebooks take 1 / (1 + this · strength) of their bits where codes are chosen by rate and distortion."""
 HEADER = 2048
 """Bytes of the header."""
 FULL_BITS = 32
@@ -40,24 +43,35 @@ def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:
     return max(LEAST, round(quality * SPLATS_PER_PIXEL * math.cbrt(photos) * detail))
 
 
-def splats_for_bytes(size: int, codebooks: Mapping[str, Sequence[int]], sh_degree: int) -> int:
-    """Number of splats in a file of level ``compact``, within a tenth.
+def splats_for_bytes(
+    size: int,
+    codebooks: Mapping[str, Sequence[int]],
+    sh_degree: int,
+    precision: Precision | None = None,
+    strength: float = 0.0,
+) -> int:
+    """Number of splats in a file of level ``compact``, within a tenth; a fifth where codes are chosen by their rate.
 
     Args:
         size: Bytes of the file.
         codebooks: Codes and dimension of each codebook by attribute.
         sh_degree: Of the splats.
+        precision: Largest errors of the file.
+        strength: Of the choice of codes by rate and distortion.
 
     Raises:
         ValueError: There is no room for splats beside the codebooks.
     """
-    fixed, bits = 8.0 * HEADER, GEOMETRY_BITS
+    usual, precision = Precision(), precision or Precision()
+    position, opacity = precision.position / usual.position, precision.opacity / usual.opacity
+    fixed, bits = 8.0 * HEADER, GEOMETRY_BITS - 3 * math.log2(position) - math.log2(opacity)
     numbers = {"scales": 3, "quats": 4, "sh0": 3, "shN": 3 * sh_coefficients(sh_degree)}
+    coded = 1 / (1 + RATE_DISTORTION * strength)
     for name, count in numbers.items():
         if name in codebooks:
             codes, dim = codebooks[name]
-            fixed += codes * dim * CODE_BITS[name]
-            bits += math.log2(codes) + ROW_BITS[name]
+            fixed += coded * codes * dim * CODE_BITS[name]
+            bits += coded * (math.log2(codes) + ROW_BITS[name])
         else:
             bits += FULL_BITS * count
     splats = int((8 * size - fixed) / bits)
