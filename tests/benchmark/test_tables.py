@@ -82,9 +82,11 @@ def test_lines_of_a_table_are_equally_long() -> None:
 
 
 def test_json_has_the_samples_and_nothing_but_plain_values() -> None:
-    results = json.loads(json.dumps(as_json(MACHINE, Scope((1,), scene=Path("a/b.ply")), ROWS), allow_nan=False))
+    scope = Scope((1,), scene=Path("a/b.ply"), beside=(Path("a/b.spz"),))
+    results = json.loads(json.dumps(as_json(MACHINE, scope, ROWS), allow_nan=False))
     assert results["machine"] == MACHINE
     assert results["settings"]["scene"] == "a/b.ply"
+    assert results["settings"]["beside"] == ["a/b.spz"]
     assert results["settings"]["threads"] == [1]
     assert [row["samples_ms"] for row in results["rows"]][:2] == [[1, 2, 3], [300, 600, 900]]
     assert results["rows"][0]["median_ms"] == 2

@@ -28,7 +28,7 @@ def as_json(machine: Mapping[str, Any], scope: Scope, rows: Sequence[Measurement
 
 def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
-        return list(value)
+        return [_plain(entry) for entry in value]
     return str(value) if isinstance(value, Path) else value
 
 
