@@ -23,7 +23,7 @@ __all__ = ["main"]
 log = logging.getLogger("nsvq_lightning.compress")
 
 DEFAULT_CODEBOOKS = "16k"
-DEFAULT_TUNING = 200
+DEFAULT_TUNING = 400
 VIEWS = 96
 """Largest number of views in which a scene is tuned."""
 

@@ -49,7 +49,7 @@ def views_of(splats: SplatTensors, root: Path | None, most: int) -> list[Camera]
 
 
 def likely_cameras(
-    splats: SplatTensors, count: int, width: int = 800, height: int = 560, seed: int = 0
+    splats: SplatTensors, count: int, width: int = 560, height: int = 392, seed: int = 0
 ) -> list[Camera]:
     """Cameras from which a scene shows much detail, as it does where photos were taken, the best one first.
 

@@ -1,0 +1,34 @@
+"""Compressed scenes of random numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nsvq_lightning.io import CompressedScene
+from nsvq_lightning.io.compressed import attribute_dims
+
+SIZES = {"quats": 64, "scales": 100, "sh0": 33, "shN": 16}
+
+
+def scene(n: int, sizes: dict[str, int] = SIZES, degree: int = 3, **header: Any) -> CompressedScene:
+    """A scene whose attributes have realistic sizes."""
+    rng = np.random.default_rng([n, degree, *sizes.values()])
+    dims = attribute_dims(degree)
+    centre = {"quats": 0.0, "scales": -4.0, "sh0": 0.0, "shN": 0.0}
+    spread = {"quats": 1.0, "scales": 1.0, "sh0": 1.0, "shN": 0.1}
+
+    def rows(name: str, count: int) -> NDArray[np.float32]:
+        return (centre[name] + spread[name] * rng.standard_normal((count, dims[name]))).astype(np.float32)
+
+    return CompressedScene(
+        means=(3 * rng.standard_normal((n, 3))).astype(np.float32),
+        opacities=(2 + 2 * rng.standard_normal(n)).astype(np.float32),
+        codes={name: rng.integers(0, k, n) for name, k in sizes.items()},
+        codebooks={name: rows(name, k) for name, k in sizes.items()},
+        raw={name: rows(name, n) for name in dims if name not in sizes},
+        sh_degree=degree,
+        **header,
+    )

@@ -1,0 +1,337 @@
+"""An independent reader of ``.nsvq`` files: the Python of docs/nsvq_format.md, block by block, in plain NumPy.
+
+It shares no code with the package and is slow. Tests compare its numbers with those of the package, and its text with
+the page, so that another reader can be written from the page alone.
+"""
+
+import hashlib
+import json
+import math
+import struct
+
+import numpy as np
+
+
+def unframe(data):
+    assert data[:8] == b"\x89NSVQ\r\n\x1a"
+    assert len(data) >= 32
+    assert hashlib.blake2b(data[24:], digest_size=16).digest() == data[8:24]
+    version, length = struct.unpack_from("<II", data, 24)
+    assert version in (1, 2)
+    assert 32 + length <= len(data)
+    header = json.loads(data[32 : 32 + length].decode("utf-8"))
+    streams, at = {}, 32 + length
+    for row in header["streams"]:
+        name, size = (row["name"], row["length"]) if isinstance(row, dict) else row[:2]
+        streams[name] = data[at : at + size]
+        at += size
+    assert at == len(data)
+    assert len(streams) == len(header["streams"])
+    return header, streams
+
+
+def attribute_table(header):
+    keys = ("name", "dim", "storage", "codes", "step")
+    rows = header["attributes"]
+    rows = [row if isinstance(row, dict) else dict(zip(keys, row, strict=True)) for row in rows]
+    return {row["name"]: {**row, "step": float(row.get("step", 0.0))} for row in rows}
+
+
+DIMS = {"means": 3, "opacities": 1, "quats": 4, "scales": 3, "sh0": 3}
+
+
+def float_rows(data, dim):
+    return np.frombuffer(data, "<f4").reshape(-1, dim) if dim else None
+
+
+def decode_paper(header, streams):
+    table, count = attribute_table(header), header["splats"]
+    rows = {}
+    coded = [entry for entry in table.values() if entry["storage"] == "codes"]
+    record = sum((entry["codes"] - 1).bit_length() for entry in coded)
+    stream, at = int.from_bytes(streams["codes"] if coded else b"", "little"), 0
+    for name, entry in table.items():
+        if entry["storage"] == "raw":
+            rows[name] = float_rows(streams[name], entry["dim"])
+            continue
+        bits = (entry["codes"] - 1).bit_length()
+        codes = [(stream >> (i * record + at)) & ((1 << bits) - 1) for i in range(count)]
+        at += bits
+        assert all(code < entry["codes"] for code in codes)
+        rows[name] = float_rows(streams[f"{name}.codebook"], entry["dim"])[np.array(codes, int)]
+    return rows
+
+
+RATES = [(1310720 + 10 * n + 16) // (20 * n + 32) for n in range(127)]
+
+
+class RangeDecoder:
+    def __init__(self, data):
+        assert len(data) % 4 == 0
+        self.words = [int(word) for word in np.frombuffer(data, "<u4")]
+        self.used = 0
+        self.code = self.word() << 32
+        self.code |= self.word()
+        self.width = 2**64 - 1
+        self.states = {}
+
+    def word(self):
+        self.used += 1
+        return self.words[self.used - 1] if self.used <= len(self.words) else 0
+
+    def refill(self):
+        if self.width < 2**32:
+            self.width <<= 32
+            self.code = ((self.code << 32) | self.word()) & (2**64 - 1)
+
+    def bit(self, context):
+        p, n = self.states.get(context, (32768, 0))
+        part = (self.width >> 16) * p
+        if self.code < part:
+            bit, self.width = 1, part
+        else:
+            bit, self.code, self.width = 0, self.code - part, self.width - part
+        target = 65488 if bit else 48
+        self.states[context] = p + (((target - p) * RATES[n]) >> 16), min(n + 1, 126)
+        self.refill()
+        return bit
+
+    def plain(self, bits):
+        """A number of this many bits, without a model; 0 for bits <= 0."""
+        value = 0
+        while bits > 0:
+            now = min(bits, 16)
+            bits -= now
+            self.width >>= now
+            digit = min(self.code // self.width, (1 << now) - 1)
+            self.code -= digit * self.width
+            value = (value << now) | digit
+            self.refill()
+        return value
+
+    def end(self):
+        assert self.used == len(self.words) + 1
+
+
+def leaf_paths(count):
+    """Path of each leaf."""
+    bits, paths = (count - 1).bit_length(), []
+    for leaf in range(count):
+        low, high, path = 0, count, 0
+        for _ in range(bits):
+            cut = low + (high - low + 1) // 2
+            right = high - low > 1 and leaf >= cut
+            path = 2 * path + right
+            if high - low > 1:
+                low, high = (cut, high) if right else (low, cut)
+        paths.append(path)
+    return paths
+
+
+def decode_paths(data, count, neighbours):
+    """Leaf of each row; count is K, and neighbours [N] holds pairs of rows, -1 for none."""
+    decoder, bits = RangeDecoder(data), (count - 1).bit_length()
+    plain, paths = max(0, bits - 16), []
+    for first, second in neighbours:
+        others = [paths[row] if row >= 0 else -1 for row in (first, second)]
+        path = 0
+        for left in range(bits - 1, plain - 1, -1):  # how many decisions come after this one
+            said = [1 + ((other >> left) & 1) if other >> (left + 1) == path else 0 for other in others]
+            node = (1 << (bits - 1 - left)) + path
+            path = 2 * path + decoder.bit(9 * node + 3 * said[0] + said[1])
+        paths.append((path << plain) + decoder.plain(plain))
+    decoder.end()
+    leaf_of = {path: leaf for leaf, path in enumerate(leaf_paths(count))}
+    return np.array([leaf_of[path] for path in paths], np.int64)
+
+
+def read_length(decoder, context):
+    """A number below 64; the context of a decision is how the decisions before it went."""
+    node = 1
+    for _ in range(6):
+        node = 2 * node + decoder.bit((context, node))
+    return node - 64
+
+
+def decode_integers(data, rows, columns):
+    assert len(data) >= columns
+    decoder = RangeDecoder(data[columns:])
+    values = np.zeros((rows, columns), np.int64)
+    for i in range(rows):
+        for j in range(columns):
+            length = read_length(decoder, ("length", j))
+            negative = decoder.plain(1) if length > 0 else 0
+            size = min(length, 1)
+            if length > 1:
+                size = 2 + decoder.bit(("second", j, length))
+                size = (size << (length - 2)) + decoder.plain(length - 2)
+            values[i, j] = -size if negative else size
+    decoder.end()
+    for j in range(columns):
+        if data[j]:
+            values[:, j] = np.cumsum(values[:, j])
+    return values
+
+
+def rows_before(count):
+    return [(i - 1, max(i - 2, -1)) for i in range(count)]
+
+
+def near_rows(points, count):
+    """points: of the splats inside the grid, as tuples of integers; count: N."""
+    neighbours = rows_before(count)
+    for i, point in enumerate(points):
+        window = range(max(0, i - 16), i)
+        ranked = sorted((sum((a - b) ** 2 for a, b in zip(point, points[j], strict=True)), j) for j in window)
+        first, second = [j for _, j in ranked[:2]] + [-1] * (2 - len(ranked[:2]))
+        neighbours[i] = first, second
+    return neighbours
+
+
+LN2 = float.fromhex("0x1.62e42fefa39efp-1")
+
+
+def depths_of(scales, scale_step, doublings, levels=None, level_count=0):
+    """scales: int64 [N, 3]; levels: int64 [N], None with storage "grid"."""
+    factor = (scale_step / 3.0) / LN2
+    x = scales.sum(axis=1).astype(np.float64) * factor + doublings
+    if levels is not None:
+        mantissas, exponents = np.frexp((np.arange(level_count) + 0.5) / level_count)
+        x = x - 0.5 * ((2.0 * mantissas - 2.0) + exponents)[levels]
+    return [21 - min(max(math.floor(value), 0), 21) for value in x.tolist()]
+
+
+def decode_keys(data, depths):
+    """Keys of the splats inside the grid, of which depths has one entry each."""
+    decoder, keys, last, before = RangeDecoder(data), [], 0, 0
+    for depth in depths:
+        shift = 63 - 3 * depth
+        length = read_length(decoder, (depth, before // 6))
+        assert length <= 3 * depth
+        step = (1 << (length - 1)) + decoder.plain(length - 1) if length else 0
+        last = ((last >> shift) + step) << shift
+        assert last < 1 << 63
+        before = length + shift if length else 0
+        keys.append(last)
+    decoder.end()
+    return keys
+
+
+def decode_positions(keys, depths, base, step):
+    """Positions [N - F, 3], and the points for near rows."""
+    means, points = [], []
+    for key, depth in zip(keys, depths, strict=True):
+        width = 1 << (21 - depth)
+        corner = [sum(((key >> (3 * bit + 2 - axis)) & 1) << bit for bit in range(21)) for axis in range(3)]
+        means.append([((float(corner[a]) + 0.5 * width) + float(base[a])) * step for a in range(3)])
+        points.append(tuple(c + (width >> 1) for c in corner))
+    with np.errstate(over="ignore"):
+        return np.array(means, np.float64).reshape(-1, 3).astype(np.float32), points
+
+
+def opacity_table(count):
+    shares = (np.arange(count) + 0.5) / count
+    return (np.log(shares) - np.log1p(-shares)).astype(np.float32)
+
+
+def values_of(integers, step):
+    with np.errstate(over="ignore"):
+        return (integers.astype(np.float64) * step).astype(np.float32)
+
+
+def decode_compact(header, streams):
+    table, count = attribute_table(header), header["splats"]
+    cells = table["means"]["storage"] == "cells"
+    leaves, integers, rows = {}, {}, {}
+
+    def decode(name, neighbours):
+        entry = table[name]
+        if entry["storage"] == "steps":
+            integers[name] = decode_integers(streams[name], count, entry["dim"])
+            return
+        leaves[name] = decode_paths(streams[name], entry["codes"], neighbours)
+        if entry["storage"] == "codes":
+            codebook = decode_integers(streams[f"{name}.codebook"], entry["codes"], entry["dim"])
+            integers[name] = codebook[leaves[name]]
+
+    first = ("opacities", "scales") if cells else ("scales",)
+    for name in first:
+        decode(name, rows_before(count))
+    *base, doublings = struct.unpack("<qqqd", streams["means.grid"])
+    far = float_rows(streams["means.far"], 3)
+    levels = (leaves["opacities"], table["opacities"]["codes"]) if cells else ()
+    depths = depths_of(integers["scales"], table["scales"]["step"], doublings, *levels)[: count - len(far)]
+    keys = decode_keys(streams["means"], depths)
+    means, points = decode_positions(keys, depths, base, table["means"]["step"])
+    rows["means"] = np.concatenate([means, far])
+    near = near_rows(points, count)
+    for name in table:
+        if name != "means" and name not in first:
+            decode(name, near)
+    rows["opacities"] = opacity_table(table["opacities"]["codes"])[leaves["opacities"]]
+    for name, values in integers.items():
+        rows[name] = values_of(values, table[name]["step"])
+    return rows
+
+
+def read_nsvq(path):
+    with open(path, "rb") as file:
+        header, streams = unframe(file.read())
+    assert header["level"] in ("compact", "paper")
+    rows = (decode_compact if header["level"] == "compact" else decode_paper)(header, streams)
+    count, higher = header["splats"], (header["sh_degree"] + 1) ** 2 - 1
+    if higher == 0:
+        rows["shN"] = np.zeros((count, 0), np.float32)
+    return {
+        "means": rows["means"],
+        "quats": rows["quats"],
+        "scales": rows["scales"],
+        "opacities": rows["opacities"].reshape(count),
+        "sh0": rows["sh0"].reshape(count, 1, 3),
+        "shN": rows["shN"].reshape(count, higher, 3),
+    }
+
+
+class RangeEncoder:
+    def __init__(self):
+        self.words, self.low, self.width, self.states = [], 0, 2**64 - 1, {}
+
+    def carry(self):
+        if self.low >= 2**64:
+            self.low -= 2**64
+            at = len(self.words) - 1
+            while self.words[at] == 2**32 - 1:
+                self.words[at] = 0
+                at -= 1
+            self.words[at] += 1
+
+    def flush(self):
+        self.carry()
+        if self.width < 2**32:
+            self.words.append(self.low >> 32)
+            self.low = (self.low << 32) & (2**64 - 1)
+            self.width <<= 32
+
+    def bit(self, context, bit):
+        p, n = self.states.get(context, (32768, 0))
+        part = (self.width >> 16) * p
+        if bit:
+            self.width = part
+        else:
+            self.low, self.width = self.low + part, self.width - part
+        target = 65488 if bit else 48
+        self.states[context] = p + (((target - p) * RATES[n]) >> 16), min(n + 1, 126)
+        self.flush()
+
+    def plain(self, value, bits):
+        while bits > 0:
+            now = min(bits, 16)
+            bits -= now
+            self.width >>= now
+            self.low += self.width * ((value >> bits) & ((1 << now) - 1))
+            self.flush()
+
+    def end(self):
+        self.low += 2**32 - 1
+        self.carry()
+        return np.array([*self.words, self.low >> 32], "<u4").tobytes()
