@@ -18,6 +18,7 @@ from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.suite_list import Unavailable
 from nsvq_lightning.commands.benchmark.timing import Case, milliseconds, sgemm, use_threads
 from nsvq_lightning.commands.benchmark.workloads import workloads
+from nsvq_lightning.commands.compress import DEFAULT_TUNING, VIEWS
 from nsvq_lightning.compression.ladder import LADDER, PLAIN, Compressor, Rung
 from nsvq_lightning.compression.pictures import decibels, pictures
 from nsvq_lightning.compression.viewpoints import views_of
@@ -33,8 +34,7 @@ from nsvq_lightning.splats.splats import SplatTensors
 __all__ = ["run"]
 
 RUNGS = ("64k", "32k", "16k", "8k", "4k", "2k", "1k")
-TUNING, VIEWS = 200, 96
-"""Steps of tuning and views to tune in, as ``nsvq compress`` has them."""
+"""Settings with codebooks that are measured."""
 PALETTES = (65536, 16384, 4096)
 """Rows of the palette of our ``.sog``."""
 
@@ -119,7 +119,7 @@ def _ours(truth: Truth, scope: Scope) -> Iterator[Made]:
     """Our files, from the most exact to the smallest in each curve."""
     plain = truth.splats.to_splats()
     rungs = [PLAIN, *(rung for rung in LADDER if rung.name in (RUNGS[-1:] if scope.quick else RUNGS))]
-    count, steps = (2, 2) if scope.quick else (VIEWS, TUNING)
+    count, steps = (2, 2) if scope.quick else (VIEWS, DEFAULT_TUNING)
     for curve, tuning in (("nsvq compress", steps), ("nsvq compress --tune 0", 0)):
         yield from (Made(curve, rung.name, ".nsvq", partial(_compress, truth, rung, count, tuning)) for rung in rungs)
     for rows in PALETTES[-1:] if scope.quick else PALETTES:
