@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.rendering.reference import rotation_matrices
+from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.splats import RawSplats
 
 __all__ = [
@@ -200,7 +200,7 @@ def split(parents: RawSplats, rules: DensityRules, generator: torch.Generator) -
     count = parents.means.shape[0] * rules.children
     repeated = RawSplats(*(t.repeat(rules.children, *([1] * (t.dim() - 1))) for t in parents))
     draws = torch.randn(count, 3, generator=generator).to(parents.means)
-    offsets = torch.einsum("nij,nj->ni", rotation_matrices(repeated.quats), repeated.scales.exp() * draws)
+    offsets = times_vectors(rotation_matrices(repeated.quats), repeated.scales.exp() * draws)
     return repeated._replace(means=repeated.means + offsets, scales=repeated.scales - math.log(rules.shrink))
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.rendering.reference import rotation_matrices
+from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.splats import RawSplats
 
 __all__ = ["GrowthRules", "add_observed", "budget_at", "draw_rows", "lowest_share", "split_longest"]
@@ -157,7 +157,7 @@ def split_longest(parents: RawSplats) -> RawSplats:
     scales = parents.scales.exp()
     longest, axis = scales.max(1, keepdim=True)
     along = torch.zeros_like(scales).scatter(1, axis, CHILD_OFFSET * longest)
-    offsets = torch.einsum("nij,nj->ni", rotation_matrices(parents.quats), along)
+    offsets = times_vectors(rotation_matrices(parents.quats), along)
     shrink = torch.full_like(scales, math.log(CHILD_WIDTH)).scatter(1, axis, math.log(CHILD_LENGTH))
     opacities = torch.logit(CHILD_OPACITY * parents.opacities.sigmoid())
     child = parents._replace(scales=parents.scales + shrink, opacities=opacities)

@@ -11,7 +11,7 @@ from torch import Tensor
 from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.random import generator
-from nsvq_lightning.rendering.reference import rotation_matrices
+from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.forms import FORMS, Form, canonical
 
 __all__ = ["covariance_error", "covariances", "form_errors"]
@@ -23,7 +23,9 @@ SAMPLE = 1 << 15
 def covariances(scales: Tensor, quats: Tensor) -> Tensor:
     """World covariances ``[N, 3, 3]`` of log-scales ``[N, 3]`` and quaternions ``[N, 4]``, wxyz, any length."""
     rotations = rotation_matrices(quats)
-    return (rotations * (2 * scales).exp()[:, None, :]) @ rotations.mT
+    squares = (2 * scales).exp()
+    columns = [times_vectors(rotations, squares * rotations[:, row]) for row in range(3)]
+    return torch.stack(columns, 2)
 
 
 def covariance_error(found: Tensor, exact: Tensor) -> float:

@@ -49,9 +49,11 @@ def least_contributing(contribution: Tensor, share: float) -> Tensor:
         contribution: Contribution ``[N]``, not negative.
         share: Share of the sum, in [0, 1); splats that contribute nothing are always in the mask.
     """
-    ascending, order = contribution.double().sort(stable=True)
+    ascending, order = contribution.sort(stable=True)
+    # One after the other, on the CPU: a GPU may add in any order, and replicas would then drop different splats.
+    sums = ascending.cpu().double().cumsum(0)
     mask = torch.empty_like(order, dtype=torch.bool)
-    mask[order] = ascending.cumsum(0) <= share * ascending.sum()
+    mask[order] = (sums <= share * sums[-1:]).to(mask.device)
     return mask
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
+from nsvq_lightning.rendering.reference import times_vectors
 
 __all__ = ["INVISIBLE", "pixel_sizes", "scale_floor"]
 
@@ -32,7 +33,7 @@ def pixel_sizes(means: Tensor, cameras: Iterable[Camera]) -> Tensor:
     smallest = torch.full_like(means[:, 0], math.inf)
     for camera in cameras:
         fx, fy, cx, cy = camera.intrinsics
-        x, y, depth = (means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).unbind(1)
+        x, y, depth = (times_vectors(camera.viewmat[:3, :3], means) + camera.viewmat[:3, 3]).unbind(1)
         u, v = fx * x / depth + cx, fy * y / depth + cy
         seen = (depth > NEAR) & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
         smallest = torch.where(seen, smallest.minimum(depth / max(fx, fy)), smallest)

@@ -27,7 +27,7 @@ from nsvq_lightning.rendering.sh import sh_colors
 from nsvq_lightning.splats.rotations import MIN_SQUARED_NORM
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors
 
-__all__ = ["Projection", "project", "render_reference", "rotation_matrices", "visible_rows"]
+__all__ = ["Projection", "project", "render_reference", "rotation_matrices", "times_vectors", "visible_rows"]
 
 TILE = 32
 """Side in pixels of the squares that are blended at a time."""
@@ -62,6 +62,14 @@ def rotation_matrices(quats: Tensor) -> Tensor:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def times_vectors(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """Products ``[N, I]`` of ``matrices [N, I, J]`` or one ``[I, J]`` and ``vectors [N, J]``.
+
+    Elementwise, in float32 wherever the inputs are: a GPU may round ``matmul`` and ``einsum`` to fewer digits (TF32).
+    """
+    return (matrices * vectors[:, None]).sum(2)
 
 
 def project(splats: SplatTensors, camera: Camera) -> Projection:

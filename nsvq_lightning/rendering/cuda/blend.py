@@ -82,7 +82,8 @@ def alpha_at(record, left, top, x, y):
     """α of a splat before the cap, 0 below 1/255, and the two factors of its exponent, at pixels of a tile."""
     a, b, c = tl.load(record + A), tl.load(record + B), tl.load(record + C)
     px, py = tl.load(record + X) - left, tl.load(record + Y) - top
-    u = tl.fma(a, x, tl.fma(b, y, -(a * px + b * py)))
+    # Explicit, so that both passes round alike: the compiler may contract sums of products, or not.
+    u = tl.fma(a, x, tl.fma(b, y, -tl.fma(a, px, b * py)))
     v = tl.fma(c, y, -(c * py))
     power = tl.fma(-u, u, tl.fma(-v, v, tl.load(record + LOG2_OPACITY)))
     return tl.where(power >= LOG2_ALPHA_MIN, tl.exp2(power), 0.0), u, v

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from compressed_scenes import SIZES, scene
 from numpy.typing import NDArray
 
 from nsvq_lightning.io import CompressedScene, FormatError, read_header, read_nsvq, write_nsvq
@@ -17,7 +18,6 @@ from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.file import encode
 from nsvq_lightning.io.nsvq.precision import OPACITY_ERRORS, Precision
 from nsvq_lightning.splats.arrays import SplatArrays
-from tests.support.compressed_scenes import SIZES, scene
 
 
 def matched(original: SplatArrays, back: SplatArrays) -> NDArray[np.intp]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import nsvq_reader
 import numpy as np
 import pytest
+from compressed_scenes import SIZES, scene
 
 from nsvq_lightning.io import CompressedScene, read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.precision import LEVELS, Precision
-from tests.support import nsvq_reader
-from tests.support.compressed_scenes import SIZES, scene
 
 ROOT = Path(__file__).resolve().parents[3]
 
