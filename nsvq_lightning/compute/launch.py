@@ -1,4 +1,8 @@
-"""Compile options that all Triton kernels share; Triton itself is not imported."""
+"""Compile options that all Triton kernels share; Triton itself is not imported.
+
+Triton compiles a kernel anew for integers that are 1 or multiples of 16. Numbers that change from step to step, such as
+that of the splats in view, are named in ``do_not_specialize``, or kernels would compile in the middle of a run.
+"""
 
 from __future__ import annotations
 

@@ -67,7 +67,9 @@ def test_what_is_not_a_number_is_never_nearest() -> None:
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
-@pytest.mark.parametrize(("n", "k", "dim"), [(100, 9, 3), (40, 5, 45), (30, 2, 70), (0, 4, 3), (50, 1, 1)])
+@pytest.mark.parametrize(
+    ("n", "k", "dim"), [(100, 9, 3), (40, 5, 45), (30, 2, 70), (0, 4, 3), (50, 1, 1), (3000, 3, 4)]
+)
 def test_sums_by_code(n: int, k: int, dim: int, dtype: torch.dtype, tolerance: float) -> None:
     draw = torch.Generator().manual_seed(n)
     values, codes = torch.randn(n, dim, generator=draw), torch.randint(0, k, (n,), generator=draw)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
@@ -41,7 +42,11 @@ NEAREST, NOISE, SUMS, SUBSTITUTION = (f"quantize.cuda.{name}" for name in ("near
         pytest.param([f"{PROJECTION}:project_backward_kernel"], marks=pytest.mark.slow),
         # Some with an argument that is 1, of which Triton makes a constant.
         [f"{LOSS}:similarity_kernel:height=1", f"{LOSS}:loss_kernel:programs=1"],
-        [f"{SUBSTITUTION}:substitute_kernel", f"{SUMS}:sum_kernel:sums=*fp64"],
+        [
+            f"{SUBSTITUTION}:substitute_kernel",
+            f"{SUMS}:part_kernel:partial=*fp64",
+            f"{SUMS}:sum_kernel:partial=*fp64:sums=*fp64",
+        ],
         pytest.param([f"{NEAREST}:nearest_kernel:num_codes=1"], marks=pytest.mark.slow),
         pytest.param([f"{LOSS}:moments_kernel:height=1", f"{LOSS}:spread_kernel:height=1"], marks=pytest.mark.slow),
         pytest.param([f"{LOSS}:gradient_kernel:height=1"], marks=pytest.mark.slow),
@@ -54,6 +59,24 @@ def test_kernels_compile_for_a_gpu(kernels: list[str]) -> None:
     command = [sys.executable, str(HERE / "triton_compile.py"), *kernels]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("kernel", "changing"),
+    [
+        (f"{PROJECTION}:project_kernel", {"n"}),
+        (f"{PROJECTION}:project_backward_kernel", {"count"}),
+        (f"{NEAREST}:nearest_kernel", {"count", "x_stride"}),
+        (f"{SUBSTITUTION}:substitute_kernel", {"seed", "count", "height"}),
+        (f"{SUBSTITUTION}:radial_kernel", {"count", "height"}),
+        (f"{NOISE}:normal_kernel", {"seed", "count"}),
+    ],
+)
+def test_numbers_that_change_from_step_to_step_compile_once(kernel: str, changing: set[str]) -> None:
+    pytest.importorskip("triton", reason="the CUDA back-end needs Triton")
+    module, _, name = kernel.partition(":")
+    function = getattr(importlib.import_module(f"nsvq_lightning.{module}"), name)
+    assert {parameter.name for parameter in function.params if parameter.do_not_specialize} == changing
 
 
 def test_error_without_gpu_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from triton.compiler import ASTSource
 
 CONSTANTS = {"DEGREE": 3, "BLOCK": 128, "BATCH": 32, "SLOTS": 8, "LANES": 16}
 CONSTANTS |= {"WITH_ALPHA": True, "WITH_DEPTH": True, "WITH_MAP": True, "BYTES": True, "DERIVED": True}
-CONSTANTS |= {"ROWS": 8, "COLUMNS": 128, "CODES": 128, "DIM": 45, "WIDTH": 64}
+CONSTANTS |= {"ROWS": 8, "COLUMNS": 128, "CODES": 128, "DIM": 45, "WIDTH": 64, "PARTS": 8, "PART": 256}
 TYPES = dict.fromkeys(("fx", "fy", "cx", "cy", "aim", "spread", "dssim_weight", "l1_step", "ssim_step"), "fp32")
 TYPES |= dict.fromkeys(("width", "height", "columns", "n", "count", "stride", "length", "programs"), "i32")
 TYPES |= dict.fromkeys(("dim", "num_codes", "x_stride", "code_stride"), "i32")

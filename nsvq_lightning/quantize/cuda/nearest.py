@@ -27,7 +27,7 @@ CODES = 128
 """Codes that a program compares its rows with at a time."""
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "x_stride"])
 def nearest_kernel(
     x, codebook, result, count, num_codes, x_stride, code_stride, DIM: tl.constexpr, ROWS: tl.constexpr,
     CODES: tl.constexpr,

@@ -70,7 +70,7 @@ def normal(seed, vector, lane):
     return length * tl.where(even, value, turn * value)
 
 
-@triton.jit(do_not_specialize=["seed"])
+@triton.jit(do_not_specialize=["seed", "count"])
 def normal_kernel(seed, out, count, BLOCK: tl.constexpr):
     """The first ``count`` values of a seed."""
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)

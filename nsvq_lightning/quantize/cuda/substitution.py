@@ -48,7 +48,7 @@ def inverses(squared):
     return tl.where(squared > TINY, 1 / tl.where(squared > TINY, squared, 1.0), 0.0)
 
 
-@triton.jit(do_not_specialize=["seed"])
+@triton.jit(do_not_specialize=["seed", "count", "height"])
 def substitute_kernel(
     seed, aim, spread, x, rows, codebook, codes, out, count, height, num_codes, DIM: tl.constexpr, ROWS: tl.constexpr,
     WIDTH: tl.constexpr,
@@ -69,7 +69,7 @@ def substitute_kernel(
     tl.store(out + i * DIM + column, value + direction * length, mask=inside)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "height"])
 def radial_kernel(
     grad, x, rows, codebook, codes, out, grad_x, radials, count, height, num_codes, DIM: tl.constexpr,
     ROWS: tl.constexpr, WIDTH: tl.constexpr,

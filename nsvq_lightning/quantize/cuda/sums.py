@@ -1,4 +1,4 @@
-"""Sums of rows by code on a GPU, in one fixed order: rows are sorted by code, and one program adds up one code's."""
+"""Sums of rows by code on a GPU, in one fixed order: rows are sorted by code, and some programs add up one code's."""
 
 from __future__ import annotations
 
@@ -18,20 +18,54 @@ WIDTH = 64
 """Largest number of columns per program."""
 
 
+PARTS = 8
+"""Most programs that share the rows of one code, so that a code of very many is no long tail; a power of two."""
+PART = 256
+"""Fewest rows of a part, but for the last one."""
+
+
 @triton.jit
-def sum_kernel(values, order, offsets, sums, dim, ROWS: tl.constexpr, WIDTH: tl.constexpr):
-    """Sum a code's rows ``order[offsets[code]:offsets[code + 1]]`` in the dtype of ``sums``."""
-    code = tl.program_id(0).to(tl.int64)
+def part_size(begin, end, PARTS: tl.constexpr, PART: tl.constexpr):
+    """Rows in a part of a code's rows ``begin`` to ``end``."""
+    return tl.maximum(tl.cdiv(end - begin, PARTS), PART)
+
+
+@triton.jit
+def part_kernel(
+    values, order, offsets, partial, dim, PARTS: tl.constexpr, PART: tl.constexpr, ROWS: tl.constexpr,
+    WIDTH: tl.constexpr,
+):  # fmt: skip
+    """Sum a part of a code's rows ``order[offsets[code]:offsets[code + 1]]`` in the dtype of ``partial``."""
+    program = tl.program_id(0).to(tl.int64)
+    code, part = program // PARTS, (program % PARTS).to(tl.int32)
     column = tl.program_id(1) * WIDTH + tl.arange(0, WIDTH)[None, :]
     begin, end = tl.load(offsets + code), tl.load(offsets + code + 1)
-    total = tl.zeros([ROWS, WIDTH], sums.dtype.element_ty)
-    for start in range(begin, end, ROWS):
-        place = start + tl.arange(0, ROWS)[:, None]
-        row = tl.load(order + place, mask=place < end, other=0)
-        value = tl.load(values + row * dim + column, mask=(place < end) & (column < dim), other=0.0)
-        total += value.to(sums.dtype.element_ty)
-    lane = tl.program_id(1) * WIDTH + tl.arange(0, WIDTH)
-    tl.store(sums + code * dim + lane, tl.sum(total, 0), mask=lane < dim)
+    size = part_size(begin, end, PARTS, PART)
+    first = begin + part * size
+    last = tl.minimum(first + size, end)
+    if first < last:
+        total = tl.zeros([ROWS, WIDTH], partial.dtype.element_ty)
+        for start in range(first, last, ROWS):
+            place = start + tl.arange(0, ROWS)[:, None]
+            row = tl.load(order + place, mask=place < last, other=0)
+            value = tl.load(values + row * dim + column, mask=(place < last) & (column < dim), other=0.0)
+            total += value.to(partial.dtype.element_ty)
+        lane = tl.program_id(1) * WIDTH + tl.arange(0, WIDTH)
+        tl.store(partial + program * dim + lane, tl.sum(total, 0), mask=lane < dim)
+
+
+@triton.jit
+def sum_kernel(
+    partial, offsets, sums, dim, PARTS: tl.constexpr, PART: tl.constexpr, WIDTH: tl.constexpr
+):  # fmt: skip
+    """Sum the parts of a code; 0 for a code without rows."""
+    code = tl.program_id(0).to(tl.int64)
+    column = tl.program_id(1) * WIDTH + tl.arange(0, WIDTH)
+    begin, end = tl.load(offsets + code), tl.load(offsets + code + 1)
+    part = tl.arange(0, PARTS)[:, None]
+    there = (part * part_size(begin, end, PARTS, PART) < end - begin) & (column < dim)[None, :]
+    total = tl.load(partial + (code * PARTS + part) * dim + column[None, :], mask=there, other=0.0)
+    tl.store(sums + code * dim + column, tl.sum(total, 0), mask=column < dim)
 
 
 def sorted_by_code(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:
@@ -61,9 +95,14 @@ def sum_rows(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype) 
     order, offsets = sorted_by_code(codes, num_codes)
     dim = values.shape[1]
     width = min(WIDTH, triton.next_power_of_2(dim))
+    columns = triton.cdiv(dim, width)
+    partial = torch.empty(num_codes * PARTS, dim, dtype=dtype, device=values.device)
     sums = torch.empty(num_codes, dim, dtype=dtype, device=values.device)
     with torch.cuda.device_of(values):
-        sum_kernel[(num_codes, triton.cdiv(dim, width))](
-            values, order, offsets, sums, dim, ROWS=ROWS, WIDTH=width, num_warps=1, **COMPILE
+        part_kernel[(num_codes * PARTS, columns)](
+            values, order, offsets, partial, dim, PARTS=PARTS, PART=PART, ROWS=ROWS, WIDTH=width, num_warps=1, **COMPILE
+        )
+        sum_kernel[(num_codes, columns)](
+            partial, offsets, sums, dim, PARTS=PARTS, PART=PART, WIDTH=width, num_warps=1, **COMPILE
         )
     return sums

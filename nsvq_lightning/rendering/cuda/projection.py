@@ -168,7 +168,7 @@ def load_geometry(means, quats, scales, row, mask):
     return load3(means + 3 * row, mask), (w, x, y, z), load3(scales + 3 * row, mask)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["n"])
 def project_kernel(
     means, quats, scales, logits, sh0, shN, view, fx, fy, cx, cy, width, height, n, stride,
     records, boxes, means2d, radii, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
@@ -257,7 +257,7 @@ def scaled_row(t0, t1, gu, gv):
     return t0 * gu[0] + t1 * gv[0], t0 * gu[1] + t1 * gv[1], t0 * gu[2] + t1 * gv[2]
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def project_backward_kernel(
     means, quats, scales, logits, shN, view, fx, fy, cx, cy, width, height, count, stride, ids, records, totals,
     g_means2d, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
