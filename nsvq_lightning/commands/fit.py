@@ -154,6 +154,16 @@ class SplatCLI(LightningCLI):
             parser.set_defaults({"return_predictions": False})
         return parser
 
+    def _set_seed(self) -> None:
+        """Hand ``--seed_everything`` on to the seeds that make a run: every draw has a generator of its own."""
+        super()._set_seed()
+        seed = self._get(self.config, "seed_everything")
+        if seed is False:
+            return
+        for part in (self._get(self.config, "model"), self._get(self.config, "data").get("init_args", {})):
+            if part.get("seed") == 0:  # the default: a seed that was asked for stays
+                part["seed"] = seed
+
     def before_instantiate_classes(self) -> None:
         """Set the switches."""
         switch(**self._get(self.config, "skips").as_dict())

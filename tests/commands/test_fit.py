@@ -15,6 +15,7 @@ import yaml
 
 from nsvq_lightning.commands import main as cli
 from nsvq_lightning.commands.configs import _without_folder, check_config, find_config, resolve_configs
+from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.nsvq.file import read_nsvq
@@ -72,6 +73,28 @@ def test_switches_are_options_that_hold_for_one_command(
     assert main(fit(demo_scene, tmp_path, "--model.codebooks=null", "--skips.blocks=false", steps=2)) == 0
     assert seen == [(False, True)]
     assert is_on("blocks")
+
+
+@pytest.mark.parametrize(
+    ("options", "seeds"),
+    [
+        ([], (0, 0)),
+        (["--seed_everything=3"], (3, 3)),
+        (["--seed_everything=3", "--model.seed=4"], (4, 3)),
+        (["--model.seed=4", "--data.seed=5"], (4, 5)),
+    ],
+)
+def test_the_seed_of_everything_is_that_of_every_draw(
+    options: list[str], seeds: tuple[int, int], demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[int, int]] = []
+
+    def look(command: SplatCLI, subcommand: str) -> None:
+        seen.append((command.model.seed, command.datamodule.seed))
+
+    monkeypatch.setattr(SplatCLI, "_run_subcommand", look)
+    assert main(fit(demo_scene, tmp_path, *options)) == 0
+    assert seen == [seeds]
 
 
 def test_a_second_run_gets_its_own_folder_and_prints_its_summary(
