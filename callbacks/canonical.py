@@ -124,7 +124,7 @@ class CanonicalCovariance(LatchedCallback):
         return form
 
     def _raise(self, trainer: Trainer, host: SplatHost) -> None:
-        self._log_floor = scale_floor(host.splats.means.detach(), train_cameras(trainer, host), self.floor)
+        self._log_floor = scale_floor(host.splats.means.detach(), train_cameras(trainer), self.floor)
         if self._log_floor is None:
             log.warning("iteration %d: no train view sees a splat; no scale is raised", trainer.global_step)
             return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
@@ -175,8 +176,10 @@ class Densification(LatchedCallback, ABC):
         reset_moments(optimizer, "opacities")
 
     def _view(self, trainer: Trainer, host: SplatHost, outputs: Mapping[str, Any]) -> Render | None:
-        """The step's rendering; None if there is none, or if the splats have changed since."""
-        splats, render = host.splats, outputs.get("render")
+        """The step's rendering; None if there is none, its loss is not finite, or the splats have changed since."""
+        splats, render, loss = host.splats, outputs.get("render"), outputs.get("late_loss")
+        if loss is not None and not math.isfinite(loss.read()):
+            return None
         if render is None or (len(render.radii) == len(splats) and outputs.get("edits", splats.edits) == splats.edits):
             return render
         if not self._warned:

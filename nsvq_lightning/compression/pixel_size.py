@@ -28,12 +28,13 @@ def pixel_sizes(means: Tensor, cameras: Iterable[Camera]) -> Tensor:
 
     Args:
         means: Centres ``[N, 3]``, world coordinates.
-        cameras: The views, on the device of ``means``.
+        cameras: The views.
     """
     smallest = torch.full_like(means[:, 0], math.inf)
     for camera in cameras:
         fx, fy, cx, cy = camera.intrinsics
-        x, y, depth = (times_vectors(camera.viewmat[:3, :3], means) + camera.viewmat[:3, 3]).unbind(1)
+        viewmat = camera.viewmat.to(means)
+        x, y, depth = (times_vectors(viewmat[:3, :3], means) + viewmat[:3, 3]).unbind(1)
         u, v = fx * x / depth + cx, fy * y / depth + cy
         seen = (depth > NEAR) & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
         smallest = torch.where(seen, smallest.minimum(depth / max(fx, fy)), smallest)
@@ -49,7 +50,7 @@ def scale_floor(means: Tensor, cameras: Iterable[Camera], pixels: float = INVISI
 
     Args:
         means: Centres ``[N, 3]``, world coordinates.
-        cameras: The views, on the device of ``means``.
+        cameras: The views.
         pixels: Size in pixels, above 0.
 
     Returns:

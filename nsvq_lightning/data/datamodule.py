@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import torch
 from lightning.pytorch import LightningDataModule
 from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
 from lightning.pytorch.utilities import rank_zero_info
 from torch.utils.data import DataLoader, Dataset, IterableDataset
 
+from nsvq_lightning.data.device_photos import DevicePhotos
 from nsvq_lightning.data.sampler import ViewSampler
 from nsvq_lightning.data.scene import Factor, Scene, SceneError, View, load_scene
 from nsvq_lightning.data.synthetic import write_synthetic_scene
@@ -57,6 +59,7 @@ class ColmapDataModule(LightningDataModule):
         self.root = Path(root)
         self.factor, self.max_width, self.test_every, self.seed = factor, max_width, test_every, seed
         self.cache_bytes, self.images_folder = cache_bytes, images_folder
+        self._photos = DevicePhotos(cache_bytes)
 
     @cached_property
     def scene(self) -> Scene:
@@ -105,6 +108,12 @@ class ColmapDataModule(LightningDataModule):
     def predict_dataloader(self) -> DataLoader[View]:
         """This process's share of all views, in the order of their names."""
         return self._ordered(range(len(self.scene)))
+
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        """Move a view to the device of the splats; on a GPU its photo stays there while the memory for photos lasts."""
+        if isinstance(batch, View):
+            return self._photos.move(batch, device)
+        return super().transfer_batch_to_device(batch, device, dataloader_idx)
 
     @property
     def process(self) -> tuple[int, int]:

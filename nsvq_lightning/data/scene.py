@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from nsvq_lightning.compute.transfer import upload
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, read_model
 from nsvq_lightning.data.images import ImageSource, ImageStore, image_size
 from nsvq_lightning.data.model_files import SceneError, larger_models
@@ -60,11 +61,12 @@ class View:
     image: Tensor
 
     def to(self, device: torch.device | str, **kwargs: object) -> View:
-        """The view on another device, or itself if it is there already; Lightning calls this to move a batch."""
-        camera, image = self.camera.to(device), self.image.to(device)
-        if camera is self.camera and image is self.image:
-            return self
-        return replace(self, camera=camera, image=image)
+        """The view with its image on another device, or itself if that is there already; Lightning moves batches by it.
+
+        The camera stays: kernels take its numbers from the host.
+        """
+        image = upload(self.image, device)
+        return self if image is self.image else replace(self, image=image)
 
 
 @dataclass(frozen=True, eq=False)

@@ -55,6 +55,14 @@ class Camera:
         return self._intrinsics
 
     @property
+    def packed_view(self) -> list[float]:
+        """Rotation row by row, translation and camera position: 15 numbers in float64, the same on every machine."""
+        *rows, _ = self.viewmat.detach().to("cpu", torch.float64).tolist()
+        rotation, translation = [row[:3] for row in rows], [row[3] for row in rows]
+        position = [-sum(row[k] * t for row, t in zip(rotation, translation, strict=True)) for k in range(3)]
+        return [*(x for row in rotation for x in row), *translation, *position]
+
+    @property
     def position(self) -> Tensor:
         """Camera centre ``[3]`` in world coordinates."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]

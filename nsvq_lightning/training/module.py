@@ -16,6 +16,7 @@ from torchmetrics import Metric
 
 from nsvq_lightning.compression.stored import compress
 from nsvq_lightning.compute.environment import threads_spin
+from nsvq_lightning.compute.transfer import LateNumber, upload
 from nsvq_lightning.data.scene import ONE_PLACE, View
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import load
@@ -140,6 +141,7 @@ class SplatModule(LightningModule):
         self._step_rates = self.rates
         self._rate_factors: dict[str, float] = {}
         self._updates = True
+        self._late_loss: tuple[str, LateNumber] | None = None
         self._micro_batch = 0
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -262,7 +264,7 @@ class SplatModule(LightningModule):
         return torch.ones(3, device=self.device) if self.background == "white" else None
 
     def _random_background(self) -> Tensor:
-        return torch.rand(3, generator=self._generator("background")).to(self.device)
+        return upload(torch.rand(3, generator=self._generator("background")), self.device)
 
     def _generator(self, *salts: str) -> torch.Generator:
         """Generator of one view of this step; quantizers draw a seed from it, so it lives on the CPU.
@@ -395,9 +397,10 @@ class SplatModule(LightningModule):
         """Loss of one view: (1 - w)·L1 + w·(1 - SSIM) + λ·Σ opacity (paper, section 3.3).
 
         Returns:
-            ``loss``, the attached ``render`` and the ``edits`` count of its splats. If the loss is not finite, the step
-            will update nothing: then None or, with several processes, which run the backward pass together, only the
-            loss.
+            ``loss``, the attached ``render``, the ``edits`` count of its splats, and ``late_loss``, the loss as a
+            number that can be read without waiting for the backward pass. If the loss is not finite, the step will
+            update nothing. A CPU knows at once: then None or, with several processes, which run the backward pass
+            together, only the loss. A GPU is asked after the backward pass has been launched, so that it never waits.
         """
         edits = self.splats.edits
         rendered = self(batch.camera, self.pixel_map)
@@ -408,11 +411,26 @@ class SplatModule(LightningModule):
             loss = loss + self.opacity_weight * self.splats.opacities.sigmoid().sum()
         if (self.global_step + 1) % log_interval(self.trainer) == 0 or not is_on("metrics"):
             self._log_step(loss, rendered.image, batch.image)
-        if not math.isfinite(loss.item()):
-            log.warning("step %d: the loss of %s is %s, no update", self.global_step + 1, batch.name, loss.item())
-            self._updates = False
+        late_loss = LateNumber(loss)
+        if not late_loss.is_here:
+            self._late_loss = batch.name, late_loss
+        elif not self._has_finite_loss(batch.name, late_loss):
             return {"loss": loss} if self.trainer.world_size > 1 else None
-        return {"loss": loss, "render": rendered, "edits": edits}
+        return {"loss": loss, "render": rendered, "edits": edits, "late_loss": late_loss}
+
+    def _has_finite_loss(self, view: str, loss: LateNumber) -> bool:
+        """Whether the loss of a view is finite; otherwise say so, and let the step update nothing."""
+        if math.isfinite(loss.read()):
+            return True
+        log.warning("step %d: the loss of %s is %s, no update", self.global_step + 1, view, loss.read())
+        self._updates = False
+        return False
+
+    def on_after_backward(self) -> None:
+        """Look at a loss whose number was still on its way when the backward pass was launched."""
+        if self._late_loss is not None:
+            self._has_finite_loss(*self._late_loss)
+            self._late_loss = None
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Drop the gradients of a step that must not update; with several processes the strategy has done so."""

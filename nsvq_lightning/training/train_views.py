@@ -39,8 +39,8 @@ def needed_scene(trainer: Trainer, need: str, otherwise: str) -> Scene:
     return scene
 
 
-def train_cameras(trainer: Trainer, host: SplatHost, *, share: bool = False) -> Iterator[Camera]:
-    """Cameras of the train views, on the device of the splats; with ``share`` only this process's part of them.
+def train_cameras(trainer: Trainer, *, share: bool = False) -> Iterator[Camera]:
+    """Cameras of the train views; with ``share`` only this process's part of them.
 
     Raises:
         ValueError: The trainer has no data module with a scene.
@@ -51,7 +51,7 @@ def train_cameras(trainer: Trainer, host: SplatHost, *, share: bool = False) -> 
         "leave contribution pruning, weights by contribution and the floor off",
     )
     indices = scene.train[trainer.global_rank :: trainer.world_size] if share else scene.train
-    return (scene.cameras[index].to(host.device) for index in indices)
+    return (scene.cameras[index] for index in indices)
 
 
 def train_contributions(trainer: Trainer, host: SplatHost) -> Tensor:
@@ -60,5 +60,5 @@ def train_contributions(trainer: Trainer, host: SplatHost) -> Tensor:
     Raises:
         ValueError: The trainer has no data module with a scene.
     """
-    cameras = train_cameras(trainer, host, share=True)
+    cameras = train_cameras(trainer, share=True)
     return sum_over_processes(trainer, contributions(host.splats, cameras, host.render_splats))

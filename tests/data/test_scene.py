@@ -78,8 +78,8 @@ def test_a_view_that_is_where_it_should_be_is_not_rebuilt(make_scene: SceneFacto
     view = load_scene(make_scene()).view(0)
     assert view.to("cpu") is view
     moved = view.to("meta")
-    assert moved.image.device.type == moved.camera.K.device.type == moved.camera.viewmat.device.type == "meta"
-    assert moved.camera.intrinsics == view.camera.intrinsics
+    assert moved.image.device.type == "meta"
+    assert moved.camera is view.camera  # kernels take its numbers from the host
     assert view.camera.to(dtype=torch.float64).K.dtype == torch.float64
 
 

@@ -29,6 +29,7 @@ from nsvq_lightning.callbacks import (
     PhaseSchedule,
     RunCheckpoint,
 )
+from nsvq_lightning.compute.transfer import LateNumber
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.nsvq.file import read_header, read_nsvq, write_nsvq
@@ -332,6 +333,23 @@ def test_splats_that_turn_non_finite_in_fine_tuning_are_dropped(
     assert sum("no update" in message for message in caplog.messages) == 1
     assert module.quantizers["scales"].codes.shape == (len(module.splats),)
     assert 10 < module.history[-1]["psnr"] < 100
+
+
+def test_a_loss_that_is_known_only_after_the_backward_pass_changes_no_bit(
+    run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def outcome() -> tuple[SplatModule, list[str]]:
+        caplog.clear()
+        _, module = run([*recipe().values(), PlantSplats("sh0", 5), PlantSplats("sh0", 25)], max_steps=30)
+        return module, [message for message in caplog.messages if "no update" in message]
+
+    at_once, said_at_once = outcome()
+    monkeypatch.setattr(LateNumber, "is_here", property(lambda _: False))  # as on a GPU
+    late, said_late = outcome()
+    assert len(said_late) == 2
+    assert said_late == said_at_once
+    for name, tensor in at_once.state_dict().items():
+        assert name == "state._train_seconds" or torch.equal(late.state_dict()[name], tensor), name
 
 
 @pytest.mark.parametrize("with_density", [True, False])

@@ -56,13 +56,10 @@ def _packed_now(camera: Camera) -> Array:
             f"an image may have {MAX_SIDE} pixels along a side, got {camera.width}x{camera.height}; render it in parts"
         )
     fx, fy, cx, cy = camera.intrinsics
-    view = camera.viewmat.detach().cpu().double().numpy()
-    rotation, translation = view[:3, :3], view[:3, 3]
     margin_x, margin_y = (FRUSTUM_MARGIN * 0.5 * side / f for side, f in ((camera.width, fx), (camera.height, fy)))
     limits = [-cx / fx - margin_x, (camera.width - cx) / fx + margin_x]
     limits += [-cy / fy - margin_y, (camera.height - cy) / fy + margin_y]
-    position = -rotation.T @ translation
-    packed = [*rotation.ravel(), *translation, *position, fx, fy, cx, cy, *limits, camera.width, camera.height]
+    packed = [*camera.packed_view, fx, fy, cx, cy, *limits, camera.width, camera.height]
     return np.array(packed, np.float32).reshape(CAMERA)
 
 

@@ -6,6 +6,7 @@ Equations: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting 
 from __future__ import annotations
 
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import torch
 import triton
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from nsvq_lightning.compute.launch import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
+from nsvq_lightning.compute.transfer import upload
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda.harmonics import color, color_backward
@@ -376,11 +378,17 @@ class Lens(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera, device: torch.device) -> Lens:
-        """Pack a camera; nothing is read back from its device."""
-        view = camera.viewmat.detach().to(torch.float64)
-        rotation, translation = view[:3, :3], view[:3, 3]
-        packed = torch.cat([rotation.flatten(), translation, -rotation.T @ translation])
-        return cls(packed.to(device, torch.float32), *camera.intrinsics, camera.width, camera.height)
+        """Pack a camera; for one that has been packed for the device before, nothing is copied."""
+        version, lens = _lenses.get(camera, {}).get(device, (-1, None))
+        if lens is None or version != camera.viewmat._version:
+            view = upload(torch.tensor(camera.packed_view, dtype=torch.float32), device)
+            lens = cls(view, *camera.intrinsics, camera.width, camera.height)
+            _lenses.setdefault(camera, {})[device] = camera.viewmat._version, lens
+        return lens
+
+
+_lenses: WeakKeyDictionary[Camera, dict[torch.device, tuple[int, Lens]]] = WeakKeyDictionary()
+"""Packed cameras by device, with the version of the matrix that each was made from."""
 
 
 class Projected(NamedTuple):
