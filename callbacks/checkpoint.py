@@ -121,7 +121,7 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
         if trainer.global_step > 0:
             self._save(trainer, pl_module)
         self._training = False
-        self._signals.deliver(self._signals.received(trainer))
+        self._signals.deliver(self._signals.received(trainer, now=True))
         self._signals.release()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:

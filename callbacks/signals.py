@@ -18,6 +18,8 @@ __all__ = ["HeldSignals"]
 log = logging.getLogger(__name__)
 
 HELD = (signal.SIGINT, signal.SIGTERM)
+APART = 16
+"""Steps between two exchanges of signals among several GPUs."""
 
 
 class HeldSignals:
@@ -46,10 +48,19 @@ class HeldSignals:
                 self._handlers[number] = handler
                 signal.signal(number, self._receive)
 
-    def received(self, trainer: Trainer) -> list[int]:
-        """Signals received by any process in the meantime: a collective, which every process must call."""
+    def received(self, trainer: Trainer, *, now: bool = False) -> list[int]:
+        """Signals received by any process in the meantime: a collective, which every process must call.
+
+        Several GPUs ask each other only in one step of 16, because the answer is waited for.
+
+        Args:
+            trainer: The trainer.
+            now: Ask in any case; what one process says, all must say.
+        """
         if trainer.world_size == 1:
             return list(self._pending)
+        if trainer.strategy.root_device.type != "cpu" and trainer.global_step % APART and not now:
+            return []
         own = torch.tensor([number in self._pending for number in HELD], dtype=torch.float32)
         counts = sum_over_processes(trainer, own.to(trainer.strategy.root_device)).tolist()
         return [number for number, count in zip(HELD, counts, strict=True) if count]

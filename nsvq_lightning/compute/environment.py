@@ -14,6 +14,12 @@ DEFAULTS = {
     # Allocate large tensors in huge pages: a step of 100k splats takes 3 % less time, one of 500k splats 4 %.
     "THP_MEM_ALLOC_ENABLE": "1",
 }
+if sys.platform == "linux":
+    # Splats grow, and with them every tensor: blocks of the old size would lie idle in a GPU's memory.
+    DEFAULTS["PYTORCH_ALLOC_CONF"] = "expandable_segments:True"
+
+_OTHER_ALLOC_CONF = {"PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_HIP_ALLOC_CONF"}
+"""Names under which a user may have set the same."""
 
 _came_late = False
 
@@ -23,7 +29,8 @@ def set_defaults() -> None:
     global _came_late
     _came_late = "torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ
     for name, value in DEFAULTS.items():
-        os.environ.setdefault(name, value)
+        if name != "PYTORCH_ALLOC_CONF" or not _OTHER_ALLOC_CONF & os.environ.keys():
+            os.environ.setdefault(name, value)
 
 
 def threads_spin() -> bool:

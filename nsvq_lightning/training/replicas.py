@@ -16,8 +16,7 @@ __all__ = ["check_replicas", "checksum", "follow_first", "from_first_process", "
 
 def follow_first(strategy: Strategy, module: nn.Module) -> None:
     """Copy the first process's parameters and buffers to the module on every process; row counts may differ before."""
-    state = {name: tensor.cpu() for name, tensor in module.state_dict().items()}
-    module.load_state_dict(strategy.broadcast(state))
+    module.load_state_dict(strategy.broadcast(module.state_dict()))
 
 
 @torch.no_grad()
@@ -60,8 +59,7 @@ def check_replicas(trainer: Trainer, event: str) -> None:
 
 def from_first_process(trainer: Trainer, tensor: Tensor) -> Tensor:
     """The first process's value of a tensor, on every process; its shape may differ before."""
-    # It is sent pickled, so move it to the CPU; otherwise every process would load it onto the first one's device.
-    return tensor if trainer.world_size == 1 else trainer.strategy.broadcast(tensor.cpu()).to(tensor.device)
+    return tensor if trainer.world_size == 1 else trainer.strategy.broadcast(tensor).to(tensor.device)
 
 
 def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:

@@ -5,16 +5,20 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any, TypeVar, cast
 
 import torch
 import torch.distributed
 from lightning.pytorch.strategies import DDPStrategy, StrategyRegistry
 from torch import Tensor
-from torch.distributed import all_reduce
+from torch.distributed import all_reduce, broadcast
 
+from nsvq_lightning.compute.transfer import upload
 from nsvq_lightning.training.replicas import follow_first
 
 __all__ = ["ViewParallelStrategy"]
+
+T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +42,8 @@ class ViewParallelStrategy(DDPStrategy):
     """What :class:`~nsvq_lightning.callbacks.DensityControl` requires of a strategy for several processes."""
 
     _accumulates = False
-    _finite = True
+    _failed: Tensor | None = None
+    """How many of this process's views of the step have a loss that is not finite, on its device."""
 
     def configure_ddp(self) -> None:
         """Copy the first process's parameters and buffers."""
@@ -56,16 +61,19 @@ class ViewParallelStrategy(DDPStrategy):
 
     def post_backward(self, closure_loss: Tensor) -> None:
         """Average the gradients over all processes."""
-        self._finite = self._finite and bool(torch.isfinite(closure_loss))
-        if self._accumulates or self.world_size == 1:
+        if self.world_size == 1:
+            return
+        failed = (~torch.isfinite(closure_loss.detach())).float()
+        self._failed = failed if self._failed is None else self._failed + failed
+        if self._accumulates:
             return
         assert self.lightning_module is not None
         parameters = [parameter for parameter in self.lightning_module.parameters() if parameter.requires_grad]
-        votes = [float(not self._finite), *(float(parameter.grad is not None) for parameter in parameters)]
-        tally = torch.tensor(votes, device=self.root_device)
-        self._finite = True
+        votes = torch.tensor([float(parameter.grad is not None) for parameter in parameters])
+        tally = torch.cat([self._failed.clamp(max=1).view(1), upload(votes, self.root_device)])
+        self._failed = None
         all_reduce(tally)
-        failed, *wanted = tally.tolist()
+        failed, *wanted = tally.tolist()  # waits for the backward pass: what is reduced next depends on it
         if failed and self.is_global_zero:
             log.warning("the loss of %d of %d processes is not finite, no update", int(failed), self.world_size)
         for parameter, count in zip(parameters, wanted, strict=True):
@@ -74,11 +82,43 @@ class ViewParallelStrategy(DDPStrategy):
             else:
                 gradient = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
                 parameter.grad = gradient.contiguous()
-        gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
-        for work in [all_reduce(gradient, async_op=True) for gradient in gradients]:
+        parts = [self._trained_part(parameter) for parameter in parameters if parameter.grad is not None]
+        sums = [part.contiguous() for part in parts]
+        for work in [all_reduce(total, async_op=True) for total in sums]:
             work.wait()
-        for gradient in gradients:
-            gradient.div_(self.world_size)  # not every backend has an average
+        for part, total in zip(parts, sums, strict=True):
+            torch.div(total, self.world_size, out=part)  # not every backend has an average
+
+    def _trained_part(self, parameter: Tensor) -> Tensor:
+        """Its gradient without the SH coefficients above the active degree, which is 0 on every process."""
+        assert parameter.grad is not None
+        splats = getattr(self.lightning_module, "splats", None)
+        if splats is None or parameter is not getattr(splats, "shN", None):
+            return parameter.grad
+        degree = getattr(self.lightning_module, "active_sh_degree", 3)
+        return parameter.grad[:, : (degree + 1) ** 2 - 1]
+
+    def reduce(self, tensor: Any, group: Any | None = None, reduce_op: Any = "mean") -> Any:
+        """Reduce a tensor; a sum without the barrier that Lightning puts before each reduction."""
+        if isinstance(tensor, Tensor) and reduce_op == "sum" and group is None and self.world_size > 1:
+            all_reduce(tensor)
+            return tensor
+        return super().reduce(tensor, group, reduce_op)
+
+    def broadcast(self, obj: T, src: int = 0) -> T:
+        """Send an object of one process to all; tensors and dictionaries of them directly, all else pickled."""
+        if isinstance(obj, Tensor):
+            return cast(T, self.broadcast({"": obj}, src)[""])
+        if not isinstance(obj, dict) or not obj or not all(isinstance(value, Tensor) for value in obj.values()):
+            return super().broadcast(obj, src)
+        own = cast("dict[str, Tensor]", obj)
+        kinds = super().broadcast({name: (list(value.shape), value.dtype) for name, value in own.items()}, src)
+        received = {}
+        for name, (shape, dtype) in kinds.items():
+            sent = own[name].detach() if self.global_rank == src else torch.empty(shape, dtype=dtype)
+            received[name] = sent.to(self.root_device).contiguous().clone()
+            broadcast(received[name], src)
+        return cast(T, received)
 
 
 StrategyRegistry.register(

@@ -14,15 +14,15 @@ from torch import Tensor
 from nsvq_lightning.callbacks.signals import HeldSignals
 
 
-def trainer(world_size: int, other: tuple[float, float] = (0.0, 0.0)) -> Any:
+def trainer(world_size: int, other: tuple[float, float] = (0.0, 0.0), device: str = "cpu", step: int = 1) -> Any:
     """One of ``world_size`` processes; another has received so many SIGINT and SIGTERM."""
 
     def reduce(tensor: Tensor, reduce_op: str) -> Tensor:
         assert reduce_op == "sum"
         return tensor.add_(torch.tensor(other))
 
-    strategy = SimpleNamespace(reduce=reduce, root_device=torch.device("cpu"))
-    return SimpleNamespace(world_size=world_size, strategy=strategy)
+    strategy = SimpleNamespace(reduce=reduce, root_device=torch.device(device))
+    return SimpleNamespace(world_size=world_size, strategy=strategy, global_step=step)
 
 
 @pytest.fixture
@@ -57,3 +57,10 @@ def test_a_signal_of_another_process_is_taken_for_ones_own(acted: list[int]) -> 
     held.deliver([signal.SIGTERM])
     assert acted == [signal.SIGTERM]
     held.release()
+
+
+def test_several_gpus_ask_each_other_now_and_then() -> None:
+    held, other = HeldSignals(), (0.0, 1.0)
+    answers = [held.received(trainer(1, device="meta", step=step)) for step in (1, 16)]
+    assert answers == [[], []]  # alone, nobody is asked
+    assert held.received(trainer(2, other, device="meta", step=15)) == []

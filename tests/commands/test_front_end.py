@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import os
 import re
 import subprocess
@@ -130,12 +131,25 @@ def test_several_devices_are_view_parallel_unless_told_otherwise(tmp_path: Path)
     assert type(SplatTrainer(devices=1, **settings).strategy).__name__ == "SingleDeviceStrategy"
 
 
-def test_the_environment_is_set_by_the_import_unless_the_user_has() -> None:
-    code = "import os, nsvq_lightning; print(os.environ['OMP_WAIT_POLICY'], os.environ['THP_MEM_ALLOC_ENABLE'])"
-    for given, expected in (({}, "passive 1\n"), ({"OMP_WAIT_POLICY": "active"}, "active 1\n")):
-        environment = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"} | given
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
-        assert done.stdout == expected
+@pytest.mark.parametrize(
+    ("given", "waiting", "blocks"),
+    [
+        ({}, "passive", "expandable_segments:True"),
+        ({"OMP_WAIT_POLICY": "active"}, "active", "expandable_segments:True"),
+        ({"PYTORCH_ALLOC_CONF": "backend:native"}, "passive", "backend:native"),
+        ({"PYTORCH_CUDA_ALLOC_CONF": "backend:native"}, "passive", None),  # the name of old, which would be overruled
+    ],
+)
+def test_the_environment_is_set_by_the_import_unless_the_user_has(
+    given: dict[str, str], waiting: str, blocks: str | None
+) -> None:
+    code = "import json, os, nsvq_lightning; print(json.dumps(dict(os.environ)))"
+    ours = ("OMP_WAIT_POLICY", "PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF")
+    environment = {key: value for key, value in os.environ.items() if key not in ours} | given
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    found = json.loads(done.stdout)
+    assert (found["OMP_WAIT_POLICY"], found["THP_MEM_ALLOC_ENABLE"]) == (waiting, "1")
+    assert found.get("PYTORCH_ALLOC_CONF") == (blocks if sys.platform == "linux" else given.get("PYTORCH_ALLOC_CONF"))
 
 
 @pytest.mark.parametrize(
