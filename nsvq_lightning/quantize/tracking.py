@@ -12,7 +12,7 @@ of all (the triangle inequality, as in Hamerly's k-means). In few dimensions the
 from __future__ import annotations
 
 from functools import cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
 from nsvq_lightning.compute.lanes import (
     broadcast,
@@ -39,6 +40,9 @@ from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, BoxMemory, box
 from nsvq_lightning.quantize.boxes import build_boxes
 from nsvq_lightning.quantize.nearest import check_rows, nearest
 from nsvq_lightning.quantize.scores import LIST, centre_codes, score_search, true_distance
+
+if TYPE_CHECKING:
+    from nsvq_lightning.quantize.cuda.tracking import DeviceTracker
 
 __all__ = ["NearestTracker"]
 
@@ -197,6 +201,7 @@ class NearestTracker:
 
     def forget(self) -> None:
         """Forget all searches; worth calling when codes have jumped."""
+        self._on_device: DeviceTracker | None = None
         self._steps = 0
         self._order: NDArray[np.int32] | None = None
         self._snapshot: Floats | None = None
@@ -220,13 +225,17 @@ class NearestTracker:
             Codes ``[V]`` int64.
 
         Raises:
-            ValueError: The shapes do not fit together, or rows are not ascending, distinct and in range.
+            ValueError: The shapes do not fit together, or rows are not ascending, distinct and in range (which is
+                checked on the CPU alone).
             TypeError: The dtypes differ or are not floating point, or rows are not int64.
         """
         check_rows(x, codebook)
         if rows is not None and rows.dim() != 1:
             raise ValueError(f"rows must have shape [V], got {list(rows.shape)}")
-        if x.device.type != "cpu" or x.dtype != torch.float32:
+        kernels = kernels_for(x)
+        if kernels == "cuda":
+            return self._search_device(x.detach().contiguous(), codebook.detach().contiguous(), rows)
+        if kernels is None:
             return nearest(x if rows is None else x.index_select(0, rows), codebook)
         values, codes = x.detach().contiguous().numpy(), codebook.detach().contiguous().numpy()
         chosen = np.arange(len(values)) if rows is None else rows.contiguous().numpy()
@@ -239,6 +248,14 @@ class NearestTracker:
         self._grow(len(values))
         search = self._search_boxes if codes.shape[1] <= MAX_DIM else self._search_lists
         return torch.from_numpy(search(values, codes, chosen))
+
+    def _search_device(self, x: Tensor, codebook: Tensor, rows: Tensor | None) -> Tensor:
+        from nsvq_lightning.quantize.cuda.tracking import DeviceTracker
+
+        if self._on_device is None or not self._on_device.fits(codebook):
+            self._on_device = DeviceTracker(*codebook.shape, codebook.device)
+        chosen = torch.arange(len(x), device=x.device) if rows is None else rows.contiguous()
+        return self._on_device.search(x, codebook, chosen)
 
     def _search_boxes(self, x: Floats, codebook: Floats, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         boxes = build_boxes(codebook, self._order if self._steps % _BOX_STEPS else None)

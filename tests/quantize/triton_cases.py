@@ -6,21 +6,24 @@ See ``tests/rendering/triton_cases.py`` on how this is run.
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 import torch
 
 from nsvq_lightning.quantize import noise
+from nsvq_lightning.quantize.cuda import tracking as tracking_module
 from nsvq_lightning.quantize.cuda.nearest import nearest_codes
 from nsvq_lightning.quantize.cuda.noise import normal_vectors
 from nsvq_lightning.quantize.cuda.substitution import substitute
 from nsvq_lightning.quantize.cuda.sums import sorted_by_code, sum_rows
+from nsvq_lightning.quantize.cuda.tracking import DeviceTracker
 from nsvq_lightning.quantize.kmeans import kmeans
+from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.quantize.nsvq import NSVQ, noise_substitution
 from nsvq_lightning.quantize.substitution import substitute as substitute_cpu
 from nsvq_lightning.random import generator
-from nsvq_lightning.skips import switched
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
@@ -28,7 +31,7 @@ DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 @pytest.fixture
 def kernels_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     """Under the interpreter float32 tensors on the CPU stand for those on a GPU."""
-    for name in ("nearest", "nsvq"):
+    for name in ("nearest", "nsvq", "tracking"):
         module = importlib.import_module(f"nsvq_lightning.quantize.{name}")
         monkeypatch.setattr(module, "kernels_for", lambda x: "cuda" if x.dtype == torch.float32 else None)
 
@@ -64,6 +67,75 @@ def test_what_is_not_a_number_is_never_nearest() -> None:
     assert torch.equal(nearest_codes(x.to(DEVICE), codebook.to(DEVICE)).cpu(), distances.argmin(1))
     assert nearest_codes(x.to(DEVICE), torch.full((5, 3), torch.nan, device=DEVICE)).tolist() == [0] * 6
     assert nearest_codes(x[:0].to(DEVICE), codebook.to(DEVICE)).shape == (0,)
+
+
+def walk(dim: int, steps: int, size: float) -> Iterator[tuple[torch.Tensor, ...]]:
+    """Rows, codes, and which rows are in view, as they move a little at each step."""
+    draw = torch.Generator().manual_seed(dim)
+    x, codebook = torch.randn(60, dim, generator=draw), torch.randn(150, dim, generator=draw)
+    for _ in range(steps):
+        x = x + size * torch.randn(x.shape, generator=draw)
+        codebook = codebook + size * torch.randn(codebook.shape, generator=draw)
+        yield x, codebook, torch.randperm(60, generator=draw)[:30].sort().values
+
+
+@pytest.fixture
+def searched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Length of the queue of each search."""
+    lengths: list[int] = []
+    queue = tracking_module._queue
+
+    def counting(chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        places, length = queue(chosen)
+        lengths.append(int(length))
+        assert places[: int(length)].tolist() == chosen.nonzero()[:, 0].tolist()
+        return places, length
+
+    monkeypatch.setattr(tracking_module, "_queue", counting)
+    return lengths
+
+
+@pytest.mark.parametrize("programs", [1, 4096])
+@pytest.mark.parametrize(("dim", "size"), [(3, 0.0), (3, 1e-4), (4, 1e-2), (45, 1e-4), (45, 1e-2), (9, 0.3)])
+def test_codes_that_a_bound_proves_are_those_of_a_search(
+    dim: int, size: float, programs: int, searched: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tracking_module, "PROGRAMS", programs)  # one works off the whole queue
+    tracker = DeviceTracker(150, dim, torch.device(DEVICE))
+    for x, codebook, rows in walk(dim, 20 if size < 1e-2 else 8, size):
+        found = tracker.search(x.to(DEVICE), codebook.to(DEVICE), rows.to(DEVICE))
+        assert torch.equal(found.cpu(), nearest(x[rows], codebook))
+    assert searched[0] == 30
+    if size < 1e-2:
+        assert 50 < sum(searched) <= 62  # each row once, and hardly ever again
+
+
+def test_a_jump_of_codes_is_paid_for_once_on_the_device(searched: list[int]) -> None:
+    tracker, everything = DeviceTracker(150, 9, torch.device(DEVICE)), torch.arange(60)
+    for step, (x, codebook, _) in enumerate(walk(9, 8, 1e-4)):
+        if step >= 3:
+            codebook = torch.where(torch.arange(150)[:, None] % 10 == 0, codebook + 1.0, codebook)
+        found = tracker.search(x.to(DEVICE), codebook.to(DEVICE), everything.to(DEVICE))
+        assert torch.equal(found.cpu(), nearest(x, codebook))
+    assert searched[:4] == [60, 0, 0, 60]
+    assert sum(searched[4:]) < 10
+
+
+def test_equal_codes_and_numbers_that_are_none_on_the_device() -> None:
+    tracker, everything = DeviceTracker(150, 9, torch.device(DEVICE)), torch.arange(60)
+    for x, codebook, _ in walk(9, 4, 1e-4):
+        codebook[75:] = codebook[:75]
+        codebook[3, 4], x[5] = torch.nan, torch.nan
+        found = tracker.search(x.to(DEVICE), codebook.to(DEVICE), everything.to(DEVICE))
+        assert torch.equal(found.cpu(), nearest(x, codebook))
+
+
+def test_few_codes_and_more_rows_on_the_device() -> None:
+    tracker = DeviceTracker(3, 4, torch.device(DEVICE))
+    for count in (5, 9, 2, 0, 7):
+        x, codebook = rows_and_codes(count, 3, 4, seed=1)
+        found = tracker.search(x.to(DEVICE), codebook.to(DEVICE), torch.arange(count, device=DEVICE))
+        assert torch.equal(found.cpu(), nearest(x, codebook))
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
@@ -167,8 +239,7 @@ def test_a_step_of_the_quantizer() -> None:
         quantizer.codebook.copy_(codebook)
     leaf = x.to(DEVICE).requires_grad_()
     rows = torch.arange(0, 50, 2)
-    with switched(distance_bounds=False):  # the bounds are the CPU's
-        out, codes = quantizer(leaf, generator(0), rows.to(DEVICE))
+    out, codes = quantizer(leaf, generator(0), rows.to(DEVICE))
     out.square().sum().backward()
     assert leaf.grad.isfinite().all()
     assert quantizer.codebook.grad.isfinite().all()

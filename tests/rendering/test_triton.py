@@ -26,7 +26,8 @@ def test_against_the_oracle(cases: str) -> None:
 
 
 BLEND, PROJECTION, LOSS = "rendering.cuda.blend", "rendering.cuda.projection", "quality.ssim_cuda"
-NEAREST, NOISE, SUMS, SUBSTITUTION = (f"quantize.cuda.{name}" for name in ("nearest", "noise", "sums", "substitution"))
+NEAREST, TRACKING = "quantize.cuda.nearest", "quantize.cuda.tracking"
+NOISE, SUMS, SUBSTITUTION = (f"quantize.cuda.{name}" for name in ("noise", "sums", "substitution"))
 
 
 @pytest.mark.parametrize(
@@ -66,7 +67,8 @@ def test_kernels_compile_for_a_gpu(kernels: list[str]) -> None:
     [
         (f"{PROJECTION}:project_kernel", {"n"}),
         (f"{PROJECTION}:project_backward_kernel", {"count"}),
-        (f"{NEAREST}:nearest_kernel", {"count", "x_stride"}),
+        (f"{NEAREST}:nearest_kernel", {"count"}),
+        (f"{TRACKING}:check_kernel", {"count"}),
         (f"{SUBSTITUTION}:substitute_kernel", {"seed", "count", "height"}),
         (f"{SUBSTITUTION}:radial_kernel", {"count", "height"}),
         (f"{NOISE}:normal_kernel", {"seed", "count"}),

@@ -29,6 +29,7 @@ USERS = (
     "quality.loss",
     "compute.rows",
     "quantize.nearest",
+    "quantize.tracking",
     "quantize.nsvq",
     "quantize.sums",
     "callbacks.density_rules",
@@ -103,7 +104,7 @@ def test_quantizer(launches: list[str], dim: int, kind: type[Any], some: bool) -
     result.sum().backward()
     assert x.grad is not None
     assert x.grad.shape == x.shape
-    expected = ["nearest_kernel"]
+    expected = ["check_kernel", "search_kernel"]
     if kind in (NSVQ, DiVeQ):
         expected += ["substitute_kernel", "radial_kernel"]
     if kind is not StraightThrough:
