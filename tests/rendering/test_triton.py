@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -30,36 +32,58 @@ NEAREST, TRACKING = "quantize.cuda.nearest", "quantize.cuda.tracking"
 NOISE, SUMS, SUBSTITUTION = (f"quantize.cuda.{name}" for name in ("noise", "sums", "substitution"))
 
 
+REGISTERS = {
+    "project_kernel": 80,
+    "project_backward_kernel": 72,
+    "blend_kernel": 96,
+    "blend_backward_kernel": 144,
+    "total_kernel": 48,
+    "moments_kernel": 112,
+    "similarity_kernel": 144,
+    "loss_kernel": 64,
+    "spread_kernel": 40,
+    "gradient_kernel": 144,
+    "nearest_kernel": 168,
+    "check_kernel": 72,
+    "search_kernel": 232,
+    "substitute_kernel": 96,
+    "radial_kernel": 96,
+    "normal_kernel": 64,
+    "part_kernel": 128,
+    "sum_kernel": 48,
+}
+"""Most registers that a thread of each kernel may take on sm_90; a multiprocessor has 65 536 for all its threads."""
+
+
 @pytest.mark.parametrize(
-    "kernels",
+    "cases",
     [
-        [f"{BLEND}:blend_backward_kernel"],
-        pytest.param([f"{BLEND}:blend_kernel", f"{BLEND}:total_kernel"], marks=pytest.mark.slow),
-        # Most steps are observed by nobody.
-        pytest.param(
-            [f"{BLEND}:{name}_kernel:WITH_MAP=0" for name in ("blend_backward", "total")], marks=pytest.mark.slow
-        ),
-        pytest.param([f"{PROJECTION}:project_kernel"], marks=pytest.mark.slow),
-        pytest.param([f"{PROJECTION}:project_backward_kernel"], marks=pytest.mark.slow),
-        # Some with an argument that is 1, of which Triton makes a constant.
-        [f"{LOSS}:similarity_kernel:height=1", f"{LOSS}:loss_kernel:programs=1"],
-        [
-            f"{SUBSTITUTION}:substitute_kernel",
-            f"{SUMS}:part_kernel:partial=*fp64",
-            f"{SUMS}:sum_kernel:partial=*fp64:sums=*fp64",
-        ],
-        pytest.param([f"{NEAREST}:nearest_kernel:num_codes=1"], marks=pytest.mark.slow),
-        pytest.param([f"{LOSS}:moments_kernel:height=1", f"{LOSS}:spread_kernel:height=1"], marks=pytest.mark.slow),
-        pytest.param([f"{LOSS}:gradient_kernel:height=1"], marks=pytest.mark.slow),
-        pytest.param([f"{SUBSTITUTION}:radial_kernel:count=1", f"{NOISE}:normal_kernel"], marks=pytest.mark.slow),
+        ["radii", "blend_backward", "search_45", "substitute_3"],
+        pytest.param(["project_0", "project_3", "project_backward_0", "project_backward_3"], marks=pytest.mark.slow),
+        pytest.param(["blend", "blend_backward_all", "loss", "loss_of_one_row"], marks=pytest.mark.slow),
+        pytest.param(["nearest_3", "nearest_45", "search_3"], marks=pytest.mark.slow),
+        pytest.param(["substitute_45", "normal", "sums_3", "sums_45"], marks=pytest.mark.slow),
     ],
 )
-def test_kernels_compile_for_a_gpu(kernels: list[str]) -> None:
+def test_kernels_compile_as_they_are_launched(cases: list[str]) -> None:
     pytest.importorskip("triton", reason="the CUDA back-end needs Triton")
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
-    command = [sys.executable, str(HERE / "triton_compile.py"), *kernels]
+    command = [sys.executable, str(HERE.parent / "support" / "gpu_launches.py"), *cases]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
+    built = json.loads(done.stdout)
+    assert built
+    for kernel in built:
+        assert kernel["stack"] == 0, kernel
+        assert kernel["registers"] <= REGISTERS[kernel["kernel"]], kernel
+
+
+def test_no_kernel_is_left_out() -> None:
+    package = HERE.parents[1] / "nsvq_lightning"
+    sources = [*package.glob("*/cuda/*.py"), package / "quality" / "ssim_cuda.py"]
+    launched = {name for path in sources for name in re.findall(r"(\w+_kernel)\[", path.read_text())}
+    defined = {name for path in sources for name in re.findall(r"def (\w+_kernel)\(", path.read_text())}
+    assert launched == defined == set(REGISTERS)
 
 
 @pytest.mark.parametrize(
