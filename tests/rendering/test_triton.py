@@ -27,7 +27,7 @@ def test_against_the_oracle(cases: str) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-BLEND, PROJECTION, LOSS = "rendering.cuda.blend", "rendering.cuda.projection", "quality.ssim_cuda"
+BINNING, BLEND, PROJECTION = (f"rendering.cuda.{name}" for name in ("binning", "blend", "projection"))
 NEAREST, TRACKING = "quantize.cuda.nearest", "quantize.cuda.tracking"
 NOISE, SUMS, SUBSTITUTION = (f"quantize.cuda.{name}" for name in ("noise", "sums", "substitution"))
 
@@ -37,7 +37,8 @@ REGISTERS = {
     "project_backward_kernel": 72,
     "blend_kernel": 96,
     "blend_backward_kernel": 144,
-    "total_kernel": 48,
+    "total_kernel": 104,
+    "expand_kernel": 48,
     "moments_kernel": 112,
     "similarity_kernel": 144,
     "loss_kernel": 64,
@@ -60,7 +61,7 @@ REGISTERS = {
     [
         ["radii", "blend_backward", "search_45", "substitute_3"],
         pytest.param(["project_0", "project_3", "project_backward_0", "project_backward_3"], marks=pytest.mark.slow),
-        pytest.param(["blend", "blend_backward_all", "loss", "loss_of_one_row"], marks=pytest.mark.slow),
+        pytest.param(["tiles", "blend", "blend_backward_all", "loss", "loss_of_one_row"], marks=pytest.mark.slow),
         pytest.param(["nearest_3", "nearest_45", "search_3"], marks=pytest.mark.slow),
         pytest.param(["substitute_45", "normal", "sums_3", "sums_45"], marks=pytest.mark.slow),
     ],
@@ -90,7 +91,9 @@ def test_no_kernel_is_left_out() -> None:
     ("kernel", "changing"),
     [
         (f"{PROJECTION}:project_kernel", {"n"}),
-        (f"{PROJECTION}:project_backward_kernel", {"count"}),
+        (f"{PROJECTION}:project_backward_kernel", {"n"}),
+        (f"{BLEND}:total_kernel", {"count"}),
+        (f"{BINNING}:expand_kernel", {"total", "count", "halvings"}),
         (f"{NEAREST}:nearest_kernel", {"count"}),
         (f"{TRACKING}:check_kernel", {"count"}),
         (f"{SUBSTITUTION}:substitute_kernel", {"seed", "count", "height"}),

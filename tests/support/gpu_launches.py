@@ -32,7 +32,7 @@ from nsvq_lightning.quantize.cuda.tracking import DeviceTracker
 from nsvq_lightning.quantize.nsvq import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.cuda import projection
-from nsvq_lightning.rendering.cuda.binning import Tiles
+from nsvq_lightning.rendering.cuda.binning import Tiles, tiles_of
 from nsvq_lightning.rendering.cuda.blend import blend, blend_backward, tile_grid
 from nsvq_lightning.rendering.cuda.projection import Lens
 from nsvq_lightning.rendering.cuda.records import RECORD
@@ -66,7 +66,8 @@ def project_backward(degree: int) -> None:
 
 def tiles() -> Tiles:
     columns, rows = tile_grid(WIDTH, HEIGHT)
-    return Tiles(*(tensor(count, dtype=torch.int32) for count in (columns * rows + 1, PAIRS, PAIRS, SEEN)))
+    lengths = columns * rows + 1, columns * rows, PAIRS, PAIRS, SEEN
+    return Tiles(*(tensor(length, dtype=torch.int32) for length in lengths))
 
 
 def render() -> None:
@@ -109,6 +110,7 @@ CASES: dict[str, Callable[[], object]] = {
     "project_3": lambda: project(3),
     "project_backward_0": lambda: project_backward(0),
     "project_backward_3": lambda: project_backward(3),
+    "tiles": lambda: tiles_of(tensor(SEEN, 4, dtype=torch.int32), tensor(SEEN, dtype=torch.int32), PAIRS, 7, 4),
     "blend": render,
     "blend_backward": lambda: render_backward(everything=False),
     "blend_backward_all": lambda: render_backward(everything=True),

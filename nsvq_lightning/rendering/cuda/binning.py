@@ -9,11 +9,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+import triton
+import triton.language as tl
 from torch import Tensor
+
+from nsvq_lightning.compute.launch import COMPILE
+from nsvq_lightning.compute.memory import check_tensor
 
 __all__ = ["Tiles", "list_tiles"]
 
 MAX_PAIRS = 2**31 - 1
+
+BLOCK = 512
+"""Pairs per program."""
 
 
 class Tiles(NamedTuple):
@@ -21,15 +29,37 @@ class Tiles(NamedTuple):
 
     Attributes:
         offsets: Where the list of each tile begins in ``ranks`` ``[tiles + 1]`` int32.
+        order: The tiles, those with the longest lists first ``[tiles]`` int32: what starts last should not take long.
         ranks: The splats of the tiles, front to back, as places in the list of splats in view ``[P]`` int32.
         slots: The slot of each of these pairs ``[P]`` int32.
         ends: End (exclusive) of each splat's slots ``[V]`` int32; the slots of a splat are consecutive.
     """
 
     offsets: Tensor
+    order: Tensor
     ranks: Tensor
     slots: Tensor
     ends: Tensor
+
+
+@triton.jit(do_not_specialize=["total", "count", "halvings"])
+def expand_kernel(boxes, ends, keys, owners, total, count, halvings, columns, BLOCK: tl.constexpr):
+    """The tile and the splat of every pair; a splat's pairs end at ``ends``."""
+    pair = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    inside = pair < total
+    low, high = tl.zeros([BLOCK], tl.int32), tl.zeros([BLOCK], tl.int32) + count
+    for _ in range(halvings):
+        middle = (low + high) // 2
+        later = tl.load(ends + middle, mask=inside & (low < high), other=0) <= pair
+        low, high = tl.where(later & (low < high), middle + 1, low), tl.where(later, high, middle)
+    begin = tl.load(ends + low - 1, mask=inside & (low > 0), other=0)
+    box = boxes + 4 * low.to(tl.int64)
+    x0, y0 = tl.load(box, mask=inside, other=0), tl.load(box + 1, mask=inside, other=0)
+    width = tl.load(box + 2, mask=inside, other=1)
+    place = (pair - begin).to(tl.int32)
+    tile = (y0 + place // width) * columns + x0 + place % width
+    tl.store(keys + pair, tile.to(keys.dtype.element_ty), mask=inside)
+    tl.store(owners + pair, low, mask=inside)
 
 
 def list_tiles(boxes: Tensor, columns: int, rows: int) -> Tiles:
@@ -37,30 +67,37 @@ def list_tiles(boxes: Tensor, columns: int, rows: int) -> Tiles:
 
     Args:
         boxes: First column and row, number of columns and rows of the tiles that each splat touches, front to back
-            ``[V, 4]``.
+            ``[V, 4]`` int32, contiguous.
         columns: Columns of tiles in the image.
         rows: Rows of tiles in the image.
 
     Raises:
+        ValueError: The boxes are not ``[V, 4]`` or not contiguous.
+        TypeError: They are not int32.
         RuntimeError: There are more pairs than can be numbered.
     """
-    device, tiles = boxes.device, columns * rows
-    x0, y0, nx, ny = boxes.unbind(1)
-    ends = (nx.long() * ny).cumsum(0)
+    check_tensor("boxes", boxes, (len(boxes), 4), boxes.device, torch.int32)
+    ends = (boxes[:, 2].long() * boxes[:, 3]).cumsum(0)
     total = int(ends[-1]) if len(boxes) else 0
     if total > MAX_PAIRS:
         raise RuntimeError(
             f"{len(boxes)} splats cover {total} tiles of the {columns}x{rows} in the image, more than can be listed; "
             "the scales have probably diverged (lower their learning rate or prune large splats)"
         )
-    ends = ends.int()
-    counts = nx * ny
-    owners = torch.repeat_interleave(counts, output_size=total)
-    place = torch.arange(total, dtype=torch.int32, device=device) - (ends - counts)[owners]
-    width = nx[owners]
-    tile = (y0[owners] + place // width) * columns + x0[owners] + place % width
+    return tiles_of(boxes, ends.int(), total, columns, rows)
+
+
+def tiles_of(boxes: Tensor, ends: Tensor, total: int, columns: int, rows: int) -> Tiles:
+    """:func:`list_tiles` where the ends of the splats' slots, and so the number of pairs, are known."""
+    device, tiles = boxes.device, columns * rows
     # 16-bit keys take a quarter of the sorting passes of 64-bit ones.
     key = torch.int16 if tiles < 2**15 else torch.int32
-    keys, slots = tile.to(key).sort(stable=True)
+    keys, owners = torch.empty(total, dtype=key, device=device), torch.empty(total, dtype=torch.int32, device=device)
+    if total:
+        expand_kernel[(triton.cdiv(total, BLOCK),)](
+            boxes, ends, keys, owners, total, len(boxes), len(boxes).bit_length(), columns, BLOCK=BLOCK, **COMPILE
+        )
+    keys, slots = keys.sort(stable=True)
     offsets = torch.searchsorted(keys, torch.arange(tiles + 1, dtype=key, device=device), out_int32=True)
-    return Tiles(offsets, owners[slots].int(), slots.int(), ends)
+    order = offsets.diff().argsort(descending=True, stable=True)
+    return Tiles(offsets, order.int(), owners[slots], slots.int(), ends)

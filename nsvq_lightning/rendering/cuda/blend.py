@@ -61,6 +61,8 @@ BATCH = 32
 """Splats between two checks of whether a tile is finished."""
 WARPS = 1
 """Warps per tile: with one, every reduction stays inside the warp."""
+SPLATS = 16
+"""Splats whose slots a program adds up: most have a few, and a program for each would have little to do."""
 SLOTS = 8
 """Number of slots of one splat that are added up at a time."""
 LANES = 16
@@ -105,11 +107,11 @@ def blend_step(record, left, top, x, y, t):
 
 @triton.jit
 def blend_kernel(
-    records, ranks, offsets, ends, background, image, transmittance, depth, columns, width, height,
+    records, ranks, offsets, order, ends, background, image, transmittance, depth, columns, width, height,
     BATCH: tl.constexpr,
 ):  # fmt: skip
     """Image, transmittance and depth of a tile, and the end of the part of its list that was processed."""
-    tile = tl.program_id(0)
+    tile = tl.load(order + tl.program_id(0))
     left, top, x, y, pixel, inside = tile_pixels(tile, columns, width, height)
     t = tl.where(inside, 1.0, 0.0)
     kept = t
@@ -138,11 +140,11 @@ def blend_kernel(
 
 @triton.jit
 def blend_backward_kernel(
-    records, ranks, slots, offsets, ends, image, transmittance, depth, g_image, g_alpha, g_depth, pixel_map,
+    records, ranks, slots, offsets, order, ends, image, transmittance, depth, g_image, g_alpha, g_depth, pixel_map,
     sums, columns, width, height, WITH_ALPHA: tl.constexpr, WITH_DEPTH: tl.constexpr, WITH_MAP: tl.constexpr,
 ):  # fmt: skip
     """Write the sums of every splat of a tile to its slot."""
-    tile = tl.program_id(0)
+    tile = tl.load(order + tl.program_id(0))
     left, top, x, y, pixel, inside = tile_pixels(tile, columns, width, height)
     g_red = tl.load(g_image + 3 * pixel, mask=inside, other=0.0)
     g_green = tl.load(g_image + 3 * pixel + 1, mask=inside, other=0.0)
@@ -194,43 +196,45 @@ def blend_backward_kernel(
 
 @triton.jit
 def field_of(total, field):
-    """One field of the sums of a splat ``[LANES]``."""
-    lane = tl.arange(0, total.shape[0])
-    return tl.sum(tl.where(lane == field, total, 0.0), 0)
+    """One field of the sums ``[SPLATS, LANES]`` of some splats."""
+    lane = tl.arange(0, total.shape[1])[None, :]
+    return tl.sum(tl.where(lane == field, total, 0.0), 1)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def total_kernel(
-    sums, slot_ends, ids, records, totals, g_means2d, observed,
-    WITH_MAP: tl.constexpr, SLOTS: tl.constexpr, LANES: tl.constexpr,
+    sums, slot_ends, ids, records, totals, g_means2d, observed, count,
+    WITH_MAP: tl.constexpr, SPLATS: tl.constexpr, SLOTS: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Add up the slots of a splat, and derive the gradient of its projected centre.
+    """Add up the slots of some splats, and derive the gradients of their projected centres.
 
     ``WITH_MAP`` also writes what the pass observed: Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · map over pixels.
     """
-    rank = tl.program_id(0).to(tl.int64)
-    end = tl.load(slot_ends + rank)
-    begin = tl.load(slot_ends + rank - 1, mask=rank > 0, other=0)
-    field = tl.arange(0, LANES)[None, :]
-    acc = tl.zeros([SLOTS, LANES], tl.float32)
-    for start in range(begin, end, SLOTS):
-        slot = start + tl.arange(0, SLOTS)[:, None]
-        mask = (slot < end) & (field < (OBSERVED_FIELDS if WITH_MAP else FIELDS))
+    rank = tl.program_id(0).to(tl.int64) * SPLATS + tl.arange(0, SPLATS)
+    seen = rank < count
+    end = tl.load(slot_ends + rank, mask=seen, other=0)
+    begin = tl.load(slot_ends + rank - 1, mask=seen & (rank > 0), other=0)
+    field = tl.arange(0, LANES)[None, None, :]
+    acc = tl.zeros([SPLATS, SLOTS, LANES], tl.float32)
+    for start in range(0, tl.max(end - begin, 0), SLOTS):
+        slot = begin[:, None, None] + start + tl.arange(0, SLOTS)[None, :, None]
+        mask = (slot < end[:, None, None]) & (field < (OBSERVED_FIELDS if WITH_MAP else FIELDS))
         place = slot.to(tl.int64) * (OBSERVED_SLOT if WITH_MAP else RECORD) + field
         acc += tl.load(sums + place, mask=mask, other=0.0)
-    total = tl.sum(acc, 0)
-    lane = tl.arange(0, LANES)
-    tl.store(totals + rank * RECORD + lane, total, mask=lane < FIELDS)
+    total = tl.sum(acc, 1)
+    lane = tl.arange(0, LANES)[None, :]
+    tl.store(totals + rank[:, None] * RECORD + lane, total, mask=seen[:, None] & (lane < FIELDS))
     u, v = field_of(total, SUM_U), field_of(total, SUM_V)
     record = records + rank * RECORD
-    a, b, c = tl.load(record + A), tl.load(record + B), tl.load(record + C)
-    row = tl.load(ids + rank)
-    tl.store(g_means2d + 2 * row, a * u * (2 * LN2))
-    tl.store(g_means2d + 2 * row + 1, (b * u + c * v) * (2 * LN2))
+    a, b = tl.load(record + A, mask=seen, other=0.0), tl.load(record + B, mask=seen, other=0.0)
+    c = tl.load(record + C, mask=seen, other=0.0)
+    row = tl.load(ids + rank, mask=seen, other=0)
+    tl.store(g_means2d + 2 * row, a * u * (2 * LN2), mask=seen)
+    tl.store(g_means2d + 2 * row + 1, (b * u + c * v) * (2 * LN2), mask=seen)
     if WITH_MAP:
-        tl.store(observed + 3 * row, tl.abs(a) * field_of(total, SUM_ABS_X) * (2 * LN2))
-        tl.store(observed + 3 * row + 1, field_of(total, SUM_ABS_Y) * (2 * LN2))
-        tl.store(observed + 3 * row + 2, field_of(total, SUM_MAP))
+        tl.store(observed + 3 * row, tl.abs(a) * field_of(total, SUM_ABS_X) * (2 * LN2), mask=seen)
+        tl.store(observed + 3 * row + 1, field_of(total, SUM_ABS_Y) * (2 * LN2), mask=seen)
+        tl.store(observed + 3 * row + 2, field_of(total, SUM_MAP), mask=seen)
 
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:
@@ -242,7 +246,8 @@ def _check_lists(records: Tensor, tiles: Tiles, count: int) -> None:
     """Check the records, and the lists of ``count`` tiles."""
     visible, pairs, device = len(records), len(tiles.ranks), records.device
     check_tensor("records", records, (visible, RECORD.value), device)
-    for name, length in (("offsets", count + 1), ("ranks", pairs), ("slots", pairs), ("ends", visible)):
+    lengths = {"offsets": count + 1, "order": count, "ranks": pairs, "slots": pairs, "ends": visible}
+    for name, length in lengths.items():
         check_tensor(f"tiles.{name}", getattr(tiles, name), (length,), device, torch.int32)
 
 
@@ -266,7 +271,7 @@ def blend(lens: Lens, records: Tensor, tiles: Tiles, background: Tensor) -> tupl
     transmittance, depth = (records.new_empty(lens.height, lens.width) for _ in range(2))
     ends = torch.empty(columns * rows, dtype=torch.int32, device=records.device)
     blend_kernel[(columns * rows,)](
-        records, tiles.ranks, tiles.offsets, ends, background, image, transmittance, depth,
+        records, tiles.ranks, tiles.offsets, tiles.order, ends, background, image, transmittance, depth,
         columns, lens.width, lens.height, BATCH=BATCH, num_warps=WARPS, **COMPILE,
     )  # fmt: skip
     return image, transmittance, depth, ends
@@ -322,7 +327,7 @@ def blend_backward(
     if len(ids):
         sums = records.new_zeros(len(tiles.slots), (OBSERVED_SLOT if with_map else RECORD).value)
         blend_backward_kernel[(columns * rows,)](
-            records, tiles.ranks, tiles.slots, tiles.offsets, ends, image, transmittance, depth,
+            records, tiles.ranks, tiles.slots, tiles.offsets, tiles.order, ends, image, transmittance, depth,
             torch.zeros_like(image) if g_image is None else g_image,
             # Placeholders that are never read stand in for missing gradients and a missing map.
             *(depth if given is None else given for given in (g_alpha, g_depth, pixel_map)),
@@ -330,8 +335,8 @@ def blend_backward(
             WITH_ALPHA=g_alpha is not None, WITH_DEPTH=g_depth is not None, WITH_MAP=with_map,
             num_warps=WARPS, **COMPILE,
         )  # fmt: skip
-        total_kernel[(len(ids),)](
-            sums, tiles.ends, ids, records, totals, g_means2d, g_means2d if observed is None else observed,
-            WITH_MAP=with_map, SLOTS=SLOTS, LANES=LANES, num_warps=1, **COMPILE,
+        total_kernel[(triton.cdiv(len(ids), SPLATS),)](
+            sums, tiles.ends, ids, records, totals, g_means2d, g_means2d if observed is None else observed, len(ids),
+            WITH_MAP=with_map, SPLATS=SPLATS, SLOTS=SLOTS, LANES=LANES, num_warps=2, **COMPILE,
         )  # fmt: skip
     return totals, g_means2d, observed

@@ -94,48 +94,51 @@ def color(sh0, shN, row, base, x, y, z, mask, DEGREE: tl.constexpr):
 
 
 @triton.jit
-def put_band(g_shN, shN, base, k, basis, r, g, b, mask):
+def put_band(g_shN, shN, base, k, basis, r, g, b, mask, inside):
     """Store the gradient of coefficient k; returns Σ_channel coefficient·gradient, the gradient of the basis value."""
     cr, cg, cb = coefficient(shN, base, k, mask)
     at = g_shN + base + 3 * k
-    tl.store(at, basis * r, mask=mask)
-    tl.store(at + 1, basis * g, mask=mask)
-    tl.store(at + 2, basis * b, mask=mask)
+    tl.store(at, basis * r, mask=inside)
+    tl.store(at + 1, basis * g, mask=inside)
+    tl.store(at + 2, basis * b, mask=inside)
     return cr * r + cg * g + cb * b
 
 
 @triton.jit
-def color_backward(g_sh0, g_shN, shN, row, base, x, y, z, r, g, b, mask, DEGREE: tl.constexpr):
-    """Store the gradients of the coefficients from those of the colour (r, g, b); returns that of the direction."""
+def color_backward(g_sh0, g_shN, shN, row, base, x, y, z, r, g, b, mask, inside, DEGREE: tl.constexpr):
+    """Store the gradients of the coefficients from those of the colour (r, g, b); returns that of the direction.
+
+    Coefficients are read where ``mask`` says, gradients written to all rows ``inside`` the table.
+    """
     at = g_sh0 + 3 * row
-    tl.store(at, r * C0, mask=mask)
-    tl.store(at + 1, g * C0, mask=mask)
-    tl.store(at + 2, b * C0, mask=mask)
+    tl.store(at, r * C0, mask=inside)
+    tl.store(at + 1, g * C0, mask=inside)
+    tl.store(at + 2, b * C0, mask=inside)
     gx, gy, gz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     if DEGREE > 0:
         b0, b1, b2 = bands1(x, y, z)
-        gy -= put_band(g_shN, shN, base, 0, b0, r, g, b, mask) * C1
-        gz += put_band(g_shN, shN, base, 1, b1, r, g, b, mask) * C1
-        gx -= put_band(g_shN, shN, base, 2, b2, r, g, b, mask) * C1
+        gy -= put_band(g_shN, shN, base, 0, b0, r, g, b, mask, inside) * C1
+        gz += put_band(g_shN, shN, base, 1, b1, r, g, b, mask, inside) * C1
+        gx -= put_band(g_shN, shN, base, 2, b2, r, g, b, mask, inside) * C1
     if DEGREE > 1:
         b0, b1, b2, b3, b4 = bands2(x, y, z)
-        e0 = put_band(g_shN, shN, base, 3, b0, r, g, b, mask) * C2A
-        e1 = put_band(g_shN, shN, base, 4, b1, r, g, b, mask) * C2A
-        e2 = put_band(g_shN, shN, base, 5, b2, r, g, b, mask) * C2B
-        e3 = put_band(g_shN, shN, base, 6, b3, r, g, b, mask) * C2A
-        e4 = put_band(g_shN, shN, base, 7, b4, r, g, b, mask) * C2C
+        e0 = put_band(g_shN, shN, base, 3, b0, r, g, b, mask, inside) * C2A
+        e1 = put_band(g_shN, shN, base, 4, b1, r, g, b, mask, inside) * C2A
+        e2 = put_band(g_shN, shN, base, 5, b2, r, g, b, mask, inside) * C2B
+        e3 = put_band(g_shN, shN, base, 6, b3, r, g, b, mask, inside) * C2A
+        e4 = put_band(g_shN, shN, base, 7, b4, r, g, b, mask, inside) * C2C
         gx += y * e0 - z * e3 + 2 * x * (e4 - e2)
         gy += x * e0 - z * e1 - 2 * y * (e2 + e4)
         gz += 4 * z * e2 - y * e1 - x * e3
     if DEGREE > 2:
         b0, b1, b2, b3, b4, b5, b6 = bands3(x, y, z)
-        e0 = put_band(g_shN, shN, base, 8, b0, r, g, b, mask) * C3A
-        e1 = put_band(g_shN, shN, base, 9, b1, r, g, b, mask) * C3B
-        e2 = put_band(g_shN, shN, base, 10, b2, r, g, b, mask) * C3C
-        e3 = put_band(g_shN, shN, base, 11, b3, r, g, b, mask) * C3D
-        e4 = put_band(g_shN, shN, base, 12, b4, r, g, b, mask) * C3C
-        e5 = put_band(g_shN, shN, base, 13, b5, r, g, b, mask) * C3E
-        e6 = put_band(g_shN, shN, base, 14, b6, r, g, b, mask) * C3A
+        e0 = put_band(g_shN, shN, base, 8, b0, r, g, b, mask, inside) * C3A
+        e1 = put_band(g_shN, shN, base, 9, b1, r, g, b, mask, inside) * C3B
+        e2 = put_band(g_shN, shN, base, 10, b2, r, g, b, mask, inside) * C3C
+        e3 = put_band(g_shN, shN, base, 11, b3, r, g, b, mask, inside) * C3D
+        e4 = put_band(g_shN, shN, base, 12, b4, r, g, b, mask, inside) * C3C
+        e5 = put_band(g_shN, shN, base, 13, b5, r, g, b, mask, inside) * C3E
+        e6 = put_band(g_shN, shN, base, 14, b6, r, g, b, mask, inside) * C3A
         xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
         gx += yz * e1 - 6 * xy * e0 + 2 * xy * e2 - 6 * xz * e3 - (4 * zz - 3 * xx - yy) * e4
         gx += 2 * xz * e5 - 3 * (xx - yy) * e6

@@ -259,15 +259,19 @@ def scaled_row(t0, t1, gu, gv):
     return t0 * gu[0] + t1 * gv[0], t0 * gu[1] + t1 * gv[1], t0 * gu[2] + t1 * gv[2]
 
 
-@triton.jit(do_not_specialize=["count"])
+@triton.jit(do_not_specialize=["n"])
 def project_backward_kernel(
-    means, quats, scales, logits, shN, view, fx, fy, cx, cy, width, height, count, stride, ids, records, totals,
-    g_means2d, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
+    means, quats, scales, logits, shN, view, fx, fy, cx, cy, width, height, n, ranks, records, totals,
+    g_means2d, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN, STRIDE: tl.constexpr, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of the attributes of the splats ``ids`` from their moments (``totals``, one slot each)."""
-    rank = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    seen = rank < count
-    row = tl.load(ids + rank, mask=seen, other=0)
+    """Gradients of all attributes from the moments (``totals``, one slot each) of the splats in view.
+
+    Rows are written in their order, those out of view (of rank -1) with zeros: reads as 0 make all that follows 0.
+    """
+    row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    inside = row < n
+    rank = tl.load(ranks + row, mask=inside, other=-1).to(tl.int64)
+    seen = rank >= 0
     mean, quat, scale = load_geometry(means, quats, scales, row, seen)
     x, y, z = view_point(view, mean)
     inverse = 1 / tl.where(seen, z, 1.0)
@@ -305,7 +309,7 @@ def project_backward_kernel(
         fu[0] * e[0] + fv[0] * f[0],
         fu[1] * e[1] + fv[1] * f[1],
         fu[2] * e[2] + fv[2] * f[2],
-        seen,
+        inside,
     )
     gw, gx, gy, gz = quaternion_gradient(
         q,
@@ -314,8 +318,8 @@ def project_backward_kernel(
         (gm1[0] * s[0], gm1[1] * s[1], gm1[2] * s[2]),
         (gm2[0] * s[0], gm2[1] * s[1], gm2[2] * s[2]),
     )
-    tl.store(g_quats + 4 * row, gw, mask=seen)
-    store3(g_quats + 4 * row + 1, gx, gy, gz, seen)
+    tl.store(g_quats + 4 * row, gw, mask=inside)
+    store3(g_quats + 4 * row + 1, gx, gy, gz, inside)
 
     # J = [[fx/z, 0, -fx·sx/z], [0, fy/z, -fy·sy/z]]; sx = x/z except where it is limited.
     w0, w1, w2 = row_of(view, 0), row_of(view, 1), row_of(view, 2)
@@ -341,18 +345,22 @@ def project_backward_kernel(
         tl.where(rgb[2] > 0, g_rgb[2], 0.0),
     )
     dx, dy, dz, d_inverse = unit_direction(view, mean)
-    cx_, cy_, cz_ = color_backward(g_sh0, g_shN, shN, row, row * stride, dx, dy, dz, red, green, blue, seen, DEGREE)
+    cx_, cy_, cz_ = color_backward(
+        g_sh0, g_shN, shN, row, row * STRIDE, dx, dy, dz, red, green, blue, seen, inside, DEGREE
+    )
+    for k in range(3 * (DEGREE + 1) * (DEGREE + 1) - 3, STRIDE):  # of the bands that are not evaluated
+        tl.store(g_shN + row * STRIDE + k, 0.0, mask=inside)
     radial = cx_ * dx + cy_ * dy + cz_ * dz
     store3(
         g_means + 3 * row,
         w0[0] * vx + w1[0] * vy + w2[0] * vz + (cx_ - radial * dx) * d_inverse,
         w0[1] * vx + w1[1] * vy + w2[1] * vz + (cy_ - radial * dy) * d_inverse,
         w0[2] * vx + w1[2] * vy + w2[2] * vz + (cz_ - radial * dz) * d_inverse,
-        seen,
+        inside,
     )
     logit = tl.load(logits + row, mask=seen, other=0.0)
     h = tl.load(total + SUM_H, mask=seen, other=0.0)
-    tl.store(g_logits + row, h / (1 + tl.exp2(logit * LOG2_E)), mask=seen)
+    tl.store(g_logits + row, h / (1 + tl.exp2(logit * LOG2_E)), mask=inside)
 
 
 class Lens(NamedTuple):
@@ -503,12 +511,14 @@ def project_backward(
     check_tensor("records", records, (len(ids), RECORD.value), device)
     check_tensor("totals", totals, (len(ids), RECORD.value), device)
     check_tensor("g_means2d", g_means2d, (len(attributes[0]), 2), device)
-    gradients = [torch.zeros_like(attribute) for attribute in attributes]
+    gradients = [torch.empty_like(attribute) for attribute in attributes]
     means, quats, scales, logits, _, shN = attributes
-    count = ids.shape[0]
-    if count:
-        project_backward_kernel[(triton.cdiv(count, BLOCK),)](
-            means, quats, scales, logits, shN, *lens, count, 3 * shN.shape[1], ids, records, totals, g_means2d,
-            *gradients, DEGREE=degree, BLOCK=BLOCK, **COMPILE,
+    n = means.shape[0]
+    ranks = torch.full((n,), -1, dtype=torch.int32, device=device)
+    ranks[ids] = torch.arange(len(ids), dtype=torch.int32, device=device)
+    if n:
+        project_backward_kernel[(triton.cdiv(n, BLOCK),)](
+            means, quats, scales, logits, shN, *lens, n, ranks, records, totals, g_means2d, *gradients,
+            STRIDE=3 * shN.shape[1], DEGREE=degree, BLOCK=BLOCK, **COMPILE,
         )  # fmt: skip
     return gradients
