@@ -35,8 +35,8 @@ NOISE, SUMS, SUBSTITUTION = (f"quantize.cuda.{name}" for name in ("noise", "sums
 REGISTERS = {
     "project_kernel": 80,
     "project_backward_kernel": 72,
-    "blend_kernel": 96,
-    "blend_backward_kernel": 144,
+    "blend_kernel": 112,
+    "blend_backward_kernel": 152,
     "total_kernel": 104,
     "expand_kernel": 48,
     "moments_kernel": 112,

@@ -19,7 +19,7 @@ from torch import Tensor
 from nsvq_lightning.compute.launch import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.rendering.cuda.binning import Tiles
-from nsvq_lightning.rendering.cuda.projection import Lens
+from nsvq_lightning.rendering.cuda.projection import Lens, load3
 from nsvq_lightning.rendering.cuda.records import (
     ALPHA_MAX,
     BLUE,
@@ -80,25 +80,35 @@ def tile_pixels(tile, columns, width, height):
 
 
 @triton.jit
-def alpha_at(record, left, top, x, y):
+def fetch(records, ranks, j, end):
+    """The record at place ``j`` of the lists, before ``end``, and what α depends on: a, b, c, x, y, log2 opacity."""
+    there = j < end
+    record = records + tl.load(ranks + j, mask=there, other=0).to(tl.int64) * RECORD
+    a, b, c = load3(record + A, there)
+    px, py = tl.load(record + X, mask=there, other=0.0), tl.load(record + Y, mask=there, other=0.0)
+    return record, a, b, c, px, py, tl.load(record + LOG2_OPACITY, mask=there, other=0.0)
+
+
+@triton.jit
+def alpha_at(fetched, left, top, x, y):
     """α of a splat before the cap, 0 below 1/255, and the two factors of its exponent, at pixels of a tile."""
-    a, b, c = tl.load(record + A), tl.load(record + B), tl.load(record + C)
-    px, py = tl.load(record + X) - left, tl.load(record + Y) - top
+    _, a, b, c, px, py, log2_opacity = fetched
+    px, py = px - left, py - top
     # Explicit, so that both passes round alike: the compiler may contract sums of products, or not.
     u = tl.fma(a, x, tl.fma(b, y, -tl.fma(a, px, b * py)))
     v = tl.fma(c, y, -(c * py))
-    power = tl.fma(-u, u, tl.fma(-v, v, tl.load(record + LOG2_OPACITY)))
+    power = tl.fma(-u, u, tl.fma(-v, v, log2_opacity))
     return tl.where(power >= LOG2_ALPHA_MIN, tl.exp2(power), 0.0), u, v
 
 
 @triton.jit
-def blend_step(record, left, top, x, y, t):
+def blend_step(fetched, left, top, x, y, t):
     """What one splat does to pixels with transmittance ``t``, the same to the bit in the forward and backward pass.
 
     Returns α before the cap, the two factors of its exponent, α, the transmittance after it, whether that leaves the
     pixel open, and the weight of the splat's colour.
     """
-    raw, u, v = alpha_at(record, left, top, x, y)
+    raw, u, v = alpha_at(fetched, left, top, x, y)
     alpha = tl.minimum(raw, ALPHA_MAX)
     after = tl.fma(-alpha, t, t)
     is_open = after >= TRANSMITTANCE_MIN
@@ -118,11 +128,14 @@ def blend_kernel(
     red, green, blue, far = tl.zeros_like(t), tl.zeros_like(t), tl.zeros_like(t), tl.zeros_like(t)
     i, end = tl.load(offsets + tile), tl.load(offsets + tile + 1)
     looked = i
+    # The next splat is on its way while this one is blended.
+    following = fetch(records, ranks, i, end)
     while i < end:
         looked = tl.minimum(i + BATCH, end)
         for j in range(i, looked):
-            record = records + tl.load(ranks + j).to(tl.int64) * RECORD
-            _, _, _, _, after, is_open, weight = blend_step(record, left, top, x, y, t)
+            fetched, following = following, fetch(records, ranks, j + 1, end)
+            record = fetched[0]
+            _, _, _, _, after, is_open, weight = blend_step(fetched, left, top, x, y, t)
             kept = tl.where(is_open, after, kept)
             t = after
             red += weight * tl.load(record + RED)
@@ -163,9 +176,12 @@ def blend_backward_kernel(
     if WITH_MAP:
         strength = tl.load(pixel_map + pixel, mask=inside, other=0.0)
     t = tl.where(inside, 1.0, 0.0)
-    for j in range(tl.load(offsets + tile), tl.load(ends + tile)):
-        record = records + tl.load(ranks + j).to(tl.int64) * RECORD
-        raw, u, v, alpha, after, is_open, weight = blend_step(record, left, top, x, y, t)
+    begin, end = tl.load(offsets + tile), tl.load(ends + tile)
+    following = fetch(records, ranks, begin, end)
+    for j in range(begin, end):
+        fetched, following = following, fetch(records, ranks, j + 1, end)
+        record = fetched[0]
+        raw, u, v, alpha, after, is_open, weight = blend_step(fetched, left, top, x, y, t)
         if tl.max(weight, 0) > 0:
             d = g_red * tl.load(record + RED) + g_green * tl.load(record + GREEN) + g_blue * tl.load(record + BLUE)
             if WITH_DEPTH:

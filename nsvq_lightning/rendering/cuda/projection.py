@@ -261,8 +261,9 @@ def scaled_row(t0, t1, gu, gv):
 
 @triton.jit(do_not_specialize=["n"])
 def project_backward_kernel(
-    means, quats, scales, logits, shN, view, fx, fy, cx, cy, width, height, n, ranks, records, totals,
-    g_means2d, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN, STRIDE: tl.constexpr, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
+    means, quats, scales, logits, shN, view, fx, fy, cx, cy, width, height, n, ranks, records, totals, g_means2d,
+    g_means, g_quats, g_scales, g_logits, g_sh0, g_shN,
+    STRIDE: tl.constexpr, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Gradients of all attributes from the moments (``totals``, one slot each) of the splats in view.
 
