@@ -51,15 +51,15 @@ def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtyp
             f"values must have shape [N, D] and codes [N], got {list(values.shape)} and {list(codes.shape)}"
         )
     values, dtype = values.detach(), dtype or values.dtype
+    if kernels_for(values) == "cuda":
+        from nsvq_lightning.quantize.cuda.sums import sum_rows
+
+        return sum_rows(values.contiguous(), codes, num_codes, dtype)
     if values.device.type == "cpu" and values.dtype in (torch.float32, torch.float64):
         sums = torch.zeros(num_codes, values.shape[1], dtype=dtype)
         numbers = flat_checked("codes", codes.contiguous(), (len(values),), INT64)
         _sum_rows(values.contiguous().numpy(), numbers, sums.numpy(), thread_count())
         return sums
-    if kernels_for(values) == "cuda":
-        from nsvq_lightning.quantize.cuda.sums import sum_rows
-
-        return sum_rows(values.contiguous(), codes, num_codes, dtype)
     return _sum_segments(values.to(dtype), codes, num_codes)
 
 

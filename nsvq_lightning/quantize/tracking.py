@@ -253,7 +253,7 @@ class NearestTracker:
         from nsvq_lightning.quantize.cuda.tracking import DeviceTracker
 
         if self._on_device is None or not self._on_device.fits(codebook):
-            self._on_device = DeviceTracker(*codebook.shape, codebook.device)
+            self._on_device = DeviceTracker(len(codebook), codebook.shape[1], codebook.device)
         chosen = torch.arange(len(x), device=x.device) if rows is None else rows.contiguous()
         return self._on_device.search(x, codebook, chosen)
 

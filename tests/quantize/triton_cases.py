@@ -83,15 +83,14 @@ def walk(dim: int, steps: int, size: float) -> Iterator[tuple[torch.Tensor, ...]
 def searched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Length of the queue of each search."""
     lengths: list[int] = []
-    queue = tracking_module._queue
+    take_snapshot = DeviceTracker._take_snapshot
 
-    def counting(chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        places, length = queue(chosen)
-        lengths.append(int(length))
-        assert places[: int(length)].tolist() == chosen.nonzero()[:, 0].tolist()
-        return places, length
+    def counting(self: DeviceTracker, codebook: torch.Tensor, ends: torch.Tensor, count: int, *, always: bool) -> None:
+        if not always:
+            lengths.append(int(ends[-1]))
+        take_snapshot(self, codebook, ends, count, always=always)
 
-    monkeypatch.setattr(tracking_module, "_queue", counting)
+    monkeypatch.setattr(DeviceTracker, "_take_snapshot", counting)
     return lengths
 
 
@@ -150,6 +149,25 @@ def test_sums_by_code(n: int, k: int, dim: int, dtype: torch.dtype, tolerance: f
     expected = torch.zeros(k, dim, dtype=torch.float64).index_add_(0, codes, values.double())
     assert found.dtype == dtype
     torch.testing.assert_close(found.cpu().double(), expected, rtol=0, atol=tolerance)
+
+
+def test_frozen_codes_are_sorted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    sums_module = importlib.import_module("nsvq_lightning.quantize.cuda.sums")
+    sorted_codes: list[int] = []
+
+    def counting(codes: torch.Tensor, num_codes: int) -> tuple[torch.Tensor, torch.Tensor]:
+        sorted_codes.append(num_codes)
+        return sorted_by_code(codes, num_codes)
+
+    monkeypatch.setattr(sums_module, "sorted_by_code", counting)
+    values, codes = torch.randn(30, 3, device=DEVICE), torch.arange(30, device=DEVICE) % 4
+    first = sum_rows(values, codes, 4, torch.float32)
+    assert torch.equal(sum_rows(values, codes, 4, torch.float32), first)
+    assert sorted_codes == [4]
+    codes[0] = 1
+    assert not torch.equal(sum_rows(values, codes, 4, torch.float32), first)
+    sum_rows(values, codes, 5, torch.float32)
+    assert sorted_codes == [4, 4, 5]
 
 
 @pytest.mark.parametrize("num_codes", [32_767, 32_768, 32_769, 40_001])

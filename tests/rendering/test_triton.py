@@ -18,7 +18,10 @@ from nsvq_lightning.rendering.rasterize import resolve_backend
 HERE = Path(__file__).parent
 
 
-@pytest.mark.parametrize("cases", ["triton_cases.py", "triton_step_cases.py", "../quantize/triton_cases.py"])
+@pytest.mark.parametrize(
+    "cases",
+    ["triton_cases.py", "triton_loss_cases.py", "../quantize/triton_cases.py", "../training/triton_step_cases.py"],
+)
 def test_against_the_oracle(cases: str) -> None:
     pytest.importorskip("triton", reason="the CUDA back-end needs Triton")
     environment = dict(os.environ, **({} if torch.cuda.is_available() else {"TRITON_INTERPRET": "1"}))
@@ -45,7 +48,10 @@ REGISTERS = {
     "spread_kernel": 40,
     "gradient_kernel": 144,
     "nearest_kernel": 168,
+    "drift_kernel": 32,
     "check_kernel": 72,
+    "queue_kernel": 40,
+    "snapshot_kernel": 32,
     "search_kernel": 232,
     "substitute_kernel": 96,
     "radial_kernel": 96,
@@ -95,7 +101,7 @@ def test_no_kernel_is_left_out() -> None:
         (f"{BLEND}:total_kernel", {"count"}),
         (f"{BINNING}:expand_kernel", {"total", "count", "halvings"}),
         (f"{NEAREST}:nearest_kernel", {"count"}),
-        (f"{TRACKING}:check_kernel", {"count"}),
+        *((f"{TRACKING}:{name}_kernel", {"count"}) for name in ("check", "queue", "search", "snapshot")),
         (f"{SUBSTITUTION}:substitute_kernel", {"seed", "count", "height"}),
         (f"{SUBSTITUTION}:radial_kernel", {"count", "height"}),
         (f"{NOISE}:normal_kernel", {"seed", "count"}),

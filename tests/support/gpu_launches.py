@@ -28,7 +28,7 @@ from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quantize.cuda.nearest import nearest_codes
 from nsvq_lightning.quantize.cuda.noise import normal_vectors
 from nsvq_lightning.quantize.cuda.sums import sum_rows
-from nsvq_lightning.quantize.cuda.tracking import DeviceTracker
+from nsvq_lightning.quantize.cuda.tracking import SNAPSHOT_STEPS, DeviceTracker
 from nsvq_lightning.quantize.nsvq import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.cuda import projection
@@ -90,9 +90,9 @@ def loss(height: int, dtype: torch.dtype) -> None:
 
 
 def search(dim: int) -> None:
-    DeviceTracker(4096, dim, torch.device("meta")).search(
-        tensor(SPLATS, dim), tensor(4096, dim), tensor(SEEN, dtype=torch.int64)
-    )
+    tracker = DeviceTracker(4096, dim, torch.device("meta"))
+    for _ in range(SNAPSHOT_STEPS):  # the last one takes a snapshot
+        tracker.search(tensor(SPLATS, dim), tensor(4096, dim), tensor(SEEN, dtype=torch.int64))
 
 
 def substitute(dim: int) -> None:

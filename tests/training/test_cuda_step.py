@@ -104,7 +104,7 @@ def test_quantizer(launches: list[str], dim: int, kind: type[Any], some: bool) -
     result.sum().backward()
     assert x.grad is not None
     assert x.grad.shape == x.shape
-    expected = ["check_kernel", "search_kernel"]
+    expected = ["drift_kernel", "check_kernel", "queue_kernel", "search_kernel", "snapshot_kernel"]
     if kind in (NSVQ, DiVeQ):
         expected += ["substitute_kernel", "radial_kernel"]
     if kind is not StraightThrough:

@@ -6,6 +6,7 @@ import torch
 import triton
 import triton.language as tl
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from nsvq_lightning.compute.launch import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
@@ -77,6 +78,19 @@ def sorted_by_code(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:
     return order, starts
 
 
+_sorted = WeakTensorKeyDictionary()
+"""Rows by code of codes that still exist, after the version of these codes and how many there may be."""
+
+
+def _remembered(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:
+    """:func:`sorted_by_code`, once for codes that stay the same, as frozen ones do."""
+    version, count, *found = _sorted.get(codes, (-1, -1))
+    if (version, count) != (codes._version, num_codes):
+        found = list(sorted_by_code(codes, num_codes))
+        _sorted[codes] = codes._version, num_codes, found[0], found[1]
+    return found[0], found[1]
+
+
 def sum_rows(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype) -> Tensor:
     """Sums ``[K, D]`` of the rows of each code, 0 for a code without rows; nothing is read back from the device.
 
@@ -92,7 +106,7 @@ def sum_rows(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype) 
     """
     check_tensor("values", values, (len(values), values.shape[-1]), values.device, values.dtype)
     check_tensor("codes", codes, (len(values),), values.device, torch.int64)
-    order, offsets = sorted_by_code(codes, num_codes)
+    order, offsets = _remembered(codes, num_codes)
     dim = values.shape[1]
     width = min(WIDTH, triton.next_power_of_2(dim))
     columns = triton.cdiv(dim, width)

@@ -24,7 +24,9 @@ __all__ = ["DeviceTracker"]
 LIST = 8
 """Codes in the list of a row."""
 BLOCK = 64
-"""Rows per program of the check."""
+"""Rows, or codes, per program of a check."""
+COPIED = 1024
+"""Numbers per program of a copy."""
 PROGRAMS = 4096
 """Most programs of a search; they share the queue, whatever its length."""
 SNAPSHOT_STEPS = 16
@@ -70,22 +72,73 @@ def bound(squared):
     return tl.sqrt(squared.to(tl.float64)) * SLACK
 
 
+@triton.jit
+def drift_kernel(codebook, snapshot, squared_drift, num_codes, DIM: tl.constexpr, BLOCK: tl.constexpr):
+    """Raise ``squared_drift[0]``, the bits of a float32, to how far any of the codes has moved since the snapshot."""
+    code = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = code < num_codes
+    squared = tl.zeros([BLOCK], tl.float32)
+    for j in range(DIM):
+        at = code.to(tl.int64) * DIM + j
+        step = tl.load(codebook + at, mask=inside, other=0.0) - tl.load(snapshot + at, mask=inside, other=0.0)
+        squared = tl.fma(step, step, squared)
+    # A code that is not a number may have been anywhere. The largest is the same in whatever order programs end.
+    largest = tl.max(tl.where(squared == squared, squared, float("inf")), 0)
+    tl.atomic_max(squared_drift, largest.to(tl.int32, bitcast=True))
+
+
+@triton.jit
+def drift_of(squared_drift):
+    """The distance that :func:`drift_kernel` has left, in float64, rounded up."""
+    return bound(tl.load(squared_drift).to(tl.float32, bitcast=True))
+
+
+@triton.jit
+def have_jumped(ends, count):
+    """Whether more than half of the rows are searched: then codes have jumped, and a new snapshot pays."""
+    return 2 * tl.load(ends + count - 1) > count
+
+
+@triton.jit(do_not_specialize=["count"])
+def snapshot_kernel(
+    codebook, snapshot, travelled, squared_drift, ends, count, size, ALWAYS: tl.constexpr, BLOCK: tl.constexpr
+):  # fmt: skip
+    """Take a snapshot of the codes, if they have jumped or ``ALWAYS``."""
+    wanted = True
+    if not ALWAYS:
+        wanted = have_jumped(ends, count)
+    if wanted:
+        place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+        tl.store(snapshot + place, tl.load(codebook + place, mask=place < size, other=0.0), mask=place < size)
+        if tl.program_id(0) == 0:
+            tl.store(travelled, tl.load(travelled) + drift_of(squared_drift))
+
+
+@triton.jit(do_not_specialize=["count"])
+def queue_kernel(ends, queue, count, BLOCK: tl.constexpr):
+    """Line up the places at which the running sum ``ends`` rises."""
+    place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    end = tl.load(ends + place, mask=place < count, other=0)
+    before = tl.load(ends + place - 1, mask=(place < count) & (place > 0), other=0)
+    tl.store(queue + before, place.to(tl.int32), mask=end > before)
+
+
 @triton.jit(do_not_specialize=["count"])
 def check_kernel(
-    x, rows, codebook, last, lists, anchors, clearance, limits, travel, result, count, DIM: tl.constexpr,
-    BLOCK: tl.constexpr, LIST: tl.constexpr,
+    x, rows, codebook, last, lists, anchors, clearance, limits, travelled, squared_drift, result, searched, count,
+    DIM: tl.constexpr, BLOCK: tl.constexpr, LIST: tl.constexpr,
 ):  # fmt: skip
-    """Codes of the rows for which a bound proves one, -1 for the others.
+    """Codes of the rows for which a bound proves one; 1 in ``searched`` for the others.
 
-    ``travel`` holds how far the codes have moved by the last snapshot, and since.
+    ``travelled`` is how far the codes have moved by the last snapshot, ``squared_drift`` since.
     """
     place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = place < count
     row = tl.load(rows + place, mask=inside, other=0)
     code = tl.load(last + row, mask=inside, other=-1)
     known = code >= 0
-    drift = tl.load(travel + 1)
-    way = tl.load(travel) + drift
+    drift = drift_of(squared_drift)
+    way = tl.load(travelled) + drift
     squared_move, squared = tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.float32)
     for j in range(DIM):
         value = tl.load(x + row * DIM + j, mask=known, other=0.0)
@@ -119,22 +172,24 @@ def check_kernel(
         limit -= moved
         tl.store(limits + row, limit, mask=anew)
         tl.store(clearance + row, tl.minimum(limit, second - drift + (way - drift)), mask=anew)
-    tl.store(result + place, tl.where(proven, code, -1).to(tl.int64), mask=inside)
+    tl.store(result + place, code.to(tl.int64), mask=inside)
+    tl.store(searched + place, (~proven).to(tl.int32), mask=inside)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def search_kernel(
-    x, rows, queue, length, codebook, last, lists, anchors, clearance, limits, travel, result, num_codes, code_stride,
-    DIM: tl.constexpr, ROWS: tl.constexpr, CODES: tl.constexpr, LIST: tl.constexpr,
+    x, rows, queue, ends, codebook, last, lists, anchors, clearance, limits, travelled, squared_drift, result, count,
+    num_codes, code_stride, DIM: tl.constexpr, ROWS: tl.constexpr, CODES: tl.constexpr, LIST: tl.constexpr,
 ):  # fmt: skip
-    """Search the first ``length[0]`` places of the queue and remember what was found."""
-    count = tl.load(length)
-    drift = tl.load(travel + 1)
-    before = tl.load(travel) - drift
-    for first in range(tl.program_id(0) * ROWS, count, tl.num_programs(0) * ROWS):
+    """Search the rows in the queue and remember what was found; ``ends[count - 1]`` is its length."""
+    length = tl.load(ends + count - 1)
+    drift = drift_of(squared_drift)
+    # If codes have jumped, these very codes are the next snapshot.
+    before = tl.load(travelled) + tl.where(have_jumped(ends, count), drift, -drift)
+    for first in range(tl.program_id(0) * ROWS, length, tl.num_programs(0) * ROWS):
         turn = first + tl.arange(0, ROWS)
-        inside = turn < count
-        place = tl.load(queue + tl.minimum(turn, count - 1))
+        inside = turn < length
+        place = tl.load(queue + tl.minimum(turn, length - 1))
         row = tl.load(rows + place)
         smallest, chosen, second = compare(x, row * DIM, codebook, num_codes, code_stride, DIM, ROWS, CODES, True)
         least, nearest = least_of(smallest, chosen, num_codes)
@@ -164,9 +219,10 @@ class DeviceTracker:
     def __init__(self, num_codes: int, dim: int, device: torch.device) -> None:
         self.num_codes, self.dim, self.device = num_codes, dim, device
         self._memory = empty_memory(0, dim, device)
-        self._snapshot: Tensor | None = None
         self._steps = 0
-        self._travel = torch.zeros(2, dtype=torch.float64, device=device)
+        self._snapshot: Tensor | None = None
+        self._travelled = torch.zeros(1, dtype=torch.float64, device=device)
+        self._squared_drift = torch.zeros(1, dtype=torch.int32, device=device)
 
     def fits(self, codebook: Tensor) -> bool:
         """Whether it remembers searches of as many codes, on this device."""
@@ -187,42 +243,46 @@ class DeviceTracker:
         check_tensor("x", x, (len(x), self.dim), self.device)
         check_tensor("codebook", codebook, (self.num_codes, self.dim), self.device)
         check_tensor("rows", rows, (len(rows),), self.device, torch.int64)
-        result = torch.empty(len(rows), dtype=torch.int64, device=self.device)
+        count = len(rows)
+        result = torch.empty(count, dtype=torch.int64, device=self.device)
         self._grow(len(x))
-        self._follow(codebook)
-        if len(rows) == 0:
+        if self._snapshot is None:
+            self._snapshot = codebook.clone()
+        if count == 0:
             return result
+        searched, queue = torch.empty(2, count, dtype=torch.int32, device=self.device)
+        travel, codes = (self._travelled, self._squared_drift), by_column(codebook)
         with torch.cuda.device_of(x):
-            check_kernel[(triton.cdiv(len(rows), BLOCK),)](
-                x, rows, codebook, *self._memory, self._travel, result, len(rows), DIM=self.dim, BLOCK=BLOCK,
+            self._follow(codebook)
+            check_kernel[(triton.cdiv(count, BLOCK),)](
+                x, rows, codebook, *self._memory, *travel, result, searched, count, DIM=self.dim, BLOCK=BLOCK,
                 LIST=LIST, **COMPILE,
             )  # fmt: skip
-            queue, length = _queue(result < 0)
-            self._take_snapshot(codebook, 2 * length > len(rows))  # codes have jumped
-            codes = by_column(codebook)
-            search_kernel[(min(PROGRAMS, triton.cdiv(len(rows), ROWS)),)](
-                x, rows, queue, length, codes, *self._memory, self._travel, result, self.num_codes, codes.shape[1],
+            ends = searched.cumsum(0, dtype=torch.int32)
+            queue_kernel[(triton.cdiv(count, COPIED),)](ends, queue, count, BLOCK=COPIED, **COMPILE)
+            search_kernel[(min(PROGRAMS, triton.cdiv(count, ROWS)),)](
+                x, rows, queue, ends, codes, *self._memory, *travel, result, count, self.num_codes, codes.shape[1],
                 DIM=self.dim, ROWS=ROWS, CODES=CODES, LIST=LIST, num_warps=1, **COMPILE,
             )  # fmt: skip
+            self._take_snapshot(codebook, ends, count, always=False)
         return result
 
     def _follow(self, codebook: Tensor) -> None:
         """Note how far codes have moved since the snapshot; now and then, take a new one."""
-        if self._snapshot is None:
-            self._snapshot = codebook.clone()
-        squares = (codebook - self._snapshot).square().sum(1)
-        self._travel[1] = squares.max().double().sqrt() * ROUNDING
         self._steps += 1
+        self._squared_drift.zero_()
+        drift_kernel[(triton.cdiv(self.num_codes, BLOCK),)](
+            codebook, self._snapshot, self._squared_drift, self.num_codes, DIM=self.dim, BLOCK=BLOCK, **COMPILE
+        )
         if self._steps % SNAPSHOT_STEPS == 0:
-            self._take_snapshot(codebook, torch.ones_like(squares[:1], dtype=torch.bool))
+            self._take_snapshot(codebook, self._squared_drift, 1, always=True)
+            self._squared_drift.zero_()
 
-    def _take_snapshot(self, codebook: Tensor, wanted: Tensor) -> None:
-        """Take a snapshot if ``wanted [1]``, which the device decides."""
-        assert self._snapshot is not None
-        torch.where(wanted, codebook, self._snapshot, out=self._snapshot)
-        travelled, drift = self._travel.unbind()
-        moved = torch.stack([travelled + drift, torch.zeros_like(drift)])
-        torch.where(wanted, moved, self._travel, out=self._travel)
+    def _take_snapshot(self, codebook: Tensor, ends: Tensor, count: int, *, always: bool) -> None:
+        snapshot_kernel[(triton.cdiv(codebook.numel(), COPIED),)](
+            codebook, self._snapshot, self._travelled, self._squared_drift, ends, count, codebook.numel(),
+            ALWAYS=always, BLOCK=COPIED, **COMPILE,
+        )  # fmt: skip
 
     def _grow(self, count: int) -> None:
         """Make room for ``count`` rows."""
@@ -230,13 +290,3 @@ class DeviceTracker:
         if count > old:
             more = empty_memory(count - old, self.dim, self.device)
             self._memory = Memory(*(torch.cat(both) for both in zip(self._memory, more, strict=True)))
-
-
-def _queue(chosen: Tensor) -> tuple[Tensor, Tensor]:
-    """Places ``[V]`` int32 of the chosen ones in order, then anything, and their number ``[1]`` int32."""
-    ends = chosen.cumsum(0, dtype=torch.int32)
-    queue = torch.empty(len(chosen) + 1, dtype=torch.int32, device=chosen.device)
-    places = torch.arange(len(chosen), dtype=torch.int32, device=chosen.device)
-    # Those that are not chosen all go to the last place, which nobody reads.
-    queue.scatter_(0, torch.where(chosen, ends - 1, len(chosen)).long(), places)
-    return queue, ends[-1:]
