@@ -371,7 +371,21 @@ def _pictures_backward() -> dict[str, Any]:
 
 _CUDA = "nsvq_lightning.rendering.cuda"
 
+
+def _pairs() -> dict[str, Any]:
+    boxes = _projected().boxes
+    ends = (boxes[:, 2] * boxes[:, 3]).cumsum(0).int()
+    return {"boxes": boxes, "ends": ends, "total": int(ends[-1]), "columns": 1, "rows": 1}
+
+
+def _search_on_device(function: Callable[..., Any], **arguments: Any) -> Any:
+    from nsvq_lightning.quantize.cuda.tracking import DeviceTracker
+
+    return function(DeviceTracker(9, 3, torch.device("cpu")), **arguments)
+
+
 TRITON: dict[str, list[Case]] = {
+    f"{_CUDA}.binning.tiles_of": [Case(_pairs)],
     f"{_CUDA}.blend.blend": [Case(_blending)],
     f"{_CUDA}.blend.blend_backward": [Case(_blending_backward)],
     f"{_SSIM}_cuda.l1_dssim": [Case(_pictures), Case(lambda: _pictures(torch.uint8))],
@@ -383,6 +397,15 @@ TRITON: dict[str, list[Case]] = {
     f"{_CUDA}.projection.project_backward": [Case(_projection_backward, call=_by_attribute)],
     f"{_Q}.cuda.nearest.nearest_codes": [
         Case(lambda: {"x": _tensor(20, 3), "codebook": _tensor(9, 3, seed=1)}, rows=("x", "codebook"))
+    ],
+    f"{_Q}.cuda.tracking.DeviceTracker.search": [
+        Case(
+            lambda: {
+                "x": _tensor(20, 3), "codebook": _tensor(9, 3, seed=1), "rows": torch.tensor([0, 2, 3, 9])
+            },
+            rows=("x", "rows"),
+            call=_search_on_device,
+        )
     ],
     f"{_Q}.cuda.noise.normal_vectors": [Case(lambda: {"seed": 5, "vectors": 4, "device": torch.device("cpu")})],
     f"{_Q}.cuda.substitution.substitute": [

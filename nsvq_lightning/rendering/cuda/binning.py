@@ -72,11 +72,8 @@ def list_tiles(boxes: Tensor, columns: int, rows: int) -> Tiles:
         rows: Rows of tiles in the image.
 
     Raises:
-        ValueError: The boxes are not ``[V, 4]`` or not contiguous.
-        TypeError: They are not int32.
         RuntimeError: There are more pairs than can be numbered.
     """
-    check_tensor("boxes", boxes, (len(boxes), 4), boxes.device, torch.int32)
     ends = (boxes[:, 2].long() * boxes[:, 3]).cumsum(0)
     total = int(ends[-1]) if len(boxes) else 0
     if total > MAX_PAIRS:
@@ -88,7 +85,14 @@ def list_tiles(boxes: Tensor, columns: int, rows: int) -> Tiles:
 
 
 def tiles_of(boxes: Tensor, ends: Tensor, total: int, columns: int, rows: int) -> Tiles:
-    """:func:`list_tiles` where the ends of the splats' slots, and so the number of pairs, are known."""
+    """:func:`list_tiles` where the ends of the splats' slots, and so the number of pairs, are known.
+
+    Raises:
+        ValueError: Boxes and ends do not fit together, or are not contiguous.
+        TypeError: They are not int32.
+    """
+    check_tensor("boxes", boxes, (len(boxes), 4), boxes.device, torch.int32)
+    check_tensor("ends", ends, (len(boxes),), boxes.device, torch.int32)
     device, tiles = boxes.device, columns * rows
     # 16-bit keys take a quarter of the sorting passes of 64-bit ones.
     key = torch.int16 if tiles < 2**15 else torch.int32
