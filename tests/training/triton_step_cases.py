@@ -94,9 +94,9 @@ def module_and_view(phase: Phase) -> tuple[SplatModule, View]:
         return torch.randn(*shape, generator=draw)
 
     splats = Splats.from_tensors(
-        rand(12, 3) * 0.3, rand(12, 4), rand(12, 3) * 0.2 - 2, rand(12), rand(12, 1, 3), rand(12, 15, 3)
+        rand(4, 3) * 0.3, rand(4, 4), rand(4, 3) * 0.2 - 2, rand(4), rand(4, 1, 3), rand(4, 15, 3)
     )
-    module = SplatModule(sh_degree=3, codebooks={"scales": 6, "quats": 5, "sh0": 4, "shN": 3}, splats=splats)
+    module = SplatModule(sh_degree=3, codebooks={"scales": 4, "quats": 4, "sh0": 4, "shN": 3}, splats=splats)
     module.backend, module.active_sh_degree, module.phase = "cuda", 3, phase
     for name, quantizer in module.quantizers.items():
         quantizer.fit(module.rows(name), generator=generator(0, 0, name))
@@ -105,8 +105,8 @@ def module_and_view(phase: Phase) -> tuple[SplatModule, View]:
     module._trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, max_steps=1000)
     viewmat = torch.eye(4)
     viewmat[2, 3] = 3.0
-    camera = Camera(torch.tensor([[18.0, 0.0, 10.0], [0.0, 18.0, 8.0], [0.0, 0.0, 1.0]]), viewmat, 20, 16)
-    return module.train(), View("a.png", 0, camera, torch.zeros(16, 20, 3, dtype=torch.uint8))
+    camera = Camera(torch.tensor([[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]]), viewmat, 8, 8)
+    return module.train(), View("a.png", 0, camera, torch.zeros(8, 8, 3, dtype=torch.uint8))
 
 
 def step(module: SplatModule, view: View, optimizer: torch.optim.Optimizer) -> None:
