@@ -1,12 +1,15 @@
 from __future__ import annotations
 
+import itertools
 import logging
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from nsvq_lightning.commands.benchmark import fitting
 from nsvq_lightning.commands.benchmark.fitting import Step, StepClock, fit, one_phase, quiet, training_callbacks
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.training.module import SplatModule
@@ -36,6 +39,18 @@ def test_steps_of_one_phase_are_timed_without_what_is_between(phase: Phase, demo
     assert min(step.milliseconds for step in clock.steps) > 0
     assert sum(step.milliseconds for step in clock.steps) / 1000 < elapsed - 4 * PAUSE
     assert len({name for name, _ in seen}) == 4
+
+
+def test_steps_that_are_timed_together_are_waited_for_once(demo_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[int] = []
+    seconds = itertools.count()
+    monkeypatch.setattr(fitting, "finish", lambda: waits.append(0))
+    monkeypatch.setattr(fitting, "time", SimpleNamespace(perf_counter=lambda: next(seconds)))
+    clock = StepClock(lambda *_: None, together=4)
+    schedule = one_phase(Phase.PRUNE, 9)
+    fit(SplatModule(sh_degree=1, codebooks=CODES), ColmapDataModule(str(demo_scene)), [schedule, clock], 9)
+    assert clock.steps == [Step(4, Phase.PRUNE, 250), Step(8, Phase.PRUNE, 250)]
+    assert len(waits) == 2
 
 
 def test_callbacks_are_those_of_the_command_that_train() -> None:

@@ -28,7 +28,7 @@ WATCHING = frozenset({"report", "export", "predictions", "checkpoint", "kernels"
 
 
 class Step(NamedTuple):
-    """One step: its 1-based iteration, the phase it was of, and how long it took, ms."""
+    """One step, or the last of some that are timed together: its 1-based iteration, its phase, and ms for each."""
 
     iteration: int
     phase: Phase
@@ -39,12 +39,15 @@ class StepClock(Callback):
     """Times steps from the end of one to the end of the next: data, hooks, loggers and loops are in it.
 
     Args:
-        between: Called after every step with the module, the view of the step and the step; not in the time.
+        between: Called after a step that has been timed with the module, its view and the step; not in the time.
+        together: Steps that are timed as one. A GPU is waited for only after the last, as in training: a wait after
+            every step would hide that the host prepares the next one in the meantime.
     """
 
-    def __init__(self, between: Callable[[Any, View, Step], None]) -> None:
+    def __init__(self, between: Callable[[Any, View, Step], None], together: int = 1) -> None:
         self.steps: list[Step] = []
-        self._between = between
+        self._between, self._together = between, together
+        self._open = 0
         self._since = 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -55,9 +58,12 @@ class StepClock(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: View, batch_idx: int
     ) -> None:
         """End a step and start the next."""
+        self._open += 1
+        if self._open < self._together:
+            return
         finish()
-        seconds = time.perf_counter() - self._since
-        phase = getattr(as_host(pl_module), "phase", Phase.WARMUP)
+        seconds = (time.perf_counter() - self._since) / self._open
+        phase, self._open = getattr(as_host(pl_module), "phase", Phase.WARMUP), 0
         self.steps.append(Step(trainer.global_step, phase, 1000 * seconds))
         self._between(pl_module, batch, self.steps[-1])
         self._since = time.perf_counter()

@@ -40,6 +40,7 @@ class Trainee(NamedTuple):
         steps: int,
         between: Callable[[Any, View, Step], None],
         accelerator: str = "cpu",
+        together: int = 1,
         **options: Any,
     ) -> None:
         """Train a copy of the splats in one phase, at their full SH degree, with codebooks of one Lloyd step.
@@ -49,13 +50,14 @@ class Trainee(NamedTuple):
             steps: How many.
             between: Called after every step, see :class:`~nsvq_lightning.commands.benchmark.fitting.StepClock`.
             accelerator: That of the trainer.
+            together: Steps that are timed as one.
             options: Further arguments of :class:`~nsvq_lightning.training.module.SplatModule`.
         """
         splats = Splats.from_tensors(*(tensor.clone() for tensor in self.splats))
         quantizer = partial(NSVQ, kmeans_steps=1)
         module = SplatModule(sh_degree=splats.sh_degree, splats=splats, quantizer=quantizer, **options)
         module.active_sh_degree = splats.sh_degree
-        callbacks = [*training_callbacks(phases=one_phase(phase, steps)), StepClock(between)]
+        callbacks = [*training_callbacks(phases=one_phase(phase, steps)), StepClock(between, together)]
         fit(module, self.data, callbacks, steps, accelerator)
 
 

@@ -49,8 +49,10 @@ COPIED = 2**28
 COPIES = 5
 FLOAT = 4
 """Bytes of a number."""
-WARM_STEPS, STEPS = {True: 6, False: 60}, {True: 8, False: 60}
+WARM_STEPS, STEPS = {True: 6, False: 60}, {True: 8, False: 200}
 """Steps that are not counted, and those that are: searches that remember need some to have something to."""
+TOGETHER = {True: 2, False: 10}
+"""Steps that are timed as one."""
 
 
 def run(scope: Scope) -> list[Measurement]:
@@ -173,7 +175,7 @@ def _step_rows(device: torch.device, names: Sequence[str], scope: Scope) -> list
 
 
 def _steps(subject: Trainee, phase: Phase, backend: str, device: torch.device, scope: Scope) -> Timing:
-    """Steps of one phase with one back-end, each followed by a matrix product."""
+    """Steps of one phase with one back-end; some together are followed by a matrix product."""
     steps: list[float] = []
     products: list[float] = []
     product = sgemm(device)
@@ -184,5 +186,6 @@ def _steps(subject: Trainee, phase: Phase, backend: str, device: torch.device, s
             products.append(milliseconds(product, device))
 
     count = WARM_STEPS[scope.quick] + STEPS[scope.quick]
-    subject.train(phase, count, between, device.type, codebooks=scope.codebooks, backend=backend)
+    together = TOGETHER[scope.quick]
+    subject.train(phase, count, between, device.type, together, codebooks=scope.codebooks, backend=backend)
     return Timing(tuple(steps), tuple(products))
