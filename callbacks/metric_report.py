@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +16,7 @@ from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor
 from torchmetrics import Metric
 
+from nsvq_lightning.compute.compilation import compile_seconds
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import save
@@ -20,6 +25,7 @@ from nsvq_lightning.quality.metrics import build_lpips, eight_bit
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.report.evaluation import ViewScore, evaluate
 from nsvq_lightning.report.files import paper_level, summarize, write_curve, write_curve_csv, write_metrics, write_views
+from nsvq_lightning.report.page import RunPage
 from nsvq_lightning.report.picture_logs import log_pictures
 from nsvq_lightning.report.pictures import comparison, file_stem, write_png
 from nsvq_lightning.splats.splats import RawSplats
@@ -39,7 +45,8 @@ class MetricReport(WritingCallback):
     """Writes the results of a run to its folder.
 
     During training: test PSNR and SSIM, number of splats and training seconds at the end of each phase and every
-    ``every`` iterations, in ``curve.csv`` and ``curve.png``. An evaluation renders what a file written at that moment
+    ``every`` iterations, in ``curve.csv``, ``curve.png`` and ``report.html``, a page that can be left open in a browser
+    and shows one view as it becomes better. An evaluation renders what a file written at that moment
     would decode to. It does not count as training time.
 
     Evaluations take the place of Lightning's validation: ``report/psnr``, ``report/ssim`` and ``report/splats`` go to
@@ -47,8 +54,8 @@ class MetricReport(WritingCallback):
     ``ModelCheckpoint`` that monitors one of them is called right away.
 
     In ``test``: writes ``scene.nsvq``, reads it back, and lets the module render the **decoded file**; then writes
-    ``metrics.json``, ``views.csv`` and a picture (photo, render, error) of each view in ``renders/``. TensorBoard and
-    Weights & Biases loggers show the pictures, too.
+    ``metrics.json``, ``views.csv``, a picture (photo, render, error) of each view in ``renders/``, and ``report.html``,
+    which holds all of it and needs no other file. TensorBoard and Weights & Biases loggers show the pictures, too.
 
     Args:
         every: Iterations of this run between two evaluations; None is a twentieth of the run, 0 means only the ends of
@@ -82,6 +89,7 @@ class MetricReport(WritingCallback):
         self._folder = Path()
         self._lpips: Metric | None = None
         self._lpips_reason: str | None = None
+        self._seconds: dict[str, float] = {}
 
     # During training
 
@@ -126,7 +134,7 @@ class MetricReport(WritingCallback):
         datamodule = getattr(trainer, "datamodule", None)
         if datamodule is None or not datamodule.scene.test:
             return
-        with host.stopwatch.paused(host.device):
+        with host.stopwatch.paused(host.device), self._timed("evaluations"):
             self._evaluate(trainer, host, iteration, datamodule.test_dataloader())
             tell_watchers(trainer, module)
 
@@ -138,7 +146,9 @@ class MetricReport(WritingCallback):
         def render_image(camera: Camera) -> Tensor:
             return host.render_splats(splats, camera).image
 
-        quality = evaluate(render_image, views, host.device)
+        folder = run_folder(trainer)
+        show = partial(_preview, folder / "preview.png") if self.pictures and trainer.is_global_zero else None
+        quality = evaluate(render_image, views, host.device, show)
         entry: dict[str, Any] = {
             "iteration": iteration,
             "phase": phase.name.lower(),
@@ -148,13 +158,24 @@ class MetricReport(WritingCallback):
             "seconds": host.train_seconds,
         }
         host.history.append(entry)
-        folder = run_folder(trainer)
         if trainer.is_global_zero:
             write_curve_csv(folder / "curve.csv", host.history)
+            self._page(folder, host).write()
         values = {f"report/{name}": float(entry[name]) for name in ("psnr", "ssim", "splats")}
         trainer.callback_metrics.update({name: torch.tensor(value) for name, value in values.items()})
         for logger in trainer.loggers:
             logger.log_metrics(values, iteration)
+
+    def _page(self, folder: Path, host: SplatHost) -> RunPage:
+        seconds = {"kernels compiled": compile_seconds(), **self._seconds}
+        return RunPage(folder, host.history, host.schedule, seconds)
+
+    @contextmanager
+    def _timed(self, part: str) -> Iterator[None]:
+        """Add the time of the body to a part that is no training."""
+        start = time.perf_counter()
+        yield
+        self._seconds[part] = self._seconds.get(part, 0.0) + time.perf_counter() - start
 
     # In test
 
@@ -167,12 +188,13 @@ class MetricReport(WritingCallback):
         # All processes call this hook; later ones differ, as some have fewer views than others.
         self._folder = run_folder(trainer)
         path = self._folder / "scene.nsvq"
-        if trainer.is_global_zero:
-            scene = host.compressed()
-            save(scene, path, host.storage)
-            self._paper_level = paper_level(scene)
-        trainer.strategy.barrier("scene.nsvq")
-        self._scene = read_nsvq(path)
+        with self._timed("file written and read"):
+            if trainer.is_global_zero:
+                scene = host.compressed()
+                save(scene, path, host.storage)
+                self._paper_level = paper_level(scene)
+            trainer.strategy.barrier("scene.nsvq")
+            self._scene = read_nsvq(path)
         # Detached tensors, not the module: a submodule would enter checkpoints.
         decoded = self._scene.decode().to(host.device).raw()
         host.evaluation_splats = RawSplats(*(tensor.detach() for tensor in decoded))
@@ -217,9 +239,16 @@ class MetricReport(WritingCallback):
             metrics = summarize(folder / "scene.nsvq", self._scene, scores, lpips, host, self._paper_level)
             write_metrics(folder / "metrics.json", metrics)
             write_views(folder / "views.csv", scores)
+            page = replace(self._page(folder, host), metrics=metrics, views=[asdict(score) for score in scores])
+            log.info("report: %s", page.write())
             if self.pictures:
                 log_pictures(trainer.loggers, [_picture(folder, score.name) for score in scores], trainer.global_step)
         self._scene, self._lpips = None, None
+
+
+def _preview(path: Path, image: Tensor, photo: Tensor) -> None:
+    """Write the photo beside the render."""
+    write_png(path, torch.cat([photo, image], dim=1))
 
 
 def _picture(folder: Path, view: str) -> Path:

@@ -35,22 +35,31 @@ class Quality:
 
 
 @torch.no_grad()
-def evaluate(render_image: Callable[[Camera], Tensor], views: Iterable[View], device: torch.device) -> Quality:
+def evaluate(
+    render_image: Callable[[Camera], Tensor],
+    views: Iterable[View],
+    device: torch.device,
+    show: Callable[[Tensor, Tensor], None] | None = None,
+) -> Quality:
     """Render every view and compare it with its photo.
 
     Args:
         render_image: Image ``[H, W, 3]`` of a camera.
         views: What to compare with.
         device: Where the splats are.
+        show: Called with the first image and its photo.
 
     Raises:
         ValueError: There are no views.
     """
     metrics = image_metrics().to(device)
-    scores = []
+    scores: list[ViewScore] = []
     for view in views:
         on_device = view.to(device)
-        values = metrics(render_image(on_device.camera), on_device.image)
+        image = render_image(on_device.camera)
+        if show is not None and not scores:
+            show(image, on_device.image)
+        values = metrics(image, on_device.image)
         scores.append(ViewScore(view.name, float(values["psnr"]), float(values["ssim"])))
     if not scores:
         raise ValueError("there are no views to evaluate; the scene needs at least one test view")

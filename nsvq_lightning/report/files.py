@@ -9,6 +9,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from nsvq_lightning.compression.stored import formula_bytes
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.compressed import CompressedScene
@@ -42,7 +45,7 @@ def summarize(
         host: The module, for its history and schedule.
         paper: :func:`paper_level` of the scene that was stored.
     """
-    file_bytes = path.stat().st_size
+    file_bytes, header = path.stat().st_size, read_header(path)
     ends = _phase_ends(host.history)
     pruned = next((end for end in ends if end["phase"] == Phase.PRUNE.name.lower()), None)
     return {
@@ -55,7 +58,9 @@ def summarize(
         "file_bytes": file_bytes,
         "plain_bytes": scene.plain_bytes,
         "ratio": scene.plain_bytes / file_bytes,
-        "level": read_header(path).level,
+        "level": header.level,
+        "streams": {"header": header.size, **{stream.name: stream.length for stream in header.streams}},
+        "codes": {name: _codes_in_use(codes, len(scene.codebooks[name])) for name, codes in scene.codes.items()},
         "paper_level": dict(paper),
         "train_seconds": host.train_seconds,
         "before_quantization": pruned if scene.codebooks else None,
@@ -109,6 +114,13 @@ def write_curve(path: Path, history: Sequence[Mapping[str, Any]], schedule: Sche
     count.set_ylim(bottom=0)
     quality.legend(loc="lower right", fontsize="small")
     write_figure(path, figure)
+
+
+def _codes_in_use(codes: NDArray[np.integer], size: int) -> dict[str, Any]:
+    """Rows of the codebook, how many of them are used, and the entropy of the codes, bits each."""
+    counts = np.bincount(codes, minlength=size)
+    shares = counts[counts > 0] / max(1, len(codes))
+    return {"codebook": size, "used": len(shares), "entropy": float(-(shares * np.log2(shares)).sum()) + 0.0}
 
 
 def _phase_ends(history: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -50,7 +50,16 @@ def finished(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 def test_a_run_leaves_scene_report_config_and_checkpoint(finished: Path) -> None:
     names = {path.name for path in finished.iterdir()}
-    assert {"scene.nsvq", "scene.ply", "metrics.json", "views.csv", "curve.csv", "curve.png", "renders"} <= names
+    assert {
+        "scene.nsvq",
+        "scene.ply",
+        "metrics.json",
+        "views.csv",
+        "curve.csv",
+        "curve.png",
+        "renders",
+        "report.html",
+    } <= names
     assert {"config.yaml", "metrics.csv", "checkpoints"} <= names
     config = yaml.safe_load((finished / "config.yaml").read_text())
     assert config["model"]["quantizer"]["init_args"] == {"kmeans_steps": 3, "start": "sample"}

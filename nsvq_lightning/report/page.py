@@ -1,0 +1,212 @@
+"""``report.html``: what a run has come to, on one page that needs no other file."""
+
+from __future__ import annotations
+
+import base64
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import cv2
+import torch
+from cv2.typing import MatLike
+
+from nsvq_lightning.io.atomic import write_text
+from nsvq_lightning.training.schedule import Phase, Schedule
+from nsvq_lightning.version import __version__
+
+from .curve_svg import curve_svg
+from .pictures import file_stem
+
+__all__ = ["RunPage"]
+
+REFRESH_SECONDS = 5
+"""Seconds after which a browser reads the page of a run that is not finished again."""
+LONGEST_SIDE = 1000
+"""Pixels to which larger views are reduced."""
+JPEG_QUALITY = 88
+
+
+@dataclass(frozen=True)
+class RunPage:
+    """The page of a run.
+
+    Attributes:
+        folder: Folder of the run, where the page goes; ``config.yaml``, ``preview.png`` and ``renders/`` in it are
+            shown where they are.
+        history: The evaluations so far.
+        schedule: Phases of the run.
+        seconds: Seconds that went into anything but training steps, by what it was.
+        metrics: The content of ``metrics.json``, see :func:`nsvq_lightning.report.files.summarize`; None before it
+            is known.
+        views: One row for each test view, as in ``views.csv``.
+    """
+
+    folder: Path
+    history: Sequence[Mapping[str, Any]]
+    schedule: Schedule
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    metrics: Mapping[str, Any] | None = None
+    views: Sequence[Mapping[str, Any]] = ()
+
+    def write(self) -> Path:
+        """Write ``report.html``, atomically; without ``metrics``, browsers read it again every few seconds.
+
+        Returns:
+            The file.
+        """
+        title = escape(f"{self.folder.resolve().parent.name} / {self.folder.resolve().name}")
+        refresh = "" if self.metrics else f'<meta http-equiv="refresh" content="{REFRESH_SECONDS}">'
+        template = Template(files("nsvq_lightning.report").joinpath("web", "report.html").read_text(encoding="utf-8"))
+        sections = (self._summary(), self._preview(), self._curve(), self._views(), self._streams(), self._codes())
+        body = "\n".join([f"<h1>{title}</h1>", *sections, self._time(), self._settings(), self._footer()])
+        path = self.folder / "report.html"
+        write_text(path, template.substitute(title=title, refresh=refresh, body=body))
+        return path
+
+    def _summary(self) -> str:
+        if self.metrics is None:
+            last = self.history[-1]
+            facts = [
+                ("iteration", f"{last['iteration']:,} of {self.schedule.total:,}"),
+                ("phase", last["phase"]),
+                ("test PSNR", _decibels(last["psnr"])),
+                ("SSIM", f"{last['ssim']:.4f}"),
+                ("splats", f"{last['splats']:,}"),
+                ("trained for", _duration(last["seconds"])),
+            ]
+        else:
+            facts = [
+                ("test PSNR", _decibels(self.metrics["psnr"])),
+                ("SSIM", f"{self.metrics['ssim']:.4f}"),
+                ("file", f"{self.metrics['file_bytes'] / 1e6:.3f} MB"),
+                ("smaller than .ply", f"{self.metrics['ratio']:.1f} x"),
+                ("splats", f"{self.metrics['num_splats']:,}"),
+                ("trained for", _duration(self.metrics["train_seconds"])),
+            ]
+            if self.metrics["lpips"] is not None:
+                facts.insert(2, ("LPIPS", f"{self.metrics['lpips']:.4f}"))
+        shown = "".join(f"<div>{name}<b>{value}</b></div>" for name, value in facts)
+        how = "measured on the decoded file" if self.metrics else "as a file written at that moment would decode to"
+        return f'<div class="figures">{shown}</div><p>Quality on test views, {how}.</p>'
+
+    def _preview(self) -> str:
+        picture = self.folder / "preview.png"
+        if self.metrics is not None or not picture.exists():
+            return ""
+        return (
+            f'{_heading("Photo and render")}<img class="preview" alt="photo and render" src="{_jpeg(_read(picture))}">'
+        )
+
+    def _curve(self) -> str:
+        return _heading("While it trained") + curve_svg(self.history, self.schedule) if self.history else ""
+
+    def _views(self) -> str:
+        worst = min((row["psnr"] for row in self.views), default=0.0)
+        shown = []
+        for row in self.views:
+            path = self.folder / "renders" / f"{file_stem(row['name'])}.png"
+            if path.exists():
+                remark = ", the lowest" if row["psnr"] == worst and len(self.views) > 1 else ""
+                caption = f"{escape(row['name'])}: {_decibels(row['psnr'])}, SSIM {row['ssim']:.4f}{remark}"
+                shown.append(_figure(_read(path), caption))
+        return f'{_heading("Test views")}<div class="views">{"".join(shown)}</div>' if shown else ""
+
+    def _streams(self) -> str:
+        if self.metrics is None:
+            return ""
+        splats, whole = max(1, self.metrics["num_splats"]), self.metrics["file_bytes"]
+        rows = [
+            (name, f"{size:,}", f"{8 * size / splats:.2f}", f'<i style="width:{12 * size / whole:.2f}rem"></i>')
+            for name, size in self.metrics["streams"].items()
+            if size
+        ]
+        rows.append(("whole file", f"{whole:,}", f"{8 * whole / splats:.2f}", ""))
+        return _heading("Bytes") + _table(("stream", "bytes", "bits a splat", ""), rows)
+
+    def _codes(self) -> str:
+        if self.metrics is None or not self.metrics["codes"]:
+            return ""
+        rows = [
+            (name, f"{codes['codebook']:,}", f"{codes['used']:,}", f"{codes['entropy']:.2f}")
+            for name, codes in self.metrics["codes"].items()
+        ]
+        return _heading("Codes") + _table(("attribute", "codebook", "in use", "entropy, bits"), rows)
+
+    def _time(self) -> str:
+        rows, before, since = [], 0, 0.0
+        for phase in Phase:
+            entries = [entry for entry in self.history if entry["phase"] == phase.name.lower()]
+            if entries:
+                steps, seconds = entries[-1]["iteration"] - before, entries[-1]["seconds"] - since
+                rows.append((phase.name.lower(), f"{steps:,}", _duration(seconds), f"{1000 * seconds / steps:.1f}"))
+                before, since = entries[-1]["iteration"], entries[-1]["seconds"]
+        rows += [(name, "", _duration(seconds), "") for name, seconds in self.seconds.items() if seconds]
+        return _heading("Time") + _table(("part", "iterations", "time", "ms an iteration"), rows) if rows else ""
+
+    def _settings(self) -> str:
+        config = self.folder / "config.yaml"
+        if not config.exists():
+            return ""
+        text = escape(config.read_text(encoding="utf-8"))
+        return f"{_heading('Settings')}<details><summary>config.yaml</summary><pre>{text}</pre></details>"
+
+    def _footer(self) -> str:
+        packages = ", ".join(f"{name} {version(name)}" for name in ("torch", "lightning", "numba"))
+        machine = f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads"
+        versions = f"nsvq-lightning {__version__}, Python {platform.python_version()}, {packages}; {machine}"
+        return f"<footer>{escape(versions)}</footer>"
+
+
+def _figure(comparison: MatLike, caption: str) -> str:
+    """Photo and render under a slider, and their error, of the three side by side."""
+    width = comparison.shape[1] // 3
+    photo, render, error = (_jpeg(comparison[:, start : start + width]) for start in (0, width, 2 * width))
+    return (
+        f'<figure><div class="pair"><img alt="photo" src="{photo}"><img alt="render" src="{render}">'
+        '<span>photo</span><span>render</span></div><input type="range" aria-label="photo or render" value="50">'
+        f'<figcaption>{caption}<details><summary>error x 4</summary><img class="preview" alt="error" src="{error}">'
+        "</details></figcaption></figure>"
+    )
+
+
+def _heading(text: str) -> str:
+    return f"<h2>{text}</h2>"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = ["".join(f"<th>{cell}</th>" for cell in head)]
+    lines += ["".join(f"<td>{cell}</td>" for cell in row) for row in rows]
+    return f'<div class="scroll"><table>{"".join(f"<tr>{line}</tr>" for line in lines)}</table></div>'
+
+
+def _read(path: Path) -> MatLike:
+    picture = cv2.imdecode(torch.frombuffer(bytearray(path.read_bytes()), dtype=torch.uint8).numpy(), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise OSError(f"{path} is not a picture any more; run 'nsvq test' again")
+    return picture
+
+
+def _jpeg(picture: MatLike) -> str:
+    """A picture as an address that holds it."""
+    factor = min(1.0, LONGEST_SIDE / max(picture.shape[:2]))
+    if factor < 1.0:
+        picture = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
+
+
+def _decibels(psnr: float | None) -> str:
+    return "no error" if psnr is None else f"{psnr:.2f} dB"
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"

@@ -1,0 +1,163 @@
+from __future__ import annotations
+
+import base64
+import math
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from nsvq_lightning.report.curve_svg import curve_svg
+from nsvq_lightning.report.page import RunPage
+from nsvq_lightning.report.pictures import comparison, write_png
+from nsvq_lightning.training.schedule import Schedule
+
+SCHEDULE = Schedule(total=450)
+VOID = {"meta", "img", "input", "link", "br"}
+METRICS: dict[str, Any] = {
+    "psnr": 31.25,
+    "ssim": 0.9,
+    "lpips": None,
+    "num_splats": 1000,
+    "file_bytes": 4000,
+    "ratio": 41.5,
+    "train_seconds": 90.0,
+    "streams": {"header": 500, "means": 3500, "means.far": 0},
+    "codes": {"quats": {"codebook": 64, "used": 40, "entropy": 5.125}},
+}
+VIEWS = [{"name": "a.jpg", "psnr": 30.0, "ssim": 0.8}, {"name": "sub/<b>.jpg", "psnr": 32.5, "ssim": 1.0}]
+
+
+def _entry(iteration: int, phase: str, psnr: float, seconds: float) -> dict[str, Any]:
+    return {
+        "iteration": iteration,
+        "phase": phase,
+        "splats": 1000,
+        "psnr": psnr,
+        "ssim": 0.5,
+        "seconds": seconds,
+    }
+
+
+HISTORY = [_entry(100, "warmup", 20.0, 5.0), _entry(150, "warmup", 21.0, 7.5), _entry(450, "finetune", 31.0, 67.5)]
+
+
+class Tags(HTMLParser):
+    """Checks that tags are closed in order; keeps addresses and text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.addresses: list[str] = []
+        self.words = ""
+        self.feed(text)
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in VOID:
+            self.open.append(tag)
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data")]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] not in ("style", "script"):
+            self.words += data + " "
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    folder = tmp_path / "a & <i>" / "version_0"
+    (folder / "renders").mkdir(parents=True)
+    photo = torch.zeros(30, 40, 3)
+    photo[:, 20:] = torch.tensor([1.0, 0.0, 0.0])
+    write_png(folder / "renders" / "a.png", comparison(torch.ones_like(photo), photo))
+    write_png(folder / "renders" / "sub_<b>.png", comparison(photo, photo))
+    (folder / "config.yaml").write_text("model: {note: '</pre><script>'}\n")
+    return folder
+
+
+def _picture(address: str) -> Any:
+    kind, data = address.split(",", 1)
+    assert kind == "data:image/jpeg;base64"
+    return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+
+
+def test_page_of_a_finished_run_needs_no_other_file(run: Path) -> None:
+    path = RunPage(run, HISTORY, SCHEDULE, {"evaluations": 12.0, "kernels compiled": 0.0}, METRICS, VIEWS).write()
+    text = path.read_text(encoding="utf-8")
+    page = Tags(text)
+    assert "http-equiv" not in text
+    assert not re.search(r"https?://|url\(|@import", text)
+    photo, render, error, *same = map(_picture, page.addresses)
+    for picture, left, right in ((photo, (0, 0, 0), (0, 0, 255)), (render, (255,) * 3, (255,) * 3)):
+        assert picture.shape == (30, 40, 3)
+        assert np.abs(picture[15, 5].astype(int) - left).max() < 8
+        assert np.abs(picture[15, 35].astype(int) - right).max() < 8
+    assert np.abs(error[15, 35].astype(int) - (255, 255, 0)).max() < 8
+    assert np.array_equal(same[0], same[1])
+    assert same[2].max() < 8
+    for words in ("a & <i> / version_0", "31.25 dB", "0.004 MB", "41.5 x", "a.jpg: 30.00 dB, SSIM 0.8000, the lowest"):
+        assert words in page.words
+    assert "sub/<b>.jpg: 32.50 dB" in page.words
+    assert "model: {note: '</pre><script>'}" in page.words
+    assert re.search(r"means +3,500 +28\.00", page.words)
+    assert "means.far" not in page.words
+    assert re.search(r"quats +64 +40 +5\.12", page.words)
+    assert re.search(r"warmup +150 +7\.5 s +50\.0", page.words)
+    assert re.search(r"finetune +300 +1 min 0 s +200\.0", page.words)
+    assert "evaluations" in page.words
+    assert "kernels compiled" not in page.words
+
+
+def test_page_of_a_running_fit_shows_a_view_and_is_read_again(run: Path) -> None:
+    write_png(run / "preview.png", torch.cat([torch.zeros(20, 1100, 3), torch.ones(20, 1100, 3)], dim=1))
+    page = RunPage(run, HISTORY[:2], SCHEDULE)
+    text = page.write().read_text(encoding="utf-8")
+    tags = Tags(text)
+    assert '<meta http-equiv="refresh" content="5">' in text
+    assert "150 of 450" in tags.words
+    assert "21.00 dB" in tags.words
+    (preview,) = map(_picture, tags.addresses)
+    assert preview.shape[1] == 1000
+    assert preview[:, 450].max() < 8
+    assert preview[:, 550].min() > 247
+
+
+def test_a_picture_that_is_none_any_more_is_named(run: Path) -> None:
+    (run / "renders" / "a.png").write_bytes(b"nothing")
+    with pytest.raises(OSError, match=r"a\.png is not a picture any more; run 'nsvq test' again"):
+        RunPage(run, HISTORY, SCHEDULE, {}, METRICS, VIEWS).write()
+    assert not (run / "report.html").exists()
+
+
+@pytest.mark.parametrize("psnr", [[31.0], [20.0, 20.0], [20.0, math.inf, 99.0], [math.inf]])
+def test_curve_stays_within_its_axes(psnr: list[float]) -> None:
+    history = [_entry(100 * (index + 1), "warmup", value, 1.0) for index, value in enumerate(psnr)]
+    text = curve_svg(history, SCHEDULE)
+    dots = [(float(x), float(y)) for x, y in re.findall(r'<circle cx="([\d.]+)" cy="([\d.]+)"', text)]
+    assert len(dots) == sum(map(math.isfinite, psnr))
+    xs = [x for x, _ in dots]
+    assert xs == sorted(set(xs))
+    assert all(48 <= x <= 716 and 28 <= y <= 288 for x, y in dots)
+    heights = [y for _, y in dots]
+    finite = [value for value in psnr if math.isfinite(value)]
+    assert [heights.index(y) for y in sorted(heights, reverse=True)] == [
+        finite.index(value) for value in sorted(finite)
+    ]
+    assert "nan" not in text
+    assert "inf" not in text
+
+
+def test_curve_shades_the_phases_where_they_are() -> None:
+    text = curve_svg(HISTORY, SCHEDULE)
+    boxes = [(float(x), float(width)) for x, width in re.findall(r'<rect x="([\d.]+)" y="28" width="([\d.]+)"', text)]
+    ends = [round((x + width - 48) / (716 - 48) * 450) for x, width in boxes]
+    assert tuple(ends) == SCHEDULE.ends
+    assert re.findall(r"(warmup|prune|quantize|finetune)</text>", text) == ["warmup", "prune", "quantize", "finetune"]
