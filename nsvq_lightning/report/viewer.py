@@ -1,0 +1,101 @@
+"""One HTML file that shows a compressed scene in any browser with WebGL 2, offline."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nsvq_lightning.io.atomic import write_text
+from nsvq_lightning.io.nsvq.file import read_header
+from nsvq_lightning.rendering.camera import Camera
+
+__all__ = ["camera_entry", "write_viewer"]
+
+_WEB = Path(__file__).parent / "web"
+
+
+def write_viewer(
+    path: str | os.PathLike[str],
+    scene_file: str | os.PathLike[str],
+    cameras: Mapping[str, Camera],
+    title: str,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    up: Sequence[float] | None = None,
+) -> int:
+    """Write a page that holds a ``.nsvq`` file, its reader, a renderer and cameras; it loads nothing from elsewhere.
+
+    Args:
+        path: HTML file to write, replaced atomically.
+        scene_file: The ``.nsvq`` file, of which the page holds every byte.
+        cameras: At least one, by name; the page starts at the first. They have the coordinates of the file's positions.
+        title: Name of the scene, plain text.
+        background: RGB in [0, 1] behind the splats.
+        up: Direction in the world about which the page orbits; by default, the mean of the cameras' own.
+
+    Returns:
+        Bytes of the page.
+
+    Raises:
+        FormatError: ``scene_file`` is damaged or not a ``.nsvq`` file.
+        ValueError: There are no cameras, ``background`` is no colour, or ``up`` is no direction.
+    """
+    if not cameras:
+        raise ValueError(f"cannot write {path}: a page needs at least one camera to start from, got none")
+    if len(background) != 3 or not all(0 <= value <= 1 for value in background):
+        raise ValueError(f"background must be three numbers from 0 to 1, got {list(background)}")
+    up = _mean_up(list(cameras.values())) if up is None else up
+    if len(up) != 3 or not 0 < math.hypot(*up) < math.inf:
+        raise ValueError(f"up must be a direction, three finite numbers that are not all 0, got {list(up)}")
+    read_header(scene_file)  # verifies the file's checksum
+    scene = {
+        "cameras": [{"name": name, **camera_entry(camera)} for name, camera in cameras.items()],
+        "background": list(background),
+        "up": list(up),
+    }
+    page = _filled(
+        (_WEB / "viewer.html").read_text(encoding="utf-8"),
+        title=html.escape(title.encode("utf-8", "replace").decode()),
+        scene=json.dumps(scene, separators=(",", ":"), allow_nan=False).replace("<", r"\u003c"),
+        file=base64.b64encode(Path(scene_file).read_bytes()).decode(),
+        css=(_WEB / "viewer.css").read_text(encoding="utf-8"),
+        decoder=(_WEB / "nsvq.js").read_text(encoding="utf-8"),
+        viewer=(_WEB / "viewer.js").read_text(encoding="utf-8"),
+    )
+    write_text(path, page)
+    return len(page.encode())
+
+
+def camera_entry(camera: Camera) -> dict[str, Any]:
+    """A camera as the page's JSON has it.
+
+    Returns:
+        ``camera_to_world``, 16 numbers row by row, of a camera that looks along -z with y up, as in OpenGL and
+        nerfstudio; ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` in pixels.
+    """
+    packed = camera.packed_view
+    right, down, forward, position = packed[:3], packed[3:6], packed[6:9], packed[12:]
+    rows = [[right[k], -down[k], -forward[k], position[k]] for k in range(3)]
+    pose = [float(f"{value:.9g}") + 0.0 for row in [*rows, [0.0, 0.0, 0.0, 1.0]] for value in row]
+    intrinsics = dict(zip(("fx", "fy", "cx", "cy"), camera.intrinsics, strict=True))
+    return {"camera_to_world": pose, "width": camera.width, "height": camera.height, **intrinsics}
+
+
+def _mean_up(cameras: Sequence[Camera]) -> list[float]:
+    """Mean of where the cameras' upper edges point; that of the first where they point everywhere."""
+    directions = -torch.tensor([camera.packed_view[3:6] for camera in cameras], dtype=torch.float64)
+    mean = directions.mean(0)
+    return [float(value) for value in (mean if mean.norm() > 0.1 else directions[0])]
+
+
+def _filled(template: str, **parts: str) -> str:
+    """The template with each ``{{name}}`` replaced; what is put in is not searched again."""
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)

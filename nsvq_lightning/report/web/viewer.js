@@ -1,0 +1,769 @@
+// A viewer of 3D Gaussian splats in WebGL 2, without dependencies. The page around it holds a .nsvq file (#file, base64),
+// its reader (#decoder, the global `nsvq`) and cameras, background and up direction (#scene, JSON).
+//
+// Pictures are those of nsvq_lightning/rendering: the same projection, blur and cut-offs, with one difference: a pixel is
+// not finished when its transmittance falls below 1e-4, as blending goes from back to front.
+//
+// Cameras have COLMAP's axes inside: x right, y down, z forward. JSON has nerfstudio's: x right, y up, z backward.
+"use strict";
+
+// ---------------------------------------------------------------------------------------------- vectors
+
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+/** a + b · scale */
+const plus = (a, b, scale = 1) => [a[0] + b[0] * scale, a[1] + b[1] * scale, a[2] + b[2] * scale];
+const times = (a, scale) => [a[0] * scale, a[1] * scale, a[2] * scale];
+const unit = (a) => times(a, 1 / Math.hypot(...a));
+/** `a` turned about the unit vector `axis`, right-handed, radians. */
+const turned = (a, axis, angle) =>
+  plus(plus(times(a, Math.cos(angle)), cross(axis, a), Math.sin(angle)), axis, dot(axis, a) * (1 - Math.cos(angle)));
+
+// ---------------------------------------------------------------------------------------------- decoding and sorting
+
+// The functions before `startEngine` also run in the worker, as source text.
+
+/** From what the file stores to what is drawn, in place: opacities, axis lengths, unit quaternions. */
+function activate(splats) {
+  const { count, opacities, scales, quats } = splats;
+  for (let i = 0; i < count; i++) {
+    opacities[i] = 1 / (1 + Math.exp(-opacities[i]));
+    const q = quats.subarray(4 * i, 4 * i + 4), norm = Math.hypot(...q);
+    if (norm > 0) for (let k = 0; k < 4; k++) q[k] /= norm;
+    else q[0] = 1;
+  }
+  for (let i = 0; i < scales.length; i++) scales[i] = Math.exp(scales[i]);
+  return splats;
+}
+
+/** A function that sorts splats from far to near along a direction. */
+function makeSorter(means) {
+  const count = means.length / 3;
+  const depths = new Float32Array(count), keys = new Uint32Array(depths.buffer), byLow = new Uint32Array(count);
+  return ([x, y, z]) => {
+    const low = new Uint32Array(65537), high = new Uint32Array(65537), order = new Uint32Array(count);
+    for (let i = 0, m = 0; i < count; i++, m += 3) {
+      depths[i] = x * means[m] + y * means[m + 1] + z * means[m + 2];
+      keys[i] ^= keys[i] >>> 31 ? 0xffffffff : 0x80000000; // unsigned integers in the order of the numbers
+      low[(keys[i] & 0xffff) + 1]++;
+      high[(keys[i] >>> 16) + 1]++;
+    }
+    for (let k = 0; k < 65536; k++) {
+      low[k + 1] += low[k];
+      high[k + 1] += high[k];
+    }
+    for (let i = 0; i < count; i++) byLow[low[keys[i] & 0xffff]++] = i;
+    for (let i = 0; i < count; i++) order[count - 1 - high[keys[byLow[i]] >>> 16]++] = byLow[i];
+    return order;
+  };
+}
+
+/** The body of the worker: it decodes the file it is sent first, then sorts along the directions it is sent. */
+function serve() {
+  let sort = null;
+  onmessage = async ({ data }) => {
+    try {
+      if (sort) {
+        const order = sort(data);
+        postMessage({ result: order }, [order.buffer]);
+      } else {
+        const splats = activate(await nsvq.decode(data));
+        sort = makeSorter(splats.means.slice());
+        postMessage({ result: splats }, [...new Set(Object.values(splats).map((part) => part.buffer).filter(Boolean))]);
+      }
+    } catch (error) {
+      postMessage({ error: String(error.message ?? error) });
+    }
+  };
+  postMessage({ result: null });
+}
+
+/** `{decode(buffer), sort(direction)}`, both promises: in a worker, or here where the browser allows none. */
+async function startEngine(decoderSource) {
+  try {
+    const source = [`"use strict";`, decoderSource, activate, makeSorter, `(${serve})();`].join("\n");
+    const worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
+    const waiting = [];
+    const reply = () => new Promise((resolve, reject) => waiting.push({ resolve, reject }));
+    worker.onmessage = ({ data }) => {
+      const { resolve, reject } = waiting.shift();
+      if ("error" in data) reject(new Error(data.error));
+      else resolve(data.result);
+    };
+    worker.onerror = (event) => waiting.splice(0).forEach(({ reject }) => reject(new Error(event.message)));
+    const started = reply();
+    await started;
+    const ask = (message, transfer) => {
+      worker.postMessage(message, transfer);
+      return reply();
+    };
+    return { decode: (buffer) => ask(buffer, [buffer]), sort: (direction) => ask(direction) };
+  } catch {
+    let sort;
+    const decode = async (buffer) => {
+      const splats = activate(await nsvq.decode(buffer));
+      sort = makeSorter(splats.means);
+      return splats;
+    };
+    return { decode, sort: async (direction) => sort(direction) };
+  }
+}
+
+// ---------------------------------------------------------------------------------------------- drawing
+
+const ROW = 2048; // splats in a row of the textures: the width that every WebGL 2 has
+
+const FULL_SCREEN = `#version 300 es
+void main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }`;
+
+/** Colour of each splat as seen from `eye`: one pixel of a texture each. */
+const COLOUR = (degree) => `#version 300 es
+precision highp float;
+precision highp sampler2DArray;
+uniform sampler2DArray geometry, harmonics;
+uniform vec3 eye;
+out vec4 colour;
+
+vec3 coefficient(int k) { return texelFetch(harmonics, ivec3(gl_FragCoord.xy, k), 0).rgb; }
+
+void main() {
+  vec3 d = texelFetch(geometry, ivec3(gl_FragCoord.xy, 0), 0).xyz - eye;
+  d *= inversesqrt(max(dot(d, d), 1e-20));
+  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
+  vec3 sum = 0.5 + 0.28209479177387814 * coefficient(0);
+#if ${degree} > 0
+  sum += 0.4886025119029199 * (z * coefficient(2) - y * coefficient(1) - x * coefficient(3));
+#endif
+#if ${degree} > 1
+  sum += 1.0925484305920792 * (x * y * coefficient(4) - y * z * coefficient(5) - x * z * coefficient(7))
+    + 0.31539156525252005 * (2.0 * zz - xx - yy) * coefficient(6)
+    + 0.5462742152960396 * (xx - yy) * coefficient(8);
+#endif
+#if ${degree} > 2
+  sum += -0.5900435899266435 * (y * (3.0 * xx - yy) * coefficient(9) + x * (xx - 3.0 * yy) * coefficient(15))
+    + 2.890611442640554 * x * y * z * coefficient(10)
+    - 0.4570457994644658 * (4.0 * zz - xx - yy) * (y * coefficient(11) + x * coefficient(13))
+    + 0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(12)
+    + 1.445305721320277 * z * (xx - yy) * coefficient(14);
+#endif
+  colour = vec4(max(sum, 0.0), 1);
+}`;
+
+/** A rectangle along the axes of each splat's ellipse, as large as the area where its opacity reaches 1/255. */
+const SPLAT = `#version 300 es
+precision highp float;
+precision highp int;
+precision highp sampler2DArray;
+uniform sampler2DArray geometry;
+uniform sampler2D colours;
+uniform mat3 rotation;     // world to camera
+uniform vec3 translation;
+uniform vec2 size;         // of the picture, pixels
+uniform vec4 lens;         // fx, fy, cx, cy, pixels
+layout(location = 0) in uint index;
+flat out vec4 colour;      // opacity last
+out vec2 offset;           // from the centre, standard deviations along the axes of the ellipse
+
+void main() {
+  gl_Position = vec4(0, 0, 2, 1);  // outside: nothing is drawn unless what follows says where
+  ivec2 at = ivec2(index % ${ROW}u, index / ${ROW}u);
+  vec4 mean = texelFetch(geometry, ivec3(at, 0), 0), q = texelFetch(geometry, ivec3(at, 1), 0);
+  vec3 deviations = texelFetch(geometry, ivec3(at, 2), 0).xyz;
+  vec3 centre = rotation * mean.xyz + translation;
+  float z = centre.z, reach = 2.0 * log(mean.w * 255.0);
+  if (!(z > 0.2) || !(reach > 0.0)) return;
+
+  mat3 axes = rotation * mat3(
+    1.0 - 2.0 * (q.z * q.z + q.w * q.w), 2.0 * (q.y * q.z + q.x * q.w), 2.0 * (q.y * q.w - q.x * q.z),
+    2.0 * (q.y * q.z - q.x * q.w), 1.0 - 2.0 * (q.y * q.y + q.w * q.w), 2.0 * (q.z * q.w + q.x * q.y),
+    2.0 * (q.y * q.w + q.x * q.z), 2.0 * (q.z * q.w - q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z));
+  axes = transpose(mat3(axes[0] * deviations.x, axes[1] * deviations.y, axes[2] * deviations.z));
+  vec2 margin = 0.15 * size / lens.xy;
+  vec2 slope = clamp(centre.xy / z, -lens.zw / lens.xy - margin, (size - lens.zw) / lens.xy + margin);
+  vec3 u = lens.x / z * (axes[0] - slope.x * axes[2]), v = lens.y / z * (axes[1] - slope.y * axes[2]);
+  float xx = dot(u, u), xy = dot(u, v), yy = dot(v, v);
+  if (!(xx + yy < 1e18)) return;
+  vec3 area = cross(u, v);  // |u x v|^2 = xx yy - xy^2, without its loss of digits
+  float determinant = dot(area, area) + 0.3 * (xx + yy) + 0.09;
+  float half_difference = 0.5 * (xx - yy), root = length(vec2(half_difference, xy));
+  float longest = 0.5 * (xx + yy) + 0.3 + root;
+  vec2 axis = half_difference >= 0.0 ? vec2(half_difference + root, xy) : vec2(xy, root - half_difference);
+  axis = root > 0.0 ? normalize(axis) : vec2(1, 0);
+
+  offset = sqrt(reach) * vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - sqrt(reach);
+  vec2 pixel = lens.xy * centre.xy / z + lens.zw
+    + offset.x * sqrt(longest) * axis + offset.y * sqrt(determinant / longest) * vec2(-axis.y, axis.x);
+  gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0, 1);
+  colour = vec4(texelFetch(colours, at, 0).rgb, mean.w);
+}`;
+
+const BLEND = `#version 300 es
+precision highp float;
+flat in vec4 colour;
+in vec2 offset;
+out vec4 pixel;
+void main() {
+  float alpha = colour.a * exp(-0.5 * dot(offset, offset));
+  if (alpha < 1.0 / 255.0) discard;
+  alpha = min(alpha, 0.99);
+  pixel = vec4(colour.rgb * alpha, alpha);
+}`;
+
+const SHOW = `#version 300 es
+precision highp float;
+uniform sampler2D picture;
+uniform vec2 scale;  // texture coordinates a pixel
+out vec4 pixel;
+void main() { pixel = vec4(texture(picture, gl_FragCoord.xy * scale).rgb, 1); }`;
+
+/** Draws splats into a canvas. `splats` as decoded, with rotations normalised, opacities and scales not raw. */
+class Renderer {
+  constructor(canvas, splats) {
+    const options = { alpha: false, antialias: false, depth: false, stencil: false, powerPreference: "high-performance" };
+    const gl = canvas.getContext("webgl2", options);
+    if (!gl) {
+      throw new Error("This browser offers no WebGL 2, which this page needs. Update it, or allow it to use the GPU.");
+    }
+    this.gl = gl;
+    this.canvas = canvas;
+    this.count = splats.count;
+    this.rows = Math.max(1, Math.ceil(splats.count / ROW));
+    if (this.rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
+      throw new Error(`This device cannot show more than ${gl.getParameter(gl.MAX_TEXTURE_SIZE) * ROW} splats.`);
+    }
+    // Eight bits would lose faint splats and add up to visible steps.
+    const fine = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
+    this.format = fine ? gl.RGBA16F : gl.RGBA8;
+    this.#upload(splats);
+    this.colours = this.#target(2, ROW, this.rows);
+    this.colour = this.#program(FULL_SCREEN, COLOUR(splats.shDegree), { geometry: 0, harmonics: 1 });
+    this.splat = this.#program(SPLAT, BLEND, { geometry: 0, colours: 2 });
+    this.show = this.#program(FULL_SCREEN, SHOW, { picture: 3 });
+    this.order = gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(0, 1);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    if (gl.getError() !== gl.NO_ERROR) throw new Error("This device has too little memory for the scene.");
+  }
+
+  /** Geometry as float32: centre and opacity, rotation, axes. Harmonics as float16: a layer for each coefficient. */
+  #upload({ count, means, opacities, quats, scales, sh0, shN, shDegree }) {
+    const gl = this.gl;
+    const layer = (channels, parts) => {
+      const texels = new Float32Array(ROW * this.rows * channels);
+      for (const { values, width, stride = width, from = 0, at = 0 } of parts) {
+        for (let i = 0; i < count; i++) {
+          for (let k = 0; k < width; k++) texels[i * channels + at + k] = values[i * stride + from + k];
+        }
+      }
+      return texels;
+    };
+    const texture = (slot, format, channels, layers) => {
+      gl.activeTexture(gl.TEXTURE0 + slot);
+      gl.bindTexture(gl.TEXTURE_2D_ARRAY, gl.createTexture());
+      gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, format, ROW, this.rows, layers.length);
+      const kind = channels === 4 ? gl.RGBA : gl.RGB;
+      layers.forEach((parts, k) => {
+        const texels = layer(channels, parts);
+        gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, k, ROW, this.rows, 1, kind, gl.FLOAT, texels);
+      });
+      gl.texParameteri(gl.TEXTURE_2D_ARRAY, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+      gl.texParameteri(gl.TEXTURE_2D_ARRAY, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    };
+    const centres = [{ values: means, width: 3 }, { values: opacities, width: 1, at: 3 }];
+    texture(0, gl.RGBA32F, 4, [centres, [{ values: quats, width: 4 }], [{ values: scales, width: 3 }]]);
+    const higher = (shDegree + 1) ** 2 - 1;
+    const harmonics = [[{ values: sh0, width: 3 }]];
+    for (let k = 0; k < higher; k++) harmonics.push([{ values: shN, width: 3, stride: 3 * higher, from: 3 * k }]);
+    texture(1, gl.RGB16F, 3, harmonics);
+  }
+
+  /** A texture to draw into, bound to a unit. */
+  #target(slot, width, height) {
+    const gl = this.gl, texture = gl.createTexture(), buffer = gl.createFramebuffer();
+    gl.activeTexture(gl.TEXTURE0 + slot);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, this.format, width, height);
+    for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+    return { texture, buffer, width, height };
+  }
+
+  /** A program as a function `name -> location`; its samplers read the given texture units. */
+  #program(vertex, fragment, samplers) {
+    const gl = this.gl, program = gl.createProgram();
+    for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, source);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+    }
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) {
+      const logs = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader));
+      throw new Error(`This device's graphics driver refuses the page's shaders: ${logs.join(" ")}`);
+    }
+    gl.useProgram(program);
+    for (const [name, slot] of Object.entries(samplers)) gl.uniform1i(gl.getUniformLocation(program, name), slot);
+    const names = ["eye", "rotation", "translation", "size", "lens", "scale"];
+    const at = Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)]));
+    return { program, at };
+  }
+
+  /** Splats from far to near. */
+  setOrder(order) {
+    this.gl.bufferData(this.gl.ARRAY_BUFFER, order, this.gl.DYNAMIC_DRAW);
+  }
+
+  /** Draw what a camera (`view` below) sees over `background`, with `share` of the canvas's resolution. */
+  draw({ position, axes, fx, fy, cx, cy }, background, share) {
+    const gl = this.gl, { width, height } = this.canvas;
+    if (this.picture?.width !== width || this.picture?.height !== height) {
+      if (this.picture) {
+        gl.deleteTexture(this.picture.texture);
+        gl.deleteFramebuffer(this.picture.buffer);
+      }
+      this.picture = this.#target(3, width, height);
+    }
+    if (!this.eye || this.eye.some((x, k) => x !== position[k])) {
+      this.eye = position;
+      gl.bindFramebuffer(gl.FRAMEBUFFER, this.colours.buffer);
+      gl.viewport(0, 0, ROW, this.rows);
+      gl.useProgram(this.colour.program);
+      gl.uniform3fv(this.colour.at.eye, position);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    }
+    const size = [Math.round(width * share), Math.round(height * share)];
+    const [sx, sy] = [size[0] / width, size[1] / height];
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.picture.buffer);
+    gl.viewport(0, 0, ...size);
+    gl.clearColor(...background, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.useProgram(this.splat.program);
+    gl.uniformMatrix3fv(this.splat.at.rotation, true, axes.flat());
+    gl.uniform3fv(this.splat.at.translation, axes.map((axis) => -dot(axis, position)));
+    gl.uniform2f(this.splat.at.size, ...size);
+    gl.uniform4f(this.splat.at.lens, fx * sx, fy * sy, cx * sx, cy * sy);
+    gl.enable(gl.BLEND);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
+    gl.disable(gl.BLEND);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, width, height);
+    gl.useProgram(this.show.program);
+    gl.uniform2f(this.show.at.scale, sx / width, sy / height);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+}
+
+// ---------------------------------------------------------------------------------------------- cameras
+
+/** Where the viewer is and what its lens sees; `frame` is the picture that stays in view whatever the window's shape. */
+class ViewPoint {
+  constructor(up) {
+    this.up = unit(up);
+  }
+
+  /** Take over a camera as JSON has it. */
+  set({ camera_to_world: m, width, height, fx, fy, cx, cy }) {
+    this.axes = [[m[0], m[4], m[8]], [-m[1], -m[5], -m[9]], [-m[2], -m[6], -m[10]]]; // right, down, forward
+    this.position = [m[3], m[7], m[11]];
+    this.frame = { width, height, fx, fy, cx, cy };
+  }
+
+  /** The camera for a picture of `width` by `height` pixels in which the whole frame is visible, as JSON has it. */
+  camera(width, height) {
+    const [r, d, f] = this.axes, p = this.position;
+    const rows = [0, 1, 2].map((k) => [r[k], -d[k], -f[k], p[k]]);
+    return { camera_to_world: [...rows.flat(), 0, 0, 0, 1], width, height, ...this.lens(width, height) };
+  }
+
+  lens(width, height) {
+    const { width: w, height: h, fx, fy, cx, cy } = this.frame;
+    const scale = Math.min(width / w, height / h);
+    return { fx: fx * scale, fy: fy * scale, cx: width / 2 + (cx - w / 2) * scale, cy: height / 2 + (cy - h / 2) * scale };
+  }
+
+  /** Turn about the point `distance` ahead; radians to the right about the up direction, and upwards. */
+  orbit(yaw, pitch) {
+    const pivot = plus(this.position, this.axes[2], this.distance);
+    const turn = (axis, angle) => (this.axes = this.axes.map((a) => turned(a, axis, angle)));
+    turn(this.up, yaw);
+    const before = Math.abs(dot(this.axes[2], this.up));
+    const after = Math.abs(dot(turned(this.axes[2], this.axes[0], pitch), this.up));
+    if (after < 0.998 || after < before) turn(this.axes[0], pitch); // not over the poles
+    const forward = unit(this.axes[2]), right = unit(cross(this.axes[1], forward));
+    this.axes = [right, cross(forward, right), forward];
+    this.position = plus(pivot, forward, -this.distance);
+  }
+
+  /** Move along the camera's own axes, scene units. */
+  move(right, down, forward) {
+    [right, down, forward].forEach((step, k) => (this.position = plus(this.position, this.axes[k], step)));
+  }
+
+  /** Come so much nearer (factor < 1) or go farther; never stuck at the point it turns about. */
+  zoom(factor) {
+    this.move(0, 0, this.distance * (1 - factor));
+    this.distance = Math.max(this.distance * factor, this.nearest);
+  }
+}
+
+// ---------------------------------------------------------------------------------------------- a path of keyframes
+
+/** Unit quaternion (wxyz) of a rotation whose columns are given. */
+function quaternionOf([a, b, c]) {
+  const candidates = [
+    [1 + a[0] + b[1] + c[2], b[2] - c[1], c[0] - a[2], a[1] - b[0]],
+    [b[2] - c[1], 1 + a[0] - b[1] - c[2], a[1] + b[0], a[2] + c[0]],
+    [c[0] - a[2], a[1] + b[0], 1 - a[0] + b[1] - c[2], b[2] + c[1]],
+    [a[1] - b[0], a[2] + c[0], b[2] + c[1], 1 - a[0] - b[1] + c[2]],
+  ];
+  const best = candidates.reduce((x, y) => (Math.hypot(...y) > Math.hypot(...x) ? y : x));
+  return best.map((x) => x / Math.hypot(...best));
+}
+
+/** Rows of the rotation of a quaternion (wxyz, any norm). */
+function rotationOf(quaternion) {
+  const norm = Math.hypot(...quaternion), [w, x, y, z] = quaternion.map((v) => v / norm);
+  return [
+    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+  ];
+}
+
+/** nerfstudio's camera path, a frame for each of its pictures: Catmull-Rom splines through the keyframes. */
+function cameraPath(keyframes, width, height, fps = 24, secondsEach = 2) {
+  const points = keyframes.map(({ camera_to_world: m, fov, aspect }) => {
+    const quaternion = quaternionOf([[m[0], m[4], m[8]], [m[1], m[5], m[9]], [m[2], m[6], m[10]]]);
+    return [m[3], m[7], m[11], ...quaternion, fov, aspect];
+  });
+  for (let k = 1; k < points.length; k++) {
+    // Of both quaternions of a rotation, that on the side of the one before.
+    if ([3, 4, 5, 6].reduce((sum, i) => sum + points[k][i] * points[k - 1][i], 0) < 0) {
+      for (const i of [3, 4, 5, 6]) points[k][i] *= -1;
+    }
+  }
+  const last = points.length - 1, frames = last * fps * secondsEach;
+  const path = Array.from({ length: frames + 1 }, (_, frame) => {
+    const k = Math.min(Math.floor(frame / (fps * secondsEach)), Math.max(last - 1, 0));
+    const t = frame / (fps * secondsEach) - k;
+    const [a, b, c, d] = [k - 1, k, k + 1, k + 2].map((i) => points[Math.min(Math.max(i, 0), last)]);
+    const values = b.map((_, i) => {
+      const bend = 2 * a[i] - 5 * b[i] + 4 * c[i] - d[i], twist = 3 * b[i] - a[i] - 3 * c[i] + d[i];
+      return b[i] + 0.5 * t * (c[i] - a[i] + t * (bend + t * twist));
+    });
+    const rows = rotationOf(values.slice(3, 7)).map((row, i) => [...row, values[i]]);
+    return { camera_to_world: [...rows.flat(), 0, 0, 0, 1], fov: values[7], aspect: values[8] };
+  });
+  return {
+    camera_type: "perspective",
+    render_height: height,
+    render_width: width,
+    fps,
+    seconds: path.length / fps,
+    camera_path: path,
+  };
+}
+
+// ---------------------------------------------------------------------------------------------- the page
+
+const element = (id) => document.getElementById(id);
+
+function say(text) {
+  element("message").textContent = text;
+  element("message").hidden = !text;
+}
+
+/** Let the browser show what was said. */
+const shown = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
+
+function bytesOf(base64) {
+  const text = atob(base64), bytes = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+  return bytes;
+}
+
+async function load() {
+  if (typeof WebGL2RenderingContext === "undefined") {
+    throw new Error("This browser has no WebGL 2, which this page needs. Update it, or try another one.");
+  }
+  const engine = await startEngine(element("decoder").textContent);
+  let bytes, splats;
+  try {
+    bytes = bytesOf(element("file").textContent.trim()).length;
+    say(`Decoding ${(bytes / 1e6).toFixed(2)} MB…`);
+    await shown();
+    splats = await engine.decode(bytesOf(element("file").textContent.trim()).buffer);
+  } catch (error) {
+    throw new Error(`The scene in this page is damaged: ${error.message}. Download or write the page again.`);
+  }
+  element("facts").textContent = `${splats.count.toLocaleString("en")} splats · ${(bytes / 1e6).toFixed(2)} MB`;
+  say("Sending splats to the GPU…");
+  await shown();
+  return { engine, splats, renderer: new Renderer(element("canvas"), splats) };
+}
+
+/** Depth of what is in front at a place of the canvas: a low quantile of the splats around it, then of all. */
+function depthAt({ count, means, opacities }, { position, axes }, { fx, fy, cx, cy }, x, y, around) {
+  for (const radius of [around, Infinity]) {
+    const depths = [];
+    for (let i = 0; i < count; i++) {
+      if (opacities[i] < 0.3) continue;
+      const d = [means[3 * i] - position[0], means[3 * i + 1] - position[1], means[3 * i + 2] - position[2]];
+      const z = dot(axes[2], d);
+      if (!(z > 0.2)) continue;
+      const dx = (fx * dot(axes[0], d)) / z + cx - x, dy = (fy * dot(axes[1], d)) / z + cy - y;
+      if (Math.hypot(dx, dy) < radius) depths.push(z);
+    }
+    if (depths.length > 4) return depths.sort((a, b) => a - b)[depths.length >> 2];
+  }
+  return 1;
+}
+
+async function main() {
+  const scene = JSON.parse(element("scene").textContent);
+  const { engine, splats, renderer } = await load();
+  const canvas = element("canvas"), view = new ViewPoint(scene.up);
+  const backgrounds = [scene.background, [0, 0, 0], [1, 1, 1], [0.5, 0.5, 0.5]];
+  const keys = new Set(), keyframes = [], waiting = [];
+  let background = 0, current = 0, scheduled = false, sorting = false, sorted = null, last = 0, touched = 0, share = 1;
+
+  // ---- frames, only when something changed
+
+  const schedule = () => {
+    if (!scheduled) {
+      scheduled = true;
+      requestAnimationFrame(frame);
+    }
+  };
+  const moved = () => {
+    touched = performance.now();
+    schedule();
+  };
+  const draw = (resolution) => {
+    const lens = view.lens(canvas.width, canvas.height);
+    renderer.draw({ ...view, ...lens }, backgrounds[background], resolution);
+  };
+
+  function frame(now) {
+    scheduled = false;
+    const elapsed = last && now - last;
+    if (keys.size) fly(Math.min(elapsed, 200) / 1000);
+    const moving = now - touched < 250;
+    // A slow device shows fewer pixels while the view moves.
+    if (elapsed > 60) share = Math.max(0.3, share * 0.8);
+    else if (elapsed) share = Math.min(1, share * 1.02);
+    last = moving ? now : 0;
+    const direction = view.axes[2];
+    const stale = !sorted || sorted.some((x, k) => x !== direction[k]);
+    if (stale && !sorting) sort(direction);
+    if (sorted) draw(moving ? share : 1);
+    if (moving) schedule();
+    else if (!stale) waiting.splice(0).forEach((resolve) => resolve());
+  }
+
+  function sort(direction) {
+    sorting = true;
+    engine.sort(direction).then((order) => {
+      sorting = false;
+      sorted = direction;
+      renderer.setOrder(order);
+      schedule();
+    }, fail);
+  }
+
+  function resize() {
+    const coarse = matchMedia("(pointer: coarse)").matches;
+    const ratio = Math.min(devicePixelRatio || 1, coarse ? 1.5 : 2);
+    const sides = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
+    if (sides[0] === canvas.width && sides[1] === canvas.height) return;
+    [canvas.width, canvas.height] = sides; // this also clears it
+    schedule();
+  }
+
+  /** A promise that is kept when the present view has been drawn, sorted and at full resolution. */
+  const settled = () =>
+    new Promise((resolve) => {
+      waiting.push(resolve);
+      schedule();
+    });
+
+  // ---- cameras
+
+  /** Turn about what is in front at a place of the window, css pixels. */
+  function focus(x, y) {
+    const { clientWidth: width, clientHeight: height } = canvas;
+    view.distance = depthAt(splats, view, view.lens(width, height), x, y, 0.06 * Math.min(width, height));
+    view.nearest = 0.05 * view.distance;
+  }
+  function place(camera) {
+    view.set(camera);
+    focus(canvas.clientWidth / 2, canvas.clientHeight / 2);
+    schedule();
+  }
+  function show(index) {
+    current = (index + scene.cameras.length) % scene.cameras.length;
+    element("cameras").value = current;
+    place(scene.cameras[current]);
+  }
+  /** Go to the camera that the address names. */
+  function follow() {
+    const name = new URLSearchParams(location.hash.slice(1)).get("camera");
+    const index = name === null ? current : scene.cameras.findIndex((camera) => camera.name === name);
+    show(Math.max(index, 0));
+    say(index < 0 ? `There is no camera ${name} here; this is the first one.` : "");
+    if (index < 0) setTimeout(say, 5000, "");
+  }
+
+  // ---- keyframes
+
+  function listed() {
+    element("keyframe").textContent = keyframes.length ? `+ Keyframe (${keyframes.length})` : "+ Keyframe";
+    element("undo").hidden = element("download").hidden = !keyframes.length;
+  }
+  function addKeyframe() {
+    const { camera_to_world, fy, width, height } = view.camera(canvas.width, canvas.height);
+    const fov = (2 * Math.atan(height / 2 / fy) * 180) / Math.PI;
+    keyframes.push({ camera_to_world, fov, aspect: width / height });
+    listed();
+  }
+  function undoKeyframe() {
+    keyframes.pop();
+    listed();
+  }
+  // Video encoders want even sizes.
+  const path = () => cameraPath(keyframes, canvas.width & ~1, canvas.height & ~1);
+  function download() {
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(new Blob([JSON.stringify(path(), null, 1)], { type: "application/json" }));
+    link.download = "camera_path.json";
+    link.click();
+    setTimeout(URL.revokeObjectURL, 60000, link.href);
+  }
+
+  // ---- hands
+
+  const changeBackground = () => {
+    background = (background + 1) % backgrounds.length;
+    schedule();
+  };
+  const actions = {
+    previous: () => show(current - 1),
+    next: () => show(current + 1),
+    reset: () => show(current),
+    background: changeBackground,
+    keyframe: addKeyframe,
+    undo: undoKeyframe,
+    download,
+  };
+  for (const [id, action] of Object.entries(actions)) {
+    element(id).addEventListener("click", () => {
+      action();
+      canvas.focus();
+    });
+  }
+  const commands = { f: "next", F: "previous", r: "reset", b: "background", k: "keyframe", K: "undo" };
+  const flight = {
+    w: [2, 1], s: [2, -1], d: [0, 1], a: [0, -1], e: [1, -1], q: [1, 1],
+    arrowleft: [3, 1], arrowright: [3, -1], arrowup: [4, -1], arrowdown: [4, 1],
+  };
+
+  function fly(seconds) {
+    const steps = [0, 0, 0, 0, 0];
+    for (const key of keys) steps[flight[key][0]] += flight[key][1] * seconds;
+    view.move(...steps.slice(0, 3).map((step) => 0.6 * view.distance * step));
+    if (steps[3] || steps[4]) view.orbit(steps[3], steps[4]);
+    touched = performance.now();
+  }
+
+  addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target === element("cameras")) return;
+    const name = event.key.toLowerCase();
+    if (name in flight) {
+      keys.add(name);
+      moved();
+    } else if (event.repeat) return;
+    else if (event.key in commands) actions[commands[event.key]]();
+    else if (name === "h") document.body.classList.toggle("bare");
+    else return;
+    event.preventDefault();
+  });
+  addEventListener("keyup", (event) => keys.delete(event.key.toLowerCase()));
+  addEventListener("blur", () => keys.clear());
+
+  const pointers = new Map();
+  /** Middle of the fingers, and their distance from it. */
+  const grip = () => {
+    const at = [...pointers.values()], x = at.reduce((s, p) => s + p.x, 0) / at.length;
+    const y = at.reduce((s, p) => s + p.y, 0) / at.length;
+    return { x, y, spread: Math.hypot(at[0].x - x, at[0].y - y) };
+  };
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    if (!pointers.has(event.pointerId)) return;
+    const before = grip();
+    pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+    const after = grip(), dx = after.x - before.x, dy = after.y - before.y;
+    if (pointers.size > 1 || event.shiftKey || event.buttons & 6) {
+      const { fx, fy } = view.lens(canvas.clientWidth, canvas.clientHeight);
+      view.move((-dx * view.distance) / fx, (-dy * view.distance) / fy, 0);
+      if (before.spread > 0 && after.spread > 0) view.zoom(before.spread / after.spread);
+    } else view.orbit((-dx * 3.5) / canvas.clientHeight, (-dy * 3.5) / canvas.clientHeight);
+    moved();
+  });
+  for (const name of ["pointerup", "pointercancel"]) {
+    canvas.addEventListener(name, (event) => pointers.delete(event.pointerId));
+  }
+  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+  canvas.addEventListener("dblclick", (event) => focus(event.clientX, event.clientY));
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    const pixels = event.deltaY * (event.deltaMode === 1 ? 30 : 1);
+    view.zoom(Math.exp(Math.max(-0.5, Math.min(0.5, pixels * (event.ctrlKey ? 0.01 : 0.0015)))));
+    moved();
+  }, { passive: false });
+
+  canvas.addEventListener("webglcontextlost", () => say("The graphics device was taken away; reload the page."));
+  element("cameras").replaceChildren(...scene.cameras.map(({ name }, index) => new Option(name, index)));
+  element("cameras").addEventListener("change", (event) => {
+    show(Number(event.target.value));
+    canvas.focus();
+  });
+  addEventListener("hashchange", follow);
+  new ResizeObserver(resize).observe(canvas);
+
+  window.nsvqViewer = {
+    /** The present camera, or, given one of the same form, that one: a promise kept when it is drawn. */
+    camera(next) {
+      if (next === undefined) return view.camera(canvas.width, canvas.height);
+      place(next);
+      return settled();
+    },
+    /** The keyframes as nerfstudio's camera path. */
+    path,
+    /** What is shown now, drawn again, as a data URL of a PNG. */
+    picture() {
+      draw(1);
+      return canvas.toDataURL();
+    },
+  };
+  resize();
+  follow();
+  await settled();
+}
+
+function fail(error) {
+  say(error.message);
+  throw error;
+}
+
+/** For automation: kept when the first sorted picture is drawn, broken if there will be none. */
+window.nsvqReady = main().catch(fail);
