@@ -21,7 +21,14 @@ const turned = (a, axis, angle) =>
 
 // ---------------------------------------------------------------------------------------------- decoding and sorting
 
+const ROW = 2048; // splats in a row of the textures: the width that every WebGL 2 has
+
 // The functions before `startEngine` also run in the worker, as source text.
+
+/** Rows of the textures, with room for at least one transparent splat after the last one. */
+function rowsFor(count) {
+  return Math.floor(count / ROW) + 1;
+}
 
 /** From what the file stores to what is drawn, in place: opacities, axis lengths, unit quaternions. */
 function activate(splats) {
@@ -36,12 +43,15 @@ function activate(splats) {
   return splats;
 }
 
-/** A function that sorts splats from far to near along a direction. */
+/**
+ * A function that sorts splats from far to near along a direction; the rest of the texture's rows is filled with the
+ * index after the last splat, which is a transparent one.
+ */
 function makeSorter(means) {
   const count = means.length / 3;
   const depths = new Float32Array(count), keys = new Uint32Array(depths.buffer), byLow = new Uint32Array(count);
   return ([x, y, z]) => {
-    const low = new Uint32Array(65537), high = new Uint32Array(65537), order = new Uint32Array(count);
+    const low = new Uint32Array(65537), high = new Uint32Array(65537), order = new Uint32Array(rowsFor(count) * ROW);
     for (let i = 0, m = 0; i < count; i++, m += 3) {
       depths[i] = x * means[m] + y * means[m + 1] + z * means[m + 2];
       keys[i] ^= keys[i] >>> 31 ? 0xffffffff : 0x80000000; // unsigned integers in the order of the numbers
@@ -54,7 +64,7 @@ function makeSorter(means) {
     }
     for (let i = 0; i < count; i++) byLow[low[keys[i] & 0xffff]++] = i;
     for (let i = 0; i < count; i++) order[count - 1 - high[keys[byLow[i]] >>> 16]++] = byLow[i];
-    return order;
+    return order.fill(count, count);
   };
 }
 
@@ -81,7 +91,7 @@ function serve() {
 /** `{decode(buffer), sort(direction)}`, both promises: in a worker, or here where the browser allows none. */
 async function startEngine(decoderSource) {
   try {
-    const source = [`"use strict";`, decoderSource, activate, makeSorter, `(${serve})();`].join("\n");
+    const source = [`"use strict"; const ROW = ${ROW};`, decoderSource, rowsFor, activate, makeSorter, `(${serve})();`].join("\n");
     const worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
     const waiting = [];
     const reply = () => new Promise((resolve, reject) => waiting.push({ resolve, reject }));
@@ -111,7 +121,7 @@ async function startEngine(decoderSource) {
 
 // ---------------------------------------------------------------------------------------------- drawing
 
-const ROW = 2048; // splats in a row of the textures: the width that every WebGL 2 has
+const GROUP = 128; // splats in an instance: GPUs are slow at instances of a few vertices
 
 const FULL_SCREEN = `#version 300 es
 void main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }`;
@@ -156,17 +166,19 @@ precision highp int;
 precision highp sampler2DArray;
 uniform sampler2DArray geometry;
 uniform sampler2D colours;
+uniform highp usampler2D order;
 uniform mat3 rotation;     // world to camera
 uniform vec3 translation;
 uniform vec2 size;         // of the picture, pixels
 uniform vec4 lens;         // fx, fy, cx, cy, pixels
-layout(location = 0) in uint index;
 flat out vec4 colour;      // opacity last
 out vec2 offset;           // from the centre, standard deviations along the axes of the ellipse
 
 void main() {
   gl_Position = vec4(0, 0, 2, 1);  // outside: nothing is drawn unless what follows says where
-  ivec2 at = ivec2(index % ${ROW}u, index / ${ROW}u);
+  int place = gl_InstanceID * ${GROUP} + (gl_VertexID >> 2);
+  int index = int(texelFetch(order, ivec2(place % ${ROW}, place / ${ROW}), 0).r);
+  ivec2 at = ivec2(index % ${ROW}, index / ${ROW});
   vec4 mean = texelFetch(geometry, ivec3(at, 0), 0), q = texelFetch(geometry, ivec3(at, 1), 0);
   vec3 deviations = texelFetch(geometry, ivec3(at, 2), 0).xyz;
   vec3 centre = rotation * mean.xyz + translation;
@@ -190,7 +202,7 @@ void main() {
   vec2 axis = half_difference >= 0.0 ? vec2(half_difference + root, xy) : vec2(xy, root - half_difference);
   axis = root > 0.0 ? normalize(axis) : vec2(1, 0);
 
-  offset = sqrt(reach) * vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - sqrt(reach);
+  offset = sqrt(reach) * (vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0);
   vec2 pixel = lens.xy * centre.xy / z + lens.zw
     + offset.x * sqrt(longest) * axis + offset.y * sqrt(determinant / longest) * vec2(-axis.y, axis.x);
   gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0, 1);
@@ -227,7 +239,7 @@ class Renderer {
     this.gl = gl;
     this.canvas = canvas;
     this.count = splats.count;
-    this.rows = Math.max(1, Math.ceil(splats.count / ROW));
+    this.rows = rowsFor(splats.count);
     if (this.rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
       throw new Error(`This device cannot show more than ${gl.getParameter(gl.MAX_TEXTURE_SIZE) * ROW} splats.`);
     }
@@ -237,13 +249,16 @@ class Renderer {
     this.#upload(splats);
     this.colours = this.#target(2, ROW, this.rows);
     this.colour = this.#program(FULL_SCREEN, COLOUR(splats.shDegree), { geometry: 0, harmonics: 1 });
-    this.splat = this.#program(SPLAT, BLEND, { geometry: 0, colours: 2 });
+    this.splat = this.#program(SPLAT, BLEND, { geometry: 0, colours: 2, order: 4 });
     this.show = this.#program(FULL_SCREEN, SHOW, { picture: 3 });
-    this.order = gl.createBuffer();
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(0, 1);
+    const corners = Uint16Array.from({ length: 6 * GROUP }, (_, k) => 4 * Math.floor(k / 6) + [0, 1, 2, 2, 1, 3][k % 6]);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    gl.activeTexture(gl.TEXTURE4);
+    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R32UI, ROW, this.rows);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     if (gl.getError() !== gl.NO_ERROR) throw new Error("This device has too little memory for the scene.");
   }
@@ -316,7 +331,9 @@ class Renderer {
 
   /** Splats from far to near. */
   setOrder(order) {
-    this.gl.bufferData(this.gl.ARRAY_BUFFER, order, this.gl.DYNAMIC_DRAW);
+    const gl = this.gl;
+    gl.activeTexture(gl.TEXTURE4);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, this.rows, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
   }
 
   /** Draw what a camera (`view` below) sees over `background`, with `share` of the canvas's resolution. */
@@ -349,7 +366,7 @@ class Renderer {
     gl.uniform2f(this.splat.at.size, ...size);
     gl.uniform4f(this.splat.at.lens, fx * sx, fy * sy, cx * sx, cy * sy);
     gl.enable(gl.BLEND);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * GROUP, gl.UNSIGNED_SHORT, 0, Math.ceil(this.count / GROUP));
     gl.disable(gl.BLEND);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, width, height);
