@@ -754,6 +754,7 @@ async function main() {
     show(Number(event.target.value));
     canvas.focus();
   });
+  element("more").open = !matchMedia("(pointer: coarse)").matches;
   addEventListener("hashchange", follow);
   new ResizeObserver(resize).observe(canvas);
 
