@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import count
@@ -27,6 +29,11 @@ FLAGS = (
     "--hide-scrollbars",
     "--remote-debugging-pipe",
 )
+
+LAUNCH = (
+    "import os, sys; os.dup2(int(sys.argv[1]), 3); os.dup2(int(sys.argv[2]), 4); os.execv(sys.argv[3], sys.argv[3:])"
+)
+"""Chromium reads commands from descriptor 3 and answers on 4."""
 
 
 class PageError(Exception):
@@ -76,7 +83,9 @@ class Page:
         self.send("Emulation.setDeviceMetricsOverride", **size)
         self.send("Emulation.setTouchEmulationEnabled", enabled=mobile)
         self.send("Page.navigate", url=url)
-        self.run("new Promise(resolve => document.readyState === 'complete' ? resolve() : addEventListener('load', resolve))")
+        self.run(
+            "new Promise(resolve => document.readyState === 'complete' ? resolve() : addEventListener('load', resolve))"
+        )
 
     def run(self, expression: str) -> Any:
         """The value of a JavaScript expression, of the result of its promise if it is one."""
@@ -93,12 +102,11 @@ def chromium(profile: Path) -> Iterator[Page]:
     assert EXECUTABLE is not None
     commands, writer = os.pipe()
     reader, answers = os.pipe()
-    # Chromium reads commands from descriptor 3 and answers on 4.
-    shell = f'exec "$0" "$@" 3<&{commands} 4>&{answers}'
-    arguments = ["sh", "-c", shell, EXECUTABLE, *FLAGS, f"--user-data-dir={profile}"]
-    process = subprocess.Popen(arguments, pass_fds=(commands, answers), stderr=subprocess.DEVNULL)
-    os.close(commands)
-    os.close(answers)
+    ends = [fcntl.fcntl(end, fcntl.F_DUPFD, 100) for end in (commands, answers)]  # not yet 3 or 4 themselves
+    arguments = [sys.executable, "-ISc", LAUNCH, *map(str, ends), EXECUTABLE, *FLAGS, f"--user-data-dir={profile}"]
+    process = subprocess.Popen(arguments, pass_fds=ends, stderr=subprocess.DEVNULL)
+    for end in (commands, answers, *ends):
+        os.close(end)
     try:
         yield Page(reader, writer)
     finally:

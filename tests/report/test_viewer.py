@@ -1,0 +1,279 @@
+"""The page that shows a scene: what is in it, and, in a browser, what it draws."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+from collections.abc import Callable, Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+import pytest
+import torch
+from chromium import Page, PageError, chromium, needs_chromium
+from numpy.typing import NDArray
+from PIL import Image
+from splat_scenes import front_camera, random_splats
+
+from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.formats import load, save
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.report import viewer
+from nsvq_lightning.report.viewer import write_viewer
+
+WEB = Path(viewer.__file__).parent / "web"
+NASTY = '</title></script><script>alert(1)</script><img src="//x.y/{{file}}" onerror=alert(2)> & <!--'
+BACKGROUND = (0.2, 0.4, 0.6)
+
+
+class Parsed(HTMLParser):
+    """Attributes and text of the elements of a page, in order."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None], str]] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs), ""))
+
+    def handle_data(self, data: str) -> None:
+        if self.elements:
+            tag, attributes, text = self.elements[-1]
+            self.elements[-1] = tag, attributes, text + data
+
+    def text(self, tag: str, **attributes: str) -> str:
+        (found,) = [
+            text
+            for name, has, text in self.elements
+            if name == tag and {k: has.get(k) for k in attributes} == attributes
+        ]
+        return found.strip("\n")
+
+
+def _cameras() -> dict[str, Camera]:
+    """The last one is elsewhere, sees another picture's shape, and has a name to be escaped."""
+    K = torch.tensor([[70.0, 0, 33], [0, 80, 41], [0, 0, 1]])
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1)))[0]
+    viewmat[:3, :3] *= torch.linalg.det(viewmat[:3, :3])
+    viewmat[2, 3] = 3.5
+    return {"front": front_camera(96, 64, cx=45.0, cy=34.5), NASTY: Camera(K, viewmat, 60, 90)}
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "scene.nsvq"
+    save(random_splats(600), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def page(scene_file: Path) -> Path:
+    path = scene_file.with_name("viewer.html")
+    size = write_viewer(path, scene_file, _cameras(), NASTY, BACKGROUND)
+    assert size == path.stat().st_size
+    return path
+
+
+@pytest.fixture(scope="module")
+def parsed(page: Path) -> Parsed:
+    return Parsed(page.read_text(encoding="utf-8"))
+
+
+def test_page_loads_nothing_and_may_load_nothing(page: Path, parsed: Parsed) -> None:
+    for tag, attributes, _ in parsed.elements:
+        assert tag not in {"link", "iframe", "img", "object", "embed", "base", "form"}
+        assert not {"src", "href", "srcset", "action", "data"} & attributes.keys()
+    text = re.sub(r'<script id="(file|scene)".*?</script>', "", page.read_text(encoding="utf-8"), flags=re.S)
+    text = re.sub(r"<(title|h1)>.*?</\1>", "", text)
+    assert not re.search(
+        r"https?:|//\w+\.\w|fetch\(|XMLHttpRequest|WebSocket|importScripts|import\(|@import|url\(", text
+    )
+    (policy,) = [a["content"] for tag, a, _ in parsed.elements if tag == "meta" and "http-equiv" in a]
+    assert (policy or "").startswith("default-src 'none';")
+
+
+def test_page_holds_the_files_bytes(scene_file: Path, parsed: Parsed) -> None:
+    assert base64.b64decode(parsed.text("script", id="file"), validate=True) == scene_file.read_bytes()
+
+
+def test_cameras_are_exact_in_the_conventions_of_nerfstudio(parsed: Parsed) -> None:
+    scene = json.loads(parsed.text("script", id="scene"))
+    assert scene["background"] == list(BACKGROUND)
+    for (name, camera), entry in zip(_cameras().items(), scene["cameras"], strict=True):
+        assert (entry["name"], entry["width"], entry["height"]) == (name, camera.width, camera.height)
+        assert (entry["fx"], entry["fy"], entry["cx"], entry["cy"]) == camera.intrinsics
+        to_world = torch.tensor(entry["camera_to_world"], dtype=torch.float64).view(4, 4)
+        to_camera = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)) @ to_world.inverse()
+        assert (to_camera - camera.viewmat).abs().max() < 1e-6
+
+
+def test_up_is_the_mean_of_the_cameras(parsed: Parsed) -> None:
+    up = json.loads(parsed.text("script", id="scene"))["up"]
+    mean = -torch.stack([camera.viewmat[1, :3] for camera in _cameras().values()]).mean(0)
+    assert torch.allclose(torch.tensor(up), mean)
+
+
+def test_names_are_text_whatever_they_contain(parsed: Parsed) -> None:
+    assert parsed.text("title") == parsed.text("h1") == NASTY
+    scripts = [(attributes.get("id"), text) for tag, attributes, text in parsed.elements if tag == "script"]
+    assert [name for name, _ in scripts] == ["scene", "file", "decoder", None]
+    assert scripts[2][1].strip() == (WEB / "nsvq.js").read_text(encoding="utf-8").strip()
+    assert scripts[3][1].strip() == (WEB / "viewer.js").read_text(encoding="utf-8").strip()
+
+
+@pytest.mark.parametrize("name", ["nsvq.js", "viewer.js", "viewer.css"])
+def test_sources_can_stand_in_a_page(name: str) -> None:
+    text = (WEB / name).read_text(encoding="utf-8").lower()
+    assert not any(end in text for end in ("</script", "</style", "<!--"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"cameras": {}}, "at least one camera"),
+        ({"background": (0, 0, 1.5)}, "three numbers from 0 to 1"),
+        ({"background": (float("nan"), 0, 0)}, "three numbers from 0 to 1"),
+        ({"up": (0, 0, 0)}, "up must be a direction"),
+        ({"up": (float("inf"), 0, 0)}, "up must be a direction"),
+    ],
+)
+def test_bad_arguments_are_refused(tmp_path: Path, scene_file: Path, change: dict[str, object], message: str) -> None:
+    arguments = {"scene_file": scene_file, "cameras": _cameras(), "title": "t", **change}
+    with pytest.raises(ValueError, match=message):
+        write_viewer(tmp_path / "page.html", **arguments)  # type: ignore[arg-type]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_damaged_file_is_refused_and_the_old_page_stays(tmp_path: Path, scene_file: Path) -> None:
+    damaged, old = tmp_path / "damaged.nsvq", tmp_path / "page.html"
+    damaged.write_bytes(scene_file.read_bytes()[:-1])
+    old.write_text("old")
+    with pytest.raises(FormatError, match=r"damaged\.nsvq: truncated or altered"):
+        write_viewer(old, damaged, _cameras(), "t")
+    assert old.read_text() == "old"
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with chromium(tmp_path_factory.mktemp("profile")) as tab:
+        yield tab
+
+
+def _drawn(tab: Page) -> NDArray[np.uint8]:
+    data = tab.run("nsvqViewer.picture()").split(",")[1]
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
+
+
+@torch.no_grad()
+def _psnr(drawn: NDArray[np.uint8], scene_file: Path, camera: Camera) -> float:
+    """PSNR in dB of what the page drew against this package's own picture, both of 8 bits."""
+    image = render(load(scene_file), camera, background=torch.tensor(BACKGROUND)).image
+    expected = (image.clamp(0, 1) * 255).round().numpy()
+    return float(10 * np.log10(255**2 / np.square(drawn - expected).mean()))
+
+
+@needs_chromium
+@pytest.mark.parametrize("workers", [True, False])
+def test_browser_draws_what_the_package_renders(tab: Page, page: Path, scene_file: Path, workers: bool) -> None:
+    script = "" if workers else "delete window.Worker"
+    identifier = tab.send("Page.addScriptToEvaluateOnNewDocument", source=script)["identifier"]
+    camera = _cameras()["front"]
+    tab.open(page.as_uri(), camera.width, camera.height)
+    tab.run("nsvqReady")
+    tab.send("Page.removeScriptToEvaluateOnNewDocument", identifier=identifier)
+    assert _psnr(_drawn(tab), scene_file, camera) > 50
+    assert tab.run("document.getElementById('message').hidden && document.getElementById('facts').textContent") == (
+        f"600 splats · {scene_file.stat().st_size / 1e6:.2f} MB"
+    )
+    urls = [event["params"]["request"]["url"] for event in tab.events if event["method"] == "Network.requestWillBeSent"]
+    assert {url.split(":")[0] for url in urls} <= {"file", "blob"}
+
+
+@needs_chromium
+def test_address_names_a_camera_and_tools_move_it(tab: Page, page: Path, scene_file: Path) -> None:
+    name, camera = list(_cameras().items())[1]
+    tab.open("about:blank", camera.width, camera.height)  # or the browser would only scroll
+    tab.open(f"{page.as_uri()}#camera={quote(name, safe='')}", camera.width, camera.height)
+    tab.run("nsvqReady")
+    assert _psnr(_drawn(tab), scene_file, camera) > 50
+    front = _cameras()["front"]
+    tab.run(f"nsvqViewer.camera({json.dumps(viewer.camera_entry(front))})")
+    seen = tab.run("nsvqViewer.camera()")
+    assert np.allclose(seen["camera_to_world"], viewer.camera_entry(front)["camera_to_world"])
+    # The whole frame is in the window: 96 pixels of it in 60.
+    assert seen["fx"] == pytest.approx(front.intrinsics[0] * 60 / 96)
+    assert (seen["width"], seen["height"]) == (60, 90)
+
+
+@needs_chromium
+def test_keyframes_become_a_camera_path(tab: Page, page: Path) -> None:
+    tab.open(page.as_uri(), 97, 64)
+    tab.run("nsvqReady")
+    poses = []
+    for key in "kfk":
+        tab.send("Input.dispatchKeyEvent", type="keyDown", key=key)
+        tab.send("Input.dispatchKeyEvent", type="keyUp", key=key)
+        poses.append(tab.run("nsvqViewer.camera()"))
+    path = tab.run("nsvqViewer.path()")
+    frames = path.pop("camera_path")
+    assert path == {
+        "camera_type": "perspective", "render_height": 64, "render_width": 96, "fps": 24, "seconds": len(frames) / 24
+    }  # fmt: skip
+    for frame, pose in ((frames[0], poses[0]), (frames[-1], poses[2])):
+        assert np.allclose(frame["camera_to_world"], pose["camera_to_world"], atol=1e-6)
+        assert frame["fov"] == pytest.approx(np.degrees(2 * np.arctan(32 / pose["fy"])))
+        assert frame["aspect"] == pytest.approx(97 / 64)
+    for frame in frames:
+        rotation = np.array(frame["camera_to_world"]).reshape(4, 4)[:3, :3]
+        assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+        assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+@needs_chromium
+def test_a_drag_orbits_what_is_in_front_and_reset_returns(tab: Page, page: Path) -> None:
+    tab.open(page.as_uri(), 400, 300)
+    tab.run("nsvqReady")
+    start = tab.run("nsvqViewer.camera()")
+    for kind, x in (("mousePressed", 200), ("mouseMoved", 230), ("mouseReleased", 230)):
+        tab.send("Input.dispatchMouseEvent", type=kind, x=x, y=100, button="left", buttons=1, clickCount=1)
+    seen = tab.run("nsvqViewer.camera()")
+    before, after = (np.array(camera["camera_to_world"]).reshape(4, 4) for camera in (start, seen))
+    assert np.abs(after - before).max() > 0.1
+    assert (after[:3, 3] - before[:3, 3]) @ before[:3, 0] < 0  # the scene follows the hand: the camera goes left
+    tab.run("document.getElementById('reset').click()")
+    assert tab.run("nsvqViewer.camera()") == start
+
+
+@needs_chromium
+@pytest.mark.parametrize(
+    ("script", "change", "message"),
+    [
+        (
+            "",
+            lambda file: file[:100] + ("A" if file[100] != "A" else "B") + file[101:],
+            "The scene in this page is damaged",
+        ),
+        ("", lambda file: file[:1000] + "!" + file[1000:], "The scene in this page is damaged"),
+        ("delete window.WebGL2RenderingContext", lambda file: file, "no WebGL 2"),
+        ("HTMLCanvasElement.prototype.getContext = () => null", lambda file: file, "no WebGL 2"),
+    ],
+)
+def test_a_page_that_cannot_show_says_why(
+    tab: Page, page: Path, parsed: Parsed, tmp_path: Path, script: str, change: Callable[[str], str], message: str
+) -> None:
+    file = parsed.text("script", id="file")
+    broken = tmp_path / "broken.html"
+    broken.write_text(page.read_text(encoding="utf-8").replace(file, change(file)), encoding="utf-8")
+    identifier = tab.send("Page.addScriptToEvaluateOnNewDocument", source=script)["identifier"]
+    tab.open(broken.as_uri(), 300, 200)
+    with pytest.raises(PageError, match=message):
+        tab.run("nsvqReady")
+    tab.send("Page.removeScriptToEvaluateOnNewDocument", identifier=identifier)
+    assert message in tab.run("document.getElementById('message').textContent")
