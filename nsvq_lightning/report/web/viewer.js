@@ -512,10 +512,11 @@ async function load() {
   const engine = await startEngine(element("decoder").textContent);
   let bytes, splats;
   try {
-    bytes = bytesOf(element("file").textContent.trim()).length;
+    const file = bytesOf(element("file").textContent.trim());
+    bytes = file.length;
     say(`Decoding ${(bytes / 1e6).toFixed(2)} MB…`);
     await shown();
-    splats = await engine.decode(bytesOf(element("file").textContent.trim()).buffer);
+    splats = await engine.decode(file.buffer);
   } catch (error) {
     throw new Error(`The scene in this page is damaged: ${error.message}. Download or write the page again.`);
   }
@@ -573,7 +574,7 @@ async function main() {
     if (keys.size) fly(Math.min(elapsed, 200) / 1000);
     const moving = now - touched < 250;
     // A slow device shows fewer pixels while the view moves.
-    if (elapsed > 60) share = Math.max(0.3, share * 0.8);
+    if (elapsed > 60) share = Math.max(0.3, share * Math.max(0.5, Math.sqrt(40 / elapsed)));
     else if (elapsed) share = Math.min(1, share * 1.02);
     last = moving ? now : 0;
     const direction = view.axes[2];
@@ -628,13 +629,12 @@ async function main() {
     element("cameras").value = current;
     place(scene.cameras[current]);
   }
-  /** Go to the camera that the address names. */
+  /** Go to the camera that the address names; returns what to say about it. */
   function follow() {
     const name = new URLSearchParams(location.hash.slice(1)).get("camera");
     const index = name === null ? current : scene.cameras.findIndex((camera) => camera.name === name);
     show(Math.max(index, 0));
-    say(index < 0 ? `There is no camera ${name} here; this is the first one.` : "");
-    if (index < 0) setTimeout(say, 5000, "");
+    return index < 0 ? `There is no camera ${name} here; this is the first one.` : "";
   }
 
   // ---- keyframes
@@ -755,7 +755,8 @@ async function main() {
     canvas.focus();
   });
   element("more").open = !matchMedia("(pointer: coarse)").matches;
-  addEventListener("hashchange", follow);
+  addEventListener("hashchange", () => say(follow()));
+  canvas.addEventListener("pointerdown", () => say(""));
   new ResizeObserver(resize).observe(canvas);
 
   window.nsvqViewer = {
@@ -774,8 +775,9 @@ async function main() {
     },
   };
   resize();
-  follow();
+  const remark = follow();
   await settled();
+  say(remark);
 }
 
 function fail(error) {
