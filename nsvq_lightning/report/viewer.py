@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import base64
-import html
 import json
 import math
 import os
-import re
 from collections.abc import Mapping, Sequence
+from html import escape
+from importlib.resources import files
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import torch
@@ -19,8 +20,6 @@ from nsvq_lightning.io.nsvq.file import read_header
 from nsvq_lightning.rendering.camera import Camera
 
 __all__ = ["camera_entry", "write_viewer"]
-
-_WEB = Path(__file__).parent / "web"
 
 
 def write_viewer(
@@ -61,14 +60,13 @@ def write_viewer(
         "background": list(background),
         "up": list(up),
     }
-    page = _filled(
-        (_WEB / "viewer.html").read_text(encoding="utf-8"),
-        title=html.escape(title.encode("utf-8", "replace").decode()),
+    page = Template(_source("viewer.html")).substitute(
+        title=escape(title.encode("utf-8", "replace").decode()),
         scene=json.dumps(scene, separators=(",", ":"), allow_nan=False).replace("<", r"\u003c"),
         file=base64.b64encode(Path(scene_file).read_bytes()).decode(),
-        css=(_WEB / "viewer.css").read_text(encoding="utf-8"),
-        decoder=(_WEB / "nsvq.js").read_text(encoding="utf-8"),
-        viewer=(_WEB / "viewer.js").read_text(encoding="utf-8"),
+        css=_source("viewer.css"),
+        decoder=_source("nsvq.js"),
+        viewer=_source("viewer.js"),
     )
     write_text(path, page)
     return len(page.encode())
@@ -96,6 +94,6 @@ def _mean_up(cameras: Sequence[Camera]) -> list[float]:
     return [float(value) for value in (mean if mean.norm() > 0.1 else directions[0])]
 
 
-def _filled(template: str, **parts: str) -> str:
-    """The template with each ``{{name}}`` replaced; what is put in is not searched again."""
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
+def _source(name: str) -> str:
+    """Text of a file of the page."""
+    return files("nsvq_lightning.report").joinpath("web", name).read_text(encoding="utf-8")
