@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nsvq_lightning.commands.positive import positive
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
 
@@ -212,9 +213,9 @@ def _parser() -> argparse.ArgumentParser:
         "--codebooks", choices=names, default=DEFAULT_CODEBOOKS, help=f"codebook sizes; {DEFAULT_CODEBOOKS} by default"
     )
     aim.add_argument(
-        "--max-error", type=_positive(float), metavar="E", help="the smallest file with an error of at most E"
+        "--max-error", type=positive(float), metavar="E", help="the smallest file with an error of at most E"
     )
-    aim.add_argument("--target-bytes", type=_positive(int), metavar="B", help="the best file of at most B bytes")
+    aim.add_argument("--target-bytes", type=positive(int), metavar="B", help="the best file of at most B bytes")
     parser.add_argument("--level", choices=LEVELS, default=DEFAULT_LEVEL, help=f"{DEFAULT_LEVEL} by default")
     parser.add_argument("--seed", type=int, default=0, help="seed of k-means")
     parser.add_argument(
@@ -236,13 +237,3 @@ def _parser() -> argparse.ArgumentParser:
         "--max-steps", type=int, metavar="N", help="training iterations: 3000 by default; 0 only measures"
     )
     return parser
-
-
-def _positive(kind: type[int] | type[float]) -> type[int] | type[float]:
-    def parse(text: str) -> int | float:
-        value = kind(text)
-        if not 0 < value < float("inf"):
-            raise argparse.ArgumentTypeError(f"must be above 0, got {text}")
-        return value
-
-    return parse  # type: ignore[return-value]

@@ -1,0 +1,37 @@
+"""The argument SCENE of commands that look at a scene: a file, or the folder of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__all__ = ["photos_of", "scene_file"]
+
+
+def scene_file(path: Path) -> Path:
+    """The scene file that is meant.
+
+    Raises:
+        ValueError: It is a folder without ``scene.nsvq``, or a checkpoint.
+    """
+    if path.is_dir():
+        file = path / "scene.nsvq"
+        if not file.is_file():
+            raise ValueError(f"{path} holds no scene.nsvq: name a scene file, or the folder of a finished run")
+        return file
+    if path.suffix == ".ckpt":
+        raise ValueError(f"{path} is a checkpoint; 'nsvq export --ckpt_path {path}' writes its scene as a file")
+    return path
+
+
+def photos_of(path: Path) -> Path | None:
+    """Folder of the photos that a scene was trained on, as the run that it lies in says; None if nothing says it."""
+    config = (path if path.is_dir() else path.parent) / "config.yaml"
+    if not config.is_file():
+        return None
+    import yaml
+
+    settings = yaml.safe_load(config.read_text(encoding="utf-8"))
+    data = settings.get("data") if isinstance(settings, dict) else None
+    data = data.get("init_args", data) if isinstance(data, dict) else {}
+    root = data.get("root")
+    return Path(root) if isinstance(root, str) and Path(root).is_dir() else None

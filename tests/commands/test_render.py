@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from splat_scenes import random_splats
+
+from nsvq_lightning.commands.main import main
+from nsvq_lightning.data.scene import load_scene
+from nsvq_lightning.io import save
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.rasterize import render
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    save(random_splats(300), tmp_path / "scene.ply")
+    return tmp_path / "scene.ply"
+
+
+def _run(*arguments: str | Path) -> int:
+    return main(["render", *map(str, arguments)])
+
+
+def _picture(path: Path, flags: int = cv2.IMREAD_COLOR) -> np.ndarray[Any, Any]:
+    found = cv2.imread(str(path), flags)
+    return found[:, :, ::-1] if found.ndim == 3 else found
+
+
+def test_cameras_of_the_photos_see_what_they_render(
+    scene: Path, demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "frames"
+    assert _run(scene, "--data.root", demo_scene, "--path", "cameras", "-o", out, "--what", "color,depth,alpha") == 0
+    cameras = load_scene(demo_scene).cameras
+    assert len(list(out.iterdir())) == len(cameras)
+    for index in (0, len(cameras) - 1):
+        seen = render(random_splats(300), cameras[index])
+        expected = (seen.image.clamp(0, 1) * 255).numpy()
+        assert np.abs(_picture(out / f"{index:05d}.png") - expected).max() <= 0.51
+        opacity = seen.alpha.numpy()
+        found = _picture(tmp_path / f"frames_alpha/{index:05d}.png")
+        assert np.abs(found - 255 * opacity[:, :, None]).max() <= 0.51
+        steps = _picture(tmp_path / f"frames_depth/{index:05d}_16bit.png", cv2.IMREAD_UNCHANGED)
+        assert steps.dtype == np.uint16
+        filled = opacity >= 0.5
+        assert np.array_equal(steps > 0, filled)
+        depth = seen.depth.numpy()[filled] / opacity[filled]
+        assert np.abs(steps[filled] - 1000 * depth).max() <= 0.51
+        shades = _picture(tmp_path / f"frames_depth/{index:05d}.png").astype(int)
+        assert shades[~filled].sum() == 0
+        if filled.any():
+            near, far = np.argmin(np.where(filled, steps, 65535)), np.argmax(steps)
+            redness = (shades[:, :, 0] - shades[:, :, 2]).ravel()
+            assert redness[near] > redness[far]
+    said = capsys.readouterr()
+    assert f"{out}: 9 frames of 96x72, color" in said.out
+    assert "9 of 9 frames" in said.err
+
+
+def test_a_run_knows_its_photos(scene: Path, demo_scene: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    save(random_splats(50), run / "scene.nsvq")
+    (run / "config.yaml").write_text(json.dumps({"data": {"class_path": "x", "init_args": {"root": str(demo_scene)}}}))
+    assert _run(run, "--frames", "5", "--size", "33x21") == 0
+    reader = cv2.VideoCapture(str(run / "render.mp4"))
+    assert reader.get(cv2.CAP_PROP_FRAME_COUNT) == 5
+    assert (reader.get(cv2.CAP_PROP_FRAME_WIDTH), reader.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (32, 20)
+
+
+def test_without_photos_cameras_are_guessed(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "frames"
+    assert _run(scene, "--seconds", "0.25", "--fps", "12", "-o", out, "--size", "40x30", "--background", "white") == 0
+    pictures = [_picture(path) for path in sorted(out.iterdir())]
+    assert [picture.shape for picture in pictures] == [(30, 40, 3)] * 3
+    assert all(picture.max() == 255 and picture.min() < 200 for picture in pictures)
+
+
+def test_keyframes_are_followed(scene: Path, demo_scene: Path, tmp_path: Path) -> None:
+    given = load_scene(demo_scene).cameras[0]
+    focal = given.intrinsics[1]
+    intrinsics = torch.tensor([[focal, 0.0, 48.0], [0.0, focal, 36.0], [0.0, 0.0, 1.0]])
+    camera = Camera(intrinsics, given.viewmat, given.width, given.height)
+    matrix = np.linalg.inv(camera.viewmat.double().numpy()) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    field = 2 * np.degrees(np.arctan(36.0 / focal))
+    entries = [{"camera_to_world": matrix.ravel().tolist(), "fov": field, "aspect": 4 / 3}] * 2
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({"camera_path": entries, "render_width": 96, "render_height": 72, "fps": 6}))
+    assert _run(scene, "--path", path, "-o", tmp_path / "out") == 0
+    expected = (render(random_splats(300), camera).image.clamp(0, 1) * 255).numpy()
+    for index in range(2):
+        assert np.abs(_picture(tmp_path / f"out/{index:05d}.png") - expected).max() <= 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--path", "cameras"], "--path cameras needs the cameras of photos"),
+        (["--path", "gone.json"], "gone.json"),
+        (["-o", "a.avi"], "a.avi: name a video (.mp4), or a folder"),
+        (["--data.root", "nowhere"], "nowhere"),
+    ],
+)
+def test_errors_are_one_line(scene: Path, arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _run(scene, *arguments) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("nsvq render: ")
+    assert words in said
+    assert said.count("\n") == 1
+
+
+def test_folders_and_checkpoints_without_a_scene_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _run(tmp_path) == 1
+    assert "holds no scene.nsvq" in capsys.readouterr().err
+    assert _run(tmp_path / "last.ckpt") == 1
+    assert "nsvq export --ckpt_path" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--frames", "0"], "must be above 0"),
+        (["--frames", "5", "--seconds", "2"], "say the same"),
+        (["--size", "12"], "must be like 1280x720"),
+        (["--what", "color,sound"], "color, depth, alpha"),
+        (["--background", "2,0,0"], "three numbers from 0 to 1"),
+    ],
+)
+def test_wrong_arguments_end_with_usage(
+    scene: Path, arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        _run(scene, *arguments)
+    assert ended.value.code == 2
+    assert words in capsys.readouterr().err

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from nsvq_lightning.report import video
+from nsvq_lightning.report.video import video_writer
+
+
+def _pictures() -> list[np.ndarray[Any, Any]]:
+    across, down = np.meshgrid(np.linspace(0, 200, 64), np.linspace(0, 200, 48))
+    return [np.stack([across, down, np.full_like(down, 20.0 * k)], axis=2).astype(np.uint8) for k in range(10)]
+
+
+def _frames(path: Path) -> list[np.ndarray[Any, Any]]:
+    reader, frames = cv2.VideoCapture(str(path)), []
+    assert reader.get(cv2.CAP_PROP_FPS) == 12
+    while True:
+        found, frame = reader.read()
+        if not found:
+            return frames
+        frames.append(frame[:, :, ::-1].astype(float))
+
+
+@pytest.fixture(params=["H.264", "VP9"])
+def codec(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    if request.param == "VP9":
+        monkeypatch.setattr(video.shutil, "which", lambda name: None)
+    elif shutil.which("ffmpeg") is None:
+        pytest.skip("ffmpeg is not installed")
+    return str(request.param)
+
+
+def test_pictures_come_back_from_the_video(tmp_path: Path, codec: str) -> None:
+    path = tmp_path / "a.mp4"
+    with video_writer(path, 64, 48, 12.0) as writer:
+        assert writer.codec == codec
+        for picture in _pictures():
+            writer.write(picture)
+    frames = _frames(path)
+    assert len(frames) == 10
+    for frame, picture in zip(frames, _pictures(), strict=True):
+        assert np.abs(frame - picture).mean() < 4
+    assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def test_an_error_leaves_the_old_video(tmp_path: Path, codec: str) -> None:
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"old")
+
+    def broken_off() -> None:
+        with video_writer(path, 64, 48, 12.0) as writer:
+            writer.write(_pictures()[0])
+            raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError, match="stop"):
+        broken_off()
+    assert path.read_bytes() == b"old"
+    assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def test_impossible_videos_are_refused(tmp_path: Path) -> None:
+    with (
+        pytest.raises(ValueError, match=r"a\.avi: a video ends in \.mp4"),
+        video_writer(tmp_path / "a.avi", 64, 48, 12),
+    ):
+        pass
+    with pytest.raises(ValueError, match="must be even, got 63x48"), video_writer(tmp_path / "a.mp4", 63, 48, 12):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_ffmpeg_says_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "ffmpeg"
+    program.write_text("#!/bin/sh\necho no such codec >&2\ncat > /dev/null\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(video.shutil, "which", lambda name: str(program))
+    with (
+        pytest.raises(OSError, match="could not write the video: no such codec"),
+        video_writer(tmp_path / "a.mp4", 64, 48, 12) as writer,
+    ):
+        writer.write(_pictures()[0])
+    assert not (tmp_path / "a.mp4").exists()
