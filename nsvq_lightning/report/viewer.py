@@ -19,7 +19,7 @@ from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.nsvq.file import read_header
 from nsvq_lightning.rendering.camera import Camera
 
-__all__ = ["camera_entry", "write_viewer"]
+__all__ = ["camera_entry", "viewer_page", "write_viewer"]
 
 
 def write_viewer(
@@ -47,29 +47,58 @@ def write_viewer(
         FormatError: ``scene_file`` is damaged or not a ``.nsvq`` file.
         ValueError: There are no cameras, ``background`` is no colour, or ``up`` is no direction.
     """
+    page = viewer_page(cameras, title, background, up, scene_file)
+    write_text(path, page)
+    return len(page.encode())
+
+
+def viewer_page(
+    cameras: Mapping[str, Camera],
+    title: str,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    up: Sequence[float] | None = None,
+    scene_file: str | os.PathLike[str] | None = None,
+    live: float = 0.0,
+) -> str:
+    """The page of :func:`write_viewer`; arguments and errors are the same.
+
+    Args:
+        cameras: See there.
+        title: See there.
+        background: See there.
+        up: See there.
+        scene_file: The ``.nsvq`` file in the page; without one, it asks its server for ``scene.nsvq``.
+        live: Seconds after which a page without a file asks its server for ``version`` again, to show a new one;
+            0 for never.
+    """
     if not cameras:
-        raise ValueError(f"cannot write {path}: a page needs at least one camera to start from, got none")
+        raise ValueError("a page needs at least one camera to start from, got none")
     if len(background) != 3 or not all(0 <= value <= 1 for value in background):
         raise ValueError(f"background must be three numbers from 0 to 1, got {list(background)}")
     up = _mean_up(list(cameras.values())) if up is None else up
     if len(up) != 3 or not 0 < math.hypot(*up) < math.inf:
         raise ValueError(f"up must be a direction, three finite numbers that are not all 0, got {list(up)}")
-    read_header(scene_file)  # verifies the file's checksum
     scene = {
         "cameras": [{"name": name, **camera_entry(camera)} for name, camera in cameras.items()],
         "background": list(background),
         "up": list(up),
     }
-    page = Template(_source("viewer.html")).substitute(
+    if scene_file is None:
+        source = f'<script data-seconds="{live:g}">\n{_source("served.js")}</script>'
+        connect = " connect-src 'self';"
+    else:
+        read_header(scene_file)  # verifies the file's checksum
+        file = base64.b64encode(Path(scene_file).read_bytes()).decode()
+        source, connect = f'<script id="file" type="text/plain">{file}</script>', ""
+    return Template(_source("viewer.html")).substitute(
         title=escape(title.encode("utf-8", "replace").decode()),
         scene=json.dumps(scene, separators=(",", ":"), allow_nan=False).replace("<", r"\u003c"),
-        file=base64.b64encode(Path(scene_file).read_bytes()).decode(),
+        source=source,
+        connect=connect,
         css=_source("viewer.css"),
         decoder=_source("nsvq.js"),
         viewer=_source("viewer.js"),
     )
-    write_text(path, page)
-    return len(page.encode())
 
 
 def camera_entry(camera: Camera) -> dict[str, Any]:

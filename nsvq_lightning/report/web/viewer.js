@@ -88,7 +88,7 @@ function serve() {
   postMessage({ result: null });
 }
 
-/** `{decode(buffer), sort(direction)}`, both promises: in a worker, or here where the browser allows none. */
+/** `{decode(buffer), sort(direction), end()}`, promises but the last: in a worker, or here where the browser allows none. */
 async function startEngine(decoderSource) {
   try {
     const source = [`"use strict"; const ROW = ${ROW};`, decoderSource, rowsFor, activate, makeSorter, `(${serve})();`].join("\n");
@@ -107,7 +107,8 @@ async function startEngine(decoderSource) {
       worker.postMessage(message, transfer);
       return reply();
     };
-    return { decode: (buffer) => ask(buffer, [buffer]), sort: (direction) => ask(direction) };
+    const end = () => worker.terminate();
+    return { decode: (buffer) => ask(buffer, [buffer]), sort: (direction) => ask(direction), end };
   } catch {
     let sort;
     const decode = async (buffer) => {
@@ -115,7 +116,7 @@ async function startEngine(decoderSource) {
       sort = makeSorter(splats.means);
       return splats;
     };
-    return { decode, sort: async (direction) => sort(direction) };
+    return { decode, sort: async (direction) => sort(direction), end: () => {} };
   }
 }
 
@@ -238,6 +239,7 @@ class Renderer {
     }
     this.gl = gl;
     this.canvas = canvas;
+    this.made = [];
     this.count = splats.count;
     this.rows = rowsFor(splats.count);
     if (this.rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
@@ -255,12 +257,25 @@ class Renderer {
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     gl.activeTexture(gl.TEXTURE4);
-    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+    gl.bindTexture(gl.TEXTURE_2D, this.#texture());
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R32UI, ROW, this.rows);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     if (gl.getError() !== gl.NO_ERROR) throw new Error("This device has too little memory for the scene.");
+  }
+
+  /** A texture that goes with the scene. */
+  #texture() {
+    this.made.push(this.gl.createTexture());
+    return this.made.at(-1);
+  }
+
+  /** Free what the scene takes on the GPU. */
+  release() {
+    for (const texture of [...this.made, this.colours.texture, this.picture?.texture]) this.gl.deleteTexture(texture ?? null);
+    for (const buffer of [this.colours.buffer, this.picture?.buffer]) this.gl.deleteFramebuffer(buffer ?? null);
+    for (const { program } of [this.colour, this.splat, this.show]) this.gl.deleteProgram(program);
   }
 
   /** Geometry as float32: centre and opacity, rotation, axes. Harmonics as float16: a layer for each coefficient. */
@@ -277,7 +292,7 @@ class Renderer {
     };
     const texture = (slot, format, channels, layers) => {
       gl.activeTexture(gl.TEXTURE0 + slot);
-      gl.bindTexture(gl.TEXTURE_2D_ARRAY, gl.createTexture());
+      gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.#texture());
       gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, format, ROW, this.rows, layers.length);
       const kind = channels === 4 ? gl.RGBA : gl.RGB;
       layers.forEach((parts, k) => {
@@ -505,25 +520,24 @@ function bytesOf(base64) {
   return bytes;
 }
 
+/** Where the scene comes from if it is not in the page: see served.js. */
+const server = window.nsvqServer;
+
+/** The decoded scene and the engine that sorts it. */
 async function load() {
-  if (typeof WebGL2RenderingContext === "undefined") {
-    throw new Error("This browser has no WebGL 2, which this page needs. Update it, or try another one.");
-  }
   const engine = await startEngine(element("decoder").textContent);
-  let bytes, splats;
   try {
-    const file = bytesOf(element("file").textContent.trim());
-    bytes = file.length;
+    const file = server ? await server.bytes() : bytesOf(element("file").textContent.trim()), bytes = file.length;
     say(`Decoding ${(bytes / 1e6).toFixed(2)} MB…`);
     await shown();
-    splats = await engine.decode(file.buffer);
+    const splats = await engine.decode(file.buffer);
+    element("facts").textContent = `${splats.count.toLocaleString("en")} splats · ${(bytes / 1e6).toFixed(2)} MB`;
+    return { engine, splats };
   } catch (error) {
+    engine.end();
+    if (server) throw new Error(`The scene cannot be shown: ${error.message}`);
     throw new Error(`The scene in this page is damaged: ${error.message}. Download or write the page again.`);
   }
-  element("facts").textContent = `${splats.count.toLocaleString("en")} splats · ${(bytes / 1e6).toFixed(2)} MB`;
-  say("Sending splats to the GPU…");
-  await shown();
-  return { engine, splats, renderer: new Renderer(element("canvas"), splats) };
 }
 
 /** Depth of what is in front at a place of the canvas: a low quantile of the splats around it, then of all. */
@@ -545,8 +559,15 @@ function depthAt({ count, means, opacities }, { position, axes }, { fx, fy, cx, 
 
 async function main() {
   const scene = JSON.parse(element("scene").textContent);
-  const { engine, splats, renderer } = await load();
+  if (typeof WebGL2RenderingContext === "undefined") {
+    throw new Error("This browser has no WebGL 2, which this page needs. Update it, or try another one.");
+  }
+  let version = server?.seconds ? await server.newVersion("", say) : "";
+  let { engine, splats } = await load();
+  say("Sending splats to the GPU…");
+  await shown();
   const canvas = element("canvas"), view = new ViewPoint(scene.up);
+  let renderer = new Renderer(canvas, splats);
   const backgrounds = [scene.background, [0, 0, 0], [1, 1, 1], [0.5, 0.5, 0.5]];
   const keys = new Set(), keyframes = [], waiting = [];
   let background = 0, current = 0, scheduled = false, sorting = false, sorted = null, last = 0, touched = 0, share = 1;
@@ -586,13 +607,35 @@ async function main() {
   }
 
   function sort(direction) {
+    const asked = engine;
     sorting = true;
     engine.sort(direction).then((order) => {
+      if (asked !== engine) return; // the scene is another one now
       sorting = false;
       sorted = direction;
       renderer.setOrder(order);
       schedule();
     }, fail);
+  }
+
+  /** Show each new version of a scene that trains, from where the viewer is. */
+  async function watch() {
+    for (;;) {
+      version = await server.newVersion(version, say);
+      try {
+        const next = await load();
+        renderer.release();
+        engine.end();
+        ({ engine, splats } = next);
+        renderer = new Renderer(canvas, splats);
+        sorting = false;
+        sorted = null;
+        say("");
+        schedule();
+      } catch (error) {
+        say(error.message);
+      }
+    }
   }
 
   function resize() {
@@ -778,6 +821,7 @@ async function main() {
   const remark = follow();
   await settled();
   say(remark);
+  if (server?.seconds) watch();
 }
 
 function fail(error) {
