@@ -18,6 +18,7 @@ from .freeze import FreezeCodes
 from .growth import BudgetedGrowth
 from .growth_rules import GrowthRules
 from .kernels import CompileAhead
+from .live import LiveScene
 from .metric_report import MetricReport
 from .opacity import OpacityRegularization
 from .phases import PhaseSchedule
@@ -47,6 +48,7 @@ __all__ = [
     "FiniteCodes",
     "FreezeCodes",
     "GrowthRules",
+    "LiveScene",
     "MetricReport",
     "OpacityRegularization",
     "OpacitySelection",

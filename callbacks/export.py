@@ -10,6 +10,7 @@ from lightning.pytorch import LightningModule, Trainer
 
 from nsvq_lightning.io.formats import FORMATS, save
 from nsvq_lightning.io.nsvq.file import as_stored
+from nsvq_lightning.report.viewer import BACKGROUNDS, some_cameras, write_viewer
 from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.run_folder import is_trial, run_folder
 
@@ -27,7 +28,10 @@ DEFAULT_EXPORT = ("nsvq", "ply")
 
 
 class ExportScene(WritingCallback):
-    """Writes ``scene.nsvq`` (the compressed scene) and ``scene.ply`` (its decoded splats, for any viewer), or others.
+    """Writes the scene when training ends.
+
+    The compressed scene is ``scene.nsvq``, and ``scene.ply`` has its decoded splats, for any viewer. With
+    ``scene.nsvq`` comes ``viewer.html``, a page that holds it and shows it in a browser.
 
     Args:
         formats: Suffixes without the dot; ``sog``, ``spz`` and ``splat`` are smaller files for viewers.
@@ -66,3 +70,10 @@ class ExportScene(WritingCallback):
             path = folder / f"scene.{suffix}"
             size = save(scene, path, host.storage) if suffix == "nsvq" else save(decoded, path)
             log.info("wrote %s (%d bytes)", path, size)
+        photos = getattr(getattr(trainer, "datamodule", None), "scene", None)
+        if "nsvq" in self.formats and photos is not None:
+            page = folder / "viewer.html"
+            title = page.resolve().parent.parent.name
+            background = BACKGROUNDS.get(host.background, BACKGROUNDS["black"])
+            size = write_viewer(page, folder / "scene.nsvq", some_cameras(photos), title, background)
+            log.info("wrote %s (%d bytes)", page, size)

@@ -21,10 +21,11 @@ LINES = 50
 
 
 class SplatProgressBar(TQDMProgressBar):
-    """One bar for all iterations of a run, also a resumed one; plain lines if the output is not a terminal.
+    """One bar for a whole run; plain lines if the output is not a terminal.
 
-    After count and time it shows the phase, the number of splats, the training PSNR of recent steps (exponential mean)
-    and the latest test PSNR. It fits 80 columns. The estimate of the remaining time excludes kernel compilation.
+    It counts all iterations, also those of earlier parts of a resumed run. After count and time it shows the phase, the
+    number of splats, the training PSNR of recent steps (exponential mean) and the latest test PSNR. It fits 80 columns.
+    The estimate of the remaining time excludes kernel compilation.
 
     Args:
         refresh_rate: Iterations between two refreshes on a terminal; 0 turns the bar off.

@@ -14,6 +14,7 @@ from .export import ExportScene
 from .finite import FiniteCodes
 from .freeze import FreezeCodes
 from .kernels import CompileAhead
+from .live import LiveScene
 from .metric_report import MetricReport
 from .opacity import OpacityRegularization
 from .phases import PhaseSchedule
@@ -46,6 +47,7 @@ STANDARD: dict[str, type[Callback]] = {
     "rate_distortion": RateDistortion,
     "freeze": FreezeCodes,
     "report": MetricReport,
+    "live": LiveScene,
     "export": ExportScene,
     "predictions": RenderWriter,
     "checkpoint": RunCheckpoint,

@@ -30,7 +30,6 @@ log = logging.getLogger(__name__)
 
 PATHS = ("through", "cameras", "orbit")
 WHAT = ("color", "depth", "alpha")
-BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 FPS = 24.0
 SECONDS = 10.0
 PASSED = 3
@@ -277,7 +276,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--background",
         type=_color,
-        default=BACKGROUNDS["black"],
+        default=(0.0, 0.0, 0.0),
         metavar="COLOR",
         help="black, white, or R,G,B in [0, 1]",
     )
@@ -293,8 +292,8 @@ def _size_argument(text: str) -> tuple[int, int]:
 
 
 def _color(text: str) -> tuple[float, ...]:
-    if text in BACKGROUNDS:
-        return BACKGROUNDS[text]
+    if text in ("black", "white"):
+        return (float(text == "white"),) * 3
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:

@@ -94,7 +94,9 @@ class RunPage:
                 facts.insert(2, ("LPIPS", f"{self.metrics['lpips']:.4f}"))
         shown = "".join(f"<div>{name}<b>{value}</b></div>" for name, value in facts)
         how = "measured on the decoded file" if self.metrics else "as a file written at that moment would decode to"
-        return f'<div class="figures">{shown}</div><p>Quality on test views, {how}.</p>'
+        viewer = (self.folder / "viewer.html").exists()
+        scene = ' <a href="viewer.html">viewer.html</a> beside this page shows the scene.' if viewer else ""
+        return f'<div class="figures">{shown}</div><p>Quality on test views, {how}.{scene}</p>'
 
     def _preview(self) -> str:
         picture = self.folder / "preview.png"

@@ -15,11 +15,22 @@ from typing import Any
 
 import torch
 
+from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.nsvq.file import read_header
 from nsvq_lightning.rendering.camera import Camera
 
-__all__ = ["camera_entry", "viewer_page", "write_viewer"]
+__all__ = ["BACKGROUNDS", "camera_entry", "some_cameras", "viewer_page", "write_viewer"]
+
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+"""RGB of the backgrounds that have names."""
+MOST_CAMERAS = 300
+"""Cameras that a page lists."""
+
+
+def some_cameras(scene: Scene) -> dict[str, Camera]:
+    """Cameras of photos by name, evenly spaced where there are many."""
+    return dict(list(zip(scene.names, scene.cameras, strict=True))[:: -(-len(scene) // MOST_CAMERAS)])
 
 
 def write_viewer(

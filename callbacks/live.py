@@ -1,0 +1,76 @@
+"""Show a running fit to those who look."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from lightning.pytorch import LightningModule, Trainer
+
+from nsvq_lightning.io.formats import save
+from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.training import live
+from nsvq_lightning.training.host import as_host
+from nsvq_lightning.training.run_folder import is_trial, run_folder
+
+from .hosted import WritingCallback
+
+__all__ = ["LiveScene"]
+
+CHECKED_EVERY = 20
+"""Iterations after which the callback sees whether somebody asks; it takes some microseconds."""
+SHARE = 0.05
+"""Largest share of the time that goes into showing."""
+
+
+class LiveScene(WritingCallback):
+    """Shows the splats of a running fit to ``nsvq view --live``.
+
+    It writes them into the folder of the run when somebody asks, and not otherwise. They are those that a file written
+    at that moment would hold, stored without loss in ``live.nsvq``. At most a twentieth of the time goes into it, and
+    none of that counts as training time. The file goes when the run ends.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import STANDARD, LiveScene
+        >>> STANDARD["live"] is LiveScene  # --callbacks.live=null leaves it out
+        True
+    """
+
+    def __init__(self) -> None:
+        self._answered = 0
+        self._next = 0.0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Forget who asked an earlier part of the run."""
+        self._answered, self._next = live.asked(run_folder(trainer)), 0.0
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Answer a viewer."""
+        if (
+            batch_idx % CHECKED_EVERY
+            or not trainer.is_global_zero
+            or time.monotonic() < self._next
+            or is_trial(trainer)
+        ):
+            return
+        folder = run_folder(trainer)
+        asked = live.asked(folder)
+        if asked == self._answered:
+            return
+        host, began = as_host(pl_module), time.monotonic()
+        with host.stopwatch.paused(host.device):
+            splats = type(host.splats).from_tensors(*host.hard_splats(host.phase)).to("cpu")
+            save(splats, folder / live.LIVE_SCENE, Storage("paper"))
+        self._answered, ended = asked, time.monotonic()
+        self._next = ended + (ended - began) / SHARE
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave the finished scene alone."""
+        if trainer.is_global_zero and not is_trial(trainer):
+            live.end(run_folder(trainer))
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Leave nothing behind that only a running fit has."""
+        self.on_fit_end(trainer, pl_module)

@@ -1,0 +1,224 @@
+"""``nsvq view``: look at a scene in the browser, also while it trains."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+import tempfile
+import webbrowser
+from collections.abc import Sequence
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from nsvq_lightning.commands.scene_argument import photos_of, scene_file
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from nsvq_lightning.rendering.camera import Camera
+
+__all__ = ["main"]
+
+PORT = 7007
+SECONDS = 3.0
+"""Time between two looks at a fit."""
+LIKELY = 12
+"""Cameras that are guessed for a scene without photos."""
+
+EPILOG = """\
+examples:
+  nsvq view runs/fox/version_0
+  nsvq view runs/fox/version_1 --live           a fit that is running
+  nsvq view scene.ply --data.root scenes/fox    with the cameras of its photos
+  nsvq view scene.nsvq -o scene.html            one file to send to somebody, no server
+"""
+
+
+class Source(NamedTuple):
+    """What is shown.
+
+    Attributes:
+        file: A ``.nsvq`` file.
+        run: Folder of the fit that is followed; None for a finished scene.
+    """
+
+    file: Path
+    run: Path | None = None
+
+    def current(self) -> Path | None:
+        """The file to show now; None if the fit has not written one yet."""
+        from nsvq_lightning.training.live import LIVE_SCENE
+
+        files = [self.file] if self.run is None else [self.run / LIVE_SCENE, self.file]
+        return next((file for file in files if file.is_file()), None)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Serve a scene until Ctrl-C.
+
+    Args:
+        argv: Arguments after ``nsvq view``; those of the process if None.
+
+    Returns:
+        0, or 1 after an error in the user's files. Wrong arguments end the process with status 2.
+    """
+    parser = _parser()
+    options = parser.parse_args(argv)
+    if options.live and (options.output is not None or not options.scene.is_dir()):
+        parser.error("--live follows a fit that is running: give the folder of the run, and no --output")
+    logging.basicConfig(format="%(message)s")
+    try:
+        with _source(options) as source:
+            if options.output is not None:
+                _write(options, source)
+            else:
+                _serve(options, source)
+    except (ValueError, OSError) as error:
+        sys.stderr.write(f"nsvq view: {error}\n")
+        return 1
+    return 0
+
+
+@contextmanager
+def _source(options: argparse.Namespace) -> Iterator[Source]:
+    """The scene that is meant, as a ``.nsvq`` file."""
+    from nsvq_lightning.io.formats import read_scene, save
+    from nsvq_lightning.io.nsvq.file import read_header
+    from nsvq_lightning.io.nsvq.precision import Storage
+
+    if options.live:
+        yield Source(options.scene / "scene.nsvq", options.scene)
+        return
+    file = scene_file(options.scene)
+    if file.suffix.lower() == ".nsvq":
+        read_header(file)  # verifies the checksum
+        yield Source(file)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / "scene.nsvq"
+        save(read_scene(file), made, Storage("paper"))
+        yield Source(made)
+
+
+def _cameras(options: argparse.Namespace, source: Source) -> dict[str, Camera]:
+    """Cameras of the photos, or guessed ones."""
+    from nsvq_lightning.compression.viewpoints import likely_cameras
+    from nsvq_lightning.data.scene import load_scene
+    from nsvq_lightning.io.formats import load
+    from nsvq_lightning.report.viewer import some_cameras
+
+    root = options.root or photos_of(options.scene)
+    if root is not None:
+        return some_cameras(load_scene(root))
+    if source.run is not None:
+        raise ValueError(f"{source.run} does not say where its photos are: name their folder with --data.root")
+    splats = load(source.file)
+    if len(splats) == 0:
+        raise ValueError(f"{options.scene} holds no splat; there is nothing to see")
+    sys.stderr.write("no photos: cameras are guessed from the scene; --data.root names the folder of the photos\n")
+    return {f"guess {index}": camera for index, camera in enumerate(likely_cameras(splats, LIKELY), 1)}
+
+
+def _title(options: argparse.Namespace) -> str:
+    path = options.scene.resolve()
+    return f"{path.parent.name} / {path.name}" if path.is_dir() else path.name
+
+
+def _write(options: argparse.Namespace, source: Source) -> None:
+    from nsvq_lightning.report.viewer import write_viewer
+
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    size = write_viewer(options.output, source.file, _cameras(options, source), _title(options))
+    sys.stdout.write(f"{options.output}: {size:,} bytes\n")
+
+
+def _serve(options: argparse.Namespace, source: Source) -> None:
+    from nsvq_lightning.report.viewer import viewer_page
+
+    live = SECONDS if source.run is not None else 0.0
+    page = viewer_page(_cameras(options, source), _title(options), live=live).encode()
+    handler = type("Handler", (_Handler,), {"page": page, "source": source})
+    try:
+        server = ThreadingHTTPServer((options.host, options.port), handler)
+    except OSError as error:
+        raise OSError(f"cannot listen on {options.host}:{options.port} ({error}); choose another --port") from None
+    with server:
+        address = f"http://{options.host}:{server.server_port}/"
+        sys.stdout.write(f"{_title(options)} is at {address} until Ctrl-C\n")
+        sys.stdout.flush()
+        if options.open:
+            webbrowser.open(address)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            sys.stdout.write("\n")
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers a browser."""
+
+    page: bytes
+    source: Source
+
+    def do_GET(self) -> None:
+        if self.path == "/":
+            self._answer(200, "text/html; charset=utf-8", self.page)
+        elif self.path in ("/scene.nsvq", "/version"):
+            self._scene(self.path == "/version")
+        else:
+            self._answer(404, "text/plain; charset=utf-8", b"there is no such page")
+
+    def _scene(self, is_question: bool) -> None:
+        from nsvq_lightning.training.live import ask
+
+        if is_question and self.source.run is not None and not self.source.file.exists():
+            ask(self.source.run)
+        file = self.source.current()
+        try:
+            if file is None:
+                self._answer(503, "text/plain; charset=utf-8", b"waiting for the run to show its splats")
+            elif is_question:
+                self._answer(200, "text/plain", f"{file.name} {file.stat().st_mtime_ns}".encode())
+            else:
+                self._answer(200, "application/octet-stream", file.read_bytes())
+        except FileNotFoundError:  # the run has ended in between
+            self._answer(503, "text/plain; charset=utf-8", b"the scene is being written")
+
+    def _answer(self, status: int, kind: str, content: bytes) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing of each request."""
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="nsvq view",
+        description="Look at a scene in the browser, with the cameras of its photos.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file, or the folder of a run")
+    parser.add_argument("--live", action="store_true", help="follow a fit that is running, given its folder")
+    parser.add_argument(
+        "--data.root",
+        dest="root",
+        type=Path,
+        metavar="FOLDER",
+        help="folder of the photos, whose cameras are offered; that of the run by default",
+    )
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT.html", help="write one page with the scene instead")
+    parser.add_argument("--port", type=int, default=PORT, help=f"{PORT} by default; 0 for any that is free")
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="127.0.0.1, this machine only, by default; 0.0.0.0 for all of the network"
+    )
+    parser.add_argument("--no-open", dest="open", action="store_false", help="do not open the browser")
+    return parser
