@@ -16,6 +16,7 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
+    "prepare": Command("make a scene of photos or a video", "nsvq_lightning.commands.prepare"),
     "fit": Command("train a scene, compress it, and measure the decoded file"),
     "test": Command("write the compressed file of a checkpoint, read it back and measure it"),
     "validate": Command("measure the scene of a checkpoint"),

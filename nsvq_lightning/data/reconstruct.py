@@ -1,0 +1,212 @@
+"""Where photos were taken from: structure from motion by COLMAP, in steps that can be continued."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sqlite3
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from nsvq_lightning.data.colmap import import_pycolmap
+from nsvq_lightning.data.images import image_size
+from nsvq_lightning.data.model_files import SceneError
+
+__all__ = ["Verdict", "reconstruct"]
+
+EXHAUSTIVE = 120
+"""Photos up to which every pair is compared; frames of a video are compared with those near them from half of it on."""
+OVERLAP = 12
+"""Frames after each with which it is compared, and as many farther ones at distances that double."""
+SHARED = 8
+"""Photos of one size from which on their camera has a lens model of four numbers, not one."""
+BATCH = 4
+"""Photos whose features are found between two reports."""
+POLLED = 1.0
+"""Seconds between two looks at how many pairs are compared."""
+
+Report = Callable[[str, int, int], None]
+"""Called with a step, how much of it is done, and how much there is."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What came out.
+
+    Attributes:
+        registered: Names of the photos whose place was found.
+        missing: Names of the others, with the number of photos that each has enough in common with.
+        points: Number of 3D points.
+        error: Mean reprojection error, pixels of the photos.
+        track: Mean number of photos that see a point.
+        models: Number of separate models; the largest is the scene.
+    """
+
+    registered: tuple[str, ...]
+    missing: dict[str, int]
+    points: int
+    error: float
+    track: float
+    models: int
+
+
+def reconstruct(
+    scene: Path, names: Sequence[str], report: Report, is_video: bool = False, max_size: int = 1600, threads: int = -1
+) -> Verdict:
+    """Find the cameras of the photos in ``scene/images`` and write them to ``scene/sparse/0``.
+
+    Photos of one size are taken to be from one camera with a fixed zoom. What a call that was stopped has found is
+    used by the next one.
+
+    Args:
+        scene: Folder of the scene.
+        names: Files in ``scene/images``.
+        report: Where to say how far it is.
+        is_video: Whether they are frames in order.
+        max_size: Longer side in pixels to which photos are reduced for finding features.
+        threads: How many; −1 for one a core.
+
+    Raises:
+        SceneError: Too few photos belong together.
+    """
+    pycolmap = import_pycolmap()
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    pycolmap.set_random_seed(0)
+    database, images = scene / "database.db", scene / "images"
+    _find_features(pycolmap, database, images, names, report, max_size, threads)
+    _compare(pycolmap, database, len(names), report, is_video, threads)
+    models = _map(pycolmap, database, scene, len(names), report, threads)
+    common = _partners(database)
+    if not models:
+        raise SceneError(
+            f"{scene}: no two photos show enough of the same things from different places; each should overlap the "
+            f"next by two thirds, be sharp, and show texture. Photos with a partner: {len(common)} of {len(names)}"
+        )
+    model = models[0]
+    registered = tuple(sorted(image.name for image in model.images.values() if image.has_pose))
+    return Verdict(
+        registered,
+        {name: common.get(name, 0) for name in names if name not in set(registered)},
+        model.num_points3D(),
+        model.compute_mean_reprojection_error(),
+        model.compute_mean_track_length(),
+        len(models),
+    )
+
+
+def _find_features(
+    pycolmap: Any, database: Path, images: Path, names: Sequence[str], report: Report, max_size: int, threads: int
+) -> None:
+    known = _rows(database, "select name from images join keypoints using (image_id)") if database.exists() else []
+    found = {name for (name,) in known}
+    cameras = dict(_rows(database, "select name, camera_id from images")) if database.exists() else {}
+    groups: defaultdict[tuple[int, int], list[str]] = defaultdict(list)
+    for name in names:
+        groups[image_size(images / name)].append(name)
+    options = pycolmap.FeatureExtractionOptions(max_image_size=max_size, num_threads=threads, use_gpu=False)
+    done = len(found)
+    for group in groups.values():
+        reader = pycolmap.ImageReaderOptions(camera_model="OPENCV" if len(group) >= SHARED else "SIMPLE_RADIAL")
+        reader.existing_camera_id = next((cameras[name] for name in group if name in cameras), -1)
+        todo = [name for name in group if name not in found]
+        while todo:
+            # The first one alone makes the camera of its group.
+            size = BATCH if reader.existing_camera_id >= 0 else 1
+            batch, todo = todo[:size], todo[size:]
+            pycolmap.extract_features(
+                database,
+                images,
+                batch,
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=options,
+                device=pycolmap.Device.cpu,
+            )
+            if reader.existing_camera_id < 0:
+                where = "select camera_id from images where name = ?"
+                reader.existing_camera_id = _rows(database, where, batch[0])[0][0]
+            done += len(batch)
+            report("finding features", done, len(names))
+
+
+def _compare(pycolmap: Any, database: Path, count: int, report: Report, is_video: bool, threads: int) -> None:
+    matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
+    exhaustive = count <= (EXHAUSTIVE // 2 if is_video else EXHAUSTIVE)
+    pairs = count * (count - 1) // 2 if exhaustive else 2 * OVERLAP * count
+    with _polled(database, lambda done: report("comparing photos", min(done, pairs), pairs)):
+        if exhaustive:
+            pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
+        else:
+            pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True)
+            pycolmap.match_sequential(
+                database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu
+            )
+    report("comparing photos", pairs, pairs)
+
+
+def _map(pycolmap: Any, database: Path, scene: Path, count: int, report: Report, threads: int) -> list[Any]:
+    """The models, the largest first, which are then in ``scene/sparse``."""
+    work, sparse = scene / "mapping", scene / "sparse"
+    if not (sparse / "0").is_dir():
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir()
+        placed = 0
+
+        def count_image() -> None:
+            nonlocal placed
+            placed += 1
+            report("placing cameras", min(placed, count), count)
+
+        options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=0, min_model_size=3)
+        found = pycolmap.incremental_mapping(
+            database, scene / "images", work, options=options, next_image_callback=count_image
+        )
+        ordered = sorted(found.values(), key=lambda model: -model.num_reg_images())
+        shutil.rmtree(work)
+        if not ordered:
+            return []
+        for index, model in enumerate(ordered):
+            (work / str(index)).mkdir(parents=True)
+            model.write(work / str(index))
+        work.rename(sparse)
+    folders = sorted((path for path in sparse.iterdir() if path.name.isdecimal()), key=lambda path: int(path.name))
+    return [pycolmap.Reconstruction(folder) for folder in folders]
+
+
+def _partners(database: Path) -> dict[str, int]:
+    """For each photo by name, the number of others that it shares enough points with; none are left out."""
+    names = dict(_rows(database, "select image_id, name from images"))
+    counts: defaultdict[str, int] = defaultdict(int)
+    for (pair,) in _rows(database, "select pair_id from two_view_geometries where rows >= 15"):
+        for image in (pair % 2147483647, pair // 2147483647):
+            if image in names:
+                counts[names[image]] += 1
+    return counts
+
+
+@contextlib.contextmanager
+def _polled(database: Path, show: Callable[[int], None]) -> Iterator[None]:
+    """Say now and then how many pairs are compared while the block compares them."""
+    ended = threading.Event()
+
+    def poll() -> None:
+        while not ended.wait(POLLED):
+            with contextlib.suppress(sqlite3.Error):
+                show(_rows(database, "select count(*) from two_view_geometries")[0][0])
+
+    thread = threading.Thread(target=poll, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _rows(database: Path, query: str, *values: Any) -> list[tuple[Any, ...]]:
+    with contextlib.closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)) as connection:
+        return connection.execute(query, values).fetchall()

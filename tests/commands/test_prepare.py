@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from nsvq_lightning.commands.main import main
+from nsvq_lightning.data.scene import load_scene
+from nsvq_lightning.data.synthetic import write_synthetic_scene
+
+
+def _noise(path: Path, seed: int = 0) -> None:
+    pixels = np.random.default_rng(seed).integers(0, 255, (40, 60, 3), dtype=np.uint8)
+    PIL.Image.fromarray(pixels).save(path)
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    return folder
+
+
+def _fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    assert main(["prepare", *map(str, arguments)]) == 1
+    said = capsys.readouterr().err.splitlines()
+    assert said[-1].startswith("nsvq prepare: ")
+    return said[-1]
+
+
+def test_sources_that_are_none_are_refused(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = tmp_path / "scene"
+    assert "no such file or folder" in _fails(capsys, tmp_path / "gone", scene)
+    (tmp_path / "a.txt").write_text("")
+    assert "neither a folder of photos nor a video" in _fails(capsys, tmp_path / "a.txt", scene)
+    assert "no photos; it must hold files" in _fails(capsys, photos, scene)
+    (tmp_path / "a.mp4").write_bytes(b"x")
+    assert "no frame can be read" in _fails(capsys, tmp_path / "a.mp4", tmp_path / "other")
+    _noise(photos / "a.png")
+    assert "1 pictures are too few" in _fails(capsys, photos, scene)
+
+
+def test_folders_of_others_are_left_alone(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    (scene / "mine.txt").write_text("precious")
+    _noise(photos / "a.png")
+    assert "not empty and was not made by this command" in _fails(capsys, photos, scene)
+    assert "not empty and was not made by this command" in _fails(capsys, photos, scene, "--again")
+    assert [path.name for path in scene.iterdir()] == ["mine.txt"]
+
+
+def test_other_options_need_a_new_beginning(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = tmp_path / "scene"
+    _noise(photos / "a.png")
+    _fails(capsys, photos, scene)
+    assert "was prepared from" in _fails(capsys, photos, scene, "--max-size", "800")
+    (scene / "mine.txt").write_text("precious")
+    assert "too few" in _fails(capsys, photos, scene, "--max-size", "800", "--again")
+    assert json.loads((scene / "prepare.json").read_text())["max_size"] == 800
+    assert (scene / "mine.txt").exists()
+
+
+def test_photos_may_lie_in_their_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = tmp_path / "scene"
+    (scene / "images").mkdir(parents=True)
+    _noise(scene / "images" / "a.png")
+    before = (scene / "images" / "a.png").read_bytes()
+    for more in ([], ["--again"]):
+        assert "too few" in _fails(capsys, scene / "images", scene, *more)
+        assert (scene / "images" / "a.png").read_bytes() == before
+
+
+def test_photos_of_nothing_in_common_are_told(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for seed in range(3):
+        _noise(photos / f"{seed}.png", seed)
+    said = _fails(capsys, photos, tmp_path / "scene")
+    assert "no two photos show enough of the same things" in said
+    assert "Photos with a partner: 0 of 3" in said
+
+
+@pytest.mark.slow
+def test_cameras_are_found_and_a_killed_run_continues(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = write_synthetic_scene(tmp_path / "made", views=48, width=480, height=360, points=500)
+    photos, scene = tmp_path / "photos", tmp_path / "scene"
+    photos.mkdir()
+    for index in range(12):
+        shutil.copy(made / f"images/view_{index:03d}.png", photos)
+    _noise(photos / "zz_odd.png")
+    import pycolmap
+
+    whole = pycolmap.incremental_mapping
+
+    def killed(*arguments: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", killed)
+    with pytest.raises(KeyboardInterrupt):
+        main(["prepare", str(photos), str(scene)])
+    first = (scene / "database.db").stat().st_size
+    monkeypatch.setattr(pycolmap, "incremental_mapping", whole)
+    capsys.readouterr()
+    assert main(["prepare", str(photos), str(scene)]) == 0
+    said = capsys.readouterr()
+    assert "finding features" not in said.err
+    assert (scene / "database.db").stat().st_size <= 1.1 * first
+    assert "12 of 13 photos have found their place" in said.out
+    assert "zz_odd.png: overlaps no other" in said.out
+    assert f"next: nsvq fit --config fast.yaml --data.root {scene}" in said.out
+    true, found = load_scene(made), load_scene(scene)
+    assert found.names == true.names[:12]
+    here, there = (np.array([camera.position.numpy() for camera in each.cameras[:12]]) for each in (true, found))
+    sides = [np.linalg.norm(each[:, None] - each[None], axis=2) for each in (here, there)]
+    scale = np.median(sides[0][sides[1] > 0] / sides[1][sides[1] > 0])
+    assert np.abs(sides[0] - scale * sides[1]).max() < 0.02 * sides[0].max()
+    assert main(["prepare", str(photos), str(scene)]) == 0
+    assert "12 of 13 photos" in capsys.readouterr().out

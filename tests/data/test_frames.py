@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import PIL.Image
+import pytest
+
+from nsvq_lightning.data.frames import copy_photos, photos_in, sharpness, write_frames
+from nsvq_lightning.data.images import image_size, read_image
+from nsvq_lightning.data.model_files import SceneError
+
+
+def _texture(shift: int = 0) -> np.ndarray[Any, Any]:
+    noise = np.random.default_rng(4).integers(0, 255, (24, 48, 3), dtype=np.uint8)
+    return np.roll(cv2.resize(noise, (192, 96), interpolation=cv2.INTER_NEAREST), shift, axis=1)
+
+
+def _video(path: Path, pictures: list[np.ndarray[Any, Any]]) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), 24, (192, 96))
+    assert writer.isOpened()
+    for picture in pictures:
+        writer.write(picture)
+    writer.release()
+    return path
+
+
+def test_the_sharpest_frame_of_each_part_is_taken(tmp_path: Path) -> None:
+    sharp = {2, 11, 17, 20}
+    pictures = [_texture(9 * k) if k in sharp else cv2.GaussianBlur(_texture(9 * k), None, 3) for k in range(24)]
+    seen: list[int] = []
+    found = write_frames(_video(tmp_path / "a.mp4", pictures), tmp_path, 4, seen.append)
+    assert [path.name for path in found] == [f"frame_{k:06d}.jpg" for k in sorted(sharp)]
+    assert seen == list(range(1, 25))
+    for path, index in zip(found, sorted(sharp), strict=True):
+        assert (
+            np.abs(read_image(path)[:, :, ::-1].astype(int) - pictures[index]).mean() < 30
+        )  # chroma has half the resolution
+
+
+def test_parts_in_which_the_camera_stands_still_are_left_out(tmp_path: Path) -> None:
+    pictures = [_texture(0)] * 12 + [_texture(40)] * 6 + [_texture(80)] * 6
+    found = write_frames(_video(tmp_path / "a.mp4", pictures), tmp_path, 8, lambda _: None)
+    assert len(found) == 3
+
+
+def test_a_short_video_gives_what_it_has(tmp_path: Path) -> None:
+    video = _video(tmp_path / "a.mp4", [_texture(30 * k) for k in range(3)])
+    assert len(write_frames(video, tmp_path, 100, lambda _: None)) == 3
+
+
+def test_what_is_no_video_is_told(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_bytes(b"nothing")
+    with pytest.raises(SceneError, match=r"a\.mp4: no frame can be read; convert it"):
+        write_frames(tmp_path / "a.mp4", tmp_path, 10, lambda _: None)
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_photos_are_turned_upright(tmp_path: Path, orientation: int) -> None:
+    upright = np.zeros((32, 64, 3), np.uint8)
+    upright[:, :32, 0] = 255  # red on the left
+    turns = {1: 0, 3: 2, 6: 1, 8: 3}[orientation]
+    stored = np.rot90(upright, turns)  # the tag says how to turn it back
+    exif = PIL.Image.Exif()
+    exif[0x0112] = orientation
+    exif[0x010F] = "maker"
+    source, target = tmp_path / "from", tmp_path / "to"
+    source.mkdir()
+    target.mkdir()
+    PIL.Image.fromarray(np.ascontiguousarray(stored)).save(source / "a.jpg", quality=95, exif=exif)
+    assert copy_photos(photos_in(source), target, lambda _: None) == []
+    assert image_size(target / "a.jpg") == (64, 32)
+    assert np.abs(read_image(target / "a.jpg").astype(int) - upright).mean() < 5
+    with PIL.Image.open(target / "a.jpg") as image:
+        assert image.getexif().get(0x0112, 1) == 1
+        assert image.getexif()[0x010F] == "maker"
+    assert (orientation == 1) == ((target / "a.jpg").read_bytes() == (source / "a.jpg").read_bytes())
+
+
+def test_damaged_photos_are_named_and_left_out(tmp_path: Path) -> None:
+    source, target = tmp_path / "from", tmp_path / "to"
+    source.mkdir()
+    target.mkdir()
+    PIL.Image.fromarray(_texture()).save(source / "a.png")
+    (source / "b.jpg").write_bytes((source / "a.png").read_bytes()[:200])
+    (source / "notes.txt").write_text("no photo")
+    steps: list[int] = []
+    ((path, _),) = copy_photos(photos_in(source), target, steps.append)
+    assert path.name == "b.jpg"
+    assert [each.name for each in target.iterdir()] == ["a.png"]
+    assert steps == [1, 2]
+
+
+def test_folders_without_usable_photos_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match="no photos; it must hold files that end in"):
+        photos_in(tmp_path)
+    (tmp_path / "a.HEIC").write_bytes(b"x")
+    with pytest.raises(SceneError, match=r"a\.HEIC and 0 more cannot be read: convert them to JPEG"):
+        photos_in(tmp_path)
+
+
+def test_sharpness_does_not_depend_on_the_size() -> None:
+    large = cv2.resize(_texture(), (1920, 960), interpolation=cv2.INTER_CUBIC)
+    small = cv2.resize(large, (960, 480), interpolation=cv2.INTER_AREA)
+    assert sharpness(large) == pytest.approx(sharpness(small), rel=0.1)
+    assert sharpness(cv2.GaussianBlur(large, None, 12)) < 0.5 * sharpness(large)
