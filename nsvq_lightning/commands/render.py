@@ -206,7 +206,8 @@ def _bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
     """Values in [0, 1] as 8 bits."""
     import numpy as np
 
-    return np.rint(np.clip(values, 0.0, 1.0) * 255).astype(np.uint8)
+    bytes_: NDArray[np.uint8] = np.rint(np.clip(values, 0.0, 1.0) * 255).astype(np.uint8)
+    return bytes_
 
 
 @contextmanager

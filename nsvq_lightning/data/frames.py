@@ -96,7 +96,7 @@ def sharpness(picture: MatLike) -> float:
 
 
 class _Frame(NamedTuple):
-    index: int
+    number: int
     sharpness: float
     picture: MatLike
 
@@ -172,7 +172,7 @@ def _keep(best: _Frame | None, folder: Path, last: MatLike | None, written: list
     tiny = cv2.resize(best.picture, TINY, interpolation=cv2.INTER_AREA).astype(np.float32)
     if last is not None and float(np.abs(tiny - last).mean()) < STILL:
         return last
-    path = folder / f"frame_{best.index:06d}.jpg"
+    path = folder / f"frame_{best.number:06d}.jpg"
     with atomic_write(path) as file:
         file.write(cv2.imencode(".jpg", best.picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())
     written.append(path)

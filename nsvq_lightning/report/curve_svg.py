@@ -26,7 +26,7 @@ def curve_svg(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> str:
         history: The evaluations, at least one.
         schedule: Phases of the run.
     """
-    last = max(schedule.total, history[-1]["iteration"])
+    last = max(schedule.total, int(history[-1]["iteration"]))
     finite = [entry["psnr"] for entry in history if math.isfinite(entry["psnr"])] or [0.0]
     low, high = math.floor(min(finite)), math.ceil(max(finite) + 0.1)
     most = 1.05 * max(entry["splats"] for entry in history)
