@@ -37,23 +37,22 @@ class LiveScene(WritingCallback):
     """
 
     def __init__(self) -> None:
+        self._running = False
         self._answered = 0
         self._next = 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Forget who asked an earlier part of the run."""
+        super().on_train_start(trainer, pl_module)
+        self._running = not is_trial(trainer)
         self._answered, self._next = live.asked(run_folder(trainer)), 0.0
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Answer a viewer."""
-        if (
-            batch_idx % CHECKED_EVERY
-            or not trainer.is_global_zero
-            or time.monotonic() < self._next
-            or is_trial(trainer)
-        ):
+        due = batch_idx % CHECKED_EVERY == 0 and time.monotonic() >= self._next
+        if not (self._running and due and trainer.is_global_zero):
             return
         folder = run_folder(trainer)
         asked = live.asked(folder)
@@ -68,8 +67,9 @@ class LiveScene(WritingCallback):
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Leave the finished scene alone."""
-        if trainer.is_global_zero and not is_trial(trainer):
+        if self._running and trainer.is_global_zero:
             live.end(run_folder(trainer))
+        self._running = False
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Leave nothing behind that only a running fit has."""
