@@ -38,16 +38,18 @@ class ColmapImage:
         name: File name relative to the image folder.
         camera_id: Key into :attr:`ColmapModel.cameras`.
         viewmat: World to camera, rigid, ``[4, 4]`` float64, scene units.
+        mask: File of its mask where the model names one.
     """
 
     name: str
     camera_id: int
     viewmat: NDArray[np.float64]
+    mask: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class ColmapModel:
-    """A COLMAP reconstruction in COLMAP's own world frame.
+    """A COLMAP reconstruction in COLMAP's own world frame, or the cameras of a transforms file as if they were one.
 
     Attributes:
         images: Registered images, sorted by name.
@@ -55,6 +57,10 @@ class ColmapModel:
         points: Sparse points ``[P, 3]`` float64, scene units, sorted by COLMAP's point id.
         colors: Their colours ``[P, 3]`` uint8 RGB.
         observations: Row of the point and row of the image of each sighting ``[O, 2]`` int64; None unless requested.
+        source: Where it comes from, for messages.
+        images_folder: Folder of the photos inside the scene folder, where the model says so.
+        test: Rows of the test images, where the model says so.
+        synthetic: Whether it is a NeRF-synthetic scene, whose transparent pixels are white by convention.
     """
 
     images: tuple[ColmapImage, ...]
@@ -62,6 +68,10 @@ class ColmapModel:
     points: NDArray[np.float64]
     colors: NDArray[np.uint8]
     observations: NDArray[np.int64] | None = None
+    source: str = "COLMAP"
+    images_folder: str | None = None
+    test: tuple[int, ...] | None = None
+    synthetic: bool = False
 
 
 def import_pycolmap() -> Any:
@@ -76,18 +86,19 @@ def import_pycolmap() -> Any:
     return pycolmap
 
 
-def read_model(root: Path, observations: bool = False) -> ColmapModel:
+def read_model(root: Path, observations: bool = False, chosen: str | None = None) -> ColmapModel:
     """Read the model of a scene folder, see :func:`nsvq_lightning.data.model_files.find_model` for where it may be.
 
     Args:
         root: Scene folder.
         observations: Also read which image saw which point; training does not need it.
+        chosen: Which model, see there.
 
     Raises:
         SceneError: There is no model, a file is damaged, or the model has no registered image or no point.
     """
     pycolmap = import_pycolmap()
-    files = find_model(root)
+    files = find_model(root, chosen)
     reconstruction = pycolmap.Reconstruction()
     try:
         if files.suffix == ".bin":

@@ -1,4 +1,4 @@
-"""Lightning data modules: a COLMAP folder, and the embedded demo scene."""
+"""Lightning data modules: a scene folder, and the embedded demo scene."""
 
 from __future__ import annotations
 
@@ -28,21 +28,23 @@ def _identity(batch: T) -> T:
 
 
 class ColmapDataModule(LightningDataModule):
-    """Views of a COLMAP scene, one per batch.
+    """Views of a scene, one per batch.
 
-    Every 8th of the sorted image names is a test view (validated and tested on, never trained on). The train views come
+    Every 8th of the sorted image names is a test view (validated and tested on, never trained on), unless the folder
+    says which are, see :func:`~nsvq_lightning.data.scene.load_scene`. The train views come
     in the endless order of :class:`~nsvq_lightning.data.sampler.ViewSampler`, which starts at the trainer's step: a
     resumed run sees the views that the uninterrupted run would have seen. With R processes, each takes its own draws
     of that one sequence, and every R-th of the test views.
 
     Args:
-        root: Scene folder: ``images/`` and a COLMAP model (``.bin`` or ``.txt``) in ``sparse/0``, ``sparse`` or itself.
-        factor: Divide the image size by 1, 2, 4 or 8 (from ``images_2`` … where it exists); None: see ``max_width``.
-        max_width: If ``factor`` is None, images wider than this many pixels are scaled down to it; None for no limit.
+        root: Scene folder: photos with a COLMAP model or a ``transforms.json``.
+        factor: Divide the image size by 1, 2, 4 or 8; None: see ``max_width``.
+        max_width: Without a factor, scale wider images down to it; None: never.
         test_every: Every ``test_every``-th view is a test view, at least 2.
         seed: Seed of the order of the train views.
-        cache_bytes: Memory for decoded images in bytes; what does not fit is decoded each time, in the background.
+        cache_bytes: Bytes for decoded images; what does not fit is decoded anew.
         images_folder: Name of the image folder.
+        model: What to read instead of ``sparse/0``: a number, a folder or a ``.json``.
     """
 
     def __init__(
@@ -54,11 +56,12 @@ class ColmapDataModule(LightningDataModule):
         seed: int = 0,
         cache_bytes: int = 4 << 30,
         images_folder: str = "images",
+        model: str | None = None,
     ) -> None:
         super().__init__()
         self.root = Path(root)
         self.factor, self.max_width, self.test_every, self.seed = factor, max_width, test_every, seed
-        self.cache_bytes, self.images_folder = cache_bytes, images_folder
+        self.cache_bytes, self.images_folder, self.model = cache_bytes, images_folder, model
         self._photos = DevicePhotos(cache_bytes)
 
     @cached_property
@@ -69,9 +72,9 @@ class ColmapDataModule(LightningDataModule):
             SceneError: The folder cannot be used.
         """
         scene = load_scene(
-            self.root, self.factor, self.max_width, self.test_every, self.cache_bytes, self.images_folder
+            self.root, self.factor, self.max_width, self.test_every, self.cache_bytes, self.images_folder, self.model
         )
-        rank_zero_info(_summary(scene, self.test_every))
+        rank_zero_info(_summary(scene))
         return scene
 
     def prepare_data(self) -> None:
@@ -228,12 +231,12 @@ class _OrderedViews(Dataset[View]):
         return self._scene.view(self._indices[position])
 
 
-def _summary(scene: Scene, test_every: int) -> str:
+def _summary(scene: Scene) -> str:
     sizes = sorted({(camera.width, camera.height) for camera in scene.cameras})
     size = f"{sizes[0][0]}x{sizes[0][1]}" + (f" to {sizes[-1][0]}x{sizes[-1][1]}" if len(sizes) > 1 else "")
     names = [scene.names[i] for i in scene.test]
     shown = ", ".join(names) if len(names) <= 8 else f"{', '.join(names[:3])}, …, {names[-1]}"
     return (
         f"{scene.root}: {len(scene)} views of {size}, {len(scene.points)} points, extent {scene.extent:.3g}; "
-        f"{len(scene.train)} train views, {len(scene.test)} test views (every {test_every}th by name: {shown})"
+        f"{len(scene.train)} train views, {len(scene.test)} test views ({scene.split}: {shown})"
     )

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-__all__ = ["ModelFiles", "SceneError", "check_binary_files", "find_model", "larger_models"]
+__all__ = ["ModelFiles", "SceneError", "check_binary_files", "find_model", "has_model", "larger_models"]
 
 FOLDERS = ("sparse/0", "sparse", ".")
 """Where a model may be inside a scene folder, in order of preference."""
@@ -50,16 +50,32 @@ class ModelFiles:
         return self.folder / f"{table}{self.suffix}"
 
 
-def find_model(root: Path) -> ModelFiles:
+def has_model(root: Path) -> bool:
+    """Whether a scene folder has a complete COLMAP model where :func:`find_model` looks for one."""
+    return any(
+        all((root / folder / f"{table}{suffix}").is_file() for table in TABLES)
+        for folder in FOLDERS
+        for suffix in (".bin", ".txt")
+    )
+
+
+def find_model(root: Path, chosen: str | None = None) -> ModelFiles:
     """The model of a scene folder: ``sparse/0``, ``sparse`` or the folder itself, binary before text.
+
+    Args:
+        root: Scene folder.
+        chosen: N for ``sparse/N``, or a folder inside ``root``; None looks in the three places.
 
     Raises:
         SceneError: The folder does not exist or holds no complete model.
     """
     if not root.is_dir():
         raise SceneError(f"scene folder {root} does not exist: give the folder that holds images/ and sparse/")
+    folders: tuple[str, ...] = FOLDERS
+    if chosen is not None:
+        folders = (f"sparse/{chosen}" if chosen.isdecimal() else chosen,)
     missing: list[str] = []
-    for folder in FOLDERS:
+    for folder in folders:
         for suffix in (".bin", ".txt"):
             files = ModelFiles((root / folder).resolve(), suffix)
             absent = [table for table in TABLES if not files.path(table).is_file()]
@@ -67,11 +83,17 @@ def find_model(root: Path) -> ModelFiles:
                 return files
             if len(absent) < len(TABLES):
                 missing.append(f"{folder} has a {suffix} model without {', '.join(t + suffix for t in absent)}")
-    looked = ", ".join(FOLDERS)
+    looked = ", ".join(folders)
     details = "; ".join(missing) or "none of the three files is in any of them"
+    if chosen is not None:
+        others = sorted({str(path.parent.relative_to(root)) for path in (root / "sparse").glob("*/cameras.*")})
+        raise SceneError(
+            f"no COLMAP model in {root / looked}: looked for cameras, images and points3D (.bin or .txt); {details}. "
+            f"Choose another (--data.model); there is {', '.join(others) or 'none in sparse/'}"
+        )
     raise SceneError(
-        f"no COLMAP model in {root}: looked for cameras, images and points3D (.bin or .txt) in {looked}; {details}. "
-        "Run COLMAP on the photos or copy the missing files"
+        f"no COLMAP model in {root}: looked for cameras, images and points3D (.bin or .txt) in {looked}; {details}; "
+        "nor is there a transforms.json. Run COLMAP on the photos or copy the missing files"
     )
 
 
@@ -88,8 +110,8 @@ def larger_models(root: Path) -> str | None:
     if not larger:
         return None
     return (
-        f"sparse/0 has {counts['0']} images, {', '.join(larger)}: COLMAP could not join them; to use another, swap "
-        "the names of the folders"
+        f"sparse/0 has {counts['0']} images, {', '.join(larger)}: COLMAP could not join them; --data.model=N "
+        "trains on sparse/N"
     )
 
 

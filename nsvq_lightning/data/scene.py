@@ -16,9 +16,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from nsvq_lightning.compute.transfer import upload
-from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, read_model
+from nsvq_lightning.data.colmap import ColmapImage, ColmapModel
 from nsvq_lightning.data.images import ImageSource, ImageStore, image_size
 from nsvq_lightning.data.model_files import SceneError, larger_models
+from nsvq_lightning.data.point_cloud import random_points
+from nsvq_lightning.data.transforms import read_poses
 from nsvq_lightning.data.undistort import Pinhole, Undistortion, rectify
 from nsvq_lightning.rendering.camera import Camera
 
@@ -83,6 +85,7 @@ class Scene:
         train: Indices of the train views, ascending.
         test: Indices of the test views, ascending.
         extent: 1.1 × the largest distance of a train camera centre from the mean of the train camera centres.
+        split: Which views are the test views, in words.
     """
 
     root: Path
@@ -94,6 +97,7 @@ class Scene:
     train: tuple[int, ...]
     test: tuple[int, ...]
     extent: float
+    split: str = "every 8th by name"
 
     def __len__(self) -> int:
         return len(self.names)
@@ -118,8 +122,13 @@ def load_scene(
     test_every: int = 8,
     cache_bytes: int = 4 << 30,
     images_folder: str = "images",
+    model: str | None = None,
 ) -> Scene:
-    """Load a COLMAP scene: ``images/`` and a model (binary or text) in ``sparse/0``, ``sparse`` or the folder itself.
+    """Load a scene: photos, and the cameras of a COLMAP model (binary or text) or of a transforms file.
+
+    The model is in ``sparse/0``, ``sparse`` or the folder itself; if there is none, ``transforms.json`` (nerfstudio,
+    instant-ngp, Polycam) or ``transforms_train.json`` and ``transforms_test.json`` (NeRF-synthetic) take its place.
+    They say where the photos are. A folder without points gets random ones.
 
     Pinhole images are used as they are; those of any other camera model are undistorted when they are decoded, like
     COLMAP's ``image_undistorter`` does.
@@ -129,9 +138,11 @@ def load_scene(
         factor: Divide the image size by 1, 2, 4 or 8, from the folder ``images_2`` (4, 8) where there is one. None
             scales images wider than ``max_width`` down to that width and leaves the others unchanged.
         max_width: Largest width in pixels where ``factor`` is None; None for no limit.
-        test_every: Every ``test_every``-th of the sorted image names is a test view, starting with the first.
+        test_every: Every ``test_every``-th of the sorted image names is a test view, starting with the first, unless
+            the transforms files say which are.
         cache_bytes: Memory for decoded images in bytes, see :class:`~nsvq_lightning.data.images.ImageStore`.
-        images_folder: Name of the image folder.
+        images_folder: Name of the image folder; a transforms file says itself where the photos are.
+        model: Which model, see :func:`nsvq_lightning.data.transforms.read_poses`; None looks for one.
 
     Raises:
         SceneError: The folder, the model or an image is missing or damaged, or the split leaves no train view.
@@ -139,27 +150,31 @@ def load_scene(
     """
     _check_arguments(factor, max_width, test_every)
     root = Path(root)
-    model = read_model(root)
-    larger = larger_models(root)
+    poses = read_poses(root, model)
+    larger = larger_models(root) if model is None and poses.source == "COLMAP" else None
     if larger is not None:
         log.warning("%s: %s", root, larger)
-    train, test = split_views([image.name for image in model.images], test_every)
-    folder, divisor = _image_folder(root, images_folder, factor)
-    sources = _image_sources(model, _locate(model.images, folder), divisor, max_width if factor is None else None)
-    centres = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in model.images])
+    names = [image.name for image in poses.images]
+    train, test = split_views(names, test_every) if poses.test is None else _given_split(len(names), poses)
+    folder, divisor = _image_folder(root, poses.images_folder or images_folder, factor)
+    sources = _image_sources(poses, _locate(poses.images, folder), divisor, max_width if factor is None else None)
+    cameras = tuple(_camera(image, source.pinhole) for image, source in zip(poses.images, sources, strict=True))
+    poses = poses if len(poses.points) else _with_random_points(root, poses, [cameras[index] for index in train])
+    centres = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in poses.images])
     extent = _extent(centres[list(train)])
     _warn_if_far(centres[list(train)], extent)
-    usable = _away_from(centres, model.points, _AT_CAMERA * extent)
+    usable = _away_from(centres, poses.points, _AT_CAMERA * extent)
     return Scene(
         root=root,
-        names=tuple(image.name for image in model.images),
-        cameras=tuple(_camera(image, source.pinhole) for image, source in zip(model.images, sources, strict=True)),
+        names=tuple(names),
+        cameras=cameras,
         images=ImageStore(sources, cache_bytes),
-        points=torch.from_numpy(model.points[usable]).float(),
-        colors=torch.from_numpy(model.colors[usable]).float() / 255,
+        points=torch.from_numpy(poses.points[usable]).float(),
+        colors=torch.from_numpy(poses.colors[usable]).float() / 255,
         train=train,
         test=test,
         extent=extent,
+        split=f"every {test_every}th by name" if poses.test is None else f"as {poses.source} says",
     )
 
 
@@ -177,6 +192,28 @@ def split_views(names: Sequence[str], test_every: int) -> tuple[tuple[int, ...],
             f"{len(test)} test views; at least 1 of each is needed: register more photos"
         )
     return train, test
+
+
+def _given_split(count: int, poses: ColmapModel) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Train and test indices as the model says.
+
+    Raises:
+        SceneError: There are none of a kind.
+    """
+    test = poses.test or ()
+    train = tuple(sorted(set(range(count)) - set(test)))
+    if not train or not test:
+        raise SceneError(
+            f"{poses.source} gives {len(train)} train and {len(test)} test views; at least 1 of each is needed: check "
+            "the photos that it lists"
+        )
+    return train, test
+
+
+def _with_random_points(root: Path, poses: ColmapModel, cameras: list[Camera]) -> ColmapModel:
+    points = random_points(cameras)
+    log.info("%s has no points: %d random ones in the volume that the cameras see take their place", root, len(points))
+    return replace(poses, points=points, colors=np.full((len(points), 3), 128, np.uint8))
 
 
 def _check_arguments(factor: int | None, max_width: int | None, test_every: int) -> None:

@@ -8,11 +8,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.formats import FORMATS
 from nsvq_lightning.io.nsvq.frame import MAGIC, read_header
 from nsvq_lightning.io.ply import plain_ply_bytes, read_ply_size
-from nsvq_lightning.io.ply_header import PLY_MAGIC, attribute_of
+from nsvq_lightning.io.ply_header import PLY_MAGIC, attribute_of, splat_degree
 from nsvq_lightning.io.sog import read_sog_header
 from nsvq_lightning.io.sog_archive import META, ZIP_MAGIC
 from nsvq_lightning.io.splat import SPLAT_LAYOUT, count_splats
@@ -63,13 +63,15 @@ def _describe_nsvq(path: Path) -> dict[str, Any]:
 
 def _describe_ply(path: Path) -> dict[str, Any]:
     header, total = read_ply_size(path)
+    with naming_file(path):
+        sh_degree = splat_degree(header)
     sizes: dict[str, int] = {}
     for name in header.properties:
         attribute = attribute_of(name)
         sizes[attribute] = sizes.get(attribute, 0) + header.count * header.dtype[name].itemsize
     # The lengths of ascii numbers vary, so only the total is known.
     streams = {"header": header.offset, **sizes} if header.encoding != "ascii" else {"text": total}
-    return _facts(f"ply, {header.encoding}", header.count, header.sh_degree, total, streams, "ply")
+    return _facts(f"ply, {header.encoding}", header.count, sh_degree, total, streams, "ply")
 
 
 def _describe_sog(path: Path) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.opacity import finite_logits
-from nsvq_lightning.io.ply_header import PlyHeader, read_ply_header
+from nsvq_lightning.io.ply_header import PlyHeader, read_ply_header, splat_degree, splat_properties
 from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.splats.sh_degree import sh_coefficients
 
-__all__ = ["plain_ply_bytes", "read_ply", "read_ply_size", "write_ply"]
+__all__ = ["plain_ply_bytes", "read_ply", "read_ply_columns", "read_ply_size", "write_ply"]
 
 _ROWS = 1 << 12
 """Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene."""
@@ -33,22 +33,37 @@ def read_ply(path: str | os.PathLike[str]) -> SplatArrays:
         FormatError: The file is truncated, or not a ``.ply`` of Gaussian splats.
     """
     header, _ = read_ply_size(path)
-    splats = _empty(header.count, header.sh_degree)
+    with naming_file(path):
+        sh_degree = splat_degree(header)
+    splats = _empty(header.count, sh_degree)
     start = 0
-    # A double beyond float32's range becomes inf, which is what a float file would hold.
-    with naming_file(path), open(path, "rb") as file, np.errstate(over="ignore"):
-        file.seek(header.offset)
-        for table in (_read_ascii if header.encoding == "ascii" else _read_binary)(file, header):
-            _store(table, splats, slice(start, start + len(table)))
-            start += len(table)
+    for table in read_ply_columns(path, header, splat_properties(sh_degree)):
+        _store(table, splats, slice(start, start + len(table)))
+        start += len(table)
     return splats
 
 
-def read_ply_size(path: str | os.PathLike[str]) -> tuple[PlyHeader, int]:
-    """Header and size in bytes of a ``.ply`` file that is long enough for its splats.
+def read_ply_columns(
+    path: str | os.PathLike[str], header: PlyHeader, names: Sequence[str]
+) -> Iterator[NDArray[np.float32]]:
+    """Tables ``[rows, len(names)]`` of some properties of the vertices of a ``.ply`` file, which follow each other.
 
     Raises:
-        FormatError: The file is truncated, or not a ``.ply`` of Gaussian splats.
+        FormatError: The file is truncated, or has something other than numbers.
+        ValueError: There is no such property.
+    """
+    columns = [header.properties.index(name) for name in names]
+    # A double beyond float32's range becomes inf, which is what a float file would hold.
+    with naming_file(path), open(path, "rb") as file, np.errstate(over="ignore"):
+        file.seek(header.offset)
+        yield from (_read_ascii if header.encoding == "ascii" else _read_binary)(file, header, columns)
+
+
+def read_ply_size(path: str | os.PathLike[str]) -> tuple[PlyHeader, int]:
+    """Header and size in bytes of a ``.ply`` file that is long enough for its vertices.
+
+    Raises:
+        FormatError: The file is truncated, or no ``.ply``.
     """
     with naming_file(path):
         header, file_bytes = read_ply_header(path), Path(path).stat().st_size
@@ -119,22 +134,21 @@ def _check_room(header: PlyHeader, file_bytes: int) -> None:
     row_bytes = 2 * len(header.properties) if header.encoding == "ascii" else header.dtype.itemsize
     needed = header.offset + header.count * row_bytes - (header.encoding == "ascii" and header.count > 0)
     if needed > file_bytes:
-        raise FormatError(f"truncated: {header.count} splats need {needed} bytes, the file has {file_bytes}")
+        raise FormatError(f"truncated: {header.count} vertices need {needed} bytes, the file has {file_bytes}")
 
 
-def _read_binary(file: BinaryIO, header: PlyHeader) -> Iterator[NDArray[np.float32]]:
-    """Tables ``[rows, P]`` of the properties of :attr:`PlyHeader.splat_properties`."""
+def _read_binary(file: BinaryIO, header: PlyHeader, columns: list[int]) -> Iterator[NDArray[np.float32]]:
+    names = [header.properties[column] for column in columns]
     for start in range(0, header.count, _ROWS):
         rows = min(_ROWS, header.count - start)
         data = file.read(rows * header.dtype.itemsize)
         if len(data) < rows * header.dtype.itemsize:
             raise FormatError("truncated while it was read")
         table = np.frombuffer(data, header.dtype)
-        columns = [table[name] for name in header.splat_properties]
-        yield np.stack(columns, axis=1, dtype=np.float32, casting="unsafe")
+        yield np.stack([table[name] for name in names], axis=1, dtype=np.float32, casting="unsafe")
 
 
-def _read_ascii(file: BinaryIO, header: PlyHeader) -> Iterator[NDArray[np.float32]]:
+def _read_ascii(file: BinaryIO, header: PlyHeader, columns: list[int]) -> Iterator[NDArray[np.float32]]:
     if header.count == 0:
         return
     try:
@@ -145,7 +159,7 @@ def _read_ascii(file: BinaryIO, header: PlyHeader) -> Iterator[NDArray[np.float3
         raise FormatError(
             f"expected {header.count} lines of {len(header.properties)} values, got {' x '.join(map(str, table.shape))}"
         )
-    yield table[:, [header.properties.index(name) for name in header.splat_properties]].astype(np.float32)
+    yield table[:, columns].astype(np.float32)
 
 
 def _empty(count: int, sh_degree: int) -> SplatArrays:
@@ -154,7 +168,7 @@ def _empty(count: int, sh_degree: int) -> SplatArrays:
 
 
 def _store(table: NDArray[np.float32], splats: SplatArrays, rows: slice) -> None:
-    """Distribute a table in the order of :attr:`PlyHeader.splat_properties`."""
+    """Distribute a table in the order of :func:`~nsvq_lightning.io.ply_header.splat_properties`."""
     means, sh0, opacities, scales, quats, rest = np.split(table, np.cumsum([3, 3, 1, 3, 4]), axis=1)
     splats.means[rows] = means
     splats.sh0[rows, 0] = sh0

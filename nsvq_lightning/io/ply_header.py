@@ -1,4 +1,4 @@
-"""The text header of a ``.ply`` file with Gaussian splats."""
+"""The text header of a ``.ply`` file: of Gaussian splats, or of any points."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.splats.sh_degree import sh_coefficients, shN_degree
 
-__all__ = ["PLY_MAGIC", "PlyHeader", "attribute_of", "read_ply_header"]
+__all__ = ["PLY_MAGIC", "PlyHeader", "attribute_of", "read_ply_header", "splat_degree", "splat_properties"]
 
 PLY_MAGIC = b"ply"
 
@@ -31,15 +31,14 @@ _REQUIRED = (
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """Where the splats of a ``.ply`` file are and what they hold.
+    """Where the vertices of a ``.ply`` file are and what they hold; vertices are splats or points.
 
     Attributes:
         encoding: ``binary_little_endian``, ``binary_big_endian`` or ``ascii``.
-        count: Number of splats N.
+        count: Number of vertices N.
         dtype: Structured dtype of one row (for ascii, that of the parsed row).
         offset: Byte of the first row; for ascii, of the first line after the header.
-        lines: Lines of other elements between ``offset`` and the first splat (ascii only).
-        sh_degree: Degree of the spherical harmonics, 0 to 3.
+        lines: Lines of other elements between ``offset`` and the first vertex (ascii only).
     """
 
     encoding: str
@@ -47,17 +46,11 @@ class PlyHeader:
     dtype: np.dtype[np.void]
     offset: int
     lines: int
-    sh_degree: int
 
     @property
     def properties(self) -> tuple[str, ...]:
         """Names of all properties in file order."""
         return self.dtype.names or ()
-
-    @property
-    def splat_properties(self) -> tuple[str, ...]:
-        """Names of the properties that make up the splats."""
-        return (*_REQUIRED, *(f"f_rest_{i}" for i in range(3 * sh_coefficients(self.sh_degree))))
 
 
 @dataclass
@@ -79,7 +72,7 @@ def read_ply_header(path: str | os.PathLike[str]) -> PlyHeader:
     """Parse only the header; the size of the data is not checked.
 
     Raises:
-        FormatError: The header is truncated, malformed, or not that of Gaussian splats.
+        FormatError: The header is truncated or malformed, or has no vertices.
     """
     with open(path, "rb") as file:
         start = file.read(_HEADER_LIMIT)
@@ -91,6 +84,27 @@ def read_ply_header(path: str | os.PathLike[str]) -> PlyHeader:
     lines = [line.split() for line in start[: end.start()].decode("latin-1").split("\n")[1:]]
     encoding = _encoding(lines)
     return _locate(encoding, _elements(lines, _BYTE_ORDER[encoding]), end.end())
+
+
+def splat_degree(header: PlyHeader) -> int:
+    """Degree of the spherical harmonics of the splats in a file, 0 to 3.
+
+    Raises:
+        FormatError: It holds something other than Gaussian splats.
+    """
+    names = header.properties
+    missing = [name for name in _REQUIRED if name not in names]
+    if missing:
+        raise FormatError(f"not a .ply of Gaussian splats: it has no property {', '.join(missing)}")
+    rest = sorted(int(name[7:]) for name in names if re.fullmatch(r"f_rest_[0-9]{1,4}", name))
+    if rest not in ([], [*range(9)], [*range(24)], [*range(45)]):
+        raise FormatError(f"SH degrees 0 to 3 have 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ...; got {len(rest)}")
+    return shN_degree(len(rest) // 3)
+
+
+def splat_properties(sh_degree: int) -> tuple[str, ...]:
+    """Names of the properties that make up splats."""
+    return (*_REQUIRED, *(f"f_rest_{i}" for i in range(3 * sh_coefficients(sh_degree))))
 
 
 def attribute_of(name: str) -> str:
@@ -128,22 +142,12 @@ def _locate(encoding: str, elements: list[_Element], offset: int) -> PlyHeader:
     lines = 0
     for element in elements:
         if element.has_list:
-            raise FormatError(f"element {element.name} holds lists; Gaussian splats have plain numbers only")
+            raise FormatError(f"element {element.name} holds lists; points and splats have plain numbers only")
         dtype = element.dtype()
         if element.name == "vertex":
-            return PlyHeader(encoding, element.count, dtype, offset, lines, _sh_degree(dtype.names or ()))
+            return PlyHeader(encoding, element.count, dtype, offset, lines)
         if encoding == "ascii":
             lines += element.count
         else:
             offset += element.count * dtype.itemsize
     raise FormatError("the header has no element vertex")
-
-
-def _sh_degree(names: tuple[str, ...]) -> int:
-    missing = [name for name in _REQUIRED if name not in names]
-    if missing:
-        raise FormatError(f"not a .ply of Gaussian splats: it has no property {', '.join(missing)}")
-    rest = sorted(int(name[7:]) for name in names if re.fullmatch(r"f_rest_[0-9]{1,4}", name))
-    if rest not in ([], [*range(9)], [*range(24)], [*range(45)]):
-        raise FormatError(f"SH degrees 0 to 3 have 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ...; got {len(rest)}")
-    return shN_degree(len(rest) // 3)

@@ -446,7 +446,10 @@ def test_wrong_settings_name_the_file_they_came_from(
     [
         (["fit", "--data", "{folder}"], "the folder of a scene is --data.root=path/to/scene"),
         (["fit", "--data", "no.Such"], "no.Such"),
-        (["compres", "a.ply", "b.nsvq"], "choose from prepare, fit, test, validate, predict, export, info, convert, compress"),
+        (
+            ["compres", "a.ply", "b.nsvq"],
+            "choose from prepare, fit, test, validate, predict, export, info, convert, compress",
+        ),
     ],
 )
 def test_likely_slips_are_told_what_was_meant(

@@ -50,7 +50,7 @@ def test_a_larger_model_beside_the_first_is_named(make_scene: SceneFactory, capl
     shutil.copytree(make_scene("equal", views=9) / "sparse/0", root / "sparse/2")
     load_scene(root)
     assert caplog.messages == [f"{root}: {larger_models(root)}"]
-    assert "sparse/0 has 9 images, sparse/1 has 10: COLMAP could not join them" in caplog.text
+    assert "sparse/0 has 9 images, sparse/1 has 10: COLMAP could not join them; --data.model=N" in caplog.text
 
 
 def test_every_eighth_name_is_a_test_view(make_scene: SceneFactory) -> None:

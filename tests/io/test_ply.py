@@ -126,7 +126,7 @@ def test_every_truncation_is_one_clear_error(tmp_path: Path) -> None:
     ("old", "new", "message"),
     [
         (b"ply\n", b"PLY\n", "does not start"),
-        (b"vertex 2", b"vertex 2000000000000", "truncated: 2000000000000 splats"),
+        (b"vertex 2", b"vertex 2000000000000", "truncated: 2000000000000 vertices"),
         (b"vertex 2", b"vertex -2", "bad header line"),
         (b"vertex 2", b"vertex 1e3", "bad header line"),
         (b"vertex 2", b"points 2", "no element vertex"),

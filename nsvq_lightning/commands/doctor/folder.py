@@ -1,4 +1,4 @@
-"""Whether a COLMAP folder is a good scene."""
+"""Whether a folder is a good scene."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from nsvq_lightning.commands.doctor.budget import check_budget
 from nsvq_lightning.commands.doctor.finding import Finding, good, note, problem, report
 from nsvq_lightning.commands.doctor.model_checks import check_cameras, check_overlap, check_points
 from nsvq_lightning.commands.doctor.photo_checks import check_exposure, check_photos, check_sizes, read_photos
-from nsvq_lightning.data.colmap import ColmapModel, read_model
+from nsvq_lightning.data.colmap import ColmapModel
 from nsvq_lightning.data.model_files import larger_models
 from nsvq_lightning.data.scene import ONE_PLACE, Scene, load_scene
+from nsvq_lightning.data.transforms import read_poses
 
 __all__ = ["check_folder"]
 
@@ -26,11 +27,11 @@ T = TypeVar("T")
 
 def check_folder(root: Path) -> Iterator[Finding]:
     """All findings about a scene folder; an unusable folder is a finding, not an exception."""
-    model, failures = _attempt("model", lambda: read_model(root, observations=True))
+    model, failures = _attempt("model", lambda: read_poses(root, observations=True))
     yield from failures
     if model is None:
         return
-    larger = larger_models(root)
+    larger = larger_models(root) if model.source == "COLMAP" else None
     if larger is not None:
         yield problem("model", larger)
     for subject, check in (("cameras", check_cameras), ("points", check_points), ("overlap", check_overlap)):
@@ -47,7 +48,7 @@ def _check_scene(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
         photos, failures = _attempt("photos", lambda: read_photos(scene, model))
     yield from failures
     if photos is not None:
-        yield from report("photos", lambda: check_photos(scene, photos, scene.root / IMAGES))
+        yield from report("photos", lambda: check_photos(scene, photos, scene.root / (model.images_folder or IMAGES)))
         yield from report("exposure", lambda: check_exposure(scene, photos))
     yield from report("split", lambda: _check_split(scene))
     yield from report("extent", lambda: _check_extent(scene))
@@ -55,7 +56,7 @@ def _check_scene(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
 
 
 def _check_split(scene: Scene) -> Iterator[Finding]:
-    text = f"{len(scene.train)} train and {len(scene.test)} test photos (every 8th by name)"
+    text = f"{len(scene.train)} train and {len(scene.test)} test photos ({scene.split})"
     values = {"train": len(scene.train), "test": len(scene.test)}
     if len(scene.train) < FEW_VIEWS:
         help_ = "what lies between them is guessed, and the test score says little; take more photos"

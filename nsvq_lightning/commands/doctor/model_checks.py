@@ -1,4 +1,4 @@
-"""Checks of a COLMAP model: cameras, points, and how the views overlap."""
+"""Checks of a model: cameras, points, and how the views overlap."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from nsvq_lightning.commands.doctor.finding import Finding, good, note, problem
 from nsvq_lightning.data.colmap import ColmapModel
+from nsvq_lightning.data.point_cloud import RANDOM_POINTS
 
 __all__ = ["check_cameras", "check_overlap", "check_points", "corner_shift", "shared_points"]
 
@@ -36,7 +37,7 @@ def check_cameras(model: ColmapModel) -> Iterator[Finding]:
     names = sorted({camera.model_name for camera in cameras})
     text = f"{len(cameras)} of {'/'.join(names)}, {_sizes(sizes)}, for {len(model.images)} registered photos"
     values = {"cameras": len(cameras), "models": names, "sizes": sizes, "photos": len(model.images)}
-    if len(cameras) > max(1, len(model.images) // 2) and len(sizes) <= 2:
+    if model.source == "COLMAP" and len(cameras) > max(1, len(model.images) // 2) and len(sizes) <= 2:
         help_ = "if one lens took them, COLMAP with --ImageReader.single_camera 1 calibrates it more exactly"
         yield note("cameras", f"{text}: nearly every photo has a camera of its own; {help_}", **values)
     else:
@@ -71,9 +72,14 @@ def corner_shift(camera: Any) -> float:
 def check_points(model: ColmapModel) -> Iterator[Finding]:
     """Number of points, outliers, and how many views saw them."""
     points = model.points
+    if not len(points):
+        help_ = "name a point cloud (ply_file_path in the file), or run COLMAP"
+        text = f"none in {model.source}: {RANDOM_POINTS:,} random ones take their place, and training has more to do"
+        yield note("points", f"{text}; {help_}" if not model.synthetic else text, points=0)
+        return
     finite = points[np.isfinite(points).all(1)]
     if not len(finite):
-        yield problem("points", "none is finite: run COLMAP again")
+        yield problem("points", f"none is finite: run {'COLMAP' if model.source == 'COLMAP' else 'the export'} again")
         return
     distances = np.linalg.norm(finite - np.median(finite, axis=0), axis=1)
     far = float(np.mean(distances > FAR * max(float(np.quantile(distances, 0.8)), 1e-12)))
@@ -94,7 +100,7 @@ def check_points(model: ColmapModel) -> Iterator[Finding]:
 def _tracks(model: ColmapModel) -> Finding:
     pairs = model.observations
     if pairs is None or not len(pairs):
-        return note("tracks", "the model has no observations, so the overlap of views is unknown")
+        return note("tracks", f"{model.source} has no observations, so the overlap of views is unknown")
     lengths = np.bincount(pairs[:, 0], minlength=len(model.points))
     share = float(np.mean(lengths >= SEEN_BY))
     text = f"{100 * share:.0f} % of the points were seen by {SEEN_BY} views or more, {lengths.mean():.1f} on average"

@@ -97,14 +97,16 @@ def exposure_of(image: Tensor, camera: Camera, model: ColmapModel, rows: NDArray
 
 
 def check_photos(scene: Scene, photos: list[Photo], folder: Path) -> Iterator[Finding]:
-    """Unreadable photos, and those that COLMAP has not registered."""
+    """Unreadable photos, and those in the folder that the model does not have."""
     broken = [photo.error for photo in photos if photo.error is not None]
     if broken:
         yield problem("photos", f"{len(broken)} of {len(photos)} cannot be used; first: {broken[0]}", errors=broken)
     else:
         yield good("photos", f"all {len(photos)} registered photos can be read")
     known = {Path(name).with_suffix("") for name in scene.names}
-    files = [path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES]
+    # The folder of a NeRF-synthetic scene also holds maps and further views.
+    found = folder.rglob("*") if folder != scene.root else ()
+    files = [path.relative_to(folder) for path in found if path.suffix.lower() in SUFFIXES]
     extra = sorted(str(path) for path in files if path.with_suffix("") not in known)
     if extra:
         help_ = "they are not used; if many, photos lack overlap or sharpness"
@@ -114,7 +116,7 @@ def check_photos(scene: Scene, photos: list[Photo], folder: Path) -> Iterator[Fi
 
 
 def check_sizes(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
-    """Whether files have the size that COLMAP saw."""
+    """Whether files have the size that the model says."""
     kinds = Counter[str]()
     for image, source in zip(model.images, scene.images.sources, strict=True):
         camera, (width, height) = model.cameras[image.camera_id], source.size
@@ -127,7 +129,7 @@ def check_sizes(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
     elif kinds["scaled"]:
         yield good("sizes", f"{text}; {kinds['scaled']} files are scaled, cameras are scaled with them", **kinds)
     else:
-        yield good("sizes", f"{text}; files are of the size COLMAP saw")
+        yield good("sizes", f"{text}; files are of the size that {model.source} says")
 
 
 def check_exposure(scene: Scene, photos: list[Photo]) -> Iterator[Finding]:

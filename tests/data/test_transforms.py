@@ -1,0 +1,255 @@
+"""Folders with a ``transforms.json``: the same cameras, points and photos as the COLMAP folder they were made from."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from transforms_scenes import APPLIED, opengl_matrix, write_blender, write_nerfstudio
+
+from nsvq_lightning.data.colmap import read_model
+from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.data.point_cloud import RANDOM_POINTS, random_points, read_points, share_seen
+from nsvq_lightning.data.scene import Scene, SceneError, load_scene
+
+SceneFactory = Callable[..., Path]
+
+
+def change(path: Path, frame: dict[str, Any] | None = None, **head: Any) -> None:
+    """Change values of a transforms file, and of its first frame; None removes one."""
+    document = json.loads(path.read_text())
+    for values, changes in ((document, head), (document["frames"][0], frame or {})):
+        values.update(changes)
+        for key in [key for key, value in changes.items() if value is None]:
+            del values[key]
+    path.write_text(json.dumps(document))
+
+
+def same_views(one: Scene, other: Scene, atol: float = 1e-6) -> None:
+    assert (one.names, one.train, one.test) == (other.names, other.train, other.test)
+    for a, b in zip(one.cameras, other.cameras, strict=True):
+        torch.testing.assert_close(a.viewmat, b.viewmat, rtol=0, atol=atol)
+        torch.testing.assert_close(a.K, b.K, rtol=1e-6, atol=1e-4)
+        assert (a.width, a.height) == (b.width, b.height)
+
+
+def test_nerfstudio_gives_the_same_views_and_points_as_colmap(demo_scene: Path, tmp_path: Path) -> None:
+    colmap, scene = load_scene(demo_scene), load_scene(write_nerfstudio(demo_scene, tmp_path / "scene"))
+    same_views(scene, colmap)
+    assert scene.extent == pytest.approx(colmap.extent, rel=1e-6)
+    torch.testing.assert_close(scene.points, colmap.points)
+    torch.testing.assert_close(scene.colors, colmap.colors)
+    assert all(torch.equal(scene.view(i).image, colmap.view(i).image) for i in range(len(scene)))
+
+
+@pytest.mark.parametrize("moved_points", [True, False], ids=["as now", "as in old versions"])
+def test_points_are_where_the_cameras_see_them(demo_scene: Path, tmp_path: Path, moved_points: bool) -> None:
+    colmap = load_scene(demo_scene)
+    scene = load_scene(write_nerfstudio(demo_scene, tmp_path / "scene", APPLIED, moved_points))
+    turned = torch.from_numpy(APPLIED[:, :3]).float()
+    torch.testing.assert_close(scene.points, colmap.points @ turned.T, rtol=0, atol=1e-5)
+    local = [s.points @ s.cameras[3].viewmat[:3, :3].T + s.cameras[3].viewmat[:3, 3] for s in (scene, colmap)]
+    torch.testing.assert_close(*local, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion", "values"),
+    [
+        ("OPENCV", (0.1, -0.02, 0.003, 0.001), {"k1": 0.1, "k2": -0.02, "p1": 0.003, "p2": 0.001}),
+        ("FULL_OPENCV", (0.1, -0.02, 0, 0, 0.01, 0, 0, 0), {"k1": 0.1, "k2": -0.02, "k3": 0.01}),
+        ("OPENCV_FISHEYE", (0.05, 0.01, 0.002, 0.001),
+         {"camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k2": 0.01, "k3": 0.002, "k4": 0.001}),
+        ("OPENCV_FISHEYE", (0.05, 0, 0, 0), {"camera_model": None, "is_fisheye": True, "k1": 0.05}),
+    ],
+)  # fmt: skip
+def test_lenses_are_those_of_colmap(
+    make_scene: SceneFactory, tmp_path: Path, model: str, distortion: tuple[float, ...], values: dict[str, Any]
+) -> None:
+    colmap = make_scene(model=model, params=(30.0, 31.0, 21.0, 15.0, *distortion))
+    root = write_pinhole(colmap, tmp_path / "json", **values)
+    one, other = load_scene(root), load_scene(colmap)
+    same_views(one, other)
+    assert torch.equal(one.view(2).image, other.view(2).image)
+
+
+def write_pinhole(colmap: Path, root: Path, **values: Any) -> Path:
+    """The folder with a transforms file of the given lens, whatever COLMAP's is."""
+    model = read_model(colmap)
+    shutil.copytree(colmap / "images", root / "images")
+    head = {"fl_x": 30.0, "fl_y": 31.0, "cx": 21.0, "cy": 15.0, "w": 40, "h": 32, "camera_model": "OPENCV"} | values
+    frames = [{"file_path": f"./images/{i.name}", "transform_matrix": opengl_matrix(i.viewmat)} for i in model.images]
+    (root / "transforms.json").write_text(json.dumps({**head, "frames": frames}))
+    return root
+
+
+def test_values_of_a_frame_come_first(make_scene: SceneFactory, tmp_path: Path) -> None:
+    """As in Polycam's exports: every frame has its own intrinsics; here one differs."""
+    root = write_pinhole(make_scene(), tmp_path / "json")
+    change(root / "transforms.json", {"fl_x": 33.0, "cx": 20.5})
+    cameras = load_scene(root).cameras
+    assert cameras[0].intrinsics == pytest.approx((33, 31, 20.5, 15))
+    assert cameras[1].intrinsics == pytest.approx((30, 31, 21, 15))
+
+
+def test_an_angle_is_a_focal_length(make_scene: SceneFactory, tmp_path: Path) -> None:
+    """As instant-ngp writes it; size and centre are those of the photo."""
+    angle = 2 * math.atan(20 / 30)
+    absent = dict.fromkeys(("fl_x", "fl_y", "cx", "cy", "w", "h"))
+    root = write_pinhole(make_scene(), tmp_path / "json", camera_angle_x=angle, **absent)
+    assert load_scene(root).cameras[0].intrinsics == pytest.approx((30, 30, 20, 16))
+    change(root / "transforms.json", camera_angle_y=2 * math.atan(16 / 25))
+    assert load_scene(root).cameras[0].intrinsics == pytest.approx((30, 25, 20, 16))
+    change(root / "transforms.json", camera_angle_x=None)
+    assert load_scene(root).cameras[0].intrinsics == pytest.approx((25, 25, 20, 16))
+
+
+def test_scaled_copies_of_the_photos_are_used(make_scene: SceneFactory, tmp_path: Path) -> None:
+    root = write_pinhole(make_scene(), tmp_path / "json")
+    (root / "images_2").mkdir()
+    for path in (root / "images").iterdir():
+        assert cv2.imwrite(str(root / "images_2" / path.name), np.full((16, 20, 3), 7, np.uint8))
+    assert set(load_scene(root, factor=2).view(4).image.flatten().tolist()) == {7}
+    assert load_scene(root, factor=4).view(4).image.shape == (8, 10, 3)
+
+
+def test_blender_scenes_have_their_own_split_and_random_points(
+    demo_scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = write_blender(demo_scene, tmp_path / "lego")
+    caplog.set_level("INFO", logger="nsvq_lightning")
+    scene = load_scene(root)
+    assert f"has no points: {RANDOM_POINTS} random ones" in caplog.text
+    colmap = read_model(demo_scene)
+    assert [scene.names[i] for i in scene.test] == ["test/r_0.png", "test/r_1.png", "test/r_2.png"]
+    assert len(scene.train) == 6
+    assert scene.split == "as transforms_train.json says"
+    np.testing.assert_allclose(scene.cameras[1].viewmat, colmap.images[4].viewmat, atol=1e-6)
+    assert scene.cameras[0].intrinsics == pytest.approx((0.78 * 96, 0.78 * 96, 36, 36))
+    assert len(scene.points) == RANDOM_POINTS
+    assert torch.equal(scene.points, load_scene(root).points)
+    (root / "transforms_test.json").rename(root / "transforms_val.json")
+    assert len(load_scene(root).test) == 3
+    (root / "transforms_val.json").unlink()
+    assert load_scene(root).split == "every 8th by name"
+
+
+def test_random_points_fill_what_the_cameras_see_together(demo_scene: Path) -> None:
+    cameras = list(load_scene(demo_scene).cameras)
+    points = random_points(cameras)
+    assert share_seen(points, cameras) > 0.9
+    radius = np.linalg.norm(np.stack([camera.position for camera in cameras]), axis=1).mean()
+    assert points.std(0).min() > 0.05 * radius
+    # Parallel axes meet nowhere.
+    ahead = [camera for camera in cameras[:1] for _ in range(3)]
+    assert share_seen(random_points(ahead), ahead) == 1
+
+
+def test_lists_of_train_and_test_photos_are_followed(make_scene: SceneFactory, tmp_path: Path) -> None:
+    root = write_pinhole(make_scene(), tmp_path / "json")
+    lists = {"train_filenames": [f"images/00{i}.png" for i in (0, 1, 2, 5)], "val_filenames": ["images/003.png"]}
+    change(root / "transforms.json", **lists)
+    scene = load_scene(root)
+    assert scene.names == ("000.png", "001.png", "002.png", "003.png", "005.png")
+    assert (scene.test, scene.train) == ((3,), (0, 1, 2, 4))
+    change(root / "transforms.json", val_filenames=["images/001.png"])
+    with pytest.raises(SceneError, match=r"001\.png is a train and a test photo"):
+        load_scene(root)
+
+
+def test_a_colmap_model_comes_first_and_any_can_be_chosen(make_scene: SceneFactory, tmp_path: Path) -> None:
+    root = write_pinhole(make_scene(views=9), tmp_path / "json")
+    shutil.copytree(make_scene("five", views=5) / "sparse", root / "sparse")
+    shutil.copytree(make_scene("six", views=6) / "sparse/0", root / "sparse/1")
+    counts = {model: len(load_scene(root, model=model)) for model in (None, "1", "sparse/0", "transforms.json")}
+    assert counts == {None: 5, "1": 6, "sparse/0": 5, "transforms.json": 9}
+    assert len(ColmapDataModule(str(root), model="1").scene) == 6
+    with pytest.raises(
+        SceneError, match=r"no COLMAP model in .*sparse/7: .*\(--data\.model\); there is sparse/0, sparse/1"
+    ):
+        load_scene(root, model="7")
+    with pytest.raises(SceneError, match=r"other\.json does not exist"):
+        load_scene(root, model="other.json")
+
+
+def mirrored(root: Path) -> None:
+    matrix = np.diag([-1.0, 1, 1, 1]).tolist()
+    change(root / "transforms.json", {"transform_matrix": matrix})
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda root: change(root / "transforms.json", camera_model="EQUIRECTANGULAR"), "RECTANGULAR, which cannot"),
+        (lambda root: change(root / "transforms.json", k4=0.1), "OPENCV and k4 = 0.1, which cannot"),
+        (lambda root: change(root / "transforms.json", fl_x=None, fl_y=None), "frame 0 has no focal length"),
+        (lambda root: change(root / "transforms.json", fl_x=-3), "focal length -3"),
+        (lambda root: change(root / "transforms.json", {"cx": "wide"}), "frame 0 has cx = 'wide'"),
+        (lambda root: change(root / "transforms.json", {"cx": float("nan")}), "frame 0 has cx = nan"),
+        (lambda root: change(root / "transforms.json", w=0), "size 0x32"),
+        (lambda root: change(root / "transforms.json", {"transform_matrix": [[1, 2], [3]]}), "no transform_matrix"),
+        (lambda root: change(root / "transforms.json", {"transform_matrix": None}), "no transform_matrix"),
+        (mirrored, "skewed or mirrored"),
+        (lambda root: change(root / "transforms.json", {"file_path": None}), "no file_path"),
+        (lambda root: change(root / "transforms.json", {"file_path": "images/001.png"}), "an earlier frame is of"),
+        (lambda root: change(root / "transforms.json", {"file_path": "images/gone.png"}), r"first gone\.png"),
+        (lambda root: change(root / "transforms.json", frames=[]), "no list of frames"),
+        (lambda root: change(root / "transforms.json", frames=[3]), "frame 0 is no table"),
+        (lambda root: change(root / "transforms.json", ply_file_path="gone.ply"), r"gone\.ply do not exist"),
+        (lambda root: (root / "transforms.json").write_text("{"), r"transforms\.json cannot be read"),
+    ],
+)  # fmt: skip
+def test_damage_is_named(
+    make_scene: SceneFactory, tmp_path: Path, damage: Callable[[Path], None], message: str
+) -> None:
+    root = write_pinhole(make_scene(), tmp_path / "json")
+    if message == "no list of frames" or "table" in message:
+        document = json.loads((root / "transforms.json").read_text())
+        document["frames"] = [] if "list" in message else [3]
+        (root / "transforms.json").write_text(json.dumps(document))
+    else:
+        damage(root)
+    with pytest.raises(SceneError, match=message):
+        load_scene(root)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_binary_point_clouds(tmp_path: Path, order: str) -> None:
+    kind = [("red", "f4"), ("x", "f8"), ("y", "f4"), ("z", "f4"), ("green", "f4"), ("blue", "f4")]
+    names = {"f4": "float", "f8": "double"}
+    table = np.array([(0, 1.5, 2, 3, 0.5, 1), (1, -1, -2, 9, 0, 0.25)], [(name, order + code) for name, code in kind])
+    head = "".join(f"property {names[code]} {name}\n" for name, code in kind)
+    form = "binary_little_endian" if order == "<" else "binary_big_endian"
+    tail = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    path = tmp_path / "points.ply"
+    path.write_bytes(
+        f"ply\nformat {form} 1.0\ncomment x\nelement vertex 2\n{head}{tail}".encode() + table.tobytes() + b"abc"
+    )
+    xyz, rgb = read_points(path)
+    np.testing.assert_array_equal(xyz, [[1.5, 2, 3], [-1, -2, 9]])
+    np.testing.assert_array_equal(rgb, [[0, 128, 255], [255, 0, 64]])
+    whole = path.read_bytes()
+    for length in range(0, len(whole) - 3, 5):
+        path.write_bytes(whole[:length])
+        with pytest.raises(SceneError, match=r"points .*points\.ply: .*copy the file again"):
+            read_points(path)
+
+
+def test_points_without_colours_are_grey_and_short_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "points.ply"
+    head = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    path.write_text(f"{head}1 2 3\n4 5 6\n")
+    xyz, rgb = read_points(path)
+    np.testing.assert_array_equal(xyz, [[1, 2, 3], [4, 5, 6]])
+    assert (rgb == 128).all()
+    for rows in ("1 2 3\n", "1 2 3\n4 5 x\n", "1 2 3\n4 5\n"):
+        path.write_text(head + rows)
+        with pytest.raises(SceneError, match=r"points\.ply: "):
+            read_points(path)
