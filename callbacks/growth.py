@@ -119,7 +119,7 @@ class BudgetedGrowth(Densification):
     def ask(self, host: SplatHost, iteration: int, batch: Any) -> None:
         """Ask for absolute gradients and edge weights during warm-up."""
         growing = host.schedule.phase_at(iteration) is Phase.WARMUP
-        host.pixel_map = edge_strength(batch.image) if growing else None
+        host.pixel_map = edge_strength(batch.image, batch.mask) if growing else None
 
     def has_asked(self, host: SplatHost) -> bool:
         """Whether a map of edges was asked for."""

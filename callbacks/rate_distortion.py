@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nsvq_lightning.compression.importance import row_weights
 from nsvq_lightning.compression.sensitivity import sensitivity
+from nsvq_lightning.quality.masking import kept
 from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.quantize.attributes import QUANTIZED, check_attributes
 from nsvq_lightning.quantize.base import Holding, is_holding
@@ -133,7 +134,7 @@ class RateDistortion(LatchedCallback):
             view = scene.view(index).to(host.device)
             signs = generator(host.seed, iteration, "signs", index)
             squares, image = sensitivity(splats, view.camera, host.render_splats, signs)
-            error += (image - eight_bit(view.image)).square().sum(dtype=torch.float64)
+            error += (kept(image, view.mask) - eight_bit(view.image)).square().sum(dtype=torch.float64)
             for name, total in shown.items():
                 total += QUANTIZED[name].rows(getattr(squares, name)).mean(1)
         error = sum_over_processes(trainer, error)

@@ -45,6 +45,7 @@ class ColmapDataModule(LightningDataModule):
         cache_bytes: Bytes for decoded images; what does not fit is decoded anew.
         images_folder: Name of the image folder.
         model: What to read instead of ``sparse/0``: a number, a folder or a ``.json``.
+        masks: Name of the folder of masks; None ignores them.
     """
 
     def __init__(
@@ -57,11 +58,12 @@ class ColmapDataModule(LightningDataModule):
         cache_bytes: int = 4 << 30,
         images_folder: str = "images",
         model: str | None = None,
+        masks: str | None = "masks",
     ) -> None:
         super().__init__()
         self.root = Path(root)
         self.factor, self.max_width, self.test_every, self.seed = factor, max_width, test_every, seed
-        self.cache_bytes, self.images_folder, self.model = cache_bytes, images_folder, model
+        self.cache_bytes, self.images_folder, self.model, self.masks = cache_bytes, images_folder, model, masks
         self._photos = DevicePhotos(cache_bytes)
 
     @cached_property
@@ -72,7 +74,14 @@ class ColmapDataModule(LightningDataModule):
             SceneError: The folder cannot be used.
         """
         scene = load_scene(
-            self.root, self.factor, self.max_width, self.test_every, self.cache_bytes, self.images_folder, self.model
+            self.root,
+            self.factor,
+            self.max_width,
+            self.test_every,
+            self.cache_bytes,
+            self.images_folder,
+            self.model,
+            self.masks,
         )
         rank_zero_info(_summary(scene))
         return scene
@@ -238,5 +247,19 @@ def _summary(scene: Scene) -> str:
     shown = ", ".join(names) if len(names) <= 8 else f"{', '.join(names[:3])}, …, {names[-1]}"
     return (
         f"{scene.root}: {len(scene)} views of {size}, {len(scene.points)} points, extent {scene.extent:.3g}; "
-        f"{len(scene.train)} train views, {len(scene.test)} test views ({scene.split}: {shown})"
+        f"{len(scene.train)} train views, {len(scene.test)} test views ({scene.split}: {shown}){_left_out(scene)}"
+    )
+
+
+def _left_out(scene: Scene) -> str:
+    """What of the photos does not count, in words."""
+    masked = sum(source.mask is not None for source in scene.images.sources)
+    transparent = sum(source.has_alpha for source in scene.images.sources)
+    return "".join(
+        (
+            f"; {masked} views have a mask" if masked else "",
+            f"; {transparent} may be transparent, which {'is white' if scene.white else 'does not count'}"
+            if transparent
+            else "",
+        )
     )

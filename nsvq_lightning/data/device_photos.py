@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from nsvq_lightning.data.images import Picture
 from nsvq_lightning.data.scene import View
 
 __all__ = ["DevicePhotos"]
@@ -28,21 +29,21 @@ class DevicePhotos:
     def __init__(self, most_bytes: int) -> None:
         self._most, self._free = most_bytes, 0
         self._device = torch.device("cpu")
-        self._kept: dict[int, tuple[Tensor, Tensor]] = {}
+        self._kept: dict[int, tuple[Tensor, View]] = {}
 
     def move(self, view: View, device: torch.device) -> View:
-        """The view with its photo on the device."""
+        """The view with its photo and mask on the device."""
         if device.type == "cpu":
             return view.to(device)
         if device != self._device:
             self._device, self._kept, self._free = device, {}, min(self._most, _spare(device))
-        host, photo = self._kept.get(view.index, (None, None))
-        if photo is not None and host is view.image:
-            return replace(view, image=photo)
+        host, there = self._kept.get(view.index, (None, None))
+        if there is not None and host is view.image:
+            return replace(view, image=there.image, mask=there.mask)
         moved = view.to(device)
-        if photo is None and moved.image.nbytes <= self._free:
-            self._kept[view.index] = view.image, moved.image
-            self._free -= moved.image.nbytes
+        if there is None and (taken := Picture(moved.image, moved.mask).nbytes) <= self._free:
+            self._kept[view.index] = view.image, moved
+            self._free -= taken
         return moved
 
     def __getstate__(self) -> dict[str, object]:

@@ -22,20 +22,24 @@ SAMPLE = 32
 """Photos that are looked at for the detail of a scene."""
 
 
-def _high_pass(image: Tensor, depth: int) -> NDArray[Any]:
+def _high_pass(image: Tensor, depth: int, mask: Tensor | None) -> NDArray[Any]:
     grey = cv2.cvtColor(image.cpu().numpy(), cv2.COLOR_RGB2GRAY)
-    return np.asarray(cv2.filter2D(grey, depth, HIGH_PASS))
+    passed = np.asarray(cv2.filter2D(grey, depth, HIGH_PASS))
+    if mask is not None:
+        passed *= cv2.erode(mask.cpu().numpy().view(np.uint8), np.ones((3, 3), np.uint8))
+    return passed
 
 
-def edge_strength(image: Tensor) -> Tensor:
+def edge_strength(image: Tensor, mask: Tensor | None = None) -> Tensor:
     """Edge strength ``[H, W]`` of a photo, in [0, 1]: the positive part of a high-pass filter of its grey values.
 
     The strongest edge has strength 1; a photo without any edge is 0 everywhere.
 
     Args:
         image: ``[H, W, 3]`` uint8 RGB.
+        mask: Which pixels count ``[H, W]`` bool; those beside one that does not have strength 0. None if all count.
     """
-    edges = torch.from_numpy(_high_pass(image, cv2.CV_8U))  # which also clips to 0..255
+    edges = torch.from_numpy(_high_pass(image, cv2.CV_8U, mask))  # which also clips to 0..255
     low, high = int(edges.min()), int(edges.max())
     return ((edges.float() - low) / max(high - low, 1)).to(image.device)
 
@@ -49,7 +53,6 @@ def detailed_pixels(scene: Scene) -> float:
     Raises:
         SceneError: An image cannot be decoded.
     """
-    counts = [
-        int((np.abs(_high_pass(scene.images[index], cv2.CV_16S)) > DETAIL).sum()) for index in scene.some_train(SAMPLE)
-    ]
+    pictures = (scene.images[index] for index in scene.some_train(SAMPLE))
+    counts = [int((np.abs(_high_pass(image, cv2.CV_16S, mask)) > DETAIL).sum()) for image, mask in pictures]
     return sum(counts) / len(counts)

@@ -1,4 +1,4 @@
-"""Image files: decoding to RGB bytes, and a cache of them with a byte budget."""
+"""Image files: decoding to RGB bytes and which of them count, and a cache of them with a byte budget."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -23,7 +24,21 @@ from nsvq_lightning.data.model_files import SceneError
 from nsvq_lightning.data.undistort import Pinhole, Undistortion
 from nsvq_lightning.skips import is_on
 
-__all__ = ["ImageSource", "ImageStore", "encode_png", "image_size", "read_image"]
+__all__ = [
+    "ROUNDED",
+    "ImageHead",
+    "ImageSource",
+    "ImageStore",
+    "Picture",
+    "encode_png",
+    "image_head",
+    "image_size",
+    "read_image",
+    "read_mask",
+]
+
+ROUNDED = 0.01
+"""Relative difference of aspect ratios that rounding explains."""
 
 # COLMAP works on the pixels as stored, so the EXIF orientation must not be applied.
 _READ = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
@@ -39,10 +54,52 @@ _LIMIT = threading.Lock()
 
 _MIRRORED = {2: (1,), 3: (0, 1), 4: (0,), 6: (0,), 7: (0, 1), 8: (1,)}
 """By orientation, the axes to mirror; from 5 on, rows and columns are swapped first."""
+_TURNED = 5
+"""EXIF orientation from which on a photo is stored lying on its side."""
+_OPPOSITE = {6: 8, 8: 6}
+"""Orientations that do not undo themselves."""
+_ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
+_OPAQUE = 128
+"""Alpha value from which on a pixel counts."""
 
 
 def _undecodable(path: Path, reason: str) -> SceneError:
     return SceneError(f"image {path} cannot be decoded ({reason}): copy it again, or remove it and run COLMAP again")
+
+
+class ImageHead(NamedTuple):
+    """What the head of an image file says: width and height in pixels as stored, EXIF orientation, transparency."""
+
+    size: tuple[int, int]
+    orientation: int
+    has_alpha: bool
+
+    @property
+    def lies_on_its_side(self) -> bool:
+        """Whether programs that apply the orientation swap width and height."""
+        return self.orientation >= _TURNED
+
+
+def image_head(path: Path) -> ImageHead:
+    """What the head of an image file says.
+
+    Raises:
+        SceneError: The file is not an image, or its head declares more pixels than it can hold.
+    """
+    try:
+        with _opened(path) as image:
+            width, height = image.size
+            # Pillow decodes a whole PNG to look for a tag that is hardly ever there.
+            tags = {} if image.format == "PNG" else image.getexif()
+            orientation = int(tags.get(_TIFF_ORIENTATION, 1))
+            if image.format == "TIFF":  # Pillow applies the orientation to their size
+                width, height = (int(tags[tag]) for tag in _TIFF_SIZE)
+            has_alpha = image.mode in _ALPHA_MODES or "transparency" in image.info
+    except _DAMAGED as error:
+        raise _undecodable(path, str(error)) from error
+    if width * height > _MOST_A_BYTE * path.stat().st_size:
+        raise _undecodable(path, f"its head declares {width}x{height} pixels in {path.stat().st_size} bytes")
+    return ImageHead((width, height), orientation, has_alpha)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -51,16 +108,7 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         SceneError: The file is not an image, or its head declares more pixels than it can hold.
     """
-    try:
-        with _opened(path) as image:
-            width, height = image.size
-            if image.format == "TIFF":  # Pillow applies the orientation to their size
-                width, height = (int(image.getexif()[tag]) for tag in _TIFF_SIZE)
-    except _DAMAGED as error:
-        raise _undecodable(path, str(error)) from error
-    if width * height > _MOST_A_BYTE * path.stat().st_size:
-        raise _undecodable(path, f"its head declares {width}x{height} pixels in {path.stat().st_size} bytes")
-    return width, height
+    return image_head(path).size
 
 
 @contextmanager
@@ -82,10 +130,23 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     Raises:
         SceneError: The file is damaged or has floating-point pixels.
     """
+    return np.asarray(cv2.cvtColor(_decoded(path, _READ), cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def _decoded(path: Path, flags: int) -> NDArray[np.uint8]:
+    """Decode an image as OpenCV does, to 8 bits, with the pixels as stored.
+
+    Args:
+        path: Image file.
+        flags: Of ``cv2.imdecode``.
+
+    Raises:
+        SceneError: The file is damaged or has floating-point pixels.
+    """
     data = path.read_bytes()  # imread fails on names outside the locale's character set
     try:
         orientation = _orientation(data)
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), _READ)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except _DAMAGED:
         image = None
     except cv2.error as error:  # a size beyond OpenCV's limits
@@ -96,7 +157,44 @@ def read_image(path: Path) -> NDArray[np.uint8]:
         image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if image.dtype != np.uint8:
         raise _undecodable(path, f"its pixels are {image.dtype}; accepted are 8 and 16 bit integers")
-    return _turned_back(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), orientation)
+    return _turned_back(image, orientation)
+
+
+def _with_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """RGB ``[H, W, 3]`` and alpha ``[H, W]`` of an image that has transparent pixels; hidden colours stay.
+
+    Raises:
+        SceneError: The file is damaged.
+    """
+    image = _decoded(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 3 or image.shape[2] != 4:
+        raise _undecodable(path, f"its transparency is not understood, its pixels are {list(image.shape[2:])}")
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGB), np.uint8), image[..., 3]
+
+
+def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
+    """Which pixels of a photo count ``[height, width]``: those that are more than half as bright as the brightest.
+
+    So white and 1 are kept, black is excluded; a mask of another size is scaled.
+
+    Args:
+        path: Image file.
+        width: Of the photo, pixels.
+        height: Of the photo, pixels.
+
+    Raises:
+        SceneError: The file is damaged, or has another aspect ratio than the photo.
+    """
+    grey = _decoded(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    kept: NDArray[np.uint8] = (grey > int(grey.max()) / 2).astype(np.uint8)
+    if abs(kept.shape[1] * height / (kept.shape[0] * width) - 1) > ROUNDED:
+        raise SceneError(
+            f"mask {path} is of {kept.shape[1]}x{kept.shape[0]}, its photo of {width}x{height}, another shape: "
+            "make it from that photo, or remove it"
+        )
+    if kept.shape != (height, width):
+        kept = np.asarray(cv2.resize(kept, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
+    return kept.astype(bool)
 
 
 def encode_png(rgb: NDArray[np.uint8]) -> bytes:
@@ -134,46 +232,103 @@ def _orientation(data: bytes) -> int:
 
 def _turned_back(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
     """A TIFF's pixels as stored: OpenCV applies the orientation to TIFFs even when told not to."""
-    stored = pixels.transpose(1, 0, 2) if orientation >= 5 else pixels
+    stored = pixels.swapaxes(0, 1) if orientation >= _TURNED else pixels
     return np.ascontiguousarray(np.flip(stored, _MIRRORED.get(orientation, ())))
+
+
+def _upright(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
+    """Stored pixels as the orientation says they are to be shown."""
+    return _turned_back(pixels, _OPPOSITE.get(orientation, orientation))
+
+
+class Picture(NamedTuple):
+    """A photo as it is compared with.
+
+    Attributes:
+        image: ``[H, W, 3]`` uint8 RGB, black where it does not count.
+        mask: Which pixels count ``[H, W]`` bool; None if all do.
+    """
+
+    image: Tensor
+    mask: Tensor | None
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory."""
+        return self.image.nbytes + (0 if self.mask is None else self.mask.nbytes)
 
 
 @dataclass(frozen=True, eq=False)
 class ImageSource:
     """How the picture of one view is made from its file.
 
+    Pixels count if the mask says so, if they are not transparent and if the camera saw them; each pixel of the picture
+    only if all that it was mixed from count.
+
     Attributes:
         path: Image file.
-        size: Its width and height in pixels.
+        size: Its width and height in pixels, after it was turned.
         undistortion: Applied first; None for a pinhole camera.
         pinhole: Camera of the resulting picture, which is resized to its size.
+        orientation: EXIF orientation to apply; 1 leaves the pixels as stored.
+        mask: Image file that says which pixels count.
+        has_alpha: Whether the file has transparent pixels.
+        backdrop: Grey value behind transparent pixels, which then count; None excludes them.
     """
 
     path: Path
     size: tuple[int, int]
     undistortion: Undistortion | None
     pinhole: Pinhole
+    orientation: int = 1
+    mask: Path | None = None
+    has_alpha: bool = False
+    backdrop: int | None = None
 
     @property
     def nbytes(self) -> int:
         """Bytes of the picture in memory."""
-        return 3 * self.pinhole.width * self.pinhole.height
+        masked = self.mask is not None or (self.has_alpha and self.backdrop is None)
+        return (3 + masked) * self.pinhole.width * self.pinhole.height
 
-    def load(self) -> Tensor:
-        """The picture, ``[H, W, 3]`` uint8 RGB.
+    def load(self) -> Picture:
+        """The picture.
 
         Raises:
-            SceneError: The file is damaged or has changed its size since the scene was loaded.
+            SceneError: A file is damaged or has changed its size since the scene was loaded, or no pixel counts.
         """
-        image = read_image(self.path)
+        image, kept = self._decode()
         height, width = image.shape[:2]
         if (width, height) != self.size:
             raise _undecodable(self.path, f"decoded to {width}x{height}, its head says {self.size[0]}x{self.size[1]}")
+        if self.mask is not None:
+            mask = read_mask(self.mask, width, height)
+            kept = mask if kept is None else kept & mask
         if self.undistortion is not None:
-            image = self.undistortion(image)
-        if image.shape[:2] != (self.pinhole.height, self.pinhole.width) or not is_on("resizing"):
-            image = cv2.resize(image, (self.pinhole.width, self.pinhole.height), interpolation=cv2.INTER_AREA)
-        return torch.from_numpy(np.ascontiguousarray(image))
+            image, kept = self.undistortion(image), self.undistortion.kept(kept)
+        size = self.pinhole.width, self.pinhole.height
+        if image.shape[1::-1] != size or not is_on("resizing"):
+            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+            if kept is not None:
+                kept = cv2.resize(kept.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255
+        if kept is None or kept.all():
+            return Picture(torch.from_numpy(np.ascontiguousarray(image)), None)
+        if not kept.any():
+            raise SceneError(
+                f"no pixel of {self.path} counts{'' if self.mask is None else f' by its mask {self.mask}'}: masks are "
+                "white where the photo counts and black elsewhere; mend it, or remove the photo from the model"
+            )
+        return Picture(torch.from_numpy(image * kept[..., None]), torch.from_numpy(kept))
+
+    def _decode(self) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+        """The file's pixels, turned, and which of them are not transparent."""
+        if not self.has_alpha:
+            return _upright(read_image(self.path), self.orientation), None
+        image, alpha = (_upright(part, self.orientation) for part in _with_alpha(self.path))
+        if self.backdrop is None:
+            return image, alpha >= _OPAQUE
+        share = alpha[..., None].astype(np.float32) / 255
+        return np.rint(image * share + self.backdrop * (1 - share)).astype(np.uint8), None
 
 
 class ImageStore:
@@ -198,14 +353,14 @@ class ImageStore:
         self.nbytes = sum(source.nbytes for source in self.sources)
         """Bytes of all pictures, decoded."""
         self._free = cache_bytes
-        self._kept: dict[int, Tensor] = {}
-        self._coming: dict[int, Future[Tensor]] = {}
+        self._kept: dict[int, Picture] = {}
+        self._coming: dict[int, Future[Picture]] = {}
 
     def __len__(self) -> int:
         return len(self.sources)
 
-    def __getitem__(self, index: int) -> Tensor:
-        """Picture ``index``, ``[H, W, 3]`` uint8 RGB on the CPU; treat it as read-only.
+    def __getitem__(self, index: int) -> Picture:
+        """Picture ``index`` on the CPU; treat it as read-only.
 
         Raises:
             SceneError: The file cannot be decoded.
@@ -213,11 +368,11 @@ class ImageStore:
         if index in self._kept:
             return self._kept[index]
         coming = self._coming.pop(index, None)
-        image = coming.result() if coming is not None else self.sources[index].load()
-        if image.nbytes <= self._free:
-            self._kept[index] = image
-            self._free -= image.nbytes
-        return image
+        picture = coming.result() if coming is not None else self.sources[index].load()
+        if picture.nbytes <= self._free:
+            self._kept[index] = picture
+            self._free -= picture.nbytes
+        return picture
 
     def prefetch(self, index: int) -> None:
         """Start decoding picture ``index`` in the background; errors are raised when it is requested."""
@@ -225,7 +380,7 @@ class ImageStore:
             return
         while len(self._coming) > 1:  # prefetched and never requested
             self._coming.pop(next(iter(self._coming)))
-        future: Future[Tensor] = Future()
+        future: Future[Picture] = Future()
         self._coming[index] = future
         threading.Thread(target=_load_into, args=(future, self.sources[index]), name="nsvq-image").start()
 
@@ -233,7 +388,7 @@ class ImageStore:
         return {**self.__dict__, "_coming": {}}
 
 
-def _load_into(future: Future[Tensor], source: ImageSource) -> None:
+def _load_into(future: Future[Picture], source: ImageSource) -> None:
     try:
         future.set_result(source.load())
     except Exception as error:  # passed on to whoever requests the picture

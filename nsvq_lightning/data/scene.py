@@ -17,7 +17,8 @@ from torch import Tensor
 
 from nsvq_lightning.compute.transfer import upload
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel
-from nsvq_lightning.data.images import ImageSource, ImageStore, image_size
+from nsvq_lightning.data.images import ROUNDED, ImageHead, ImageSource, ImageStore, image_head
+from nsvq_lightning.data.masks import find_masks
 from nsvq_lightning.data.model_files import SceneError, larger_models
 from nsvq_lightning.data.point_cloud import random_points
 from nsvq_lightning.data.transforms import read_poses
@@ -35,13 +36,12 @@ _CAMERAS_WITH_KEPT_MAPS = 8
 """With more distorted cameras than this (say, one per photo), the undistortion maps would take more than the images."""
 _FARTHEST = 1e4
 """Distance of the cameras from the origin, in extents, beyond which rounding moves splats by much of a pixel."""
-_ROUNDED = 0.01
-"""Relative difference of aspect ratios that rounding explains."""
 OTHER_SHAPE = (
     "have another aspect ratio than their camera: they were cropped, rotated or mixed up after COLMAP ran; copy the "
     "photos it ran on"
 )
 ONE_PLACE = "are taken from one place: without parallax there is no depth; move while taking photos"
+_WHITE = 255
 _AT_CAMERA = 1e-6
 """Distance from a camera's centre, in extents, within which a point is a failed triangulation, not a surface."""
 
@@ -54,21 +54,25 @@ class View:
         name: Name of the image in the COLMAP model.
         index: Position among all views of the scene, sorted by name.
         camera: Pinhole camera of the picture.
-        image: ``[H, W, 3]`` uint8 RGB; shared with the scene's cache, so read-only.
+        image: ``[H, W, 3]`` uint8 RGB, black where it does not count; shared with the scene's cache, so read-only.
+        mask: Which pixels count ``[H, W]`` bool; None if all do.
     """
 
     name: str
     index: int
     camera: Camera
     image: Tensor
+    mask: Tensor | None = None
 
     def to(self, device: torch.device | str, **kwargs: object) -> View:
-        """The view with its image on another device, or itself if that is there already; Lightning moves batches by it.
+        """The view with its photo on another device, or itself if that is there already; Lightning moves batches by it.
 
         The camera stays: kernels take its numbers from the host.
         """
         image = upload(self.image, device)
-        return self if image is self.image else replace(self, image=image)
+        if image is self.image:
+            return self
+        return replace(self, image=image, mask=None if self.mask is None else upload(self.mask, device))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +90,7 @@ class Scene:
         test: Indices of the test views, ascending.
         extent: 1.1 × the largest distance of a train camera centre from the mean of the train camera centres.
         split: Which views are the test views, in words.
+        white: Whether the photos show objects in front of white, as those of NeRF-synthetic scenes do.
     """
 
     root: Path
@@ -98,6 +103,7 @@ class Scene:
     test: tuple[int, ...]
     extent: float
     split: str = "every 8th by name"
+    white: bool = False
 
     def __len__(self) -> int:
         return len(self.names)
@@ -112,7 +118,7 @@ class Scene:
         Raises:
             SceneError: Its image cannot be decoded.
         """
-        return View(self.names[index], index, self.cameras[index], self.images[index])
+        return View(self.names[index], index, self.cameras[index], *self.images[index])
 
 
 def load_scene(
@@ -123,12 +129,16 @@ def load_scene(
     cache_bytes: int = 4 << 30,
     images_folder: str = "images",
     model: str | None = None,
+    masks: str | None = "masks",
 ) -> Scene:
     """Load a scene: photos, and the cameras of a COLMAP model (binary or text) or of a transforms file.
 
     The model is in ``sparse/0``, ``sparse`` or the folder itself; if there is none, ``transforms.json`` (nerfstudio,
     instant-ngp, Polycam) or ``transforms_train.json`` and ``transforms_test.json`` (NeRF-synthetic) take its place.
     They say where the photos are. A folder without points gets random ones.
+
+    Pixels that a mask excludes (see :func:`nsvq_lightning.data.masks.find_masks`) or that are transparent do not count:
+    no loss and no metric depends on them. Only NeRF-synthetic scenes are shown in front of white instead.
 
     Pinhole images are used as they are; those of any other camera model are undistorted when they are decoded, like
     COLMAP's ``image_undistorter`` does.
@@ -143,6 +153,7 @@ def load_scene(
         cache_bytes: Memory for decoded images in bytes, see :class:`~nsvq_lightning.data.images.ImageStore`.
         images_folder: Name of the image folder; a transforms file says itself where the photos are.
         model: Which model, see :func:`nsvq_lightning.data.transforms.read_poses`; None looks for one.
+        masks: Name of the folder of masks, which need not exist; None ignores masks.
 
     Raises:
         SceneError: The folder, the model or an image is missing or damaged, or the split leaves no train view.
@@ -157,7 +168,11 @@ def load_scene(
     names = [image.name for image in poses.images]
     train, test = split_views(names, test_every) if poses.test is None else _given_split(len(names), poses)
     folder, divisor = _image_folder(root, poses.images_folder or images_folder, factor)
-    sources = _image_sources(poses, _locate(poses.images, folder), divisor, max_width if factor is None else None)
+    mask_files: list[Path | None] = [None] * len(names)
+    if masks is not None:
+        mask_files = find_masks(poses.images, root, [f"{masks}_{factor}", masks] if factor else [masks])
+    files = _locate(poses.images, folder)
+    sources = _image_sources(poses, files, mask_files, divisor, max_width if factor is None else None)
     cameras = tuple(_camera(image, source.pinhole) for image, source in zip(poses.images, sources, strict=True))
     poses = poses if len(poses.points) else _with_random_points(root, poses, [cameras[index] for index in train])
     centres = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in poses.images])
@@ -175,6 +190,7 @@ def load_scene(
         test=test,
         extent=extent,
         split=f"every {test_every}th by name" if poses.test is None else f"as {poses.source} says",
+        white=poses.synthetic,
     )
 
 
@@ -265,12 +281,18 @@ def _locate(images: Sequence[ColmapImage], folder: Path) -> list[Path]:
 
 def same_shape(camera: Any, width: int, height: int) -> bool:
     """Whether a picture has the aspect ratio of its ``pycolmap.Camera``, up to rounding of its size."""
-    return bool(abs(width * camera.height / (height * camera.width) - 1) < _ROUNDED)
+    return bool(abs(width * camera.height / (height * camera.width) - 1) < ROUNDED)
 
 
-def _image_sources(model: ColmapModel, paths: list[Path], divisor: int, max_width: int | None) -> list[ImageSource]:
+def _image_sources(
+    model: ColmapModel, paths: list[Path], masks: list[Path | None], divisor: int, max_width: int | None
+) -> list[ImageSource]:
     """One source per view; views with the same camera and file size share their undistortion."""
-    sizes = [image_size(path) for path in paths]
+    heads = [image_head(path) for path in paths]
+    turned = [_is_turned(model.cameras[image.camera_id], head) for image, head in zip(model.images, heads, strict=True)]
+    if any(turned):
+        log.info("%d of %d photos are turned by their EXIF orientation, as their cameras are", sum(turned), len(turned))
+    sizes = [head.size[::-1] if turn else head.size for head, turn in zip(heads, turned, strict=True)]
     kinds = [(image.camera_id, size) for image, size in zip(model.images, sizes, strict=True)]
     others = sum(not same_shape(model.cameras[camera_id], *size) for camera_id, size in kinds)
     if others:
@@ -281,11 +303,26 @@ def _image_sources(model: ColmapModel, paths: list[Path], divisor: int, max_widt
         camera = model.cameras[camera_id]
         rectified[camera_id, size] = rectify(camera, *size, keep_maps=keep_maps)
     sources = []
-    for path, kind in zip(paths, kinds, strict=True):
+    for path, mask, kind, head, turn in zip(paths, masks, kinds, heads, turned, strict=True):
         full, undistortion = rectified[kind]
-        pinhole = full.resized(*target_size(full.width, full.height, divisor, max_width))
-        sources.append(ImageSource(path, kind[1], undistortion, pinhole))
+        source = ImageSource(
+            path,
+            kind[1],
+            undistortion,
+            full.resized(*target_size(full.width, full.height, divisor, max_width)),
+            orientation=head.orientation if turn else 1,
+            mask=mask,
+            has_alpha=head.has_alpha,
+            backdrop=_WHITE if model.synthetic else None,
+        )
+        sources.append(source)
     return sources
+
+
+def _is_turned(camera: Any, head: ImageHead) -> bool:
+    """Whether the program that made a camera looked at its photo turned by its EXIF orientation, as COLMAP does not."""
+    width, height = head.size
+    return head.lies_on_its_side and not same_shape(camera, width, height) and same_shape(camera, height, width)
 
 
 def target_size(width: int, height: int, divisor: int, max_width: int | None) -> tuple[int, int]:

@@ -100,6 +100,25 @@ class Undistortion:
             result[maps.blank] = 0
         return result
 
+    def kept(self, kept: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+        """Which pixels of the pinhole image count: those that the camera saw, and whose sources ``[H, W]`` count.
+
+        Args:
+            kept: Which pixels of the file count; None if all do.
+
+        Returns:
+            ``[H, W]``; None if all count.
+        """
+        maps = self.maps()
+        seen = None if maps.blank is None else ~maps.blank
+        if kept is None:
+            return seen
+        whole = kept.astype(np.uint8) * np.uint8(255)
+        sources: NDArray[np.bool_] = (
+            cv2.remap(whole, maps.x, maps.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) == 255
+        )
+        return sources if seen is None else sources & seen
+
     def maps(self) -> Maps:
         """Where each pixel of the pinhole image comes from."""
         if self._maps is not None:
@@ -129,7 +148,7 @@ class Undistortion:
         if not self._warned:
             self._warned = True
             _LOG.warning(
-                "camera %s (%s): %.1f %% of the pinhole image is black: its field of view is too wide for a pinhole",
+                "camera %s (%s): %.1f %% of the pinhole image is left out: its field of view is too wide for a pinhole",
                 self._camera.camera_id,
                 self._camera.model_name,
                 100 * blank.mean(),

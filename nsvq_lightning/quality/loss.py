@@ -9,17 +9,19 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
+from nsvq_lightning.quality.masking import kept, mean_of_kept
 from nsvq_lightning.quality.ssim import check_pair, in_range, plain_ssim
 
 __all__ = ["photometric_loss", "ssim"]
 
 
-def ssim(image: Tensor, target: Tensor) -> Tensor:
+def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """Structural similarity as the splatting papers measure it: Gaussian window, σ 1.5, zero padding, mean over RGB.
 
     Args:
         image: ``[H, W, 3]``, clamped to [0, 1].
         target: ``[H, W, 3]``, uint8 or in [0, 1].
+        mask: Which pixels count ``[H, W]`` bool, see :mod:`nsvq_lightning.quality.masking`; None if all do.
 
     Returns:
         Scalar, 1 for equal images (Wang et al. 2004, eq. 13; beyond the border the images count as 0).
@@ -27,7 +29,9 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     Raises:
         ValueError: The shapes differ.
     """
-    check_pair(image, target)
+    check_pair(image, target, mask)
+    if mask is not None:
+        return 1 - mean_of_kept(1 - ssim(kept(image, mask), kept(target, mask)), mask)
     kernels = None if torch.is_grad_enabled() and image.requires_grad else _kernels(image, target)
     if kernels == "cpu":
         from nsvq_lightning.quality.ssim_cpu import l1_dssim
@@ -40,7 +44,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     return plain_ssim(*in_range(image, target))
 
 
-def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2) -> Tensor:
+def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2, mask: Tensor | None = None) -> Tensor:
     """(1 - λ)·mean |image - target| + λ·(1 - SSIM), differentiable in ``image``, which is clamped to [0, 1] first.
 
     float32 images take fused kernels for clamping, loss and gradient; everything else is plain torch.
@@ -49,11 +53,14 @@ def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2) -
         image: Rendered ``[H, W, 3]``; values outside [0, 1] get no gradient.
         target: Photo ``[H, W, 3]``, uint8 or in [0, 1].
         dssim_weight: λ in [0, 1].
+        mask: Which pixels count ``[H, W]`` bool, see :mod:`nsvq_lightning.quality.masking`; None if all do.
 
     Raises:
         ValueError: The shapes differ.
     """
-    check_pair(image, target)
+    check_pair(image, target, mask)
+    if mask is not None:
+        return mean_of_kept(photometric_loss(kept(image, mask), kept(target, mask), dssim_weight), mask)
     kernels = _kernels(image, target)
     if kernels is not None:
         function = _CpuLoss if kernels == "cpu" else _CudaLoss

@@ -7,7 +7,6 @@ per image.
 from __future__ import annotations
 
 import logging
-import math
 from typing import Any
 
 import torch
@@ -15,6 +14,7 @@ from torch import Tensor
 from torchmetrics import Metric, MetricCollection
 
 from nsvq_lightning.quality.loss import ssim
+from nsvq_lightning.quality.masking import kept, mean_of_kept
 from nsvq_lightning.quality.ssim import check_pair
 
 __all__ = ["PSNR", "SSIM", "build_lpips", "eight_bit", "image_metrics", "psnr"]
@@ -29,7 +29,7 @@ def eight_bit(image: Tensor) -> Tensor:
     return image.clamp(0.0, 1.0).mul_(255).round_().div_(255)
 
 
-def psnr(image: Tensor, target: Tensor) -> Tensor:
+def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """Peak signal-to-noise ratio in dB from the squared error pooled over pixels and RGB.
 
     PSNR = -10 · log10(mean((image - target)²)), summed in float64; equal images give infinity.
@@ -37,10 +37,11 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
     Args:
         image: ``[H, W, 3]`` in [0, 1].
         target: ``[H, W, 3]`` in [0, 1].
+        mask: Which pixels count ``[H, W]`` bool; None if all do.
     """
     # The norm sums in float64 without making a float64 copy of the images.
-    error = torch.linalg.vector_norm(image - target, dtype=torch.float64)
-    return -20.0 * torch.log10(error / math.sqrt(image.numel()))
+    error = torch.linalg.vector_norm(kept(image - target, mask), dtype=torch.float64)
+    return -10.0 * torch.log10(mean_of_kept(error.square() / image.numel(), mask))
 
 
 class _MeanOverImages(Metric):
@@ -57,25 +58,26 @@ class _MeanOverImages(Metric):
         self.add_state("total", default=torch.tensor(0.0, dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("images", default=torch.tensor(0), dist_reduce_fx="sum")
 
-    def update(self, image: Tensor, target: Tensor) -> None:
+    def update(self, image: Tensor, target: Tensor, mask: Tensor | None = None) -> None:
         """Add one image.
 
         Args:
             image: Rendered image ``[H, W, 3]``, float in any range or uint8.
             target: Photo ``[H, W, 3]``, uint8 or float in [0, 1].
+            mask: Which pixels count ``[H, W]`` bool; None if all do.
 
         Raises:
             ValueError: The shapes differ.
         """
-        check_pair(image, target)
-        self.total += self._score(eight_bit(image), eight_bit(target))
+        check_pair(image, target, mask)
+        self.total += self._score(eight_bit(image), eight_bit(target), mask)
         self.images += 1
 
     def compute(self) -> Tensor:
         """Mean over the images so far, scalar float32."""
         return (self.total / self.images).float()
 
-    def _score(self, image: Tensor, target: Tensor) -> Tensor:
+    def _score(self, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
         raise NotImplementedError
 
 
@@ -89,15 +91,15 @@ class PSNR(_MeanOverImages):
         20.0
     """
 
-    def _score(self, image: Tensor, target: Tensor) -> Tensor:
-        return psnr(image, target)
+    def _score(self, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+        return psnr(image, target, mask)
 
 
 class SSIM(_MeanOverImages):
     """Mean over images of the structural similarity of the training loss (11×11 Gaussian window, zero padding)."""
 
-    def _score(self, image: Tensor, target: Tensor) -> Tensor:
-        score: Tensor = ssim(image, target).double()
+    def _score(self, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+        score: Tensor = ssim(image, target, mask).double()
         return score
 
 

@@ -20,14 +20,16 @@ def ssim_window() -> Tensor:
     return taps / taps.sum()
 
 
-def check_pair(image: Tensor, target: Tensor) -> None:
+def check_pair(image: Tensor, target: Tensor, mask: Tensor | None = None) -> None:
     """Refuse pictures that cannot be compared.
 
     Raises:
-        ValueError: They are not both ``[H, W, 3]``.
+        ValueError: They are not both ``[H, W, 3]``, or the mask is not ``[H, W]``.
     """
     if image.shape != target.shape or image.dim() != 3 or image.shape[-1] != 3:
         raise ValueError(f"image and target must both be [H, W, 3], got {list(image.shape)} and {list(target.shape)}")
+    if mask is not None and mask.shape != image.shape[:2]:
+        raise ValueError(f"the mask of images {list(image.shape)} must be [H, W], got {list(mask.shape)}")
 
 
 def in_range(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:

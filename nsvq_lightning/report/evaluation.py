@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.data.scene import View
+from nsvq_lightning.quality.masking import kept
 from nsvq_lightning.quality.metrics import image_metrics
 from nsvq_lightning.rendering.camera import Camera
 
@@ -56,10 +57,10 @@ def evaluate(
     scores: list[ViewScore] = []
     for view in views:
         on_device = view.to(device)
-        image = render_image(on_device.camera)
+        image = kept(render_image(on_device.camera), on_device.mask)
         if show is not None and not scores:
             show(image, on_device.image)
-        values = metrics(image, on_device.image)
+        values = metrics(image, on_device.image, on_device.mask)
         scores.append(ViewScore(view.name, float(values["psnr"]), float(values["ssim"])))
     if not scores:
         raise ValueError("there are no views to evaluate; the scene needs at least one test view")

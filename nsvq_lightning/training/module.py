@@ -17,11 +17,12 @@ from torchmetrics import Metric
 from nsvq_lightning.compression.stored import compress
 from nsvq_lightning.compute.environment import threads_spin
 from nsvq_lightning.compute.transfer import LateNumber, upload
-from nsvq_lightning.data.scene import ONE_PLACE, View
+from nsvq_lightning.data.scene import ONE_PLACE, Scene, View
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.quality.loss import photometric_loss
+from nsvq_lightning.quality.masking import kept
 from nsvq_lightning.quality.metrics import eight_bit, image_metrics, psnr
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.quantize.nsvq import NSVQ
@@ -78,7 +79,8 @@ class SplatModule(LightningModule):
         quantizer: Makes the quantizer of an attribute from (number of codes, dimension).
         codebooks: The paper's name for the codebook sizes ("0.5k" to "16k"), or number of codes by attribute (scales,
             quats, sh0, shN; those left out stay unquantized), or None for plain 3D Gaussian splatting.
-        background: Colour behind the splats; ``random`` draws a new one each step and tests on black.
+        background: Colour behind the splats; ``auto``: that of the photos, which is white for NeRF-synthetic scenes
+            and black otherwise; ``random`` draws a new one each step and tests on black.
         dssim_weight: Share of 1 - SSIM in the loss; the rest is L1.
         rates: Learning rates.
         backend: Rasterizer, see :func:`nsvq_lightning.render`.
@@ -97,7 +99,7 @@ class SplatModule(LightningModule):
         sh_degree: int = 3,
         quantizer: Callable[[int, int], nn.Module] = NSVQ,
         codebooks: str | dict[str, int] | None = "16k",
-        background: Literal["black", "white", "random"] = "black",
+        background: Literal["auto", "black", "white", "random"] = "auto",
         dssim_weight: float = 0.2,
         rates: LearningRates = LearningRates(),  # noqa: B008  frozen
         backend: str = "auto",
@@ -107,8 +109,8 @@ class SplatModule(LightningModule):
         splats: Splats | None = None,
     ) -> None:
         super().__init__()
-        if background not in ("black", "white", "random"):
-            raise ValueError(f"background must be black, white or random, got {background!r}")
+        if background not in ("auto", "black", "white", "random"):
+            raise ValueError(f"background must be auto, black, white or random, got {background!r}")
         if not 0.0 <= dssim_weight <= 1.0:
             raise ValueError(f"dssim_weight must be between 0 and 1, got {dssim_weight}")
         self.splats = splats if splats is not None else Splats(sh_degree)
@@ -117,7 +119,7 @@ class SplatModule(LightningModule):
             name: {"quantizer": type(q).__name__, "codes": q.codebook.shape[0]} for name, q in self.quantizers.items()
         }
         """Class and number of codes by attribute, as requested; k-means and checkpoints may give fewer codes."""
-        self.background = background
+        self.background: str = background
         self.dssim_weight = dssim_weight
         # A checkpoint stores these two as plain dictionaries.
         self.rates = LearningRates(**rates) if isinstance(rates, Mapping) else rates
@@ -304,9 +306,11 @@ class SplatModule(LightningModule):
             )
         # An interrupted evaluation may have left its splats.
         self.evaluation_splats = None
+        scene = scene_of(self.trainer)
+        if scene is not None:
+            self._take_background(scene)
         if stage != "fit":
             return
-        scene = scene_of(self.trainer)
         if scene is not None and self.extent == 0.0:
             self.state.extent = scene.extent
         if len(self.splats) == 0:
@@ -315,6 +319,20 @@ class SplatModule(LightningModule):
             raise ValueError(f"the {len(scene.train)} train photos of {scene.root} {ONE_PLACE}")
         if self.extent <= 0.0:
             raise ValueError("the extent of the scene is unknown; fit with a data module that has a scene")
+
+    def _take_background(self, scene: Scene) -> None:
+        """Render over what the photos have behind their objects.
+
+        Raises:
+            ValueError: It was asked for another background.
+        """
+        if self.background == "auto":
+            self.background = "white" if scene.white else "black"
+        if scene.white and self.background != "white":
+            raise ValueError(
+                f"the photos of {scene.root} are transparent around their objects and are shown on white, "
+                f"model.background is {self.background}: leave it at auto"
+            )
 
     def _first_splats(self) -> Splats:
         if self.init_from is not None:
@@ -406,11 +424,11 @@ class SplatModule(LightningModule):
         rendered = self(batch.camera, self.pixel_map)
         if self.wants_screen_gradients:
             rendered.means2d.retain_grad()
-        loss = photometric_loss(rendered.image, batch.image, self.dssim_weight)
+        loss = photometric_loss(rendered.image, batch.image, self.dssim_weight, batch.mask)
         if self.opacity_weight:
             loss = loss + self.opacity_weight * self.splats.opacities.sigmoid().sum()
         if (self.global_step + 1) % log_interval(self.trainer) == 0 or not is_on("metrics"):
-            self._log_step(loss, rendered.image, batch.image)
+            self._log_step(loss, rendered.image, batch)
         late_loss = LateNumber(loss)
         if not late_loss.is_here:
             self._late_loss = batch.name, late_loss
@@ -437,8 +455,8 @@ class SplatModule(LightningModule):
         if not self._updates:
             optimizer.zero_grad()
 
-    def _log_step(self, loss: Tensor, image: Tensor, target: Tensor) -> None:
-        quality = psnr(eight_bit(image.detach()), eight_bit(target)).float()
+    def _log_step(self, loss: Tensor, image: Tensor, view: View) -> None:
+        quality = psnr(eight_bit(image.detach()), eight_bit(view.image), view.mask).float()
         values: dict[str, Metric | Tensor | int | float] = {
             "train/loss": loss.detach(),
             "train/psnr": quality,
@@ -467,8 +485,8 @@ class SplatModule(LightningModule):
     on_validation_end = on_test_end = on_predict_end = _evaluation_end
 
     def _evaluation_step(self, view: View, prefix: str) -> dict[str, Any]:
-        image = self._evaluation_image(view.camera)
-        scores = self.view_metrics(image, view.image)
+        image = kept(self._evaluation_image(view.camera), view.mask)
+        scores = self.view_metrics(image, view.image, view.mask)
         self.log_dict({f"{prefix}/{name}": metric for name, metric in self.view_metrics.items()}, batch_size=1)
         return {"image": image, **scores}
 

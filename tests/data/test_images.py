@@ -13,9 +13,8 @@ import PIL.Image
 import pytest
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from nsvq_lightning.data.images import ImageSource, ImageStore, image_size, read_image
+from nsvq_lightning.data.images import ImageSource, ImageStore, Picture, image_size, read_image
 from nsvq_lightning.data.model_files import SceneError
 from nsvq_lightning.data.undistort import Pinhole
 from nsvq_lightning.skips import switched
@@ -154,7 +153,7 @@ def test_downscaling_averages_areas(tmp_path: Path) -> None:
     PIL.Image.fromarray(image).save(tmp_path / "a.png")
     source = ImageSource(tmp_path / "a.png", (12, 8), None, Pinhole(np.eye(3), 6, 4))
     expected = image.reshape(4, 2, 6, 2, 3).astype(float).mean(axis=(1, 3))
-    assert np.abs(source.load().numpy() - expected).max() <= 0.5
+    assert np.abs(source.load().image.numpy() - expected).max() <= 0.5
     assert source.nbytes == source.load().nbytes
 
 
@@ -163,7 +162,7 @@ def test_resizing_a_picture_to_its_own_size_would_change_no_bit(tmp_path: Path) 
     source = ImageSource(tmp_path / "a.png", (9, 6), None, Pinhole(np.eye(3), 9, 6))
     with switched(resizing=False):
         resized = source.load()
-    assert torch.equal(resized, source.load())
+    assert torch.equal(resized.image, source.load().image)
 
 
 def test_picture_that_changed_its_size_since_loading(tmp_path: Path) -> None:
@@ -177,7 +176,7 @@ class _Counting(ImageSource):
 
     threads: list[str]
 
-    def load(self) -> Tensor:
+    def load(self) -> Picture:
         self.threads.append(threading.current_thread().name)
         return super().load()
 
@@ -206,7 +205,7 @@ def test_budget_keeps_what_fits(sources: list[_Counting], budget: int, decodings
     store = ImageStore(sources, cache_bytes=budget)  # 18 bytes a picture
     for _ in range(3):
         for i in range(4):
-            assert set(store[i].flatten().tolist()) == {i}
+            assert set(store[i].image.flatten().tolist()) == {i}
     assert _decodings(sources) == decodings
 
 
@@ -214,7 +213,7 @@ def test_prefetched_pictures_are_decoded_once_and_elsewhere(sources: list[_Count
     store = ImageStore(sources, cache_bytes=0)
     store.prefetch(2)
     store.prefetch(2)
-    assert set(store[2].flatten().tolist()) == {2}
+    assert set(store[2].image.flatten().tolist()) == {2}
     assert sources[2].threads == ["nsvq-image"]
     for i in range(4):  # announced and never fetched: few are held
         store.prefetch(i)
@@ -232,7 +231,7 @@ def test_errors_of_prefetched_pictures_surface_when_asked_for(sources: list[_Cou
 def test_store_survives_pickling_with_a_prefetch_under_way(sources: list[_Counting]) -> None:
     store = ImageStore([ImageSource(s.path, s.size, None, s.pinhole) for s in sources])
     store.prefetch(1)
-    torch.testing.assert_close(pickle.loads(pickle.dumps(store))[1], store[1])
+    torch.testing.assert_close(pickle.loads(pickle.dumps(store))[1].image, store[1].image)
 
 
 def test_negative_budget(sources: list[_Counting]) -> None:

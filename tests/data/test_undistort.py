@@ -112,7 +112,7 @@ def test_resizing_scales_all_of_K() -> None:
     np.testing.assert_allclose(scaled.K, np.array([[50, 0, 25.5], [0, 110 / 3, 11], [0, 0, 1]]))
 
 
-def test_wide_fisheye_warns_of_black_pixels(caplog: pytest.LogCaptureFixture) -> None:
+def test_wide_fisheye_warns_of_pixels_it_never_saw(caplog: pytest.LogCaptureFixture) -> None:
     _, undistortion = rectify(_camera("SIMPLE_RADIAL_FISHEYE", (90.0, 200.0, 150.0, 0.0)), 400, 300)
     assert undistortion is not None
     with caplog.at_level(logging.WARNING, "nsvq_lightning"):

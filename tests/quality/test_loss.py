@@ -110,3 +110,29 @@ def test_ssim_does_not_depend_on_who_computes_it() -> None:
         values = [ssim(tensor, other) for tensor in (image, image.clone().requires_grad_(), image.double())]
         torch.testing.assert_close(values[1].detach(), values[0], atol=1e-5, rtol=0)
         torch.testing.assert_close(values[2].float(), values[0], atol=1e-5, rtol=0)
+
+
+def test_a_mask_takes_pixels_out_of_loss_gradient_and_similarity() -> None:
+    """Whatever the excluded pixels show, in either picture; the rest is as if it were the picture's own border."""
+    image, photo = pair(20, 24)
+    mask = torch.ones(image.shape[:2], dtype=torch.bool)
+    mask[:, 9:] = False
+    cut = image[:, :9].contiguous(), photo[:, :9].contiguous()
+    for weight in (0.0, 0.2, 1.0):
+        leaf, part = image.clone().requires_grad_(), cut[0].clone().requires_grad_()
+        loss, expected = photometric_loss(leaf, photo, weight, mask), photometric_loss(part, cut[1], weight)
+        loss.backward()
+        expected.backward()
+        assert (leaf.grad[:, 9:] == 0).all()
+        if weight == 0:
+            torch.testing.assert_close(loss, expected)
+            torch.testing.assert_close(leaf.grad[:, :9], part.grad)
+        other = torch.where(mask[..., None], image, torch.rand_like(image))
+        torch.testing.assert_close(
+            photometric_loss(other, torch.where(mask[..., None], photo, 1 - photo), weight, mask), loss
+        )
+    same = torch.where(mask[..., None], photo, torch.rand_like(photo))
+    assert float(ssim(same, photo, mask)) == pytest.approx(1, abs=1e-6)
+    assert float(ssim(image, photo, mask)) < 0.99
+    with pytest.raises(ValueError, match=r"must be \[H, W\], got"):
+        ssim(image, photo, mask[1:])

@@ -10,7 +10,7 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
-from nsvq_lightning.quality.metrics import PSNR, SSIM, build_lpips, eight_bit, image_metrics
+from nsvq_lightning.quality.metrics import PSNR, SSIM, build_lpips, eight_bit, image_metrics, psnr
 
 
 def picture(seed: int, height: int = 40, width: int = 52) -> Tensor:
@@ -98,3 +98,17 @@ def test_missing_lpips_is_a_reason_and_no_traceback() -> None:
     if reason is not None:
         assert reason.startswith("LPIPS")
         assert "\n" not in reason
+
+
+def test_excluded_pixels_do_not_enter_the_metrics() -> None:
+    image, photo = picture(1), picture(2)
+    mask = torch.zeros(image.shape[:2], dtype=torch.bool)
+    mask[10:30, 5:40] = True
+    inside = psnr(eight_bit(image)[10:30, 5:40], eight_bit(photo)[10:30, 5:40])
+    collection = image_metrics()
+    scores = collection(image, photo, mask=mask)
+    assert float(scores["psnr"]) == pytest.approx(float(inside), abs=1e-5)
+    others = image_metrics()(
+        torch.where(mask[..., None], image, 1 - image), photo.where(mask[..., None], 1 - photo), mask
+    )
+    assert {name: float(value) for name, value in others.items()} == {name: float(v) for name, v in scores.items()}

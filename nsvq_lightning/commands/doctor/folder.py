@@ -11,7 +11,13 @@ from typing import TypeVar
 from nsvq_lightning.commands.doctor.budget import check_budget
 from nsvq_lightning.commands.doctor.finding import Finding, good, note, problem, report
 from nsvq_lightning.commands.doctor.model_checks import check_cameras, check_overlap, check_points
-from nsvq_lightning.commands.doctor.photo_checks import check_exposure, check_photos, check_sizes, read_photos
+from nsvq_lightning.commands.doctor.photo_checks import (
+    check_exposure,
+    check_masks,
+    check_photos,
+    check_sizes,
+    read_photos,
+)
 from nsvq_lightning.data.colmap import ColmapModel
 from nsvq_lightning.data.model_files import larger_models
 from nsvq_lightning.data.scene import ONE_PLACE, Scene, load_scene
@@ -49,6 +55,7 @@ def _check_scene(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
     yield from failures
     if photos is not None:
         yield from report("photos", lambda: check_photos(scene, photos, scene.root / (model.images_folder or IMAGES)))
+        yield from report("masks", lambda: check_masks(scene, photos))
         yield from report("exposure", lambda: check_exposure(scene, photos))
     yield from report("split", lambda: _check_split(scene))
     yield from report("extent", lambda: _check_extent(scene))

@@ -15,10 +15,11 @@ from torch import Tensor
 
 from nsvq_lightning.commands.doctor.finding import Finding, good, note, problem
 from nsvq_lightning.data.colmap import ColmapModel
+from nsvq_lightning.data.images import image_head
 from nsvq_lightning.data.scene import OTHER_SHAPE, Scene, SceneError, same_shape
 from nsvq_lightning.rendering.camera import Camera
 
-__all__ = ["Photo", "check_exposure", "check_photos", "check_sizes", "exposure_of", "read_photos"]
+__all__ = ["Photo", "check_exposure", "check_masks", "check_photos", "check_sizes", "exposure_of", "read_photos"]
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
 GAMMA = 2.2
@@ -26,6 +27,8 @@ LOWEST = 4.0
 """Grey level below which noise and black clipping say nothing about exposure."""
 ENOUGH = 30
 """Points that a view must see for their median brightness to give its exposure."""
+MOSTLY = 0.7
+"""Share of excluded pixels from which on masks may be inverted."""
 UNEVEN = 0.5
 """Stops between the darkest and brightest tenth of the photos above which colours visibly disagree."""
 
@@ -38,11 +41,13 @@ class Photo:
         error: Why it could not be decoded, None if it could.
         brightness: Mean grey level, 0 to 255.
         exposure: How much brighter than in other photos its points are, in stops; None where it saw too few.
+        counts: Share of its pixels that no mask excludes.
     """
 
     error: str | None = None
     brightness: float = 0.0
     exposure: float | None = None
+    counts: float = 1.0
 
 
 def read_photos(scene: Scene, model: ColmapModel) -> list[Photo]:
@@ -50,11 +55,15 @@ def read_photos(scene: Scene, model: ColmapModel) -> list[Photo]:
 
     def read(index: int) -> Photo:
         try:
-            image = scene.images.sources[index].load()
+            image, mask = scene.images.sources[index].load()
         except (SceneError, OSError) as error:
             return Photo(error=str(error))
+        counting = image if mask is None else image[mask]
         return Photo(
-            None, float(image.float().mean()), exposure_of(image, scene.cameras[index], model, rows.get(index))
+            None,
+            float(counting.float().mean()),
+            exposure_of(image, scene.cameras[index], model, rows.get(index)),
+            1.0 if mask is None else float(mask.float().mean()),
         )
 
     rows = _rows_by_view(model)
@@ -130,6 +139,37 @@ def check_sizes(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
         yield good("sizes", f"{text}; {kinds['scaled']} files are scaled, cameras are scaled with them", **kinds)
     else:
         yield good("sizes", f"{text}; files are of the size that {model.source} says")
+    yield from _check_orientation(scene)
+
+
+def _check_orientation(scene: Scene) -> Iterator[Finding]:
+    """Say what becomes of photos that a phone stored lying on their side."""
+    lying = [image_head(source.path).lies_on_its_side for source in scene.images.sources]
+    turned = sum(source.orientation != 1 for source in scene.images.sources)
+    stored = sum(lying) - turned
+    if turned:
+        yield good("orientation", f"{turned} photos are turned by their EXIF orientation, as their cameras are")
+    if stored:
+        text = f"{stored} photos are used as stored, not as their EXIF orientation says, like COLMAP did"
+        yield good(
+            "orientation", f"{text}: pictures of the report lie on their side, the scene does not", stored=stored
+        )
+
+
+def check_masks(scene: Scene, photos: list[Photo]) -> Iterator[Finding]:
+    """How much of the photos masks and transparency exclude."""
+    masked = [(photo.counts, name) for photo, name in zip(photos, scene.names, strict=True) if photo.counts < 1]
+    if not masked:
+        return
+    share = 1 - float(np.mean([counts for counts, _ in masked]))
+    text = f"{len(masked)} of {len(photos)} photos have pixels that do not count, {100 * share:.0f} % of them"
+    values = {"masked": len(masked), "excluded": share}
+    least = min(masked)
+    if share > MOSTLY:
+        help_ = "masks are white where the photo counts; if yours are black there, invert them"
+        yield note("masks", f"{text}, most in {least[1]}; {help_}", **values)
+    else:
+        yield good("masks", text, **values)
 
 
 def check_exposure(scene: Scene, photos: list[Photo]) -> Iterator[Finding]:

@@ -85,7 +85,7 @@ def run(scope: Scope) -> list[Measurement]:
 
 def _truths(scope: Scope) -> Iterator[Truth]:
     if scope.photos is not None and scope.init_from is not None:
-        scene, splats = load_scene(scope.photos), SplatArrays.from_splats(load(scope.init_from))
+        scene, splats = load_scene(scope.photos, masks=None), SplatArrays.from_splats(load(scope.init_from))
         images = [eight_bit(scene.view(index).image) for index in scene.test]
         yield Truth(scope.photos.name, splats, [scene.cameras[index] for index in scene.test], images)
         return
