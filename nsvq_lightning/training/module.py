@@ -79,8 +79,8 @@ class SplatModule(LightningModule):
         quantizer: Makes the quantizer of an attribute from (number of codes, dimension).
         codebooks: The paper's name for the codebook sizes ("0.5k" to "16k"), or number of codes by attribute (scales,
             quats, sh0, shN; those left out stay unquantized), or None for plain 3D Gaussian splatting.
-        background: Colour behind the splats; ``auto``: that of the photos, which is white for NeRF-synthetic scenes
-            and black otherwise; ``random`` draws a new one each step and tests on black.
+        background: Colour behind the splats; ``auto``: white for NeRF-synthetic scenes, black for others; ``random``
+            draws a new one each step and tests on black.
         dssim_weight: Share of 1 - SSIM in the loss; the rest is L1.
         rates: Learning rates.
         backend: Rasterizer, see :func:`nsvq_lightning.render`.

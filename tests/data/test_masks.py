@@ -95,10 +95,22 @@ def test_masks_are_undistorted_with_their_photo(make_scene: SceneFactory) -> Non
 
 
 def test_pixels_that_a_wide_lens_never_saw_do_not_count(make_scene: SceneFactory) -> None:
-    root = make_scene(views=2, model="SIMPLE_RADIAL_FISHEYE", params=(9.0, 20.0, 15.0, 0.0), size=(40, 30))
-    view = load_scene(root).view(0)
-    assert view.mask is not None
-    assert (view.image[~view.mask] == 0).all()
+    root = make_scene(views=2, model="SIMPLE_RADIAL", params=(30.0, 20.0, 16.0, 0.1))
+    write_masks(root, ["000.png"])
+    scene = load_scene(root)
+    undistortion = scene.images.sources[0].undistortion
+    assert undistortion is not None
+    maps = undistortion.maps()
+    blank = np.zeros(maps.x.shape, bool)
+    blank[:4] = True
+    undistortion._maps = maps._replace(blank=blank)
+    kept = scene.view(1).mask
+    assert kept is not None
+    assert torch.equal(kept, torch.from_numpy(~blank))
+    masked = scene.view(0).mask
+    assert masked is not None
+    assert not masked[:4].any()
+    assert masked[4:].float().mean() < 0.6
 
 
 def test_transparent_pixels_do_not_count(make_scene: SceneFactory) -> None:
