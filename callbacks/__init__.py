@@ -13,6 +13,7 @@ from .density import DensityControl
 from .density_rules import DensityRules
 from .dropout import SplatDropout
 from .export import ExportScene
+from .exposure import ExposureCompensation
 from .finite import FiniteCodes
 from .freeze import FreezeCodes
 from .growth import BudgetedGrowth
@@ -45,6 +46,7 @@ __all__ = [
     "DensityControl",
     "DensityRules",
     "ExportScene",
+    "ExposureCompensation",
     "FiniteCodes",
     "FreezeCodes",
     "GrowthRules",

@@ -21,7 +21,10 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.file import read_nsvq
-from nsvq_lightning.quality.metrics import build_lpips, eight_bit
+from nsvq_lightning.quality.color import color_corrected
+from nsvq_lightning.quality.loss import ssim
+from nsvq_lightning.quality.masking import kept
+from nsvq_lightning.quality.metrics import build_lpips, eight_bit, psnr
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.report.evaluation import ViewScore, evaluate
 from nsvq_lightning.report.files import paper_level, summarize, write_curve, write_curve_csv, write_metrics, write_views
@@ -215,8 +218,11 @@ class MetricReport(WritingCallback):
         if self._scene is None:
             return
         image, photo = outputs["image"], eight_bit(batch.image)
-        score = ViewScore(batch.name, float(outputs["psnr"]), float(outputs["ssim"]))
-        self._scores.append(replace(score, lpips=self._lpips_of(image, photo)))
+        lpips = self._lpips_of(image, photo)
+        corrected = kept(eight_bit(color_corrected(image, photo, batch.mask)), batch.mask)
+        corrected_scores = float(psnr(corrected, photo, batch.mask)), float(ssim(corrected, photo, batch.mask))
+        scores = float(outputs["psnr"]), float(outputs["ssim"])
+        self._scores.append(ViewScore(batch.name, *scores, lpips, *corrected_scores))
         if self.pictures:
             path = _picture(self._folder, batch.name)
             path.parent.mkdir(exist_ok=True)

@@ -18,12 +18,17 @@ __all__ = ["Quality", "ViewScore", "evaluate"]
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Quality of one view: PSNR in dB, SSIM, and LPIPS where it was measured."""
+    """Quality of one view: PSNR in dB, SSIM, LPIPS where it was measured.
+
+    ``cc_psnr`` and ``cc_ssim`` are those after a colour correction to the photo, where that was measured.
+    """
 
     name: str
     psnr: float
     ssim: float
     lpips: float | None = None
+    cc_psnr: float | None = None
+    cc_ssim: float | None = None
 
 
 @dataclass(frozen=True)

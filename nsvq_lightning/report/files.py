@@ -51,6 +51,7 @@ def summarize(
     return {
         "psnr": _mean([score.psnr for score in scores]),
         "ssim": _mean([score.ssim for score in scores]),
+        **{name: _mean([getattr(score, name) for score in scores]) for name in ("cc_psnr", "cc_ssim")},
         "lpips": lpips[0],
         "lpips_reason": lpips[1],
         "views": len(scores),

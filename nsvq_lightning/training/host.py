@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import torch
@@ -19,6 +19,7 @@ from nsvq_lightning.training.schedule import Phase, Schedule
 from nsvq_lightning.training.state import Stopwatch
 
 if TYPE_CHECKING:
+    from nsvq_lightning.data.scene import View
     from nsvq_lightning.io.compressed import CompressedScene
     from nsvq_lightning.io.nsvq.precision import Storage
 
@@ -64,6 +65,8 @@ class SplatHost(Protocol):
     """Whether the training step retains the gradient of the projected centres."""
     pixel_map: Tensor | None
     """Strength ``[H, W]`` of the pixels of the next view, whose rendering then has ``observed``; None for neither."""
+    appearance: Callable[[Tensor, View], Tensor] | None
+    """Makes of the rendered picture ``[H, W, 3]`` of a train view what its photo shows, before the loss; or None."""
     splat_budget: int | None
     """How many splats the scene is to have in the end; None for as many as density control makes."""
     dropout: float

@@ -135,6 +135,7 @@ class SplatModule(LightningModule):
         self.opacity_weight = 0.0
         self.wants_screen_gradients = False
         self.pixel_map: Tensor | None = None
+        self.appearance: Callable[[Tensor, View], Tensor] | None = None
         self.splat_budget: int | None = None
         self.dropout = 0.0
         self.evaluation_splats: SplatTensors | None = None
@@ -424,11 +425,12 @@ class SplatModule(LightningModule):
         rendered = self(batch.camera, self.pixel_map)
         if self.wants_screen_gradients:
             rendered.means2d.retain_grad()
-        loss = photometric_loss(rendered.image, batch.image, self.dssim_weight, batch.mask)
+        image = rendered.image if self.appearance is None else self.appearance(rendered.image, batch)
+        loss = photometric_loss(image, batch.image, self.dssim_weight, batch.mask)
         if self.opacity_weight:
             loss = loss + self.opacity_weight * self.splats.opacities.sigmoid().sum()
         if (self.global_step + 1) % log_interval(self.trainer) == 0 or not is_on("metrics"):
-            self._log_step(loss, rendered.image, batch)
+            self._log_step(loss, image, batch)
         late_loss = LateNumber(loss)
         if not late_loss.is_here:
             self._late_loss = batch.name, late_loss

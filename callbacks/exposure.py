@@ -1,0 +1,127 @@
+"""Exposure compensation: photos of one place differ in brightness and colour, the scene does not."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from torch import Tensor
+
+from nsvq_lightning.data.scene import View
+from nsvq_lightning.training.host import as_host
+from nsvq_lightning.training.replicas import sum_over_processes
+from nsvq_lightning.training.schedule import next_iteration
+from nsvq_lightning.training.train_views import needed_scene
+
+from .hosted import HostedCallback
+
+__all__ = ["ExposureCompensation"]
+
+log = logging.getLogger(__name__)
+
+
+class ExposureCompensation(HostedCallback):
+    """Gives each train photo an affine map of colours, which is applied to its rendered picture before the loss.
+
+    Cameras that choose exposure and white balance by themselves make photos that contradict each other; splats then
+    learn colours that depend on the direction, or haze before the lens. Here colour c becomes (I + A)·c + b with a
+    3 × 3 matrix A and a vector b for each photo, trained beside the splats by an Adam of its own. Their mean over the
+    train photos is kept at zero, so that the scene keeps the photos' usual colours.
+
+    Test views are rendered as they are: nobody knows their exposure. Their ``cc_psnr`` and ``cc_ssim`` in
+    ``metrics.json`` are measured after a colour correction to the photo
+    (:func:`nsvq_lightning.quality.color.color_corrected`).
+
+    Args:
+        rate: Learning rate at the start.
+        final: Its factor at the end; it falls exponentially.
+
+    Raises:
+        ValueError: ``rate`` or ``final`` is not positive and finite.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import ExposureCompensation, standard
+        >>> callbacks = [*standard(), ExposureCompensation()]  # --trainer.callbacks+=ExposureCompensation
+        >>> callbacks[-1].rate
+        0.001
+    """
+
+    def __init__(self, rate: float = 0.001, final: float = 0.1) -> None:
+        if not all(math.isfinite(value) and value > 0 for value in (rate, final)):
+            raise ValueError(f"rate and final must be positive and finite, got {rate} and {final}")
+        self.rate, self.final = rate, final
+        self._changes = torch.zeros(0, 3, 4)
+        self._adam: torch.optim.Adam | None = None
+        self._row: dict[int, int] = {}
+        self._loaded: dict[str, Any] | None = None
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start from no change, or from what a checkpoint has.
+
+        Raises:
+            ValueError: The trainer has no data module with a scene, or the checkpoint is of another number of photos.
+        """
+        super().on_train_start(trainer, pl_module)
+        scene = needed_scene(trainer, "exposures are those of the train photos", "leave out ExposureCompensation")
+        host = as_host(pl_module)
+        self._row = {view: row for row, view in enumerate(scene.train)}
+        start = torch.zeros(len(scene.train), 3, 4)
+        if self._loaded is not None:
+            start = self._loaded["changes"].detach().clone()
+            if len(start) != len(scene.train):
+                raise ValueError(
+                    f"the checkpoint has exposures of {len(start)} train photos, {scene.root} has {len(scene.train)}: "
+                    "continue with the photos of the run"
+                )
+        self._changes = start.to(host.device).requires_grad_()
+        self._adam = torch.optim.Adam([self._changes], lr=self.rate)
+        if self._loaded is not None:
+            self._adam.load_state_dict(self._loaded["adam"])
+            self._loaded = None
+        host.appearance = self._appearance
+
+    def _appearance(self, image: Tensor, view: View) -> Tensor:
+        """The rendered picture ``[H, W, 3]`` with the exposure of a train photo."""
+        change = self._changes[self._row[view.index]] - self._changes.mean(0)
+        flat = torch.addmm(change[:, 3], image.reshape(-1, 3), (torch.eye(3, device=change.device) + change[:, :3]).T)
+        return flat.reshape(image.shape)
+
+    def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Any) -> None:
+        """Take a step; a loss that is not finite changes nothing."""
+        if self._adam is None:
+            return
+        share = next_iteration(trainer) / max(1, as_host(pl_module).schedule.total)
+        self._adam.param_groups[0]["lr"] = self.rate * self.final ** min(1.0, share)
+        gradient = torch.zeros_like(self._changes) if self._changes.grad is None else self._changes.grad
+        self._changes.grad = sum_over_processes(trainer, gradient.nan_to_num_(0.0, 0.0, 0.0))
+        self._adam.step()
+        self._adam.zero_grad()
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say how much the photos differ."""
+        as_host(pl_module).appearance = None
+        gains = 1 + self._changes.detach()[:, :, :3].diagonal(dim1=1, dim2=2).mean(1)
+        if len(gains):
+            low, high = gains.log2().aminmax()
+            log.info(
+                "exposures of the train photos: %+.2f to %+.2f stops",
+                low - gains.log2().mean(),
+                high - gains.log2().mean(),
+            )
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Leave the module as it was."""
+        as_host(pl_module).appearance = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Exposures and the state of their Adam."""
+        if self._adam is None:
+            return {}
+        return {"changes": self._changes.detach(), "adam": self._adam.state_dict()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from there."""
+        self._loaded = state_dict or None

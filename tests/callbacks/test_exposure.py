@@ -1,0 +1,98 @@
+"""Exposure compensation on photos that were made brighter and darker, and colour correction for metrics."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch import Callback, Trainer
+
+from nsvq_lightning.callbacks import ExposureCompensation, PhaseSchedule
+from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.quality.color import color_corrected
+from nsvq_lightning.quality.metrics import psnr
+from nsvq_lightning.training.module import SplatModule
+
+STOPS = (0.0, 0.4, -0.4, 0.3, -0.3, 0.2, -0.2, 0.0, 0.0)
+"""Of the nine photos, the first and the last of which are test views."""
+
+
+@pytest.fixture(scope="module")
+def uneven_scene(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("uneven")
+    (root / "images").mkdir()
+    os.symlink(demo_scene / "sparse", root / "sparse", target_is_directory=True)
+    for path, stops in zip(sorted((demo_scene / "images").iterdir()), STOPS, strict=True):
+        photo = cv2.imread(str(path)).astype(np.float32) * 0.7
+        assert cv2.imwrite(str(root / "images" / path.name), (photo * 2**stops).clip(0, 255).astype(np.uint8))
+    return root
+
+
+def fit(
+    scene: Path, folder: Path, callbacks: list[Callback], steps: int, ckpt_path: str | None = None, total: int = 150
+) -> tuple[Trainer, SplatModule]:
+    trainer = Trainer(
+        max_steps=steps,
+        accelerator="cpu",
+        default_root_dir=folder,
+        logger=False,
+        callbacks=[PhaseSchedule(total, None, warmup_end=total, prune_end=total, quantize_end=total), *callbacks],
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    module = SplatModule(sh_degree=0, codebooks=None)
+    trainer.fit(module, ColmapDataModule(str(scene)), ckpt_path=ckpt_path, weights_only=True)
+    return trainer, module
+
+
+def test_exposures_are_found(uneven_scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", logger="nsvq_lightning")
+    compensation = ExposureCompensation(rate=0.003)
+    _, module = fit(uneven_scene, tmp_path, [compensation], 150)
+    changes = compensation.state_dict()["changes"]
+    assert changes.shape == (7, 3, 4)
+    gains = 1 + (changes - changes.mean(0))[:, :, :3].diagonal(dim1=1, dim2=2).mean(1)
+    found, true = gains.log2(), torch.tensor(STOPS[1:8])
+    assert float(torch.corrcoef(torch.stack([found, true]))[0, 1]) > 0.85
+    assert "exposures of the train photos: " in caplog.text
+    assert module.appearance is None
+
+
+def test_a_resumed_run_has_the_same_bits(uneven_scene: Path, tmp_path: Path) -> None:
+    whole = ExposureCompensation()
+    _, module = fit(uneven_scene, tmp_path / "whole", [whole], 20)
+    first, _ = fit(uneven_scene, tmp_path / "part", [ExposureCompensation()], 9)
+    first.save_checkpoint(tmp_path / "9.ckpt")
+    resumed = ExposureCompensation()
+    _, other = fit(uneven_scene, tmp_path / "rest", [resumed], 20, str(tmp_path / "9.ckpt"))
+    assert torch.equal(whole.state_dict()["changes"], resumed.state_dict()["changes"])
+    assert torch.equal(module.splats.means, other.splats.means)
+    assert torch.equal(module.splats.sh0, other.splats.sh0)
+
+
+def test_rates_must_be_positive() -> None:
+    for arguments in ({"rate": 0.0}, {"final": float("nan")}, {"rate": float("inf")}):
+        with pytest.raises(ValueError, match="must be positive and finite"):
+            ExposureCompensation(**arguments)
+
+
+def test_colour_correction_undoes_a_map_of_colours() -> None:
+    generator = torch.Generator().manual_seed(0)
+    photo = torch.rand(30, 40, 3, generator=generator) * 0.6 + 0.2
+    mixing = torch.tensor([[0.8, 0.1, 0.0], [0.05, 0.7, 0.1], [0.0, 0.1, 0.9]])
+    image = photo @ mixing.T + 0.05
+    assert float(psnr(image, photo)) < 30
+    assert float(psnr(color_corrected(image, photo), photo)) > 60
+    mask = torch.zeros(30, 40, dtype=torch.bool)
+    mask[:20] = True
+    spoiled = torch.where(mask[..., None], image, torch.rand(30, 40, 3, generator=generator))
+    assert float(psnr(color_corrected(spoiled, photo, mask), photo, mask)) > 60
+    # Grey pictures leave most coefficients open; clipped ones all.
+    grey = image.mean(-1, keepdim=True).expand(-1, -1, 3)
+    assert float(psnr(color_corrected(grey, photo), photo)) > float(psnr(grey, photo))
+    assert torch.equal(color_corrected(torch.ones(4, 5, 3), torch.ones(4, 5, 3)), torch.ones(4, 5, 3))
