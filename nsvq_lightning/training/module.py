@@ -359,7 +359,8 @@ class SplatModule(LightningModule):
         checkpoint["schedule"] = asdict(self.schedule)
         stored = checkpoint.get(self.CHECKPOINT_HYPER_PARAMS_KEY)
         if stored is not None:
-            checkpoint[self.CHECKPOINT_HYPER_PARAMS_KEY] = plain(stored)
+            # Without the photos nobody knows what "auto" was.
+            checkpoint[self.CHECKPOINT_HYPER_PARAMS_KEY] = plain(stored) | {"background": self.background}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Restore history and schedule; a fit keeps its own schedule, and may continue with other codebooks.
