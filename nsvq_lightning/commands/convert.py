@@ -5,17 +5,25 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from nsvq_lightning.commands.progress import progress
 from nsvq_lightning.io.attribute_error import attribute_errors
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import FORMATS, read_scene, save
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
+from nsvq_lightning.io.placing import UP_AXES, cropped, rotated, turn_up
 from nsvq_lightning.io.sog import PALETTE_LIMIT
 from nsvq_lightning.io.spz import DEFAULT_VERSION
 from nsvq_lightning.io.spz_frame import SPZ_VERSIONS
+
+if TYPE_CHECKING:
+    from nsvq_lightning.data.scene import View
 
 __all__ = ["main"]
 
@@ -30,6 +38,7 @@ examples:
   nsvq convert scene.nsvq scene.sog
   nsvq convert scene.ply scene.sog --palette 4096
   nsvq convert scene.ply scene.spz --measure
+  nsvq convert scene.nsvq clean.nsvq --floaters --up z --data.root my/scene
 """
 
 
@@ -48,14 +57,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     for flag, suffix in (_OPTIONS[name] for name in chosen):
         if options.output.suffix.lower() != suffix:
             parser.error(f"{flag} is an option of {suffix} files, but the output is {options.output}")
-    if options.root is not None and not options.measure:
+    if options.up_from is not None and options.up is None:
+        parser.error("--up-from says where up is: add --up to say what it is to become")
+    if options.root is None and options.floaters:
+        parser.error("--floaters asks the photos: add --data.root")
+    if options.root is None and options.up is not None and options.up_from is None:
+        parser.error("--up needs to know where up is now: add --data.root or --up-from")
+    if options.root is not None and not (options.measure or options.floaters or options.up):
         parser.error("--data.root says where to measure: add --measure")
+    if options.measure and (options.crop or options.floaters or options.up):
+        parser.error("--measure compares with the input as it is: convert without it first")
     logging.basicConfig(format="%(message)s")
     logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
     if "level" in chosen:
         chosen["storage"] = Storage(chosen.pop("level"))
     try:
-        _convert(options.input, options.output, chosen)
+        _convert(options, chosen)
         if options.measure:
             _measure(options.input, options.output, options.root)
     except (ValueError, OSError) as error:
@@ -64,12 +81,71 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _convert(source: Path, output: Path, options: dict[str, Any]) -> None:
-    scene = read_scene(source).finite()
+def _convert(options: argparse.Namespace, chosen: dict[str, Any]) -> None:
+    output: Path = options.output
+    scene = _cleaned(read_scene(options.input).finite(), options)
     output.parent.mkdir(parents=True, exist_ok=True)
-    size = save(scene, output, **options)
+    size = save(scene, output, **chosen)
     each = f", {size / len(scene):.1f} per splat" if len(scene) else ""
     sys.stdout.write(f"{output}: {len(scene):,} splats in {size:,} bytes{each}\n{_errors(scene, output)}")
+
+
+def _cleaned(scene: CompressedScene, options: argparse.Namespace) -> CompressedScene:
+    """The scene within the box, without floaters, turned, in this order."""
+    before = len(scene)
+    if options.crop is not None:
+        scene = cropped(scene, np.array(options.crop[:3]), np.array(options.crop[3:]))
+        if len(scene) == 0:
+            raise ValueError(f"no splat of {options.input} is in the box {' '.join(map(str, options.crop))}")
+        sys.stdout.write(f"crop: {before - len(scene):,} of {before:,} splats are outside\n")
+    if options.floaters:
+        scene = _without_floaters(scene, options.root)
+    if options.up is not None:
+        scene = rotated(scene, turn_up(_up(options), options.up))
+    return scene.in_use() if len(scene) < before else scene
+
+
+def _up(options: argparse.Namespace) -> NDArray[np.float64]:
+    if options.up_from is None:
+        from nsvq_lightning.data.scene import load_scene
+        from nsvq_lightning.rendering.cameras import up_of
+
+        return up_of(load_scene(options.root).cameras)
+    up = np.array(options.up_from)
+    length = float(np.linalg.norm(up))
+    if not 0 < length < np.inf:
+        raise ValueError(f"--up-from {' '.join(map(str, options.up_from))} is no direction")
+    return np.asarray(up / length)
+
+
+def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
+    import torch
+
+    from nsvq_lightning.compression.floaters import floaters
+    from nsvq_lightning.data.scene import load_scene
+    from nsvq_lightning.rendering.rasterize import render
+    from nsvq_lightning.report.evaluation import evaluate
+
+    photos = load_scene(root)
+    splats = scene.decode().raw()
+
+    def views() -> Iterator[View]:
+        return (photos.view(index) for index in progress(photos.train, "photos"))
+
+    def quality(keep: torch.Tensor) -> str:
+        tested = evaluate(
+            lambda camera: render(type(splats)(*(t[keep] for t in splats)), camera).image,
+            (photos.view(index) for index in photos.test),
+            torch.device("cpu"),
+        )
+        return f"{tested.psnr:.2f} dB"
+
+    removed = floaters(splats, views, render)
+    before, after = quality(torch.ones_like(removed)), quality(~removed)
+    sys.stdout.write(
+        f"floaters: {int(removed.sum()):,} of {len(scene):,} splats; test photos at {before} before, {after} after\n"
+    )
+    return scene.take((~removed).numpy())
 
 
 def _errors(scene: CompressedScene, output: Path) -> str:
@@ -125,10 +201,26 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--level", choices=LEVELS, help="level of .nsvq")
     parser.add_argument("--measure", action="store_true", help="render both files and say how they differ")
     parser.add_argument(
+        "--crop",
+        nargs=6,
+        type=float,
+        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="keep the splats with centres in this box, in scene units of the input",
+    )
+    parser.add_argument(
+        "--floaters", action="store_true", help="remove splats that no photo of --data.root supports; takes minutes"
+    )
+    parser.add_argument(
+        "--up", choices=UP_AXES, help="turn the scene so that up, as the cameras of --data.root hold it, is this axis"
+    )
+    parser.add_argument(
+        "--up-from", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where up is in the input, for --up"
+    )
+    parser.add_argument(
         "--data.root",
         dest="root",
         type=Path,
         metavar="FOLDER",
-        help="measure in the train views of a COLMAP folder instead of views from around the scene",
+        help="scene folder: for --floaters and --up, and for --measure instead of views from around the scene",
     )
     return parser

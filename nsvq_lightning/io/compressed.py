@@ -139,6 +139,15 @@ class CompressedScene:
             stored_bytes=None,
         )
 
+    def in_use(self) -> CompressedScene:
+        """The same splats, with codebooks of only the rows that they use; without splats, of the first one."""
+        rows = {name: np.unique(codes, return_inverse=True) for name, codes in self.codes.items()}
+        return replace(
+            self,
+            codes={name: codes for name, (_, codes) in rows.items()},
+            codebooks={name: self.codebooks[name][used if len(used) else [0]] for name, (used, _) in rows.items()},
+        )
+
     def finite(self) -> CompressedScene:
         """The splats without NaN or infinite values; a warning counts the others by attribute."""
         bad = {name: np.where(np.isfinite(rows).all(1), 0, np.nan) for name, rows in self.codebooks.items()}

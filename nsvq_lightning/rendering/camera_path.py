@@ -12,9 +12,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
+from scipy.spatial.transform import RotationSpline
 
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.cameras import looked_at, poses, up_of
 
 __all__ = ["orbit", "read_camera_path", "reframed", "smooth_path"]
 
@@ -22,8 +23,6 @@ FINE = 16
 """Points of a path at which its speed is measured, for each of its frames."""
 SURROUNDED = math.radians(270)
 """Arc that cameras must fill for an orbit to go all the way round."""
-LITTLE = 1e-5
-"""Weight of what decides where cameras that all look the same way leave a direction open."""
 OPENGL = np.diag([1.0, -1.0, -1.0])
 """From a camera with y up that looks along -z to one with y down that looks along z."""
 
@@ -54,7 +53,7 @@ def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     width, height = cameras[0].width, cameras[0].height
     if any((camera.width, camera.height) != (width, height) for camera in cameras):
         raise ValueError("cameras of a path must have one size; reframe them first")
-    positions, rotations = _poses(cameras)
+    positions, rotations = poses(cameras)
     unit = float(np.median(np.linalg.norm(positions - positions.mean(0), axis=1))) or 1.0
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1) / unit
     steps += (rotations[:-1].inv() * rotations[1:]).magnitude() if len(cameras) > 1 else 0.0
@@ -95,10 +94,8 @@ def orbit(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """
     if not cameras or frames < 1:
         raise ValueError(f"an orbit needs at least one camera and one frame, got {len(cameras)} and {frames}")
-    positions, rotations = _poses(cameras)
-    axes = rotations.as_matrix()
-    middle = _looked_at(positions, axes[:, :, 2])
-    up = _up(axes)
+    positions, _ = poses(cameras)
+    middle, up = looked_at(cameras), up_of(cameras)
     across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     across /= np.linalg.norm(across)
     ahead = np.cross(up, across)
@@ -164,31 +161,6 @@ def _entry_camera(entry: Mapping[str, Any], width: int, height: int) -> Camera:
         raise ValueError(f"a field of view is {field} degrees")
     focal = 0.5 * height / math.tan(math.radians(field) / 2)
     return _camera(_view(rotation @ OPENGL, pose[:3, 3]), (focal, focal, width / 2, height / 2), width, height)
-
-
-def _poses(cameras: Sequence[Camera]) -> tuple[NDArray[np.float64], Rotation]:
-    """Positions ``[N, 3]``, and rotations from camera to world."""
-    packed = np.array([camera.packed_view for camera in cameras])
-    return packed[:, 12:], Rotation.from_matrix(packed[:, :9].reshape(-1, 3, 3).transpose(0, 2, 1))
-
-
-def _looked_at(positions: NDArray[np.float64], forward: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The point nearest to all lines of sight; where they are parallel, one in front of the cameras."""
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    spread = np.linalg.norm(positions - positions.mean(0), axis=1).max() or 1.0
-    ahead = positions.mean(0) + 2 * spread * forward.mean(0)
-    weight = LITTLE * len(positions)
-    total = across.sum(0) + weight * np.eye(3)
-    return np.linalg.solve(total, np.einsum("nij,nj->i", across, positions) + weight * ahead)
-
-
-def _up(axes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where cameras with these axes ``[N, 3, 3]`` have up: at right angles to their right, near to their upper edge."""
-    right, upper = axes[:, :, 0], -axes[:, :, 1].mean(0)
-    if np.linalg.norm(upper) < 0.1:  # they are turned in all directions
-        return -axes[0, :, 1]
-    up = np.linalg.solve(right.T @ right / len(axes) + LITTLE * np.eye(3), upper)
-    return np.asarray(up / np.linalg.norm(up))
 
 
 def _arc(angles: NDArray[np.float64]) -> tuple[float, float]:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from nsvq_lightning.splats.sh_degree import sh_coefficients
 
-__all__ = ["C0", "C1", "C2", "C3", "sh_basis", "sh_colors"]
+__all__ = ["C0", "C1", "C2", "C3", "sh_basis", "sh_colors", "sh_rotation"]
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+_PROBES = 32
+"""Directions at which rotated functions are compared, evenly spread: four for each function of the largest band."""
+_GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
@@ -48,3 +53,27 @@ def sh_colors(directions: Tensor, sh0: Tensor, shN: Tensor, degree: int) -> Tens
     """
     coefficients = torch.cat([sh0, shN[:, : sh_coefficients(degree)]], 1)
     return ((sh_basis(directions, degree)[..., None] * coefficients).sum(1) + 0.5).clamp_min(0)
+
+
+def sh_rotation(rotation: Tensor, degree: int) -> Tensor:
+    """The matrix ``[(degree + 1)² - 1]²`` that turns higher coefficients: ``matrix @ shN`` are those of turned splats.
+
+    Colours seen along ``rotation @ direction`` are then those that were seen along ``direction``. A band turns into
+    itself, so each has a block, and the constant coefficients stay. The basis itself says what the blocks are: they
+    solve basis(turned directions) · block = basis(directions), for more directions than there are functions.
+
+    Args:
+        rotation: From old to new world axes ``[3, 3]``, float64 for an exact result.
+        degree: Of the spherical harmonics, 0 to 3.
+    """
+    steps = torch.arange(_PROBES, dtype=rotation.dtype, device=rotation.device)
+    height = (2 * steps + 1) / _PROBES - 1
+    across, turn = (1 - height * height).sqrt(), _GOLDEN_ANGLE * steps
+    directions = torch.stack([across * turn.cos(), across * turn.sin(), height], 1)
+    before, after = sh_basis(directions, degree), sh_basis(directions @ rotation.T, degree)
+    bands = [slice(band * band, (band + 1) ** 2) for band in range(1, degree + 1)]
+    blocks = [torch.linalg.lstsq(after[:, band], before[:, band]).solution for band in bands]
+    turned = rotation.new_zeros(2 * (sh_coefficients(degree),))
+    for band, block in zip(bands, blocks, strict=True):
+        turned[band.start - 1 : band.stop - 1, band.start - 1 : band.stop - 1] = block
+    return turned

@@ -1,11 +1,12 @@
-"""Rotations as the three smallest components of a unit quaternion; the largest one follows from them."""
+"""Quaternions: of length 1, by their three smallest components, and of turned splats."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-__all__ = ["MIN_SQUARED_NORM", "from_smallest_three", "smallest_three", "unit"]
+__all__ = ["MIN_SQUARED_NORM", "from_smallest_three", "smallest_three", "turned", "unit"]
 
 MIN_SQUARED_NORM = 1e-24
 """Squared quaternion norms are floored here, so that a zero quaternion is the identity and has no gradient."""
@@ -16,6 +17,13 @@ def unit(quats: NDArray[np.float32]) -> NDArray[np.float64]:
     wide = quats.astype(np.float64)
     length = np.linalg.norm(wide, axis=1, keepdims=True)
     return np.where(length > 0, wide / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
+
+
+def turned(quats: NDArray[np.float32], rotation: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Quaternions wxyz ``[N, 4]`` after all axes have turned by a rotation ``[3, 3]``; lengths stay."""
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return np.asarray(quats.astype(np.float64) @ product.T, np.float32)
 
 
 def smallest_three(units: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:

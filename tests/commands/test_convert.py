@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -151,3 +152,59 @@ def test_options_that_do_not_fit_end_with_status_2(
         main(arguments)
     assert end.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_results_are_cropped_and_turned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = coded_scene(300)
+    save(scene, tmp_path / "a.nsvq", Storage("paper"))
+    box = ["--crop", "-0.5", "-99", "-99", "99", "99", "99"]
+    assert main([str(tmp_path / "a.nsvq"), str(tmp_path / "b.nsvq"), "--level", "paper", *box]) == 0
+    kept = read_scene(tmp_path / "b.nsvq")
+    means = read_scene(tmp_path / "a.nsvq").arrays().means
+    inside = int((means[:, 0] >= -0.5).sum())
+    assert 0 < len(kept) == inside < 300
+    assert f"crop: {300 - inside} of 300 splats are outside" in capsys.readouterr().out
+    assert set(kept.codes) == set(scene.codes)
+    assert main([str(tmp_path / "b.nsvq"), str(tmp_path / "c.ply"), "--up", "z", "--up-from", "0", "-1", "0"]) == 0
+    x, y, z = kept.arrays().means.T
+    turned = read_scene(tmp_path / "c.ply").arrays()
+    order, others = np.lexsort(turned.means.T), np.lexsort(np.stack([x, z, -y]))
+    np.testing.assert_allclose(turned.means[order], np.stack([x, z, -y], 1)[others], atol=1e-5)
+
+
+def test_up_and_floaters_ask_the_photos(demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from nsvq_lightning.data.scene import load_scene
+    from nsvq_lightning.splats.splats import Splats
+
+    scene = load_scene(demo_scene)
+    splats = Splats.from_points(scene.points, scene.colors, 0)
+    save(splats, tmp_path / "a.ply")
+    arguments = ["--data.root", str(demo_scene), "--floaters", "--up", "y"]
+    assert main([str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), *arguments]) == 0
+    out = capsys.readouterr().out
+    found = re.search(r"floaters: ([\d,]+) of 500 splats; test photos at ([\d.]+) dB before, ([\d.]+) dB after", out)
+    assert found is not None
+    assert len(read_scene(tmp_path / "b.ply")) == 500 - int(found[1])
+    assert float(found[3]) >= float(found[2])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--crop", "5", "5", "5", "6", "6", "6"], "no splat of .* is in the box 5.0 5.0 5.0 6.0 6.0 6.0"),
+        (["--up", "z", "--up-from", "0", "0", "0"], "--up-from 0.0 0.0 0.0 is no direction"),
+        (["--up", "z"], "--up needs to know where up is now: add --data.root or --up-from"),
+        (["--up-from", "0", "0", "1"], "--up-from says where up is: add --up"),
+        (["--floaters"], "--floaters asks the photos: add --data.root"),
+        (["--crop", "1", "1", "1", "2", "2", "2", "--measure"], "--measure compares with the input as it is"),
+    ],
+)
+def test_what_cannot_be_cleaned_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    save(coded_scene(30, 1), tmp_path / "a.nsvq")
+    with pytest.raises(SystemExit) as stop:
+        sys.exit(main([str(tmp_path / "a.nsvq"), str(tmp_path / "b.nsvq"), *arguments]))
+    assert stop.value.code in (1, 2)
+    assert re.search(message, capsys.readouterr().err)
+    assert not (tmp_path / "b.nsvq").exists()
