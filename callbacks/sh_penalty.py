@@ -16,7 +16,7 @@ __all__ = ["ShPenalty"]
 
 
 class ShPenalty(HostedCallback):
-    """Adds ``weight`` / 2N · Σ ``shN``² to the loss, so that colours depend on the direction only where it shows.
+    """Adds weight / 2N · Σ shN² to the loss, so that colours depend on the direction only where it shows.
 
     With few photos each splat is seen from few directions, and between them its colour is whatever the noise of the
     photos made of it. Coefficients that the photos do not need go to zero, which also makes a file without SH codebook

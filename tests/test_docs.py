@@ -6,6 +6,8 @@ import argparse
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +15,8 @@ from typing import Any, NamedTuple
 import pytest
 from compressed_scenes import scene as coded_scene
 
+import nsvq_lightning.callbacks
+import nsvq_lightning.io
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.commands.registry import COMMANDS
 from nsvq_lightning.io import save
@@ -20,7 +24,7 @@ from nsvq_lightning.io import save
 ROOT = Path(__file__).resolve().parents[1]
 if not (ROOT / "docs").is_dir():
     pytest.skip("a source distribution has no docs", allow_module_level=True)
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 SMALL = ((r"max_steps=\d+", "max_steps=8"), (r'codebooks="4k"', 'codebooks="0.5k"'))
 """What is smaller in a test."""
 EXECUTED = ("info", "convert")
@@ -40,10 +44,10 @@ class Block(NamedTuple):
 
 
 def blocks() -> Iterator[Block]:
-    for page in PAGES:
-        text = page.read_text()
+    for path in PAGES:
+        page, text = path.relative_to(ROOT).with_suffix("").as_posix().removeprefix("docs/"), path.read_text()
         for found in re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
-            yield Block(page.stem, text[: found.start()].count("\n") + 1, found[1], found[2])
+            yield Block(page, text[: found.start()].count("\n") + 1, found[1], found[2])
 
 
 def commands() -> Iterator[tuple[str, list[str]]]:
@@ -148,3 +152,23 @@ def test_settings_are_accepted(block: Block, workplace: Path, capsys: pytest.Cap
     with pytest.raises(SystemExit) as stop:
         main(["fit", "--config", "nsvq_4k.yaml", "--config", "own.yaml", "--data.root=my/scene", "--print_config"])
     assert stop.value.code == 0, capsys.readouterr().err
+
+
+def test_the_api_reference_is_built_without_warnings(tmp_path: Path) -> None:
+    pytest.importorskip("sphinx")
+    build = [sys.executable, "-m", "sphinx", "-W", "-q", "-b", "html", str(ROOT / "docs/api"), str(tmp_path)]
+    done = subprocess.run(build, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "index.html").read_text()
+    public = {*nsvq_lightning.__all__, *nsvq_lightning.callbacks.__all__, *nsvq_lightning.io.__all__}
+    assert {name for name in public if not name.isupper() and f">{name}<" not in page} == set()
+
+
+def test_the_index_names_every_page() -> None:
+    index = (ROOT / "docs/README.md").read_text()
+    assert {page.name for page in (ROOT / "docs").glob("*.md")} - {"README.md"} == set(
+        re.findall(r"\((\w+\.md)\)", index)
+    )
+    for page in PAGES:
+        for target in re.findall(r"\]\(([\w./]+)\)", page.read_text()):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"

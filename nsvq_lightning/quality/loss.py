@@ -45,7 +45,7 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2, mask: Tensor | None = None) -> Tensor:
-    """(1 - λ)·mean |image - target| + λ·(1 - SSIM), differentiable in ``image``, which is clamped to [0, 1] first.
+    """(1 - λ)·mean abs(image - target) + λ·(1 - SSIM), differentiable in ``image``, which is clamped to [0, 1] first.
 
     float32 images take fused kernels for clamping, loss and gradient; everything else is plain torch.
 

@@ -39,8 +39,8 @@ class Render(NamedTuple):
             backward pass to get screen-space gradients.
         depth: Σ weight · view-space z ``[H, W]``; divide by ``alpha`` for the mean depth.
         observed: With ``observe``, zeros ``[N, 3]`` whose ``grad`` the backward pass of a loss L sets to sums over the
-            pixels p: Σ |∂L/∂x at p|, Σ |∂L/∂y at p| of the projected centre (x, y) in pixels (AbsGS, Ye et al. 2024),
-            and Σ weight · ``observe``. Otherwise None.
+            pixels p: Σ abs(∂L/∂x at p), Σ abs(∂L/∂y at p) of the projected centre (x, y) in pixels (AbsGS, Ye et al.
+            2024), and Σ weight · ``observe``. Otherwise None.
     """
 
     image: Tensor
