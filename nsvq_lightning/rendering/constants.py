@@ -6,6 +6,7 @@ __all__ = [
     "ALPHA_MAX",
     "ALPHA_MIN",
     "BLUR",
+    "FAINTEST",
     "FINITE",
     "FRUSTUM_MARGIN",
     "HUGE_FOOTPRINT",
@@ -24,6 +25,9 @@ BLUR = 0.3
 
 ALPHA_MIN = 1.0 / 255.0
 """Contributions below one 8-bit step are skipped."""
+
+FAINTEST = 1e-6
+"""Smallest factor of an opacity by anti-aliasing: far below what any pixel shows, and its logarithm is finite."""
 
 ALPHA_MAX = 0.99
 """Opacity of one splat at one pixel is capped here; the cap has no gradient."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.compute.devices import kernels_for, triton_obstacle
+from nsvq_lightning.rendering.antialias import compensated
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.gsplat import support as gsplat_support
 from nsvq_lightning.rendering.reference import render_reference, visible_rows
@@ -58,6 +59,7 @@ def render(
     sh_degree: int | None = None,
     background: Tensor | None = None,
     observe: Tensor | None = None,
+    antialiased: bool = False,
     backend: str = "auto",
 ) -> Render:
     """Render splats as a camera sees them (3D Gaussian Splatting, eq. 3), differentiable in all six raw attributes.
@@ -69,6 +71,9 @@ def render(
         background: RGB ``[3]`` behind the splats; black by default.
         observe: Strength of each pixel ``[H, W]``; the backward pass then also sums up what ``Render.observed`` holds.
             Back-end ``gsplat`` cannot do this.
+        antialiased: Make splats fainter as the rasterizer's blur makes them larger, so that those smaller than a pixel
+            look alike from near and far (:func:`nsvq_lightning.rendering.antialias.compensated`). For scenes that were
+            trained so.
         backend: One of :data:`BACKENDS`.
 
     Returns:
@@ -91,6 +96,8 @@ def render(
         raise ValueError(f"background must be one RGB colour of shape [3], got {list(background.shape)}")
     background = background.to(means)
     name = resolve_backend(backend, means)
+    if antialiased:
+        splats = compensated(splats, camera, visible(splats, camera, backend=name))
     if observe is None:
         return Render(*_rasterizer(name)(splats, camera, degree, background))
     if tuple(observe.shape) != (camera.height, camera.width):

@@ -84,33 +84,14 @@ def clear_rows(first, last, stride, g_means, g_quats, g_scales, g_logits, g_sh0,
 
 
 @inline
-def geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y):
-    """Gradients of mean (without the colour's share), quaternion and log-scales of 16 splats.
+def axes_backward(camera, view, axes, gu, gv, g2x, g2y, g_depth):
+    """Gradients of mean and quaternion of 16 splats from those of the rows ``gu``, ``gv`` of U = T·M.
 
-    ``total`` are the 16 sums of a slot, ``g2x``, ``g2y`` the gradient of the projected centre.
+    ``view`` is what :func:`affine` returns, ``axes`` what :func:`axes_of` does; ``g2x``, ``g2y`` are the gradient of
+    the projected centre, ``g_depth`` that of the depth.
     """
-    two = broadcast(F(2))
-    (x, y, _), inverse, (slope_x, slope_y), t0, t1 = affine(camera, mean)
-    q, q_inverse, lengths, m = axes_of(quat, scale)
-    u, v = image_axes(t0, m), image_axes(t1, m)
-
-    # dL/dΣ = ½ Fᵀ S F with S = Σ h uuᵀ, so dL/dU = Fᵀ S (F U). The rows of F U are a·u + b·v and c·v; by Lagrange's
-    # identity the first is a·(v × (u × v) + blur·u)/|v|², which stays accurate for needles.
-    a, b, c = record[A], record[B], record[C]
-    k = two * broadcast(COVARIANCE_SCALE)
-    uu, uv, vv = k * total[SUM_UU], k * total[SUM_UV], k * total[SUM_VV]
-    per_yy = broadcast(F(1)) / (dot3(v[0], v[1], v[2], v[0], v[1], v[2]) + broadcast(BLUR))
-    n = cross(u, v)
-    n = cross(v, (n[0] * per_yy, n[1] * per_yy, n[2] * per_yy))
-    blur = broadcast(BLUR) * per_yy
-    r = a * fma(blur, u[0], n[0]), a * fma(blur, u[1], n[1]), a * fma(blur, u[2], n[2])
-    s = c * v[0], c * v[1], c * v[2]
-    e = fma(uu, r[0], uv * s[0]), fma(uu, r[1], uv * s[1]), fma(uu, r[2], uv * s[2])
-    f = fma(uv, r[0], vv * s[0]), fma(uv, r[1], vv * s[1]), fma(uv, r[2], vv * s[2])
-    gu = a * e[0], a * e[1], a * e[2]
-    gv = fma(b, e[0], c * f[0]), fma(b, e[1], c * f[1]), fma(b, e[2], c * f[2])
-    g_scale = fma(r[0], e[0], s[0] * f[0]), fma(r[1], e[1], s[1] * f[1]), fma(r[2], e[2], s[2] * f[2])
-
+    (x, y, _), inverse, (slope_x, slope_y), t0, t1 = view
+    q, q_inverse, lengths, m = axes
     gm = (
         fma(t0[0], gu[0], t1[0] * gv[0]), fma(t0[0], gu[1], t1[0] * gv[1]), fma(t0[0], gu[2], t1[0] * gv[2]),
         fma(t0[1], gu[0], t1[1] * gv[0]), fma(t0[1], gu[1], t1[1] * gv[1]), fma(t0[1], gu[2], t1[1] * gv[2]),
@@ -146,12 +127,44 @@ def geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y):
     vy = fnma(free_y * fy_z, j12, fy * g2y)
     vz = (one + free_x) * fx_z * slope_x * j02 + (one + free_y) * fy_z * slope_y * j12
     vz = vz - fx_z * (x * g2x + j00) - fy_z * (y * g2y + j11)
-    vz = vz + total[SUM_DEPTH]
+    vz = vz + g_depth
     g_mean = (
         rotate_back(camera, 0, vx, vy, vz),
         rotate_back(camera, 1, vx, vy, vz),
         rotate_back(camera, 2, vx, vy, vz),
     )
+    return g_mean, g_quat
+
+
+@inline
+def geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y):
+    """Gradients of mean (without the colour's share), quaternion and log-scales of 16 splats.
+
+    ``total`` are the 16 sums of a slot, ``g2x``, ``g2y`` the gradient of the projected centre.
+    """
+    two = broadcast(F(2))
+    view, axes = affine(camera, mean), axes_of(quat, scale)
+    _, _, _, t0, t1 = view
+    _, _, _, m = axes
+    u, v = image_axes(t0, m), image_axes(t1, m)
+
+    # dL/dΣ = ½ Fᵀ S F with S = Σ h uuᵀ, so dL/dU = Fᵀ S (F U). The rows of F U are a·u + b·v and c·v; by Lagrange's
+    # identity the first is a·(v × (u × v) + blur·u)/|v|², which stays accurate for needles.
+    a, b, c = record[A], record[B], record[C]
+    k = two * broadcast(COVARIANCE_SCALE)
+    uu, uv, vv = k * total[SUM_UU], k * total[SUM_UV], k * total[SUM_VV]
+    per_yy = broadcast(F(1)) / (dot3(v[0], v[1], v[2], v[0], v[1], v[2]) + broadcast(BLUR))
+    n = cross(u, v)
+    n = cross(v, (n[0] * per_yy, n[1] * per_yy, n[2] * per_yy))
+    blur = broadcast(BLUR) * per_yy
+    r = a * fma(blur, u[0], n[0]), a * fma(blur, u[1], n[1]), a * fma(blur, u[2], n[2])
+    s = c * v[0], c * v[1], c * v[2]
+    e = fma(uu, r[0], uv * s[0]), fma(uu, r[1], uv * s[1]), fma(uu, r[2], uv * s[2])
+    f = fma(uv, r[0], vv * s[0]), fma(uv, r[1], vv * s[1]), fma(uv, r[2], vv * s[2])
+    gu = a * e[0], a * e[1], a * e[2]
+    gv = fma(b, e[0], c * f[0]), fma(b, e[1], c * f[1]), fma(b, e[2], c * f[2])
+    g_scale = fma(r[0], e[0], s[0] * f[0]), fma(r[1], e[1], s[1] * f[1]), fma(r[2], e[2], s[2] * f[2])
+    g_mean, g_quat = axes_backward(camera, view, axes, gu, gv, g2x, g2y, total[SUM_DEPTH])
     return g_mean, g_quat, g_scale
 
 

@@ -30,7 +30,7 @@ from nsvq_lightning.rendering.cpu.records import CAMERA, GROUP_TILES, RECORD, TI
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.splats import ATTRIBUTES, SplatTensors, sh_degree_of
 
-__all__ = ["render_cpu", "visible_cpu"]
+__all__ = ["pack_camera", "render_cpu", "visible_cpu"]
 
 PROJECTION_SCRATCH = 2048 + 64
 MAX_ENTRIES = 2**31 - 1
@@ -42,7 +42,8 @@ _packed: WeakKeyDictionary[Camera, tuple[int, Array]] = WeakKeyDictionary()
 """Cameras as kernels read them, and the version of the matrix that it was made from."""
 
 
-def _pack_camera(camera: Camera) -> Array:
+def pack_camera(camera: Camera) -> Array:
+    """A camera as kernels read it; packed once."""
     version, packed = _packed.get(camera, (-1, np.empty(0)))
     if version != camera.viewmat._version:
         packed = _packed_now(camera)
@@ -74,7 +75,7 @@ class _Frame:
     """One view of the splats on its way through the stages; holds its workspace for as long as it lives."""
 
     def __init__(self, splats: SplatTensors, camera: Camera) -> None:
-        self.camera = _pack_camera(camera)
+        self.camera = pack_camera(camera)
         self.width, self.height = camera.width, camera.height
         self.group_columns, group_rows = group_grid(camera.width, camera.height)
         self.tiles = self.group_columns * group_rows * GROUP_TILES
@@ -295,5 +296,5 @@ def visible_cpu(splats: SplatTensors, camera: Camera) -> Tensor:
     threads = thread_count()
     found, runs = np.empty(splats.means.shape[0], np.int64), np.empty((threads, 2), np.int64)
     scratch = np.empty((threads, PROJECTION_SCRATCH), np.float32)
-    find_visible(threads, _pack_camera(camera), *geometry, found, runs, scratch)
+    find_visible(threads, pack_camera(camera), *geometry, found, runs, scratch)
     return torch.from_numpy(np.concatenate([found[first:last] for first, last in runs]))
