@@ -16,6 +16,7 @@ from .export import ExportScene
 from .exposure import ExposureCompensation
 from .finite import FiniteCodes
 from .freeze import FreezeCodes
+from .frequency import FrequencyLimit
 from .growth import BudgetedGrowth
 from .growth_rules import GrowthRules
 from .kernels import CompileAhead
@@ -49,6 +50,7 @@ __all__ = [
     "ExposureCompensation",
     "FiniteCodes",
     "FreezeCodes",
+    "FrequencyLimit",
     "GrowthRules",
     "LiveScene",
     "MetricReport",

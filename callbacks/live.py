@@ -7,8 +7,10 @@ from typing import Any
 
 from lightning.pytorch import LightningModule, Trainer
 
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.training import live
 from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.run_folder import is_trial, run_folder
@@ -61,7 +63,9 @@ class LiveScene(WritingCallback):
         host, began = as_host(pl_module), time.monotonic()
         with host.stopwatch.paused(host.device):
             splats = type(host.splats).from_tensors(*host.hard_splats(host.phase)).to("cpu")
-            save(splats, folder / live.LIVE_SCENE, Storage("paper"))
+            config = {"antialiased": getattr(pl_module, "antialiased", False)}
+            scene = CompressedScene.from_arrays(SplatArrays.from_splats(splats), config=config)
+            save(scene, folder / live.LIVE_SCENE, Storage("paper"))
         self._answered, ended = asked, time.monotonic()
         self._next = ended + (ended - began) / SHARE
 

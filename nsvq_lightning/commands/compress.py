@@ -16,6 +16,7 @@ from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
 
 if TYPE_CHECKING:
     from nsvq_lightning.compression.ladder import Candidate
+    from nsvq_lightning.io.compressed import CompressedScene
     from nsvq_lightning.rendering.camera import Camera
     from nsvq_lightning.splats.arrays import SplatArrays
 
@@ -103,7 +104,7 @@ def _compress(options: argparse.Namespace) -> int:
     if len(arrays) == 0:
         raise ValueError(f"{source} holds no finite splat; there is nothing to compress")
     cameras = views_of(arrays.to_splats(), options.root, VIEWS)
-    candidate, pictures = _candidate(options, arrays, cameras, scene.origin)
+    candidate, pictures = _candidate(options, arrays, cameras, scene)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     result = Result(candidate.rung.name, candidate.data, candidate.error)
     if options.root is not None and options.max_steps != 0:
@@ -117,7 +118,7 @@ def _compress(options: argparse.Namespace) -> int:
             path = folder / "scene.nsvq"
             data = with_origin(path.read_bytes(), scene.origin)
             # A new one: keeping the pictures of the original would fill the memory during training.
-            error = Compressor(arrays, cameras, candidate.storage).error(data)
+            error = Compressor(arrays, cameras, candidate.storage, antialiased=scene.antialiased).error(data)
             result = _within_aim(options, result, Result(f"{result.settings}, trained with photos", data, error), path)
     with atomic_write(options.output) as file:
         file.write(result.data)
@@ -146,12 +147,14 @@ def _within_aim(options: argparse.Namespace, untrained: Result, trained: Result,
 
 
 def _candidate(
-    options: argparse.Namespace, arrays: SplatArrays, cameras: list[Camera], origin: tuple[float, float, float]
+    options: argparse.Namespace, arrays: SplatArrays, cameras: list[Camera], scene: CompressedScene
 ) -> tuple[Candidate, int]:
     """The scene as the options ask for it, and the number of pictures in which its error was measured."""
     from nsvq_lightning.compression.ladder import LADDER, PLAIN, Compressor, finest_within, smallest_within
 
-    compressor = Compressor(arrays, cameras, Storage(options.level), options.seed, origin, options.tune)
+    compressor = Compressor(
+        arrays, cameras, Storage(options.level), options.seed, scene.origin, options.tune, scene.antialiased
+    )
     if options.max_error is not None:
         candidate = smallest_within(compressor, options.max_error)
     elif options.target_bytes is not None:
@@ -183,6 +186,7 @@ def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> i
             "--model.quantizer=TrainedStraightThrough",
             "--model.quantizer.start=spread",
             "--model.rates.means=1.6e-6",  # the rate of a trained scene has already decayed
+            f"--model.antialiased={str(candidate.scene.antialiased).lower()}",
             f"--model.seed={options.seed}",
             f"--model.storage.level={candidate.storage.level}",
             *(f"--model.storage.precision.{name}={value}" for name, value in precision.items()),

@@ -6,6 +6,7 @@ import argparse
 import logging
 import sys
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -128,19 +129,20 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
 
     photos = load_scene(root)
     splats = scene.decode().raw()
+    look = partial(render, antialiased=scene.antialiased)
 
     def views() -> Iterator[View]:
         return (photos.view(index) for index in progress(photos.train, "photos"))
 
     def quality(keep: torch.Tensor) -> str:
         tested = evaluate(
-            lambda camera: render(type(splats)(*(t[keep] for t in splats)), camera).image,
+            lambda camera: look(type(splats)(*(t[keep] for t in splats)), camera).image,
             (photos.view(index) for index in photos.test),
             torch.device("cpu"),
         )
         return f"{tested.psnr:.2f} dB"
 
-    removed = floaters(splats, views, render)
+    removed = floaters(splats, views, look)
     before, after = quality(torch.ones_like(removed)), quality(~removed)
     sys.stdout.write(
         f"floaters: {int(removed.sum()):,} of {len(scene):,} splats; test photos at {before} before, {after} after\n"
@@ -168,7 +170,8 @@ def _measure(source: Path, output: Path, root: Path | None) -> None:
         raise ValueError(f"{source} holds no finite splat; there is nothing to measure")
     splats = original.decode()
     cameras = views_of(splats, root, MEASURED)
-    error = picture_error(read_scene(output).decode(), cameras, pictures(splats, cameras))
+    expected = pictures(splats, cameras, original.antialiased)
+    error = picture_error(read_scene(output).decode(), cameras, expected, original.antialiased)
     sys.stdout.write(
         f"  error {error:.4g} ({decibels(error):.2f} dB against {source.name} in {len(cameras)} pictures)\n"
     )

@@ -81,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _render(options: argparse.Namespace) -> None:
     import torch
 
-    from nsvq_lightning.io.formats import load
+    from nsvq_lightning.io.formats import read_scene
     from nsvq_lightning.rendering.rasterize import render
     from nsvq_lightning.report.video import SUFFIX
 
@@ -90,7 +90,8 @@ def _render(options: argparse.Namespace) -> None:
     suffix = output.suffix.lower()
     if suffix not in ("", SUFFIX):
         raise ValueError(f"{output}: name a video ({SUFFIX}), or a folder for PNGs")
-    splats = load(file)
+    scene = read_scene(file)
+    splats = scene.decode()
     if len(splats) == 0:
         raise ValueError(f"{file} holds no splat; there is nothing to render")
     cameras, fps = _path(options, splats, is_video=bool(suffix))
@@ -99,7 +100,7 @@ def _render(options: argparse.Namespace) -> None:
 
     @torch.no_grad()
     def look(camera: Camera) -> Render:
-        return render(raw, camera, background=background, backend=options.backend)
+        return render(raw, camera, background=background, antialiased=scene.antialiased, backend=options.backend)
 
     pictures = _pictures(options.what, look, cameras)
     first = cameras[0]

@@ -130,13 +130,15 @@ class Compressor:
         seed: int = 0,
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
         tuning: int = 0,
+        antialiased: bool = False,
     ) -> None:
         if len(splats) == 0 or not cameras:
             raise ValueError(f"cannot compress {len(splats)} splats seen by {len(cameras)} cameras")
         self._splats = RawSplats(*(tensor.detach() for tensor in splats.to_splats().raw()))
         self._views, self._cameras = cameras, cameras[:: -(-len(cameras) // MEASURED) or 1]
         self._storage, self._seed, self._origin, self._tuning = storage, seed, origin, tuning
-        self._pictures = pictures(self._splats, self._cameras)
+        self._antialiased = antialiased
+        self._pictures = pictures(self._splats, self._cameras, antialiased)
         if not any(bool(picture.any()) for picture in self._pictures):
             raise ValueError(
                 f"all {len(self._cameras)} pictures of the scene are black, so no error can be measured: photos "
@@ -170,7 +172,7 @@ class Compressor:
     def error(self, data: bytes) -> float:
         """Root mean square difference between the pictures of a ``.nsvq`` file and those of the scene."""
         splats = RawSplats(*(tensor.detach() for tensor in decode(*unframe(data)).decode().raw()))
-        return picture_error(splats, self._cameras, self._pictures)
+        return picture_error(splats, self._cameras, self._pictures, self._antialiased)
 
     def _compressed(self, rung: Rung) -> Candidate:
         scene = self._quantized(rung.codebooks)
@@ -194,7 +196,9 @@ class Compressor:
             weight = None if scales else self._weights
             quantizer.fit(rows, weight, generator(self._seed, 0, "kmeans", name))
             quantizers[name] = cast(Quantizer, quantizer)
-        config = {"codebooks": {name: len(q.codebook) for name, q in quantizers.items()}}
+        config: dict[str, object] = {"codebooks": {name: len(q.codebook) for name, q in quantizers.items()}}
+        if self._antialiased:
+            config["antialiased"] = True
         scene = replace(compress(splats, quantizers), config=config, origin=self._origin)
         return tuned(scene, splats, self._views, self._tuning, self._seed) if quantizers else scene
 

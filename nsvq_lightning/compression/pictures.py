@@ -48,14 +48,16 @@ def middle_of(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
 
 
 @torch.no_grad()
-def pictures(splats: SplatTensors, cameras: Sequence[Camera]) -> list[Tensor]:
+def pictures(splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool = False) -> list[Tensor]:
     """What each camera sees, ``[H, W, 3]`` in [0, 1]."""
-    return [render(splats, camera).image.clamp(0, 1) for camera in cameras]
+    return [render(splats, camera, antialiased=antialiased).image.clamp(0, 1) for camera in cameras]
 
 
-def picture_error(splats: SplatTensors, cameras: Sequence[Camera], expected: Sequence[Tensor]) -> float:
+def picture_error(
+    splats: SplatTensors, cameras: Sequence[Camera], expected: Sequence[Tensor], antialiased: bool = False
+) -> float:
     """Root mean square difference between the pictures of a scene and expected ones, for channels in [0, 1]."""
-    found = zip(pictures(splats, cameras), expected, strict=True)
+    found = zip(pictures(splats, cameras, antialiased), expected, strict=True)
     return math.sqrt(float(np.mean([float((a - b).double().square().mean()) for a, b in found])))
 
 

@@ -179,6 +179,11 @@ class CompressedScene:
         return self.arrays().to_splats()
 
     @property
+    def antialiased(self) -> bool:
+        """Whether it is to be rendered with anti-aliasing, as it was trained (``antialiased`` of :attr:`config`)."""
+        return self.config.get("antialiased") is True
+
+    @property
     def plain_bytes(self) -> int:
         """Bytes of the plain ``.ply`` of the same scene."""
         return plain_ply_bytes(len(self), self.sh_degree)

@@ -35,6 +35,7 @@ class Format:
         read: Scene from a file; codebooks are kept where the format has them.
         write: ``write(path, scene, **options) -> bytes written``.
         keeps_origin: Whether the file holds the origin that positions are relative to.
+        says_antialiased: Whether the file can say that a scene is to be rendered with anti-aliasing.
         takes_storage: Whether ``write`` has an option ``storage``, the level and precision.
         in_order: Gives the splats of a scene that a file holds, in file order, for comparison with what is read back;
             None if the format loses nothing, or states its errors itself.
@@ -45,6 +46,7 @@ class Format:
     write: Callable[..., int]
     keeps_origin: bool = False
     takes_storage: bool = False
+    says_antialiased: bool = True
     in_order: Callable[[CompressedScene], CompressedScene] | None = None
 
 
@@ -104,6 +106,11 @@ def save(
     scene = scene.finite()
     if any(scene.origin) and not entry.keeps_origin:
         logger.warning("%s: the origin %s of the positions is not stored; add it in the viewer", path, scene.origin)
+    if scene.antialiased and not entry.says_antialiased:
+        logger.warning(
+            "%s: the file cannot say that the scene was trained with anti-aliasing: switch it on in the viewer, or "
+            "small splats look too thick", path,
+        )  # fmt: skip
     if entry.takes_storage:
         options["storage"] = storage or Storage()
     elif storage is not None:
@@ -132,7 +139,7 @@ def _write_nsvq(path: Path, scene: CompressedScene, *, storage: Storage) -> int:
 
 
 FORMATS: dict[str, Format] = {
-    ".ply": Format("3D Gaussian Splatting", _read_ply, _write_ply),
+    ".ply": Format("3D Gaussian Splatting", _read_ply, _write_ply, says_antialiased=False),
     ".nsvq": Format("compressed scene of this package", read_nsvq, _write_nsvq, keeps_origin=True, takes_storage=True),
     ".sog": Format("PlayCanvas, SuperSplat", read_sog, write_sog, in_order=in_sog_order),
     ".spz": Format("Niantic", read_spz, write_spz, in_order=in_spz_order),
@@ -140,6 +147,7 @@ FORMATS: dict[str, Format] = {
         "first viewers on the web, without spherical harmonics",
         read_splat,
         write_splat,
+        says_antialiased=False,
         in_order=lambda scene: scene,
     ),
 }

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from nsvq_lightning.io.clamping import Clamped
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
-from nsvq_lightning.io.spz_frame import MOST_FRACTION, SPZ_VERSIONS, SpzHeader, read_frame, write_frame
+from nsvq_lightning.io.spz_frame import ANTIALIASED, MOST_FRACTION, SPZ_VERSIONS, SpzHeader, read_frame, write_frame
 from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.splats.rotations import from_smallest_three, smallest_three, unit
 from nsvq_lightning.splats.sh_degree import sh_coefficients
@@ -91,7 +91,7 @@ def write_spz(path: str | os.PathLike[str], scene: CompressedScene, *, version: 
         raise ValueError(f"version of .spz must be {' or '.join(map(str, SPZ_VERSIONS))}, got {version}")
     scene = in_spz_order(scene)
     clamped = Clamped()
-    header = SpzHeader(version, len(scene), scene.sh_degree, _fraction_bits(scene))
+    header = SpzHeader(version, len(scene), scene.sh_degree, _fraction_bits(scene), ANTIALIASED * scene.antialiased)
     arrays: dict[str, NDArray[Any]] = {
         "means": _packed_means(scene, header.fraction_bits, clamped),
         "opacities": np.rint(255 * opacity_of(scene.opacities)).astype(np.uint8),
@@ -159,7 +159,9 @@ def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
         FormatError: The file is truncated, altered, of another version, or not a ``.spz`` file; or version 4 needs
             Zstandard, and it is not installed.
     """
-    return CompressedScene.from_arrays(_unpacked(*read_frame(path)))
+    header, arrays = read_frame(path)
+    config = {"antialiased": True} if header.flags & ANTIALIASED else {}
+    return CompressedScene.from_arrays(_unpacked(header, arrays), config=config)
 
 
 def _unpacked(header: SpzHeader, arrays: dict[str, NDArray[np.uint8]]) -> SplatArrays:

@@ -35,7 +35,16 @@ from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.splats.sh_degree import sh_coefficients
 
-__all__ = ["MOST_FRACTION", "SPZ_MAGICS", "SPZ_VERSIONS", "SpzHeader", "read_frame", "read_spz_header", "write_frame"]
+__all__ = [
+    "ANTIALIASED",
+    "MOST_FRACTION",
+    "SPZ_MAGICS",
+    "SPZ_VERSIONS",
+    "SpzHeader",
+    "read_frame",
+    "read_spz_header",
+    "write_frame",
+]
 
 _MAGIC = b"NGSP"
 SPZ_MAGICS = (b"\x1f\x8b", _MAGIC)
@@ -51,6 +60,8 @@ _HEAD = _HEADER.size + _TABLE_OFFSET.size
 _ENTRY = struct.Struct("<QQ")
 _MOST_A_BYTE = 1032
 """Most bytes that one byte of a deflate stream can expand to."""
+ANTIALIASED = 1
+"""The flag of a scene that was trained with anti-aliasing."""
 _EXTENDED = 2
 """The flag of extensions."""
 _EXTENSION = struct.Struct("<II")
@@ -67,7 +78,7 @@ class SpzHeader:
         count: Number of splats N.
         sh_degree: Degree of the spherical harmonics, 0 to 3.
         fraction_bits: Fractional bits of the positions.
-        flags: 1 for a scene trained with antialiasing, 2 where extensions follow.
+        flags: :data:`ANTIALIASED`, and 2 where extensions follow.
     """
 
     version: int

@@ -130,8 +130,8 @@ def change_coordinates(splats: Splats, optimizer: Optimizer, name: str, values: 
 
 
 @torch.no_grad()
-def raise_scales(splats: Splats, floor: float) -> None:
-    """Raise all log-scales below ``floor`` to it, in place; the moments stay."""
+def raise_scales(splats: Splats, floor: float | Tensor) -> None:
+    """Raise all log-scales below ``floor`` (or each splat's, ``[N, 1]``) to it, in place; the moments stay."""
     splats.scales.clamp_(min=floor)
 
 

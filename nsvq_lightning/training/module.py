@@ -77,16 +77,17 @@ class SplatModule(LightningModule):
     Args:
         sh_degree: Highest degree of the spherical harmonics, 0 to 3.
         quantizer: Makes the quantizer of an attribute from (number of codes, dimension).
-        codebooks: The paper's name for the codebook sizes ("0.5k" to "16k"), or number of codes by attribute (scales,
-            quats, sh0, shN; those left out stay unquantized), or None for plain 3D Gaussian splatting.
+        codebooks: The paper's name for their sizes ("0.5k" to "16k"), codes by attribute (scales, quats, sh0, shN;
+            others stay unquantized), or None.
         background: Colour behind the splats; ``auto``: white for NeRF-synthetic scenes, black for others; ``random``
             draws a new one each step and tests on black.
         dssim_weight: Share of 1 - SSIM in the loss; the rest is L1.
         rates: Learning rates.
         backend: Rasterizer, see :func:`nsvq_lightning.render`.
+        antialiased: Render with anti-aliasing.
         seed: Seed of every draw of the run except the order of the views.
         storage: Level of the compressed file, and how exactly it stores the scene.
-        init_from: Scene file of any format to start from instead of the scene's points; non-finite splats are left out.
+        init_from: Scene file of any format to start from, without its non-finite splats.
         splats: Splats to start from, for use from Python.
 
     Raises:
@@ -103,6 +104,7 @@ class SplatModule(LightningModule):
         dssim_weight: float = 0.2,
         rates: LearningRates = LearningRates(),  # noqa: B008  frozen
         backend: str = "auto",
+        antialiased: bool = False,
         seed: int = 0,
         storage: Storage = Storage(),  # noqa: B008  frozen
         init_from: str | None = None,
@@ -125,6 +127,7 @@ class SplatModule(LightningModule):
         self.rates = LearningRates(**rates) if isinstance(rates, Mapping) else rates
         self.storage = Storage.from_dict(storage) if isinstance(storage, Mapping) else storage
         self.backend = backend
+        self.antialiased = antialiased
         self.seed = seed
         self.init_from = init_from
         self.save_hyperparameters(ignore=["splats"])
@@ -244,7 +247,15 @@ class SplatModule(LightningModule):
         self, splats: SplatTensors, camera: Camera, background: Tensor | None, observe: Tensor | None = None
     ) -> Render:
         degree = min(self.active_sh_degree, sh_degree_of(splats.shN))
-        return render(splats, camera, sh_degree=degree, background=background, observe=observe, backend=self.backend)
+        return render(
+            splats,
+            camera,
+            sh_degree=degree,
+            background=background,
+            observe=observe,
+            antialiased=self.antialiased,
+            backend=self.backend,
+        )
 
     def _phase_splats(self, camera: Camera) -> RawSplats:
         raw = self.splats.raw()
@@ -289,6 +300,7 @@ class SplatModule(LightningModule):
             "phase_ends": list(self.schedule.ends),
             "rates": asdict(self.rates),
             "background": self.background,
+            **({"antialiased": True} if self.antialiased else {}),
             "dssim_weight": self.dssim_weight,
             "extent": self.extent,
             "seed": self.seed,

@@ -161,7 +161,8 @@ void main() {
 }`;
 
 /** A rectangle along the axes of each splat's ellipse, as large as the area where its opacity reaches 1/255. */
-const SPLAT = `#version 300 es
+/** Draws the splats; with `antialiased`, opacities shrink as the blur enlarges the ellipse, as the scene was trained. */
+const SPLAT = (antialiased) => `#version 300 es
 precision highp float;
 precision highp int;
 precision highp sampler2DArray;
@@ -198,6 +199,9 @@ void main() {
   if (!(xx + yy < 1e18)) return;
   vec3 area = cross(u, v);  // |u x v|^2 = xx yy - xy^2, without its loss of digits
   float determinant = dot(area, area) + 0.3 * (xx + yy) + 0.09;
+  float opacity = mean.w * ${antialiased ? "sqrt(dot(area, area) / determinant)" : "1.0"};
+  reach = 2.0 * log(opacity * 255.0);
+  if (!(reach > 0.0)) return;
   float half_difference = 0.5 * (xx - yy), root = length(vec2(half_difference, xy));
   float longest = 0.5 * (xx + yy) + 0.3 + root;
   vec2 axis = half_difference >= 0.0 ? vec2(half_difference + root, xy) : vec2(xy, root - half_difference);
@@ -207,7 +211,7 @@ void main() {
   vec2 pixel = lens.xy * centre.xy / z + lens.zw
     + offset.x * sqrt(longest) * axis + offset.y * sqrt(determinant / longest) * vec2(-axis.y, axis.x);
   gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0, 1);
-  colour = vec4(texelFetch(colours, at, 0).rgb, mean.w);
+  colour = vec4(texelFetch(colours, at, 0).rgb, opacity);
 }`;
 
 const BLEND = `#version 300 es
@@ -251,7 +255,7 @@ class Renderer {
     this.#upload(splats);
     this.colours = this.#target(2, ROW, this.rows);
     this.colour = this.#program(FULL_SCREEN, COLOUR(splats.shDegree), { geometry: 0, harmonics: 1 });
-    this.splat = this.#program(SPLAT, BLEND, { geometry: 0, colours: 2, order: 4 });
+    this.splat = this.#program(SPLAT(splats.header.config?.antialiased === true), BLEND, { geometry: 0, colours: 2, order: 4 });
     this.show = this.#program(FULL_SCREEN, SHOW, { picture: 3 });
     const corners = Uint16Array.from({ length: 6 * GROUP }, (_, k) => 4 * Math.floor(k / 6) + [0, 1, 2, 2, 1, 3][k % 6]);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());

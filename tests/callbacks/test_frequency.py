@@ -1,0 +1,59 @@
+"""The 3D limit: scales stay above a share of a pixel until codebooks are placed."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from lightning.pytorch import Trainer
+
+from nsvq_lightning.callbacks import FrequencyLimit, PhaseSchedule
+from nsvq_lightning.compression.pixel_size import pixel_sizes
+from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.io.formats import read_scene, save
+from nsvq_lightning.training.module import SplatModule
+
+
+def fit(scene: Path, folder: Path, steps: int) -> tuple[Trainer, SplatModule]:
+    trainer = Trainer(
+        max_steps=steps,
+        accelerator="cpu",
+        default_root_dir=folder,
+        logger=False,
+        callbacks=[PhaseSchedule(100, None, warmup_end=100, prune_end=100, quantize_end=100), FrequencyLimit(3.0)],
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    module = SplatModule(sh_degree=0, codebooks=None, antialiased=True)
+    trainer.fit(module, ColmapDataModule(str(scene)))
+    return trainer, module
+
+
+def test_no_scale_falls_below_the_limit(demo_scene: Path, tmp_path: Path) -> None:
+    trainer, module = fit(demo_scene, tmp_path, 12)
+    scene = trainer.datamodule.scene  # type: ignore[attr-defined]
+    sizes = pixel_sizes(module.splats.means.detach(), [scene.cameras[i] for i in scene.train])
+    floors = (3.0 * sizes).log()
+    seen = sizes.isfinite()
+    assert seen.float().mean() > 0.9
+    lowest = module.splats.scales.detach().min(1).values
+    assert (lowest[seen] > floors[seen] - 0.1).all()  # splats have moved a little since
+    assert (lowest[seen] < floors[seen] + 0.1).float().mean() > 0.2  # and some would have been smaller
+    save(module.compressed(), tmp_path / "a.nsvq")
+    assert read_scene(tmp_path / "a.nsvq").antialiased
+
+
+@pytest.mark.parametrize("pixels", [0.0, -1.0, math.inf, math.nan])
+def test_the_limit_is_positive(pixels: float) -> None:
+    with pytest.raises(ValueError, match="pixels must be positive and finite"):
+        FrequencyLimit(pixels)
+
+
+def test_the_limits_are_kept_in_checkpoints() -> None:
+    one, other = FrequencyLimit(), FrequencyLimit()
+    one._floor = torch.zeros(3, 1)
+    other.load_state_dict(one.state_dict())
+    assert torch.equal(other._floor, torch.zeros(3, 1))  # type: ignore[arg-type]
