@@ -1,93 +1,114 @@
-"""Floaters: splats that the photos would rather be without."""
+"""Find the splats that the photos speak against: floaters."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable
 
 import torch
 from torch import Tensor
 
-from nsvq_lightning.compression.sensitivity import sensitivity
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.masking import kept
 from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.constants import ALPHA_MAX
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors
 
-__all__ = ["floaters"]
+__all__ = ["floaters", "removal_effects"]
 
-ROUNDS = 8
-"""Most rounds: floaters hide behind each other, and spoil the pixels by which other splats are judged."""
-AT_ONCE = 0.5
-"""Share of what removals would gain that is taken in one round, the largest gains first."""
-LEAST = 4.0
-"""Gain from which on a splat is removed, as a multiple of the photos' mean error by splat."""
-CERTAINTY = 0.5
-"""Standard deviations by which the gain must exceed its estimate's noise."""
-STEEP = 1e-4
-"""Smallest derivative of an opacity by its logit that is divided by."""
+log = logging.getLogger(__name__)
+
+PROBES = 4
+"""Random signs for a picture: the estimate of a splat seen in five views has a relative error of 0.3."""
+UNWANTED = 1 / 3
+"""Share of its opacity, at most, that the photos want of a floater; 0 for one in front of a finished scene."""
+SHARE = 1e-4
+"""Share of the squared error, at least, by which removing a floater lowers it; less is not seen, and is noise."""
+FALL = 0.25
+"""Of splats in the same pixels, the worst goes first: a round takes those whose gain is this share of the largest."""
+MOST_ROUNDS = 12
+SATURATED = 250 / 255
+"""A channel of a photo from here on agrees with every brighter one."""
 
 
-@torch.no_grad()
 def floaters(
-    splats: RawSplats, views: Callable[[], Iterable[View]], render: Callable[[SplatTensors, Camera], Render]
+    splats: SplatTensors, views: Callable[[], Iterable[View]], render: Callable[[SplatTensors, Camera], Render]
 ) -> Tensor:
-    """Which splats no photo supports ``[N]``: their removal brings the pictures nearer to the photos, or is not seen.
+    """Mask ``[N]`` of the splats that no train view supports, as removing them lowers the error or changes nothing.
 
-    A pixel is linear in the opacity o of each splat, so the squared error E of all photos is a parabola in it, and
-    removing the splat alone changes it by −o·E' + o²·½E'': the gradient, and the diagonal of the Gauss-Newton matrix
-    (:func:`~nsvq_lightning.compression.sensitivity.sensitivity`). Where training has ended E' is small, and every splat
-    that shows is supported by its second term. The removals that gain most go first, then all are judged again.
+    A floater hides what is behind it, so removing that, too, would seem to help; therefore the worst ones are removed
+    first, and the others are judged again.
+
+    Args:
+        splats: Raw attributes of N splats, positions in the coordinates of the views.
+        views: Gives the train views, all of them: what only photos that are left out support would go.
+        render: The rasterizer.
+    """
+    raw = RawSplats(*(getattr(splats, name).detach() for name in RawSplats._fields))
+    left = torch.arange(len(raw.means), device=raw.means.device)
+    threshold = torch.inf
+    for number in range(MOST_ROUNDS):
+        rest = RawSplats(*(tensor[left] for tensor in raw))
+        slope, curvature, error = removal_effects(rest, views(), render, generator(0, number, "floaters"))
+        gain = torch.where(slope < 2 * (UNWANTED - 1) * curvature, -slope - curvature, 0)
+        least = SHARE * error
+        threshold = max(least, FALL * min(threshold, float(gain.amax())))
+        gone = (gain > threshold) | (curvature == 0)
+        log.info("round %d: %d of %d splats go", number + 1, int(gone.sum()), len(left))
+        left = left[~gone]
+        if threshold == least or len(left) == 0:
+            break
+    mask = torch.ones(len(raw.means), dtype=torch.bool, device=raw.means.device)
+    mask[left] = False
+    return mask
+
+
+def removal_effects(
+    splats: SplatTensors,
+    views: Iterable[View],
+    render: Callable[[SplatTensors, Camera], Render],
+    signs: torch.Generator,
+    probes: int = PROBES,
+) -> tuple[Tensor, Tensor, float]:
+    """What removing each splat, and no other one, does to the squared error of pictures.
+
+    A pixel is affine in each splat's opacity there: without the splat, the difference e between picture and photo is
+    e + Δ, with Δ = -α ∂I/∂α. So Σ e² changes by Σ 2 e Δ + Σ Δ² over all pixels and channels, exactly. One backward
+    pass has the first sum for all splats; the second one is estimated without bias as the mean square of Σ ±Δ, with
+    random signs (Hutchinson 1990). If its opacity were a share t of what it is, the error would be least at
+    t = 1 + (first sum) / (2 · second sum).
 
     Args:
         splats: Raw attributes of N splats.
-        views: Gives the train photos, all of them: what only photos that are left out support would go.
+        views: Cameras and photos; pixels that do not count have no error.
         render: The rasterizer.
+        signs: Generator of the signs, on the CPU.
+        probes: Draws of signs for each view.
+
+    Returns:
+        Both sums ``[N]``, and Σ e².
     """
-    rows = torch.arange(len(splats.means), device=splats.means.device)
-    for number in range(ROUNDS):
-        change, unseen, error = _removals(RawSplats(*(tensor[rows] for tensor in splats)), views(), render)
-        gains = change.clamp_max(0)
-        order = gains.argsort()
-        first = gains[order].cumsum(0) >= AT_ONCE * gains.sum()
-        gone = torch.zeros_like(unseen)
-        gone[order] = first
-        gone &= change < -LEAST * error / max(1, len(rows))
-        if number == 0:
-            gone |= unseen
-        rows = rows[~gone]
-        if not gone.any():
-            break
-    removed = torch.ones(len(splats.means), dtype=torch.bool, device=rows.device)
-    removed[rows] = False
-    return removed
-
-
-def _removals(
-    splats: RawSplats, views: Iterable[View], render: Callable[[SplatTensors, Camera], Render]
-) -> tuple[Tensor, Tensor, float]:
-    """By how much the error grows without each splat ``[N]``, at least; which no view shows ``[N]``; the error."""
-    opacities = splats.opacities.sigmoid()
-    by_logit = opacities / (opacities * (1 - opacities)).clamp_min(STEEP)
-    slope, bend, noise = (torch.zeros_like(opacities) for _ in range(3))
-    error = 0.0
+    # No opacity reaches the rasterizer's cap, which has no gradient.
+    cap = torch.logit(torch.tensor(ALPHA_MAX - 0.01)).item()
+    opacities = splats.opacities.detach().clamp_max(cap).requires_grad_()
+    raw = RawSplats(*(getattr(splats, name).detach() for name in RawSplats._fields))._replace(opacities=opacities)
+    # α ∂/∂α of a pixel's opacity α = σ(x) · G, from ∂/∂x.
+    scale = -1 / torch.sigmoid(-opacities.detach())
+    slope, curvature, error = torch.zeros_like(scale), torch.zeros_like(scale), 0.0
     for view in views:
-
-        def masked(some: SplatTensors, camera: Camera, mask: Tensor | None = view.mask) -> Render:
-            rendered = render(some, camera)
-            return rendered._replace(image=kept(rendered.image, mask))
-
-        logits = splats.opacities.detach().requires_grad_()
         with torch.enable_grad():
-            image = masked(splats._replace(opacities=logits), view.camera).image
-            squares = (image - eight_bit(view.image)).square().sum()
-        (gradient,) = torch.autograd.grad(squares, logits)
-        slope += by_logit * gradient
-        shown, _ = sensitivity(splats, view.camera, masked, generator(0, view.index, "signs"))
-        curvature = by_logit.square() * shown.opacities
-        bend += curvature
-        noise += curvature.square()
-        error += float(squares.detach())
-    return bend - slope + CERTAINTY * noise.sqrt(), (bend == 0) & (slope == 0), error
+            image = kept(render(raw, view.camera).image, view.mask)
+        photo = eight_bit(view.image).to(image)
+        difference = image.detach() - photo
+        difference.masked_fill_((photo >= SATURATED) & (difference > 0), 0)
+        error += float(difference.double().square().sum())
+        (gradient,) = torch.autograd.grad(image, opacities, 2 * difference, retain_graph=True)
+        slope += scale * gradient
+        for _ in range(probes):
+            draws = torch.randint(0, 2, image.shape, generator=signs, dtype=torch.int8).to(image) * 2 - 1
+            (gradient,) = torch.autograd.grad(image, opacities, draws, retain_graph=True)
+            curvature += (scale * gradient).square_() / probes
+    return slope, curvature, error

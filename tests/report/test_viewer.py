@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 from PIL import Image
 from splat_scenes import front_camera, random_splats
 
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.io.formats import load, save
+from nsvq_lightning.io.formats import read_scene, save
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.report import viewer
 from nsvq_lightning.report.viewer import write_viewer
+from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.splats.splats import RawSplats
 
 WEB = Path(viewer.__file__).parent / "web"
@@ -185,9 +187,25 @@ def _drawn(tab: Page) -> NDArray[np.uint8]:
 @torch.no_grad()
 def _psnr(drawn: NDArray[np.uint8], scene_file: Path, camera: Camera) -> float:
     """PSNR in dB of what the page drew against this package's own picture, both of 8 bits."""
-    image = render(load(scene_file), camera, background=torch.tensor(BACKGROUND)).image
+    scene = read_scene(scene_file)
+    image = render(scene.decode(), camera, background=torch.tensor(BACKGROUND), antialiased=scene.antialiased).image
     expected = (image.clamp(0, 1) * 255).round().numpy()
     return float(10 * np.log10(255**2 / np.square(drawn - expected).mean()))
+
+
+@needs_chromium
+def test_anti_aliasing_is_what_the_file_says(tab: Page, tmp_path: Path) -> None:
+    small = _splats()._replace(scales=_splats().scales - 2)
+    for antialiased in (False, True):
+        scene = CompressedScene.from_arrays(SplatArrays.from_splats(small), config={"antialiased": antialiased})
+        save(scene, tmp_path / f"{antialiased}.nsvq")
+        write_viewer(tmp_path / "viewer.html", tmp_path / f"{antialiased}.nsvq", _cameras(), "t", BACKGROUND)
+        camera = _cameras()["front"]
+        tab.open((tmp_path / "viewer.html").as_uri(), camera.width, camera.height)
+        tab.run("nsvqReady")
+        assert _psnr(_drawn(tab), tmp_path / f"{antialiased}.nsvq", camera) > 55
+        assert _psnr(_drawn(tab), tmp_path / "False.nsvq", camera) > 55 or antialiased
+    assert _psnr(_drawn(tab), tmp_path / "False.nsvq", camera) < 40
 
 
 @needs_chromium
