@@ -7,7 +7,7 @@ import shutil
 import sqlite3
 import threading
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,7 @@ class Verdict:
         points: Number of 3D points.
         error: Mean reprojection error, pixels of the photos.
         track: Mean number of photos that see a point.
-        models: Number of separate models; the largest is the scene.
+        models: Number of separate models, each with photos that no larger one has; the largest is the scene.
     """
 
     registered: tuple[str, ...]
@@ -87,10 +87,10 @@ def reconstruct(
             f"next by two thirds, be sharp, and show texture. Photos with a partner: {len(common)} of {len(names)}"
         )
     model = models[0]
-    registered = tuple(sorted(image.name for image in model.images.values() if image.has_pose))
+    registered = _registered(model)
     return Verdict(
-        registered,
-        {name: common.get(name, 0) for name in names if name not in set(registered)},
+        tuple(sorted(registered)),
+        {name: common.get(name, 0) for name in names if name not in registered},
         model.num_points3D(),
         model.compute_mean_reprojection_error(),
         model.compute_mean_track_length(),
@@ -165,7 +165,7 @@ def _map(pycolmap: Any, database: Path, scene: Path, count: int, report: Report,
         found = pycolmap.incremental_mapping(
             database, scene / "images", work, options=options, next_image_callback=count_image
         )
-        ordered = sorted(found.values(), key=lambda model: -model.num_reg_images())
+        ordered = _adding(found.values())
         shutil.rmtree(work)
         if not ordered:
             return []
@@ -175,6 +175,22 @@ def _map(pycolmap: Any, database: Path, scene: Path, count: int, report: Report,
         work.rename(sparse)
     folders = sorted((path for path in sparse.iterdir() if path.name.isdecimal()), key=lambda path: int(path.name))
     return [pycolmap.Reconstruction(folder) for folder in folders]
+
+
+def _adding(models: Iterable[Any]) -> list[Any]:
+    """The largest model, and those with photos that no larger one has; COLMAP also leaves parts of larger ones."""
+    adding: list[Any] = []
+    placed: set[str] = set()
+    for model in sorted(models, key=lambda model: -model.num_reg_images()):
+        names = _registered(model)
+        if not names <= placed:
+            adding.append(model)
+            placed |= names
+    return adding
+
+
+def _registered(model: Any) -> set[str]:
+    return {image.name for image in model.images.values() if image.has_pose}
 
 
 def _partners(database: Path) -> dict[str, int]:

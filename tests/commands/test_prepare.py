@@ -3,12 +3,14 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import PIL.Image
 import pytest
 
 from nsvq_lightning.commands.main import main
+from nsvq_lightning.data import reconstruct
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.data.synthetic import write_synthetic_scene
 
@@ -81,6 +83,16 @@ def test_photos_of_nothing_in_common_are_told(photos: Path, tmp_path: Path, caps
     said = _fails(capsys, photos, tmp_path / "scene")
     assert "no two photos show enough of the same things" in said
     assert "Photos with a partner: 0 of 3" in said
+
+
+def test_a_model_whose_photos_are_all_in_a_larger_one_is_left_out() -> None:
+    def model(*names: str) -> SimpleNamespace:
+        images = dict(enumerate(SimpleNamespace(name=name, has_pose=True) for name in names))
+        return SimpleNamespace(images=images, num_reg_images=lambda: len(names))
+
+    part, whole, other = model("b", "c"), model("a", "b", "c", "d"), model("d", "e")
+    assert reconstruct._adding([part, other, whole]) == [whole, other]
+    assert reconstruct._adding([]) == []
 
 
 @pytest.mark.slow
