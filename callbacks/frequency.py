@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import torch
 from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor
 
@@ -20,7 +19,11 @@ from .hosted import HostedCallback
 __all__ = ["FrequencyLimit"]
 
 EVERY = 100
-"""Iterations after which the sizes of pixels are looked at anew, as splats move; they also are when splats change."""
+"""Iterations after which the sizes of pixels are looked at anew, as splats move; those of new splats are at once."""
+PIXEL_SIZES = "pixel_sizes"
+"""Side table: size of a pixel in the photo that sees the splat closest, scene units; 0 where not yet looked at."""
+NO_LIMIT = 1e-30
+"""Size for splats that no photo sees."""
 
 
 class FrequencyLimit(HostedCallback):
@@ -52,12 +55,9 @@ class FrequencyLimit(HostedCallback):
         self._edits = 0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Continue with the sizes of pixels that a checkpoint has."""
+        """Look at the splats anew; what is known of them is in a side table."""
         super().on_train_start(trainer, pl_module)
-        splats = as_host(pl_module).splats
-        self._edits = splats.edits
-        if self._floor is not None:
-            self._floor = self._floor.to(splats.means.device) if len(self._floor) == len(splats) else None
+        self._floor = None
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -68,21 +68,14 @@ class FrequencyLimit(HostedCallback):
             return
         splats = host.splats
         if self._floor is None or splats.edits != self._edits or iteration % EVERY == 0:
-            sizes = pixel_sizes(splats.means.detach(), train_cameras(trainer))
-            # What no photo sees has no limit.
-            self._floor = (self.pixels * sizes).log().nan_to_num(-math.inf, -math.inf, -math.inf)[:, None]
-            self._edits = splats.edits
-        with torch.no_grad():
-            raise_scales(splats, self._floor)
+            sizes = splats.add_table(PIXEL_SIZES)
+            if iteration % EVERY == 0:
+                sizes.zero_()
+            new = (sizes == 0).nonzero()[:, 0]
+            sizes[new] = pixel_sizes(splats.means.detach()[new], train_cameras(trainer)).nan_to_num(posinf=NO_LIMIT)
+            self._floor, self._edits = (self.pixels * sizes).log()[:, None], splats.edits
+        raise_scales(splats, self._floor)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Forget the splats."""
+        """Forget the limits."""
         self._floor = None
-
-    def state_dict(self) -> dict[str, Any]:
-        """The limits in use."""
-        return {"floor": self._floor}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on with them."""
-        self._floor = state_dict["floor"]

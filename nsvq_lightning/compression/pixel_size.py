@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
-from nsvq_lightning.rendering.reference import times_vectors
 
 __all__ = ["INVISIBLE", "pixel_sizes", "scale_floor"]
 
@@ -20,6 +19,8 @@ CLOSE = 0.05
 """Share of the splats that may be seen from closer than the floor assumes."""
 SAMPLE = 1 << 16
 """Largest number of splats in the sample."""
+BATCH = 1 << 17
+"""Pairs of a splat and a view that are looked at together; they fit into a processor's cache."""
 
 
 @torch.no_grad()
@@ -30,15 +31,30 @@ def pixel_sizes(means: Tensor, cameras: Iterable[Camera]) -> Tensor:
         means: Centres ``[N, 3]``, world coordinates.
         cameras: The views.
     """
-    smallest = torch.full_like(means[:, 0], math.inf)
-    for camera in cameras:
-        fx, fy, cx, cy = camera.intrinsics
-        viewmat = camera.viewmat.to(means)
-        x, y, depth = (times_vectors(viewmat[:3, :3], means) + viewmat[:3, 3]).unbind(1)
-        u, v = fx * x / depth + cx, fy * y / depth + cy
-        seen = (depth > NEAR) & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
-        smallest = torch.where(seen, smallest.minimum(depth / max(fx, fy)), smallest)
-    return smallest
+    views = list(cameras)
+    sizes = torch.full_like(means[:, 0], math.inf)
+    if not views:
+        return sizes
+    intrinsics = torch.tensor([camera.intrinsics for camera in views], dtype=torch.float64)
+    extents = torch.tensor([(camera.width, camera.height) for camera in views], dtype=torch.float64)
+    fx, fy, cx, cy = intrinsics.T[:, :, None]
+    x, y, z = torch.stack([camera.viewmat.detach().to("cpu", torch.float64) for camera in views])[:, :3].unbind(1)
+    # Rows ``[views, 4]`` that give, of a position, its column · depth, row · depth and depth.
+    lines = [line.to(means).unsqueeze(-1).unbind(1) for line in (fx * x + cx * z, fy * y + cy * z, z)]
+    width, height, focal = torch.cat([extents, intrinsics[:, :2].amax(1, keepdim=True)], 1).to(means).T[:, :, None]
+    step = max(1, BATCH // len(views))
+    for rows in (slice(start, start + step) for start in range(0, len(means), step)):
+        batch = means[rows].unbind(1)
+        u, v, depth = (_affine(line, batch) for line in lines)
+        inside = torch.minimum(u, v).minimum(width * depth - u).minimum(height * depth - v) >= 0
+        sizes[rows] = torch.where(inside & (depth > NEAR), depth / focal, math.inf).amin(0)
+    return sizes
+
+
+def _affine(line: Sequence[Tensor], position: Sequence[Tensor]) -> Tensor:
+    """Elementwise, as a GPU may round matrix products to fewer digits (TF32)."""
+    (a, b, c, d), (x, y, z) = line, position
+    return torch.addcmul(d, a, x).addcmul_(b, y).addcmul_(c, z)
 
 
 def scale_floor(means: Tensor, cameras: Iterable[Camera], pixels: float = INVISIBLE) -> float | None:

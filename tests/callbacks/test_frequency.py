@@ -7,22 +7,29 @@ from pathlib import Path
 
 import pytest
 import torch
-from lightning.pytorch import Trainer
+from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.callbacks import FrequencyLimit, PhaseSchedule
 from nsvq_lightning.compression.pixel_size import pixel_sizes
 from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.formats import read_scene, save
+from nsvq_lightning.training.edit import append_rows
+from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.module import SplatModule
 
 
-def fit(scene: Path, folder: Path, steps: int) -> tuple[Trainer, SplatModule]:
+def fit(scene: Path, folder: Path, steps: int, *first: Callback) -> tuple[Trainer, SplatModule]:
     trainer = Trainer(
         max_steps=steps,
         accelerator="cpu",
         default_root_dir=folder,
         logger=False,
-        callbacks=[PhaseSchedule(100, None, warmup_end=100, prune_end=100, quantize_end=100), FrequencyLimit(3.0)],
+        callbacks=[
+            *first,
+            PhaseSchedule(100, None, warmup_end=100, prune_end=100, quantize_end=100),
+            FrequencyLimit(3.0),
+        ],
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
@@ -52,8 +59,25 @@ def test_the_limit_is_positive(pixels: float) -> None:
         FrequencyLimit(pixels)
 
 
-def test_the_limits_are_kept_in_checkpoints() -> None:
-    one, other = FrequencyLimit(), FrequencyLimit()
-    one._floor = torch.zeros(3, 1)
-    other.load_state_dict(one.state_dict())
-    assert torch.equal(other._floor, torch.zeros(3, 1))  # type: ignore[arg-type]
+class Doubled(Callback):
+    """Adds every splat once more, far too small."""
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: object) -> None:
+        if trainer.global_step == 5:
+            copies = {name: value.detach().clone() for name, value in as_host(pl_module).splats.attributes().items()}
+            copies["scales"] -= 10
+            append_rows(as_host(pl_module).splats, trainer.optimizers[0], copies)
+
+
+def test_new_splats_have_a_limit_at_once(demo_scene: Path, tmp_path: Path) -> None:
+    _, module = fit(demo_scene, tmp_path, 5, Doubled())
+    known, lowest = module.splats.tables()["pixel_sizes"], module.splats.scales.detach().min(1).values
+    half = len(known) // 2
+    assert (known > 0).all()
+    seen = known > 1e-20
+    assert (lowest[seen] >= (3.0 * known[seen]).log()).all()
+    # Those that were there are as they were looked at in the first step, the new ones as they are now.
+    scene = load_scene(demo_scene)
+    sizes = pixel_sizes(module.splats.means.detach(), [scene.cameras[i] for i in scene.train])
+    assert torch.equal(known[half:], sizes[half:].nan_to_num(posinf=1e-30))
+    assert not torch.equal(known[:half], sizes[:half].nan_to_num(posinf=1e-30))
