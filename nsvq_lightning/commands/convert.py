@@ -20,7 +20,7 @@ from nsvq_lightning.io.formats import FORMATS, read_scene, save
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.placing import UP_AXES, cropped, rotated, turn_up
 from nsvq_lightning.io.sog import PALETTE_LIMIT
-from nsvq_lightning.io.spz import DEFAULT_VERSION
+from nsvq_lightning.io.spz import DEFAULT_AXES, DEFAULT_VERSION, SPZ_AXES
 from nsvq_lightning.io.spz_frame import SPZ_VERSIONS
 
 if TYPE_CHECKING:
@@ -28,7 +28,12 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-_OPTIONS = {"level": ("--level", ".nsvq"), "palette": ("--palette", ".sog"), "version": ("--spz-version", ".spz")}
+_OPTIONS = {
+    "level": ("--level", ".nsvq"),
+    "palette": ("--palette", ".sog"),
+    "version": ("--spz-version", ".spz"),
+    "axes": ("--spz-axes", ".spz"),
+}
 """Options of writers: their flag here, and their format."""
 
 EPILOG = """\
@@ -87,6 +92,8 @@ def _convert(options: argparse.Namespace, chosen: dict[str, Any]) -> None:
     scene = _cleaned(read_scene(options.input).finite(), options)
     output.parent.mkdir(parents=True, exist_ok=True)
     size = save(scene, output, **chosen)
+    # What reading the output back would say of it is known here.
+    logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
     each = f", {size / len(scene):.1f} per splat" if len(scene) else ""
     sys.stdout.write(f"{output}: {len(scene):,} splats in {size:,} bytes{each}\n{_errors(scene, output)}")
 
@@ -200,6 +207,12 @@ def _parser() -> argparse.ArgumentParser:
         type=int,
         choices=SPZ_VERSIONS,
         help=f"version of .spz; {DEFAULT_VERSION} by default, which more viewers support",
+    )
+    parser.add_argument(
+        "--spz-axes",
+        dest="axes",
+        choices=SPZ_AXES,
+        help=f"axes of .spz; {DEFAULT_AXES} by default, those of .ply, as viewers take them",
     )
     parser.add_argument("--level", choices=LEVELS, help="level of .nsvq")
     parser.add_argument("--measure", action="store_true", help="render both files and say how they differ")

@@ -16,6 +16,7 @@ from nsvq_lightning.io.ply_header import PLY_MAGIC, attribute_of, splat_degree
 from nsvq_lightning.io.sog import read_sog_header
 from nsvq_lightning.io.sog_archive import META, ZIP_MAGIC
 from nsvq_lightning.io.splat import SPLAT_LAYOUT, count_splats
+from nsvq_lightning.io.spz import DEFAULT_AXES
 from nsvq_lightning.io.spz_frame import SPZ_MAGICS, read_spz_header
 
 __all__ = ["describe"]
@@ -84,7 +85,10 @@ def _describe_spz(path: Path) -> dict[str, Any]:
     header, streams = read_spz_header(path)
     encoding = "zstd" if header.version == 4 else "gzip"
     total = path.stat().st_size
-    return _facts(f"spz, version {header.version}", header.count, header.sh_degree, total, streams, encoding)
+    axes = header.axes or f"not stated, taken as {DEFAULT_AXES.upper()}"
+    return _facts(
+        f"spz, version {header.version}, axes {axes}", header.count, header.sh_degree, total, streams, encoding
+    )
 
 
 def _describe_splat(path: Path) -> dict[str, Any]:

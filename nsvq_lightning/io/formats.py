@@ -90,7 +90,8 @@ def save(
         storage: Level and precision of ``.nsvq``. For another format, the file then holds what the ``.nsvq`` file
             would decode to, so that all files of a run hold the same splats.
         options: For ``.sog``: ``palette`` (most rows of the palette for spherical harmonics without a codebook, default
-            65536). For ``.spz``: ``version`` (3 or 4, default 3).
+            65536). For ``.spz``: ``version`` (3 or 4, default 3) and ``axes`` (``rdf``, those of ``.ply``
+            and the default, or ``rub``).
 
     Returns:
         Bytes of the file.

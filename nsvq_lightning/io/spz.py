@@ -18,14 +18,17 @@ SH           3 (d² + 2d)        128 + 128 x, coefficient by coefficient, three 
 Niantic's writer first rounds spherical harmonics to 5 and 4 bits, for a smaller file; that reduced a trained scene to
 31 dB, so all 8 bits are used here.
 
-Axes are right, up, back; ours are right, down, forward, so y and z change sign, and with them the coefficients of odd
-functions of either.
+Axes: the text of the format says right, up, back (RUB), but viewers and converters take those of ``.ply``, which are
+ours: right, down, front (RDF). So these are the default, also of a file that does not say. Where others have the
+opposite direction, coordinates change sign, and with them the coefficients of odd functions.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 import os
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -34,15 +37,22 @@ from numpy.typing import NDArray
 from nsvq_lightning.io.clamping import Clamped
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
+from nsvq_lightning.io.placing import UP_AXES, rotated
 from nsvq_lightning.io.spz_frame import ANTIALIASED, MOST_FRACTION, SPZ_VERSIONS, SpzHeader, read_frame, write_frame
 from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.splats.rotations import from_smallest_three, smallest_three, unit
 from nsvq_lightning.splats.sh_degree import sh_coefficients
 
-__all__ = ["DEFAULT_VERSION", "in_spz_order", "read_spz", "write_spz"]
+__all__ = ["DEFAULT_AXES", "DEFAULT_VERSION", "SPZ_AXES", "in_spz_order", "read_spz", "write_spz"]
+
+logger = logging.getLogger(__name__)
 
 DEFAULT_VERSION = 3
 """The version that every reader of the format supports."""
+SPZ_AXES = ("rdf", "rub")
+"""Axes that are written."""
+DEFAULT_AXES = "rdf"
+"""The axes that viewers take a file to have, whatever it says."""
 _POSITION = 24
 _USUAL_FRACTION = 12
 _POSITION_ERROR = 0.05
@@ -52,9 +62,29 @@ _BLOCK = 1 << 16
 """Rows of spherical harmonics rounded at a time."""
 _ORDER = ("quats", "scales", "sh0", "shN")
 """Attributes by whose codes the splats are sorted, the most important last."""
-_FLIPPED_AXES = np.array([1.0, -1.0, -1.0])
-_FLIPPED_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)[:, None]
-"""Signs of the real spherical harmonics of degree 1 to 3 when y and z change sign, ``[15, 1]``."""
+_ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
+"""Coordinates that the real spherical harmonics of degree 1 to 3 are odd functions of."""
+
+
+@dataclass(frozen=True)
+class _Signs:
+    """What changes sign between right, down, front and other axes: coordinates ``[3]``, and what follows from them."""
+
+    axes: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, axes: str) -> _Signs:
+        return cls(np.array([1 if a == b else -1 for a, b in zip(axes, "RDF", strict=True)], np.float32))
+
+    @property
+    def quats(self) -> NDArray[np.float32]:
+        """Of quaternions wxyz ``[4]``; a rotation's axis does not mirror as positions do."""
+        return np.array([1, *(self.axes.prod() * self.axes)], np.float32)
+
+    def harmonics(self, sh_degree: int) -> NDArray[np.float32]:
+        """Of the spherical harmonics ``[coefficients, 1]``."""
+        signs = [math.prod(self.axes["xyz".index(axis)] for axis in odd) for odd in _ODD[: sh_coefficients(sh_degree)]]
+        return np.array(signs, np.float32)[:, None]
 
 
 def in_spz_order(scene: CompressedScene) -> CompressedScene:
@@ -69,7 +99,9 @@ def in_spz_order(scene: CompressedScene) -> CompressedScene:
     return scene.take(np.lexsort([np.arange(len(scene)), *codes]))
 
 
-def write_spz(path: str | os.PathLike[str], scene: CompressedScene, *, version: int = DEFAULT_VERSION) -> int:
+def write_spz(
+    path: str | os.PathLike[str], scene: CompressedScene, *, version: int = DEFAULT_VERSION, axes: str = DEFAULT_AXES
+) -> int:
     """Write a scene as ``.spz``.
 
     Positions get as many fractional bits as the smallest splats need. Splats with a non-finite value are left out
@@ -79,26 +111,34 @@ def write_spz(path: str | os.PathLike[str], scene: CompressedScene, *, version: 
         path: File to write, replaced atomically.
         scene: The scene.
         version: 3, or 4, which uses Zstandard.
+        axes: One of :data:`SPZ_AXES`: ``rdf`` (right, down, front), or ``rub`` (right, up, back).
 
     Returns:
         Bytes of the file.
 
     Raises:
-        ValueError: Another version.
+        ValueError: Another version, or other axes.
         FormatError: Version 4 needs Zstandard, and it is not installed.
     """
     if version not in SPZ_VERSIONS:
         raise ValueError(f"version of .spz must be {' or '.join(map(str, SPZ_VERSIONS))}, got {version}")
+    if axes not in SPZ_AXES:
+        raise ValueError(f"axes of .spz must be {' or '.join(SPZ_AXES)}, got {axes!r}")
     scene = in_spz_order(scene)
-    clamped = Clamped()
-    header = SpzHeader(version, len(scene), scene.sh_degree, _fraction_bits(scene), ANTIALIASED * scene.antialiased)
+    clamped, signs = Clamped(), _Signs.of(axes.upper())
+    flags, fraction = ANTIALIASED * scene.antialiased, _fraction_bits(scene)
+    # Viewers expect version 3 to be silent, in the default axes; Babylon.js turns a scene that says so upside down.
+    stated = axes.upper() if version == 4 or axes != DEFAULT_AXES else ""
+    header = SpzHeader(version, len(scene), scene.sh_degree, fraction, flags, stated)
     arrays: dict[str, NDArray[Any]] = {
-        "means": _packed_means(scene, header.fraction_bits, clamped),
+        "means": _packed_means(scene.means * signs.axes, fraction, clamped),
         "opacities": np.rint(255 * opacity_of(scene.opacities)).astype(np.uint8),
         "sh0": _packed(scene, "sh0", _COLOR * 255, 127.5, clamped),
         "scales": _packed(scene, "scales", 16, 160, clamped),
-        "quats": scene.spread("quats", lambda rows, _: _packed_quats(rows)),
-        "shN": scene.spread("shN", lambda rows, uses: _packed_sh(rows, uses, scene.sh_degree, clamped)),
+        "quats": scene.spread("quats", lambda rows, _: _packed_quats(rows * signs.quats)),
+        "shN": scene.spread(
+            "shN", lambda rows, uses: _packed_sh(rows, uses, signs.harmonics(scene.sh_degree), clamped)
+        ),
     }
     clamped.warn(path, len(scene))
     return write_frame(path, header, arrays)
@@ -118,9 +158,9 @@ def _fraction_bits(scene: CompressedScene) -> int:
     return min(max(min(needed, fits), min(_USUAL_FRACTION, mostly_fits), 0), MOST_FRACTION)
 
 
-def _packed_means(scene: CompressedScene, fraction: int, clamped: Clamped) -> NDArray[np.uint8]:
+def _packed_means(means: NDArray[np.float32], fraction: int, clamped: Clamped) -> NDArray[np.uint8]:
     end = 1 << _POSITION - 1
-    fixed = clamped.nearest("means", scene.means * (_FLIPPED_AXES * (1 << fraction)), (-end, end - 1))
+    fixed = clamped.nearest("means", means * (1 << fraction), (-end, end - 1))
     return fixed.astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3]
 
 
@@ -131,7 +171,7 @@ def _packed(scene: CompressedScene, name: str, factor: float, zero: float, clamp
 
 
 def _packed_quats(rows: NDArray[np.float32]) -> NDArray[np.uint32]:
-    largest, others = smallest_three((unit(rows) * [1, *_FLIPPED_AXES])[:, [1, 2, 3, 0]])
+    largest, others = smallest_three(unit(rows)[:, [1, 2, 3, 0]])
     packed = largest.astype(np.uint32)
     for part in others.T:
         magnitude = np.minimum(np.rint(511 * math.sqrt(2) * np.abs(part)), 511).astype(np.uint32)
@@ -140,20 +180,20 @@ def _packed_quats(rows: NDArray[np.float32]) -> NDArray[np.uint32]:
 
 
 def _packed_sh(
-    rows: NDArray[np.float32], uses: NDArray[np.int64] | None, sh_degree: int, clamped: Clamped
+    rows: NDArray[np.float32], uses: NDArray[np.int64] | None, signs: NDArray[np.float32], clamped: Clamped
 ) -> NDArray[np.uint8]:
-    coefficients = sh_coefficients(sh_degree)
-    values = rows.reshape(len(rows), coefficients, 3)
+    values = rows.reshape(len(rows), len(signs), 3)
     packed = np.empty(values.shape, np.uint8)
     for start in range(0, len(rows), _BLOCK):
         block = slice(start, start + _BLOCK)
-        flipped = 128 * _FLIPPED_SH[:coefficients] * values[block]
-        packed[block] = clamped.nearest("shN", flipped + 128, (0, 255), None if uses is None else uses[block])
+        packed[block] = clamped.nearest(
+            "shN", 128 * signs * values[block] + 128, (0, 255), None if uses is None else uses[block]
+        )
     return packed
 
 
 def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
-    """Read a ``.spz`` file of version 1 to 4; its extensions are ignored.
+    """Read a ``.spz`` file of version 1 to 4, with any axes; other extensions are ignored.
 
     Raises:
         FormatError: The file is truncated, altered, of another version, or not a ``.spz`` file; or version 4 needs
@@ -161,19 +201,29 @@ def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
     """
     header, arrays = read_frame(path)
     config = {"antialiased": True} if header.flags & ANTIALIASED else {}
-    return CompressedScene.from_arrays(_unpacked(header, arrays), config=config)
+    if not header.axes:
+        logger.info(
+            "%s: the file does not say where its axes point; taken as right, down, front, as in .ply. If it is upside "
+            "down: nsvq convert --up minus-y --up-from 0 1 0", path,
+        )  # fmt: skip
+    axes = header.axes or DEFAULT_AXES.upper()
+    turn = axes[1] in "FB"
+    if turn:  # z is up or down: signs first, then a quarter turn, as Niantic's library does it, which writes such files
+        axes = axes[0] + axes[2] + {"F": "B", "B": "F"}[axes[1]]
+    scene = CompressedScene.from_arrays(_unpacked(header, arrays, _Signs.of(axes)), config=config)
+    return rotated(scene, UP_AXES["z"]) if turn else scene
 
 
-def _unpacked(header: SpzHeader, arrays: dict[str, NDArray[np.uint8]]) -> SplatArrays:
-    coefficients = sh_coefficients(header.sh_degree)
-    sh = (arrays["shN"].reshape(header.count, coefficients, 3).astype(np.float32) - 128) / 128
+def _unpacked(header: SpzHeader, arrays: dict[str, NDArray[np.uint8]], signs: _Signs) -> SplatArrays:
+    harmonics = signs.harmonics(header.sh_degree)
+    sh = (arrays["shN"].reshape(header.count, len(harmonics), 3).astype(np.float32) - 128) / 128
     return SplatArrays(
-        means=(_unpacked_means(header, arrays["means"]) * _FLIPPED_AXES).astype(np.float32),
-        quats=_unpacked_quats(header, arrays["quats"]),
+        means=(_unpacked_means(header, arrays["means"]) * signs.axes).astype(np.float32),
+        quats=_unpacked_quats(header, arrays["quats"]) * signs.quats,
         scales=(arrays["scales"] / 16 - 10).astype(np.float32),
         opacities=logits_of_bytes(arrays["opacities"][:, 0]),
         sh0=((arrays["sh0"][:, None] / 255 - 0.5) / _COLOR).astype(np.float32),
-        shN=(sh * _FLIPPED_SH[:coefficients]).astype(np.float32),
+        shN=(sh * harmonics).astype(np.float32),
     )
 
 
@@ -196,4 +246,4 @@ def _unpacked_quats(header: SpzHeader, data: NDArray[np.uint8]) -> NDArray[np.fl
         parts = np.stack([packed >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)], axis=1)
         others = (parts & 511) / (511 * math.sqrt(2)) * np.where(parts & 512, -1, 1)
         xyzw = from_smallest_three((packed >> np.uint32(30)).astype(np.intp), others)
-    return xyzw[:, [3, 0, 1, 2]] * np.array([1, *_FLIPPED_AXES], np.float32)
+    return xyzw[:, [3, 0, 1, 2]]

@@ -1,7 +1,7 @@
 """The container of a ``.spz`` file: one gzip stream up to version 3, one Zstandard stream per array in version 4.
 
 Integers are little-endian. Up to version 3 the gzip stream holds the first 16 bytes below, the arrays, and perhaps
-extensions. Version 4:
+extensions, of which only that of the axes is read and written. Version 4:
 
 ============  ==================  ==================================================================================
 offset        bytes               content
@@ -23,7 +23,7 @@ import os
 import struct
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,9 +64,15 @@ ANTIALIASED = 1
 """The flag of a scene that was trained with anti-aliasing."""
 _EXTENDED = 2
 """The flag of extensions."""
-_EXTENSION = struct.Struct("<II")
-_AXES, _RIGHT_UP_BACK = 0xADBE0003, (0, 4)
-"""The extension that states the axes, and its value for the axes of files without it."""
+_EXTENSION = struct.Struct("<III")
+"""Type and length, then the number of the axes."""
+_AXES = 0xADBE0003
+"""The extension that states the axes."""
+_SYSTEMS = (
+    *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
+    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
+)
+"""Axes by the number that the extension holds; 0 says nothing."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +85,8 @@ class SpzHeader:
         sh_degree: Degree of the spherical harmonics, 0 to 3.
         fraction_bits: Fractional bits of the positions.
         flags: :data:`ANTIALIASED`, and 2 where extensions follow.
+        axes: Where x, y and z point: right or left, down or up, front or back, by their first letters; empty if the
+            file does not say.
     """
 
     version: int
@@ -86,6 +94,7 @@ class SpzHeader:
     sh_degree: int
     fraction_bits: int
     flags: int = 0
+    axes: str = ""
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -101,9 +110,8 @@ class SpzHeader:
 
     def pack(self) -> bytes:
         """The 16 bytes that all versions have."""
-        streams = len(self.streams) if self.version == 4 else 0
-        fields = (self.version, self.count, self.sh_degree, self.fraction_bits, self.flags, streams)
-        return _HEADER.pack(_MAGIC, *fields)
+        streams, flags = len(self.streams) if self.version == 4 else 0, self.flags | (_EXTENDED if self.axes else 0)
+        return _HEADER.pack(_MAGIC, self.version, self.count, self.sh_degree, self.fraction_bits, flags, streams)
 
 
 def write_frame(path: str | os.PathLike[str], header: SpzHeader, arrays: Mapping[str, NDArray[Any]]) -> int:
@@ -121,21 +129,22 @@ def write_frame(path: str | os.PathLike[str], header: SpzHeader, arrays: Mapping
         FormatError: Version 4 needs Zstandard, and it is not installed.
     """
     contents = [np.ascontiguousarray(arrays[name]).data.cast("B") for name in header.streams]
+    axes = _EXTENSION.pack(_AXES, 4, _SYSTEMS.index(header.axes)) if header.axes else b""
     with atomic_write(path) as file:
         if header.version == 4:
             with naming_file(path):
                 streams = [zstd.compress(content) for content in contents]
             table = (_ENTRY.pack(len(s), len(c)) for s, c in zip(streams, contents, strict=True))
-            file.writelines([header.pack(), _TABLE_OFFSET.pack(_HEAD), *table, *streams])
+            file.writelines([header.pack(), _TABLE_OFFSET.pack(_HEAD + len(axes)), axes, *table, *streams])
         else:
             # No file name and no time stamp: the same scene gives the same bytes.
             with gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as stream:
-                stream.writelines([header.pack(), *contents])
+                stream.writelines([header.pack(), *contents, axes])
         return file.tell()
 
 
 def read_frame(path: str | os.PathLike[str]) -> tuple[SpzHeader, dict[str, NDArray[np.uint8]]]:
-    """Header and arrays ``[N, bytes per splat]`` by name; extensions are ignored.
+    """Header and arrays ``[N, bytes per splat]`` by name; extensions other than that of the axes are ignored.
 
     Raises:
         FormatError: The file is truncated, altered, of another version, or not a ``.spz`` file; or version 4 needs
@@ -151,7 +160,9 @@ def read_frame(path: str | os.PathLike[str]) -> tuple[SpzHeader, dict[str, NDArr
 
 
 def read_spz_header(path: str | os.PathLike[str]) -> tuple[SpzHeader, dict[str, int]]:
-    """Header, and the size in bytes of each part of the file; the arrays are not decoded.
+    """Header, and the size in bytes of each part of the file.
+
+    The arrays are not decoded; up to version 3 they are unpacked where extensions follow them.
 
     Raises:
         FormatError: The file is truncated, of another version, or not a ``.spz`` file.
@@ -160,9 +171,11 @@ def read_spz_header(path: str | os.PathLike[str]) -> tuple[SpzHeader, dict[str, 
     with naming_file(path), open(path, "rb") as file:
         start = file.read(1 << 12)
         if not start.startswith(_MAGIC):
-            return _parse_stream(zlib.decompressobj(wbits=31), start, total), {"all": total}
+            header = _parse_stream(zlib.decompressobj(wbits=31), start, total)
+            return _unzip(start + file.read())[0] if header.flags & _EXTENDED else header, {"all": total}
         header, offset = _parse_head(start, total)
-        file.seek(offset)
+        file.seek(_HEAD)
+        header = _with_axes(header, file.read(offset - _HEAD))
         lengths = _lengths(header, file.read(_ENTRY.size * len(header.streams)), total - offset)
     return header, {"header": total - sum(lengths.values()), **lengths}
 
@@ -170,8 +183,7 @@ def read_spz_header(path: str | os.PathLike[str]) -> tuple[SpzHeader, dict[str, 
 def _unpack(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
     """Header and arrays of version 4."""
     header, offset = _parse_head(data, len(data))
-    if header.flags & _EXTENDED:
-        _check_axes(data[_HEAD:offset])
+    header = _with_axes(header, data[_HEAD:offset])
     start = offset + _ENTRY.size * len(header.streams)
     contents = {}
     for name, length in _lengths(header, data[offset:start], len(data) - offset).items():
@@ -205,19 +217,17 @@ def _lengths(header: SpzHeader, table: bytes, rest: int) -> dict[str, int]:
     return lengths
 
 
-def _check_axes(extensions: bytes) -> None:
-    """Refuse a file that declares axes other than right, up, back."""
+def _with_axes(header: SpzHeader, extensions: bytes) -> SpzHeader:
+    """The header with the axes that the extensions state."""
     start = 0
-    while start + _EXTENSION.size <= len(extensions):
-        kind, length = _EXTENSION.unpack_from(extensions, start)
-        content = extensions[start + _EXTENSION.size :][:length]
-        if kind == _AXES and int.from_bytes(content, "little") not in _RIGHT_UP_BACK:
-            raise FormatError(
-                f"coordinate system {int.from_bytes(content, 'little')} of the extension for axes; this release reads "
-                "right, up, back",
-                "save it in those, or as .ply",
-            )
-        start += _EXTENSION.size + length
+    while header.flags & _EXTENDED and start + _EXTENSION.size <= len(extensions):
+        kind, length, system = _EXTENSION.unpack_from(extensions, start)
+        if (kind, length) == (_AXES, 4):
+            if system >= len(_SYSTEMS):
+                raise FormatError(f"damaged, or newer than this release: coordinate system {system}, not 0 to 16")
+            return replace(header, axes=_SYSTEMS[system])
+        start += 8 + length
+    return header
 
 
 def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
@@ -230,10 +240,13 @@ def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
         if len(contents[name]) < size:
             raise FormatError(f"truncated: {name} of {header.count} splats has {len(contents[name])} of {size} bytes")
     # Extensions follow the arrays; reading to the end of the stream verifies its checksum.
+    extensions = b""
     while not gunzip.eof:
-        if not _inflate(gunzip, gunzip.unconsumed_tail, 1 << 16) and not gunzip.eof:
+        part = _inflate(gunzip, gunzip.unconsumed_tail, 1 << 16)
+        if not part and not gunzip.eof:
             raise FormatError("truncated: the gzip stream has no end")
-    return header, contents
+        extensions = extensions or part
+    return _with_axes(header, extensions), contents
 
 
 def _parse_stream(gunzip: zlib._Decompress, data: bytes, file_bytes: int) -> SpzHeader:

@@ -96,11 +96,16 @@ def test_a_conversion_says_what_it_lost(
 
 
 @needs_zstd
-def test_the_version_of_spz_is_chosen(tmp_path: Path) -> None:
+def test_version_and_axes_of_spz_are_chosen(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     save(coded_scene(30, 1), tmp_path / "a.nsvq")
-    for options, version in (([], 3), (["--spz-version", "3"], 3), (["--spz-version", "4"], 4)):
+    for options, version, axes in (
+        ([], 3, ""),
+        (["--spz-version", "3", "--spz-axes", "rub"], 3, "RUB"),
+        (["--spz-version", "4"], 4, "RDF"),
+    ):
         assert main([str(tmp_path / "a.nsvq"), str(tmp_path / "b.spz"), *options]) == 0
-        assert read_spz_header(tmp_path / "b.spz")[0].version == version
+        header, _ = read_spz_header(tmp_path / "b.spz")
+        assert (header.version, header.axes, caplog.text) == (version, axes, "")
 
 
 def test_measuring_says_how_the_pictures_differ(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -142,6 +147,7 @@ def test_errors_in_files_are_one_line_and_status_1(
         (["a.nsvq", "b.ply", "--palette", "8"], "--palette is an option of .sog files"),
         (["a.nsvq", "b.sog", "--level", "paper"], "--level is an option of .nsvq files"),
         (["a.nsvq", "b.sog", "--spz-version", "4"], "--spz-version is an option of .spz files"),
+        (["a.nsvq", "b.ply", "--spz-axes", "rub"], "--spz-axes is an option of .spz files"),
         (["a.nsvq", "b.sog", "--data.root", "x"], "add --measure"),
     ],
 )

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 import torch
 from ring import cameras_around
-from viewer_scenes import angles, coded_scene, nearest_in, needs_zstd, plain_scene, sigmoid
+from scipy.spatial.transform import Rotation
+from viewer_scenes import angles, assert_same, coded_scene, nearest_in, needs_zstd, plain_scene, sigmoid
 
 from nsvq_lightning.commands.info import main as info
 from nsvq_lightning.compression.pictures import decibels, picture_error, pictures
@@ -23,12 +24,13 @@ from nsvq_lightning.io import CompressedScene, FormatError, SplatArrays, load, r
 from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.sog import write_sog
 from nsvq_lightning.io.spz_frame import read_spz_header
+from nsvq_lightning.rendering.sh import sh_basis
 
 SUFFIXES = (".splat", ".spz", ".sog")
 SH_C0 = 0.28209479177387814
 
 
-def round_trip(scene: CompressedScene, path: Path, **options: int) -> tuple[SplatArrays, SplatArrays]:
+def round_trip(scene: CompressedScene, path: Path, **options: int | str) -> tuple[SplatArrays, SplatArrays]:
     """What was read, and what was written in the order of the file."""
     assert save(scene, path, **options) == path.stat().st_size
     read, written = read_scene(path).arrays(), scene.arrays()
@@ -138,41 +140,64 @@ def test_sog_clusters_a_codebook_with_more_rows_than_labels(tmp_path: Path) -> N
     assert np.unique(back.codes["shN"], return_counts=True)[1].tolist() == [n // 8] * 8
 
 
-def read_scene_of(scene: CompressedScene, path: Path, **options: int) -> CompressedScene:
+def read_scene_of(scene: CompressedScene, path: Path, **options: int | str) -> CompressedScene:
     save(scene, path, **options)
     return read_scene(path)
 
 
-def test_spz_has_the_axes_right_up_back(tmp_path: Path) -> None:
-    """Oracle: the picture of a scene turned by 180° about x is that of the turned coefficients."""
+SYSTEMS = ["RDF", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"]
+
+
+@pytest.mark.parametrize(("number", "axes"), [*enumerate(SYSTEMS), (12, "RFU")])
+def test_spz_has_the_axes_that_it_states(tmp_path: Path, number: int, axes: str) -> None:
+    """Oracle: axes are mapped by their letters; shapes and colours turn with what they are seen along."""
     path = tmp_path / "x.spz"
-    scene = plain_scene(1, 3)
-    turned = read_scene_of(scene, path).arrays()
-    stream = gzip.decompress(path.read_bytes())
-    x, y, z = (int.from_bytes(stream[16 + 3 * i : 19 + 3 * i], "little", signed=True) for i in range(3))
-    scale = 1 << stream[13]
-    np.testing.assert_allclose(np.array([x, -y, -z]) / scale, scene.means[0], atol=1 / scale)
-    stored = (np.frombuffer(stream[-45:], np.uint8).astype(np.float64).reshape(15, 3) - 128) / 128
-    rng = np.random.default_rng(0)
-    for direction in rng.normal(size=(5, 3)):
-        direction /= np.linalg.norm(direction)
-        ours = _basis(direction) @ turned.shN[0]
-        theirs = _basis(direction * [1, -1, -1]) @ stored
-        np.testing.assert_allclose(theirs, ours, atol=1e-6)
+    save(plain_scene(5), path, axes="rub")
+    content = gzip.decompress(path.read_bytes())
+    assert content[-12:] == struct.pack("<III", 0xADBE0003, 4, 4)
 
+    def stating(system: int) -> SplatArrays:
+        path.write_bytes(gzip.compress(content[:-4] + struct.pack("<I", system)))
+        return read_scene(path).arrays()
 
-def _basis(direction: np.ndarray) -> np.ndarray:
-    """Spherical harmonics of degree 1 to 3, from their polynomials up to factors (which do not matter here)."""
-    x, y, z = direction
-    return np.array(
-        [
-            *(-y, z, -x),
-            *(x * y, -y * z, 2 * z * z - x * x - y * y, -x * z, x * x - y * y),
-            *(-y * (3 * x * x - y * y), x * y * z, -y * (4 * z * z - x * x - y * y)),
-            z * (2 * z * z - 3 * x * x - 3 * y * y),
-            *(-x * (4 * z * z - x * x - y * y), z * (x * x - y * y), -x * (x * x - 3 * y * y)),
-        ]
+    stored, read = stating(6), stating(number)
+    opposite = dict(zip("RLDUFB", "LRUDBF", strict=True))
+    to_ours = np.array([[(a == own) - (a == opposite[own]) for a in axes] for own in "RDF"])
+    np.testing.assert_allclose(read.means, stored.means @ to_ours.T, atol=1e-6)
+    theirs, ours = (
+        turn * np.exp(a.scales)[:, None] @ turn.transpose(0, 2, 1)
+        for a in (stored, read)
+        for turn in [Rotation.from_quat(a.quats, scalar_first=True).as_matrix()]
     )
+    np.testing.assert_allclose(ours, to_ours @ theirs @ to_ours.T, atol=1e-5)
+    directions = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    seen, meant = (
+        np.einsum("dk,kc->dc", sh_basis(torch.tensor(d), 3)[:, 1:].numpy(), a.shN[0])
+        for d, a in ((directions, read), (directions @ to_ours, stored))
+    )
+    np.testing.assert_allclose(seen, meant, atol=1e-5)
+
+
+@pytest.mark.parametrize("version", [3, pytest.param(4, marks=needs_zstd)])
+def test_spz_has_the_axes_of_ply_unless_told_otherwise(
+    tmp_path: Path, version: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    path, scene = tmp_path / "x.spz", plain_scene(1)
+    caplog.set_level(logging.INFO)
+    turned = read_scene_of(scene, path, version=version, axes="rub").arrays()
+    assert (read_spz_header(path)[0].axes, caplog.text) == ("RUB", "")
+    silent = version == 3  # which all viewers show upright
+    plain = read_scene_of(scene, path, version=version).arrays()
+    assert read_spz_header(path)[0].axes == ("" if silent else "RDF")
+    assert describe(path)["format"] == f"spz, version {version}, axes {'not stated, taken as ' if silent else ''}RDF"
+    assert ("x.spz: the file does not say where its axes point; taken as right, down, front" in caplog.text) == silent
+    assert_same(turned, plain)
+    if version == 3:
+        x = int.from_bytes(gzip.decompress(path.read_bytes())[19:22], "little", signed=True)
+        assert x / (1 << read_spz_header(path)[0].fraction_bits) == plain.means[0, 1]
+    with pytest.raises(ValueError, match=r"axes of \.spz must be rdf or rub, got 'luf'"):
+        save(scene, path, axes="luf")
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -191,12 +216,12 @@ def test_spz_of_older_versions(tmp_path: Path, version: int) -> None:
     path = tmp_path / "x.spz"
     path.write_bytes(gzip.compress(header + body + b"extensions"))
     read = load(path)
-    np.testing.assert_allclose(read.means.detach().numpy(), means * [1, -1, -1])
+    np.testing.assert_allclose(read.means.detach().numpy(), means)
     assert read.opacities.tolist() == [-20, 20]
     np.testing.assert_allclose(read.scales.detach().numpy(), 0)
     np.testing.assert_allclose(read.sh0[0, 0].tolist(), [-0.5 / 0.15, 0.5 / 255 / 0.15, 0.5 / 0.15], atol=1e-6)
     half = 1 / 255
-    np.testing.assert_allclose(read.quats[0].tolist(), [0, 1, -half, -half], atol=1e-6)
+    np.testing.assert_allclose(read.quats[0].tolist(), [0, 1, half, half], atol=1e-6)
 
 
 @pytest.mark.parametrize(("extent", "log_scale", "bits"), [(10.0, -5.0, 12), (0.01, -11.0, 20), (3e4, -3.0, 8)])
@@ -236,7 +261,7 @@ def test_values_out_of_range_are_clamped_and_counted(
     assert ("clamped to it" in caplog.text) == bool(expected)
     if suffix == ".spz":
         assert read.scales.min() == -10
-        assert read.shN.min() == -127 / 128  # the sign of this coefficient changes with the axes
+        assert read.shN.min() == -1
     if suffix == ".sog":
         np.testing.assert_allclose(read.sh0, written.sh0, atol=0.05)
 
