@@ -67,12 +67,14 @@ def _describe_ply(path: Path) -> dict[str, Any]:
     with naming_file(path):
         sh_degree = splat_degree(header)
     sizes: dict[str, int] = {}
-    for name in header.properties:
-        attribute = attribute_of(name)
-        sizes[attribute] = sizes.get(attribute, 0) + header.count * header.dtype[name].itemsize
+    for table in [header, *(header.others[name] for name in ("sh",) if header.packed and name in header.others)]:
+        for name in table.properties:
+            attribute = attribute_of(name)
+            sizes[attribute] = sizes.get(attribute, 0) + table.count * table.dtype[name].itemsize
     # The lengths of ascii numbers vary, so only the total is known.
-    streams = {"header": header.offset, **sizes} if header.encoding != "ascii" else {"text": total}
-    return _facts(f"ply, {header.encoding}", header.count, sh_degree, total, streams, "ply")
+    streams = {"header": total - sum(sizes.values()), **sizes} if header.encoding != "ascii" else {"text": total}
+    name = "compressed" if header.packed else header.encoding
+    return _facts(f"ply, {name}", header.count, sh_degree, total, streams, "ply")
 
 
 def _describe_sog(path: Path) -> dict[str, Any]:

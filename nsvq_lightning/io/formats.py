@@ -13,6 +13,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.io.ply import read_ply, write_ply
+from nsvq_lightning.io.ply_header import read_ply_header
 from nsvq_lightning.io.sog import in_sog_order, read_sog, write_sog
 from nsvq_lightning.io.splat import read_splat, write_splat
 from nsvq_lightning.io.spz import in_spz_order, read_spz, write_spz
@@ -35,7 +36,6 @@ class Format:
         read: Scene from a file; codebooks are kept where the format has them.
         write: ``write(path, scene, **options) -> bytes written``.
         keeps_origin: Whether the file holds the origin that positions are relative to.
-        says_antialiased: Whether the file can say that a scene is to be rendered with anti-aliasing.
         takes_storage: Whether ``write`` has an option ``storage``, the level and precision.
         in_order: Gives the splats of a scene that a file holds, in file order, for comparison with what is read back;
             None if the format loses nothing, or states its errors itself.
@@ -46,7 +46,6 @@ class Format:
     write: Callable[..., int]
     keeps_origin: bool = False
     takes_storage: bool = False
-    says_antialiased: bool = True
     in_order: Callable[[CompressedScene], CompressedScene] | None = None
 
 
@@ -97,21 +96,18 @@ def save(
         Bytes of the file.
 
     Raises:
-        ValueError: Unknown suffix.
+        ValueError: Unknown suffix, or one that is only read.
         TypeError: The format has no such option.
     """
     path = Path(path)
+    if path.name.lower().endswith(".compressed.ply"):
+        raise ValueError(f"cannot write {path}: compressed .ply files are only read; .sog and .spz are smaller")
     entry = _format_of(path, "write")
     if not isinstance(scene, CompressedScene):
         scene = CompressedScene.from_arrays(SplatArrays.from_splats(scene))
     scene = scene.finite()
     if any(scene.origin) and not entry.keeps_origin:
         logger.warning("%s: the origin %s of the positions is not stored; add it in the viewer", path, scene.origin)
-    if scene.antialiased and not entry.says_antialiased:
-        logger.warning(
-            "%s: the file cannot say that the scene was trained with anti-aliasing: switch it on in the viewer, or "
-            "small splats look too thick", path,
-        )  # fmt: skip
     if entry.takes_storage:
         options["storage"] = storage or Storage()
     elif storage is not None:
@@ -128,11 +124,14 @@ def _format_of(path: Path, action: str) -> Format:
 
 
 def _read_ply(path: Path) -> CompressedScene:
-    return CompressedScene.from_arrays(read_ply(path))
+    splats = read_ply(path)
+    return CompressedScene.from_arrays(
+        splats, config={"antialiased": True} if read_ply_header(path).antialiased else {}
+    )
 
 
 def _write_ply(path: Path, scene: CompressedScene) -> int:
-    return write_ply(path, scene.arrays())
+    return write_ply(path, scene.arrays(), scene.antialiased)
 
 
 def _write_nsvq(path: Path, scene: CompressedScene, *, storage: Storage) -> int:
@@ -140,7 +139,7 @@ def _write_nsvq(path: Path, scene: CompressedScene, *, storage: Storage) -> int:
 
 
 FORMATS: dict[str, Format] = {
-    ".ply": Format("3D Gaussian Splatting", _read_ply, _write_ply, says_antialiased=False),
+    ".ply": Format("3D Gaussian Splatting", _read_ply, _write_ply),
     ".nsvq": Format("compressed scene of this package", read_nsvq, _write_nsvq, keeps_origin=True, takes_storage=True),
     ".sog": Format("PlayCanvas, SuperSplat", read_sog, write_sog, in_order=in_sog_order),
     ".spz": Format("Niantic", read_spz, write_spz, in_order=in_spz_order),
@@ -148,7 +147,6 @@ FORMATS: dict[str, Format] = {
         "first viewers on the web, without spherical harmonics",
         read_splat,
         write_splat,
-        says_antialiased=False,
         in_order=lambda scene: scene,
     ),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -12,22 +13,25 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.errors import FormatError, naming_file
-from nsvq_lightning.io.opacity import finite_logits
-from nsvq_lightning.io.ply_header import PlyHeader, read_ply_header, splat_degree, splat_properties
+from nsvq_lightning.io.opacity import finite_logits, logits_of_bytes
+from nsvq_lightning.io.ply_header import MIP_COMMENTS, PlyHeader, read_ply_header, splat_degree, splat_properties
 from nsvq_lightning.splats.arrays import SplatArrays
+from nsvq_lightning.splats.rotations import from_smallest_three
 from nsvq_lightning.splats.sh_degree import sh_coefficients
 
 __all__ = ["plain_ply_bytes", "read_ply", "read_ply_columns", "read_ply_size", "write_ply"]
 
 _ROWS = 1 << 12
 """Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene."""
+_SH_C0 = 0.5 / math.sqrt(math.pi)
 
 
 def read_ply(path: str | os.PathLike[str]) -> SplatArrays:
     """Read the splats of a ``.ply`` file.
 
     Properties may come in any order and any number type, binary (either byte order) or ascii; with or without normals.
-    The number of ``f_rest`` properties gives the SH degree, 0 to 3; other properties and elements are skipped.
+    The number of ``f_rest`` properties gives the SH degree, 0 to 3; other properties and elements are skipped. A
+    compressed ``.ply`` of PlayCanvas is known by its header.
 
     Raises:
         FormatError: The file is truncated, or not a ``.ply`` of Gaussian splats.
@@ -35,6 +39,8 @@ def read_ply(path: str | os.PathLike[str]) -> SplatArrays:
     header, _ = read_ply_size(path)
     with naming_file(path):
         sh_degree = splat_degree(header)
+        if header.packed:
+            return _read_packed(path, header, sh_degree)
     splats = _empty(header.count, sh_degree)
     start = 0
     for table in read_ply_columns(path, header, splat_properties(sh_degree)):
@@ -71,17 +77,18 @@ def read_ply_size(path: str | os.PathLike[str]) -> tuple[PlyHeader, int]:
     return header, file_bytes
 
 
-def write_ply(path: str | os.PathLike[str], splats: SplatArrays) -> int:
+def write_ply(path: str | os.PathLike[str], splats: SplatArrays, antialiased: bool = False) -> int:
     """Write splats as little-endian ``.ply``, 62 float32 per splat at SH degree 3.
 
     Args:
         path: File to write, replaced atomically.
         splats: The scene; :func:`nsvq_lightning.save` leaves out non-finite splats, on which viewers fail.
+        antialiased: Say in comments that they were trained with anti-aliasing.
 
     Returns:
         Bytes of the file.
     """
-    header = _header_text(len(splats), splats.sh_degree)
+    header = _header_text(len(splats), splats.sh_degree, antialiased)
     with atomic_write(path) as file:
         file.write(header)
         for start in range(0, len(splats), _ROWS):
@@ -108,9 +115,12 @@ def _property_names(sh_degree: int) -> list[str]:
     ]
 
 
-def _header_text(count: int, sh_degree: int) -> bytes:
+def _header_text(count: int, sh_degree: int, antialiased: bool = False) -> bytes:
+    comments = "".join(f"comment {key} {value}\n" for key, value in MIP_COMMENTS.items()) if antialiased else ""
     properties = "".join(f"property float {name}\n" for name in _property_names(sh_degree))
-    return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n".encode("ascii")
+    return f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {count}\n{properties}end_header\n".encode(
+        "ascii"
+    )
 
 
 def _rows(splats: SplatArrays, rows: slice) -> NDArray[np.float32]:
@@ -133,6 +143,8 @@ def _check_room(header: PlyHeader, file_bytes: int) -> None:
     # An ascii value takes at least one digit and one separator; the last separator may be missing.
     row_bytes = 2 * len(header.properties) if header.encoding == "ascii" else header.dtype.itemsize
     needed = header.offset + header.count * row_bytes - (header.encoding == "ascii" and header.count > 0)
+    if header.packed:
+        needed = max(needed, *(header.others[name].end for name in ("chunk", "sh") if name in header.others))
     if needed > file_bytes:
         raise FormatError(f"truncated: {header.count} vertices need {needed} bytes, the file has {file_bytes}")
 
@@ -160,6 +172,48 @@ def _read_ascii(file: BinaryIO, header: PlyHeader, columns: list[int]) -> Iterat
             f"expected {header.count} lines of {len(header.properties)} values, got {' x '.join(map(str, table.shape))}"
         )
     yield table[:, columns].astype(np.float32)
+
+
+def _read_packed(path: str | os.PathLike[str], header: PlyHeader, sh_degree: int) -> SplatArrays:
+    """The splats of a compressed ``.ply``; 256 that follow each other share a row of bounds."""
+    chunks, vertices = (
+        np.fromfile(path, table.dtype, table.count, offset=table.offset) for table in (header.others["chunk"], header)
+    )
+
+    def within(parts: NDArray[np.float64], names: Sequence[str]) -> NDArray[np.float64]:
+        """Shares of the ways from the smallest to the largest values of the chunk, ``[N, 3]``."""
+        ends = (np.stack([chunks[f"{end}_{name}"] for name in names], 1, dtype=np.float64) for end in ("min", "max"))
+        low, high = (np.repeat(end, 256, axis=0)[: header.count] for end in ends)
+        return low * (1 - parts) + high * parts
+
+    rotations, colors = vertices["packed_rotation"], _parts(vertices["packed_color"], 8, 8, 8, 8)
+    rgb = within(colors[:, :3], "rgb") if "min_r" in header.others["chunk"].properties else colors[:, :3]
+    others = (_parts(rotations, 10, 10, 10) - 0.5) * math.sqrt(2)
+    shN = np.zeros((header.count, 0, 3), np.float32)
+    if sh_degree:
+        sh = header.others["sh"]
+        rows = np.fromfile(path, sh.dtype, sh.count, offset=sh.offset)
+        # Bytes stand for the middles of 256ths, the first and the last for the ends.
+        values = (8 * (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1] - 0.5)).astype(np.float32)
+        columns = [values[rows[f"f_rest_{i}"]] for i in range(3 * sh_coefficients(sh_degree))]
+        shN = np.stack(columns, axis=1).reshape(header.count, 3, -1).transpose(0, 2, 1)
+    return SplatArrays(
+        means=within(_parts(vertices["packed_position"], 11, 10, 11), "xyz").astype(np.float32),
+        quats=from_smallest_three((rotations >> 30).astype(np.intp), others),
+        scales=within(
+            _parts(vertices["packed_scale"], 11, 10, 11), [f"scale_{axis}" for axis in "xyz"]
+        ).astype(np.float32),
+        opacities=logits_of_bytes((vertices["packed_color"] & 255).astype(np.uint8)),
+        sh0=((rgb[:, None] - 0.5) / _SH_C0).astype(np.float32),
+        shN=np.ascontiguousarray(shN),
+    )  # fmt: skip
+
+
+def _parts(words: NDArray[np.uint32], *bits: int) -> NDArray[np.float64]:
+    """Numbers of so many bits, the last one in the lowest, as shares of the largest ``[N, len(bits)]``."""
+    shifts = np.cumsum((0, *bits[:0:-1]))[::-1]
+    shares = [(words >> shift) % (1 << size) / ((1 << size) - 1) for size, shift in zip(bits, shifts, strict=True)]
+    return np.stack(shares, axis=1)
 
 
 def _empty(count: int, sh_degree: int) -> SplatArrays:

@@ -90,7 +90,8 @@ def write_sog(path: str | os.PathLike[str], scene: CompressedScene, *, palette: 
         "version": 2,
         "asset": {"generator": "nsvq-lightning"},
         "count": count,
-        **({"antialias": True} if scene.antialiased else {}),
+        # The second is how it was said before; readers know one of them.
+        **({"model": "antialiased", "antialias": True} if scene.antialiased else {}),
         "means": {**means, "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scale_levels, "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
@@ -235,7 +236,8 @@ def read_sog(path: str | os.PathLike[str]) -> CompressedScene:
             raw["shN"] = np.zeros((count, 0), np.float32)
         means = _unpacked_means(meta, *(archive.texels(_file(meta, "means", i), count) for i in range(2)))
         opacities = logits_of_bytes(colors[:, 3])
-        config = {"antialiased": True} if meta.get("antialias") is True else {}
+        antialiased = meta.get("model") == "antialiased" or meta.get("antialias") is True
+        config = {"antialiased": True} if antialiased else {}
         return CompressedScene(means, opacities, codes, codebooks, raw, degree, config)
 
 

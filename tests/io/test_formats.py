@@ -37,6 +37,10 @@ def test_options_reach_the_format(tmp_path: Path) -> None:
 def test_unknown_suffix_lists_what_is_supported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"'\.obj'; supported are \.ply .*\.nsvq"):
         save(scene(1, 0), tmp_path / "x.obj")
+    for name in ("x.Compressed.ply", "x.ksplat"):
+        with pytest.raises(ValueError, match=rf"cannot write .*{name}: "):
+            save(scene(1, 0), tmp_path / name)
+        assert not (tmp_path / name).exists()
     with pytest.raises(ValueError, match=r"cannot read .*unknown suffix ''"):
         load(tmp_path / "x")
 

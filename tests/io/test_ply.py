@@ -136,6 +136,8 @@ def test_every_truncation_is_one_clear_error(tmp_path: Path) -> None:
         (b"property float opacity", b"property list uchar float opacity", "holds lists"),
         (b"property float nx", b"property float x", "'x' twice"),
         (b"property float f_rest_8\n", b"", "0, 9, 24 or 45"),
+        (b"f_rest_0\n", b"f_rest_00\n", r"x\.ply: .*; got 9, among them f_rest_00"),
+        (b"f_rest_8\n", b"f_rest_\xb2\n", r"x\.ply: .*; got 9, among them f_rest_"),
         (b"end_header\n", b"end_heather\n", "no end_header"),
     ],
 )
@@ -165,3 +167,51 @@ def test_random_damage_never_ends_in_another_error(tmp_path: Path) -> None:
         except FormatError:
             refused += 1
     assert refused > 250
+
+
+def _packed(**counts: int) -> bytes:
+    """Two compressed splats, all of whose bits are 0, with harmonics of degree 1."""
+    bounds = [f"{end}_{part}{axis}" for part in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
+    elements = [
+        ("chunk", 1, [f"float {name}" for name in bounds]),
+        ("vertex", 2, [f"uint packed_{name}" for name in ("position", "rotation", "scale", "color")]),
+        ("sh", 2, [f"uchar f_rest_{i}" for i in range(9)]),
+    ]
+    text = "ply\nformat binary_little_endian 1.0\n"
+    for name, count, properties in elements:
+        text += f"element {name} {counts.get(name, count)}\n" + "".join(f"property {line}\n" for line in properties)
+    return text.encode() + b"end_header\n" + struct.pack("<12f", *range(12)) + bytes(2 * 16 + 2 * 9)
+
+
+def test_a_compressed_ply_is_known_by_its_header(tmp_path: Path) -> None:
+    path = tmp_path / "x.ply"
+    path.write_bytes(_packed())
+    read = read_ply(path)
+    np.testing.assert_array_equal(read.means, [[0, 1, 2]] * 2)
+    np.testing.assert_array_equal(read.scales, [[6, 7, 8]] * 2)
+    np.testing.assert_allclose(read.quats, [[0, *[-(0.5**0.5)] * 3]] * 2, atol=1e-6)  # of no unit length: damaged
+    np.testing.assert_array_equal(read.opacities, [-20, -20])
+    np.testing.assert_allclose(read.sh0, -np.sqrt(np.pi))
+    np.testing.assert_array_equal(read.shN, np.full((2, 3, 3), -4))
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (_packed()[:-1], "truncated: 2 vertices need"),
+        (_packed(vertex=10**9), "truncated: 1000000000 vertices need"),
+        (_packed(sh=10**9), "truncated: 2 vertices need"),
+        (_packed(chunk=0), "damaged: 2 compressed splats, 0 chunks of 256, harmonics of 2"),
+        (_packed(sh=1), "damaged: 2 compressed splats, 1 chunks of 256, harmonics of 1"),
+        (_packed().replace(b"uint packed_scale", b"int packed_scale"), "no property packed_scale of type u4"),
+        (_packed().replace(b"min_scale_x", b"min_scale_q"), "no property min_scale_x of type f4"),
+        (_packed().replace(b"uchar f_rest_3", b"char f_rest_3"), "no property f_rest_3 of type u1"),
+        (_packed().replace(b"f_rest_3", b"f_rest_9"), "got 9, among them f_rest_9"),
+        (_packed().replace(b"binary_little_endian", b"ascii"), "ascii"),
+    ],
+)
+def test_damaged_compressed_ply(tmp_path: Path, data: bytes, message: str) -> None:
+    path = tmp_path / "x.ply"
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match=rf"x\.ply: .*{message}"):
+        read_ply(path)
