@@ -88,12 +88,12 @@ def read_table(path: Path) -> SplatArrays:
     return arrays
 
 
-def assert_same(theirs: SplatArrays, ours: SplatArrays, rotation: float = 2e-6) -> None:
+def assert_same(theirs: SplatArrays, ours: SplatArrays, rotation: float = 2e-6, opacity: float = 2e-6) -> None:
     """Two readers found the same numbers, row for row, up to their floating-point arithmetic."""
     np.testing.assert_allclose(theirs.means, ours.means, rtol=2e-6, atol=2e-6)
     np.testing.assert_allclose(theirs.scales, ours.scales, rtol=0, atol=2e-6)
     np.testing.assert_allclose(theirs.sh0, ours.sh0, rtol=0, atol=2e-6)
-    np.testing.assert_allclose(sigmoid(theirs.opacities), sigmoid(ours.opacities), rtol=0, atol=2e-6)
+    np.testing.assert_allclose(sigmoid(theirs.opacities), sigmoid(ours.opacities), rtol=0, atol=opacity)
     np.testing.assert_allclose(theirs.shN, ours.shN, rtol=0, atol=1e-6)
     assert angles(theirs.quats, ours.quats).max() <= rotation
 
