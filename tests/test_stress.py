@@ -131,13 +131,16 @@ def test_inf_scale_is_named_and_dropped(log_scale: float, backend: str, caplog: 
     assert splats.scales.max() == -2.0
 
 
-def test_the_largest_size_that_is_kept_trains() -> None:
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("log_scale", [18.0, 21.5, 24.5, 28.0, LARGEST_LOG_SCALE])
+def test_the_largest_sizes_that_are_kept_train(log_scale: float, antialiased: bool) -> None:
     """On the near plane, where a splat covers most pixels; plain torch overflows there, and then drops the splat."""
     camera = SCENES["one splat"].workload.camera
     place = camera.position + (1.01 * NEAR) * camera.viewmat[2, :3]
-    splat = _one_splat(LARGEST_LOG_SCALE)._replace(means=place[None])
+    splat = _one_splat(log_scale)._replace(means=place[None])
     leaves = RawSplats(*(tensor.requires_grad_() for tensor in splat))
-    gradients = torch.autograd.grad(render(leaves, camera, backend="cpu").image.square().sum(), leaves)
+    image = render(leaves, camera, antialiased=antialiased, backend="cpu").image
+    gradients = torch.autograd.grad(image.square().sum(), leaves)
     assert all(bool(gradient.isfinite().all()) for gradient in gradients)
     assert gradients[RawSplats._fields.index("scales")].any()
 

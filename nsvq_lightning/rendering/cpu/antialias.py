@@ -82,6 +82,9 @@ def keep_light_backward(threads, camera, means, quats, scales, ids, count, gradi
             squared, area, size, added, n = light(u, v)
             # At the floor, and where the blur does not count, the factor is constant.
             free = (size < broadcast(HUGE_FOOTPRINT)) & (squared > broadcast(LEAST))
+            # A huge splat's v × n would overflow, and 0 · ∞ is not 0.
+            u = select(free, u[0], zero), select(free, u[1], zero), select(free, u[2], zero)
+            v = select(free, v[0], zero), select(free, v[1], zero), select(free, v[2], zero)
             whole = area + added
             g = select(free, load(gradient, start) * vsqrt(squared) / whole, zero)
             by_area = select(free, g * added / area, zero)
