@@ -150,6 +150,7 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Restore the signal handlers in any case."""
+        super().teardown(trainer, pl_module, stage)
         self._signals.release()
 
     def _save(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -8,7 +8,7 @@ from typing import ClassVar
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.training.host import check_optimizer, splat_host
-from nsvq_lightning.training.run_folder import is_trial, run_folder, take
+from nsvq_lightning.training.run_folder import hold, is_trial, let_go, run_folder, take
 
 __all__ = ["HostedCallback", "WritingCallback"]
 
@@ -70,6 +70,13 @@ class WritingCallback(HostedCallback):
         if stage not in self.stages:
             return
         if self.folder is None:
-            run_folder(trainer)
-        elif not is_trial(trainer):
+            folder = run_folder(trainer)
+            if trainer.is_global_zero and not is_trial(trainer):
+                hold(folder)  # again, if an earlier stage of the run has ended
+        elif trainer.is_global_zero and not is_trial(trainer):
             take(Path(self.folder), trainer.ckpt_path)
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Let go of the folder: nothing is written after this."""
+        if stage in self.stages:
+            let_go(run_folder(trainer) if self.folder is None else Path(self.folder))

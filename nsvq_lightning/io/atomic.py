@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-__all__ = ["atomic_path", "atomic_write", "write_text"]
+__all__ = ["atomic_path", "atomic_write", "remove_temporaries", "write_text"]
 
 
 @contextmanager
@@ -37,7 +37,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     if not target.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: the folder {target.parent} does not exist; create it first")
     # Not mkstemp: it creates files that only their owner can read, and renaming would keep that.
-    temporary = target.parent / f".{secrets.token_hex(8)}.tmp"
+    temporary = target.parent / f".{os.getpid()}-{secrets.token_hex(8)}.tmp"
     try:
         yield temporary
         _sync(temporary, os.O_RDWR)  # not read-only: Windows flushes only files that are open for writing
@@ -69,6 +69,18 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write a text file as UTF-8 in one step, see :func:`atomic_write`."""
     with atomic_write(path) as file:
         file.write(text.encode())
+
+
+def remove_temporaries(folder: Path, process: str) -> None:
+    """Remove what a killed process has left unfinished.
+
+    Args:
+        folder: Where to look, in folders inside it, too.
+        process: Number of the process, which does not run any more; what is no number is the number of none.
+    """
+    if process.isdecimal():
+        for path in folder.rglob(f".{process}-*.tmp"):
+            path.unlink(missing_ok=True)
 
 
 def _sync(path: Path, access: int) -> None:

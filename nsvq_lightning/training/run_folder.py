@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import atexit
+import errno
+import logging
+import os
+import platform
+import sys
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
+from typing import TextIO
 from weakref import WeakKeyDictionary
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
-__all__ = ["claim_version", "is_trial", "reserve", "run_folder", "take"]
+from nsvq_lightning.io.atomic import remove_temporaries
+
+__all__ = ["claim_version", "hold", "is_trial", "let_go", "reserve", "run_folder", "take"]
+
+log = logging.getLogger(__name__)
 
 RUN_FILES = (
     "scene.nsvq",
@@ -26,6 +38,15 @@ RUN_FILES = (
 LOG = "metrics.csv"
 """File of Lightning's CSV logger, which removes an existing one."""
 
+MARKER = ".running"
+"""File that the process of a run keeps locked; it names that process and its machine."""
+
+_LOCKED_BYTE = 1 << 20
+"""On Windows, what is locked cannot be read: lock a byte beyond the text."""
+
+_HELD: dict[Path, TextIO] = {}
+"""The locked marker of each folder that this process writes a run to."""
+
 _FOLDERS: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
 _RESERVED: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
 
@@ -39,7 +60,8 @@ def run_folder(trainer: Trainer) -> Path:
     process must make.
 
     Raises:
-        FileExistsError: The folder holds another run. The run of the checkpoint that a fit continues from is its own.
+        FileExistsError: The folder holds another run, or another process writes to it. The run of the checkpoint that a
+            fit continues from is its own.
     """
     folder = _FOLDERS.get(trainer)
     if folder is None:
@@ -92,23 +114,104 @@ def claim_version(parent: Path) -> Path:
 
 
 def take(folder: Path, checkpoint: str | Path | None) -> None:
-    """Create the folder if needed; set aside the log of the run in it, before a CSV logger removes it.
+    """Create the folder if needed and hold it; set aside the log of the run in it, before a CSV logger removes it.
 
     Args:
         folder: Folder that was given for a run.
         checkpoint: Checkpoint that a fit continues from, if any.
 
     Raises:
-        FileExistsError: It holds a run, and the checkpoint is not in it.
+        FileExistsError: It holds a run, and the checkpoint is not in it; or another process writes to it.
     """
-    if any((folder / name).exists() for name in RUN_FILES):
-        if checkpoint is None or not Path(checkpoint).resolve().is_relative_to(folder.resolve()):
-            raise FileExistsError(
-                f"{folder} already holds a run, and no run is overwritten: name another folder or version, or none "
-                "to take the next free one"
-            )
-        _set_aside(folder / LOG)
+    _refuse_other_run(folder, checkpoint)
     folder.mkdir(parents=True, exist_ok=True)
+    hold(folder)
+    _refuse_other_run(folder, checkpoint)  # one that has come and gone in between
+    _set_aside(folder / LOG)
+
+
+def hold(folder: Path) -> None:
+    """Keep other processes from writing a run to a folder until :func:`let_go`, or until this process ends, however.
+
+    Only one process can lock the marker, and the system unlocks it when that ends: what a killed run has left is an
+    unlocked marker, and temporary files, which are removed.
+
+    Raises:
+        FileExistsError: Another process holds the folder.
+    """
+    if folder.resolve() in _HELD:
+        return
+    path = folder / MARKER
+    while True:
+        file = path.open("a+", encoding="utf-8", errors="replace")
+        try:
+            _lock(file)
+            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                break
+        except (BlockingIOError, PermissionError):
+            file.seek(0)
+            owner = file.read().strip() or "that has just started"
+            file.close()
+            raise FileExistsError(
+                f"another run is writing to {folder} now, process {owner}: wait until it has ended, or name another "
+                "folder"
+            ) from None
+        except FileNotFoundError:
+            pass
+        file.close()  # whoever held it has just removed it
+    file.seek(0)
+    remove_temporaries(folder, file.read().partition(" ")[0])
+    file.truncate(0)
+    file.write(f"{os.getpid()} on {platform.node()}\n")
+    file.flush()
+    _HELD[folder.resolve()] = file
+
+
+def let_go(folder: Path) -> None:
+    """Let other processes write to a folder that this one holds; does nothing otherwise."""
+    file = _HELD.pop(folder.resolve(), None)
+    if file is not None:
+        with suppress(OSError):  # Windows removes no open file; an unlocked one does no harm
+            (folder / MARKER).unlink()
+        file.close()
+
+
+@atexit.register
+def _let_go_of_all() -> None:
+    for folder in list(_HELD):
+        let_go(folder)
+
+
+def _lock(file: TextIO) -> None:
+    """Lock an open file until it is closed.
+
+    Raises:
+        BlockingIOError: Another process has locked it; on Windows a PermissionError.
+    """
+    if sys.platform == "win32":
+        import msvcrt
+
+        file.seek(_LOCKED_BYTE)
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        return
+    import fcntl
+
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
+            raise
+        log.warning("this file system has no locks: make sure that no two runs are given the same folder")
+
+
+def _refuse_other_run(folder: Path, checkpoint: str | Path | None) -> None:
+    if not any((folder / name).exists() for name in RUN_FILES):
+        return
+    if checkpoint is None or not Path(checkpoint).resolve().is_relative_to(folder.resolve()):
+        raise FileExistsError(
+            f"{folder} already holds a run, and no run is overwritten: name another folder or version, or none "
+            "to take the next free one"
+        )
 
 
 def _given(trainer: Trainer) -> Path | None:
@@ -125,7 +228,9 @@ def _choose(trainer: Trainer) -> Path:
         return _RESERVED.pop(trainer)
     folder = _given(trainer)
     if folder is None:
-        return claim_version(Path(trainer.default_root_dir) / _scene_name(trainer))
+        folder = claim_version(Path(trainer.default_root_dir) / _scene_name(trainer))
+        hold(folder)
+        return folder
     take(folder, trainer.ckpt_path if trainer.state.fn == "fit" else None)
     return folder
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +18,8 @@ from nsvq_lightning.callbacks import ExportScene, MetricReport, PhaseSchedule, R
 from nsvq_lightning.commands.benchmark.fitting import quiet_trainer
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.training.run_folder import claim_version, run_folder
+from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.training.run_folder import _HELD, MARKER, claim_version, hold, let_go, run_folder, take
 
 
 class Elsewhere(Logger):
@@ -48,6 +53,7 @@ def test_every_run_gets_the_next_version_whatever_the_logger(
         folder = run_folder(trainer)
         assert folder == tmp_path / "runs" / demo_scene.name / f"version_{version}"
         assert {"scene.nsvq", "curve.csv", "checkpoints/last.ckpt"} <= contents(folder).keys()
+        assert MARKER not in contents(folder)
         found.append(contents(folder))
     assert contents(tmp_path / "runs" / demo_scene.name / "version_0") == found[0]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["runs"]
@@ -95,6 +101,74 @@ def test_runs_that_start_together_get_different_folders(tmp_path: Path, monkeypa
     (tmp_path / "version_notes").mkdir()
     monkeypatch.setattr(Path, "glob", lambda *_: iter(()))  # another run was faster between the look and the claim
     assert claim_version(tmp_path).name == "version_3"
+
+
+def taken_by(
+    folder: Path, processes: int, then: Callable[[], object] = lambda: None, checkpoint: Path | None = None
+) -> list[str]:
+    """What each of some processes is told that take a folder at once, and live until the last one has tried."""
+    fork = multiprocessing.get_context("fork")
+    told, barrier = fork.SimpleQueue(), fork.Barrier(processes)
+
+    def one() -> None:
+        _HELD.clear()  # what the forked one holds is not theirs
+        barrier.wait()
+        try:
+            take(folder, checkpoint)
+            message = "taken"
+        except FileExistsError as error:
+            message = str(error)
+        barrier.wait()
+        told.put(message)
+        then()
+
+    started = [fork.Process(target=one) for _ in range(processes)]
+    for process in started:
+        process.start()
+    messages = [told.get() for _ in started]
+    for process in started:
+        process.join()
+    return messages
+
+
+def test_of_runs_that_take_one_folder_at_once_one_gets_it(tmp_path: Path) -> None:
+    for number in range(2):
+        folder = tmp_path / str(number)
+        won, *lost = sorted(taken_by(folder, 6), key=lambda message: message != "taken")
+        assert won == "taken"
+        assert len(lost) == 5
+        assert all(f"another run is writing to {folder} now, process " in message for message in lost)
+
+
+def test_a_killed_run_holds_no_folder_and_what_it_left_unfinished_goes(tmp_path: Path) -> None:
+    def unfinished() -> None:
+        with atomic_write(tmp_path / "renders" / "a.png"):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    (tmp_path / "renders").mkdir()
+    last = tmp_path / "renders" / "last.ckpt"
+    foreign = tmp_path / f".{os.getpid()}-0123.tmp"
+    foreign.touch()  # of a process that still runs
+    assert taken_by(tmp_path, 1, unfinished, last) == ["taken"]
+    assert (tmp_path / MARKER).exists()
+    assert len(list(tmp_path.rglob("*.tmp"))) == 2
+    take(tmp_path, last)
+    assert list(tmp_path.rglob("*.tmp")) == [foreign]
+    assert taken_by(tmp_path, 1, checkpoint=last) == [
+        f"another run is writing to {tmp_path} now, process {os.getpid()} on {os.uname().nodename}: wait until it has "
+        "ended, or name another folder"
+    ]
+    let_go(tmp_path)
+    assert not (tmp_path / MARKER).exists()
+
+
+def test_nobody_continues_a_run_in_its_folder_while_it_trains(tmp_path: Path) -> None:
+    (tmp_path / "scene.nsvq").touch()
+    hold(tmp_path)
+    (message,) = taken_by(tmp_path, 1, checkpoint=tmp_path / "checkpoints" / "last.ckpt")
+    assert "another run is writing" in message
+    let_go(tmp_path)
+    assert taken_by(tmp_path, 1, checkpoint=tmp_path / "checkpoints" / "last.ckpt") == ["taken"]
 
 
 def test_one_trainer_has_one_folder(tmp_path: Path) -> None:
