@@ -25,7 +25,7 @@ from nsvq_lightning.commands.registry import COMMANDS
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.skips import SKIPS, switch, switched
-from nsvq_lightning.training.checkpoints import read_checkpoint
+from nsvq_lightning.training.checkpoints import check_settings, read_checkpoint
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_trial, reserve, run_folder
 from nsvq_lightning.training.trainer import SplatTrainer
@@ -176,8 +176,11 @@ class SplatCLI(LightningCLI):
             FileNotFoundError: There is no such checkpoint.
         """
         path = self.config[self.config.subcommand].get("ckpt_path")
-        if path is not None and path.partition(":")[0] not in NAMED_CHECKPOINTS and "://" not in path:
-            read_checkpoint(path)
+        remote = path is not None and (path.partition(":")[0] in NAMED_CHECKPOINTS or "://" in path)
+        if path is not None and (not remote or Path(path).is_file()):
+            settings = read_checkpoint(path).get("hyper_parameters", {})
+            if self.config.subcommand != "fit":
+                check_settings(path, settings, [argument.partition("=")[2] or argument for argument in self._arguments])
         if self.config.subcommand != "fit":
             super()._parse_ckpt_path()
             own = [self.config.subcommand, *_options_of("model", self._arguments)]

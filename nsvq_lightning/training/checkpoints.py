@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict, is_dataclass
+from operator import attrgetter
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -15,7 +17,10 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from nsvq_lightning.io.errors import FormatError
 
-__all__ = ["PlainCheckpointIO", "plain", "read_checkpoint"]
+__all__ = ["PlainCheckpointIO", "check_settings", "plain", "read_checkpoint"]
+
+NEVER_IMPORTED = ("init_from", "codebooks", "_instantiator")
+"""Settings of a module whose text, whatever it is, is only text; Lightning and :func:`check_settings` know the last."""
 
 WAY_OUT = "pass a checkpoint that nsvq fit has written, …/checkpoints/last.ckpt"
 
@@ -70,6 +75,52 @@ def _check_contents(path: Path, checkpoint: Any) -> None:
     if not {"splats.means", "state._phase"} <= state.keys():
         first = ", ".join(list(state)[:3]) or "nothing"
         raise FormatError(f"{path}: a checkpoint of another model, which has {first} but no splats", WAY_OUT)
+
+
+def check_settings(path: Any, settings: Mapping[str, Any], named: Collection[str] = ()) -> None:
+    """Check that making a module from the settings of a checkpoint imports nothing.
+
+    The parser would import whatever they name. What is named by the user, on the command line or in Python, has been
+    imported before.
+
+    Args:
+        path: The checkpoint, for messages.
+        settings: Its hyper-parameters.
+        named: Texts on the command line.
+
+    Raises:
+        FormatError: They name something that has not been imported, or that was not made to be named.
+    """
+    if settings.get("_instantiator") not in (None, "lightning.pytorch.cli.instantiate_module"):
+        raise FormatError(f"{path}: refused, it names the function {settings['_instantiator']}", WAY_OUT)
+    for option, text in _texts("model", {k: v for k, v in settings.items() if k not in NEVER_IMPORTED}):
+        if text not in named and not _is_harmless(text):
+            raise FormatError(
+                f"{path}: refused, its {option} is {text}, and a checkpoint may not import what it names",
+                f"if you trust that code, name it: --{option}={text}, or import it first in Python",
+            )
+
+
+def _texts(option: str, value: Any) -> Iterator[tuple[str, str]]:
+    """All texts among settings, each with the command-line option that sets it."""
+    if isinstance(value, str):
+        yield option, value
+    elif isinstance(value, Mapping | list | tuple):
+        for key, part in value.items() if isinstance(value, Mapping) else enumerate(value):
+            yield from _texts(option if key in ("class_path", "init_args") else f"{option}.{key}", part)
+
+
+def _is_harmless(text: str) -> bool:
+    """Whether a text is a plain word, or the name of something that has been imported from where it was defined."""
+    if re.fullmatch(r"[\w+-]*", text):
+        return not Path(text).is_file()  # the parser would read settings from it
+    root, _, rest = text.partition(".")
+    try:
+        found = attrgetter(rest)(sys.modules[root])
+    except (KeyError, AttributeError):
+        return False
+    # Else torch.os.system would be part of torch.
+    return root not in sys.stdlib_module_names and str(getattr(found, "__module__", "")).partition(".")[0] == root
 
 
 class PlainCheckpointIO(TorchCheckpointIO):

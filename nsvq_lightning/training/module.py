@@ -7,10 +7,11 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
-from typing import Any, Literal, cast
+from typing import Any, Literal, Self, cast
 
 import torch
 from lightning.pytorch import LightningModule
+from lightning.pytorch.utilities.model_helpers import _restricted_classmethod
 from torch import Tensor, nn
 from torchmetrics import Metric
 
@@ -41,7 +42,7 @@ from nsvq_lightning.training.branch import (
     check_continuation,
     continued_schedule,
 )
-from nsvq_lightning.training.checkpoints import plain
+from nsvq_lightning.training.checkpoints import PlainCheckpointIO, check_settings, plain
 from nsvq_lightning.training.edit import finite_splats
 from nsvq_lightning.training.optim import (
     LearningRates,
@@ -149,6 +150,24 @@ class SplatModule(LightningModule):
         self._updates = True
         self._late_loss: tuple[str, LateNumber] | None = None
         self._micro_batch = 0
+
+    @_restricted_classmethod
+    def load_from_checkpoint(cls, checkpoint_path: Any, *args: Any, **settings: Any) -> Self:
+        """Lightning's, which would also import what the checkpoint names; here only the user names what to import.
+
+        Args:
+            checkpoint_path: File or address.
+            *args: Lightning's arguments.
+            **settings: Those by name, and arguments of this class that replace the checkpoint's.
+
+        Raises:
+            FormatError: The checkpoint is damaged, or its settings name something that has not been imported.
+        """
+        stored = (
+            PlainCheckpointIO().load_checkpoint(os.fspath(checkpoint_path)).get(cls.CHECKPOINT_HYPER_PARAMS_KEY, {})
+        )
+        check_settings(checkpoint_path, {name: value for name, value in stored.items() if name not in settings})
+        return super().load_from_checkpoint(checkpoint_path, *args, **settings)
 
     def __setattr__(self, name: str, value: Any) -> None:
         # Lightning writes it before and after each of some thirty hooks of a step; nn.Module would look for a

@@ -279,6 +279,26 @@ def test_export_reads_no_scene(finished: Path, tmp_path: Path) -> None:
     assert len(load(tmp_path / "out.ply")) > 0
 
 
+def test_only_the_command_line_names_what_is_imported(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    mark = tmp_path / "mark"
+    (tmp_path / "foreign.py").write_text(
+        f"from nsvq_lightning import quantize\nopen({str(mark)!r}, 'w')\nclass Mine(quantize.NSVQ): ...\n"
+    )
+    checkpoint = torch.load(finished / "checkpoints" / "last.ckpt", weights_only=True)
+    checkpoint["hyper_parameters"]["quantizer"]["class_path"] = "foreign.Mine"
+    torch.save(checkpoint, tmp_path / "last.ckpt")
+    for command in (["export"], ["predict", "--data.root=nowhere"]):
+        assert main([*command, "--ckpt_path=last.ckpt"]) == 1
+        assert "name it: --model.quantizer=foreign.Mine, or" in capsys.readouterr().err
+        assert not mark.exists()
+    assert main(["export", "--ckpt_path=last.ckpt", "--model.quantizer=foreign.Mine"]) == 0
+    assert mark.exists()
+    assert read_nsvq(tmp_path / "scene.nsvq").config["quantizers"]["sh0"] == "Mine"
+
+
 def test_options_win_over_the_checkpoint_in_export(finished: Path, tmp_path: Path) -> None:
     arguments = ["export", f"--ckpt_path={finished / 'checkpoints' / 'last.ckpt'}"]
     for level in ("compact", "paper"):

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.training.checkpoints import PlainCheckpointIO, read_checkpoint
+from nsvq_lightning.training.checkpoints import PlainCheckpointIO, check_settings, read_checkpoint
+from nsvq_lightning.training.module import SplatModule
 
 SCENE = {"splats.means": torch.arange(300.0).view(100, 3), "state._phase": torch.tensor(0)}
 
@@ -68,6 +69,51 @@ def test_code_is_not_run(tmp_path: Path) -> None:
     assert not mark.exists()
     torch.load(path, weights_only=False)  # it would have been
     assert mark.is_dir()
+
+
+NSVQ = "nsvq_lightning.quantize.NSVQ"
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"quantizer": "evilmod.f"},
+        {"quantizer": {"class_path": "evilmod.f"}},
+        {"quantizer.class_path": "evilmod.f"},
+        {"quantizer": '{"class_path": "evilmod.f"}'},
+        {"quantizer": {"class_path": NSVQ, "init_args": {"start": ["evilmod.f"]}}},
+        {"quantizer": "evil.yaml"},
+        {"quantizer": "evil"},
+        {"quantizer": "os.system"},
+        {"quantizer": "torch.os.system"},
+        {"rates": {"class_path": "evilmod.f"}},
+        {"_class_path": "evilmod.f"},
+        {"_instantiator": "evilmod.f"},
+    ],
+    ids=str,
+)
+def test_a_checkpoint_imports_nothing(
+    settings: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "evilmod.py").write_text("open('mark', 'w')\n")
+    for name in ("evil", "evil.yaml"):
+        (tmp_path / name).write_text("class_path: evilmod.f\n")
+    write(
+        tmp_path / "a.ckpt", hyper_parameters={"_instantiator": "lightning.pytorch.cli.instantiate_module"} | settings
+    )
+    with pytest.raises(FormatError, match=r"^a.ckpt: refused, it"):
+        SplatModule.load_from_checkpoint("a.ckpt")
+    assert not (tmp_path / "mark").exists()
+
+
+def test_what_the_user_has_named_is_loaded() -> None:
+    for settings in ({"quantizer": f"{__name__}.Harmful"}, {"init_from": "old.ply", "codebooks": "0.5k"}):
+        check_settings("a.ckpt", settings)
+    with pytest.raises(FormatError, match=r"its model.quantizer.table is a/b.txt, .*: --model.quantizer.table=a/b.txt"):
+        check_settings("a.ckpt", {"quantizer": {"class_path": NSVQ, "init_args": {"table": "a/b.txt"}}})
+    check_settings("a.ckpt", {"quantizer": {"class_path": NSVQ, "init_args": {"table": "a/b.txt"}}}, ["a/b.txt"])
 
 
 def test_what_is_no_checkpoint_of_this_package_is_refused(tmp_path: Path) -> None:
