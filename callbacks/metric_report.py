@@ -35,6 +35,7 @@ from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.run_folder import is_trial, run_folder
 from nsvq_lightning.training.schedule import next_iteration
+from nsvq_lightning.training.train_views import scene_of
 
 from .hosted import WritingCallback
 from .watchers import tell_watchers
@@ -224,9 +225,14 @@ class MetricReport(WritingCallback):
         scores = float(outputs["psnr"]), float(outputs["ssim"])
         self._scores.append(ViewScore(batch.name, *scores, lpips, *corrected_scores))
         if self.pictures:
-            path = _picture(self._folder, batch.name)
+            path = self._picture(trainer, batch.name)
             path.parent.mkdir(exist_ok=True)
             write_png(path, comparison(image, photo))
+
+    def _picture(self, trainer: Trainer, view: str) -> Path:
+        """File of the picture of a view."""
+        scene = scene_of(trainer)
+        return self._folder / "renders" / f"{file_stem(view, scene.names if scene is not None else ())}.png"
 
     def _lpips_of(self, image: Tensor, photo: Tensor) -> float | None:
         if self._lpips is None:
@@ -245,21 +251,17 @@ class MetricReport(WritingCallback):
             metrics = summarize(folder / "scene.nsvq", self._scene, scores, lpips, host, self._paper_level)
             write_metrics(folder / "metrics.json", metrics)
             write_views(folder / "views.csv", scores)
-            page = replace(self._page(folder, host), metrics=metrics, views=[asdict(score) for score in scores])
-            log.info("report: %s", page.write())
+            pictures = [self._picture(trainer, score.name) for score in scores]
+            views = [asdict(score) | {"picture": path.name} for score, path in zip(scores, pictures, strict=True)]
+            log.info("report: %s", replace(self._page(folder, host), metrics=metrics, views=views).write())
             if self.pictures:
-                log_pictures(trainer.loggers, [_picture(folder, score.name) for score in scores], trainer.global_step)
+                log_pictures(trainer.loggers, pictures, trainer.global_step)
         self._scene, self._lpips = None, None
 
 
 def _preview(path: Path, image: Tensor, photo: Tensor) -> None:
     """Write the photo beside the render."""
     write_png(path, torch.cat([photo, image], dim=1))
-
-
-def _picture(folder: Path, view: str) -> Path:
-    """File of the picture of a view."""
-    return folder / "renders" / f"{file_stem(view)}.png"
 
 
 def _mean(scores: list[ViewScore], name: str) -> float:

@@ -10,6 +10,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.report.pictures import file_stem, write_png
 from nsvq_lightning.training.run_folder import is_trial, run_folder
+from nsvq_lightning.training.train_views import scene_of
 
 __all__ = ["RenderWriter"]
 
@@ -60,7 +61,9 @@ class RenderWriter(Callback):
         """Write one picture."""
         if is_trial(trainer):
             return
-        write_png(self._target / f"{file_stem(outputs['name'])}.png", outputs["image"])
+        scene = scene_of(trainer)
+        stem = file_stem(outputs["name"], scene.names if scene is not None else ())
+        write_png(self._target / f"{stem}.png", outputs["image"])
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Say where the pictures are."""

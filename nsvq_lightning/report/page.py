@@ -22,7 +22,6 @@ from nsvq_lightning.training.schedule import Phase, Schedule
 from nsvq_lightning.version import __version__
 
 from .curve_svg import curve_svg
-from .pictures import file_stem
 
 __all__ = ["RunPage"]
 
@@ -45,7 +44,7 @@ class RunPage:
         seconds: Seconds that went into anything but training steps, by what it was.
         metrics: The content of ``metrics.json``, see :func:`nsvq_lightning.report.files.summarize`; None before it
             is known.
-        views: One row for each test view, as in ``views.csv``.
+        views: One row for each test view, as in ``views.csv``, with ``picture``, the name of its file in ``renders/``.
     """
 
     folder: Path
@@ -113,7 +112,7 @@ class RunPage:
         worst = min((row["psnr"] for row in self.views), default=0.0)
         shown = []
         for row in self.views:
-            path = self.folder / "renders" / f"{file_stem(row['name'])}.png"
+            path = self.folder / "renders" / row["picture"]
             if path.exists():
                 remark = ", the lowest" if row["psnr"] == worst and len(self.views) > 1 else ""
                 caption = f"{escape(row['name'])}: {_decibels(row['psnr'])}, SSIM {row['ssim']:.4f}{remark}"

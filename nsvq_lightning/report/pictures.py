@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
+from functools import lru_cache
+from hashlib import sha256
 from pathlib import Path
+from unicodedata import normalize
 
 import torch
 from torch import Tensor
@@ -12,10 +17,45 @@ from nsvq_lightning.io.atomic import atomic_write
 
 __all__ = ["comparison", "file_stem", "write_png"]
 
+LONGEST = 120
+"""Bytes of a file name without suffix; file systems take 143 to 255 with it."""
 
-def file_stem(name: str) -> str:
-    """File name without suffix for a view: folders of its name become underscores."""
-    return str(Path(name).with_suffix("")).replace("/", "_").replace("\\", "_")
+
+def file_stem(name: str, names: tuple[str, ...] = ()) -> str:
+    """File name without suffix for a view: folders of its name become underscores.
+
+    A name that is too long, or would be that of another view too where case makes no difference, ends in a digest.
+
+    Args:
+        name: Of the view.
+        names: Of all views whose files go into one folder.
+    """
+    return _file_stems(names if name in names else (name,))[name]
+
+
+@lru_cache(maxsize=8)
+def _file_stems(names: tuple[str, ...]) -> dict[str, str]:
+    plain = {name: str(Path(name).with_suffix("")).replace("/", "_").replace("\\", "_") for name in names}
+    uses = Counter(_folded(stem) for stem in plain.values())
+    return {
+        name: stem if uses[_folded(stem)] == 1 and _is_plain(stem) else _digested(name, stem)
+        for name, stem in plain.items()
+    }
+
+
+def _folded(stem: str) -> str:
+    """What file systems that do not tell case or composed characters apart make of a name."""
+    return normalize("NFKC", normalize("NFKC", stem).casefold())
+
+
+def _is_plain(stem: str) -> bool:
+    return len(stem.encode(errors="surrogateescape")) <= LONGEST and not re.search("~[0-9a-f]{12}$", _folded(stem))
+
+
+def _digested(name: str, stem: str) -> str:
+    digest = sha256(name.encode(errors="surrogateescape")).hexdigest()[:12]
+    start = stem.encode(errors="surrogateescape")[: LONGEST - len(digest) - 1].decode(errors="ignore")
+    return f"{start}~{digest}"
 
 
 def comparison(image: Tensor, photo: Tensor, gain: float = 4.0) -> Tensor:

@@ -2,7 +2,9 @@ from __future__ import annotations
 
 import base64
 import math
+import os
 import re
+import unicodedata
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ import torch
 
 from nsvq_lightning.report.curve_svg import curve_svg
 from nsvq_lightning.report.page import RunPage
-from nsvq_lightning.report.pictures import comparison, write_png
+from nsvq_lightning.report.pictures import comparison, file_stem, write_png
 from nsvq_lightning.training.schedule import Schedule
 
 SCHEDULE = Schedule(total=450)
@@ -30,7 +32,10 @@ METRICS: dict[str, Any] = {
     "streams": {"header": 500, "means": 3500, "means.far": 0},
     "codes": {"quats": {"codebook": 64, "used": 40, "entropy": 5.125}},
 }
-VIEWS = [{"name": "a.jpg", "psnr": 30.0, "ssim": 0.8}, {"name": "sub/<b>.jpg", "psnr": 32.5, "ssim": 1.0}]
+VIEWS = [
+    {"name": "a.jpg", "psnr": 30.0, "ssim": 0.8, "picture": "a.png"},
+    {"name": "sub/<b>.jpg", "psnr": 32.5, "ssim": 1.0, "picture": "sub_<b>.png"},
+]
 
 
 def _entry(iteration: int, phase: str, psnr: float, seconds: float) -> dict[str, Any]:
@@ -161,3 +166,22 @@ def test_curve_shades_the_phases_where_they_are() -> None:
     ends = [round((x + width - 48) / (716 - 48) * 450) for x, width in boxes]
     assert tuple(ends) == SCHEDULE.ends
     assert re.findall(r"(warmup|prune|quantize|finetune)</text>", text) == ["warmup", "prune", "quantize", "finetune"]
+
+
+def test_ordinary_names_stay_as_they_are() -> None:
+    names = ("view_000.png", "IMG 1.2.JPG", "left/é.jpg", "right/é.jpg")
+    assert [file_stem(name, names) for name in names] == ["view_000", "IMG 1.2", "left_é", "right_é"]
+    assert file_stem("a/b.png") == "a_b"  # of views that nobody has listed
+
+
+def test_files_of_different_views_differ_and_fit_any_file_system(tmp_path: Path) -> None:
+    same = ("a/b.png", "a_b.png", "x.png", "x.jpg", "X.jpeg", "é.png", "e\u0301.png", "a/b.jpg~0123456789ab.png")
+    deep = tuple("/".join(["ö" * 100] * 2 + [last]) for last in ("1.png", "2.png"))
+    names = (*same, *deep, "y~0123456789ab.png", "z\udcff.png")
+    stems = [file_stem(name, names) for name in names]
+    assert len({unicodedata.normalize("NFC", stem).casefold() for stem in stems}) == len(names)
+    for stem in stems:
+        assert len(os.fsencode(stem)) <= 120
+        (tmp_path / f"{stem}.png").touch()
+    assert re.fullmatch("a_b~[0-9a-f]{12}", stems[0])
+    assert len(list(tmp_path.iterdir())) == len(names)
