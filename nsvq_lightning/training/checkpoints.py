@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict, is_dataclass
+from hashlib import sha256
 from operator import attrgetter
 from pathlib import Path
 from pickle import UnpicklingError
@@ -15,9 +16,13 @@ from zipfile import BadZipFile, ZipFile
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
+from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.errors import FormatError
 
-__all__ = ["PlainCheckpointIO", "check_settings", "plain", "read_checkpoint"]
+__all__ = ["SCENE", "PlainCheckpointIO", "check_scene", "check_settings", "plain", "read_checkpoint", "scene_record"]
+
+SCENE = "scene"
+"""Key under which a checkpoint holds which scene it is of."""
 
 NEVER_IMPORTED = ("init_from", "codebooks", "_instantiator")
 """Settings of a module whose text, whatever it is, is only text; Lightning and :func:`check_settings` know the last."""
@@ -121,6 +126,36 @@ def _is_harmless(text: str) -> bool:
         return False
     # Else torch.os.system would be part of torch.
     return root not in sys.stdlib_module_names and str(getattr(found, "__module__", "")).partition(".")[0] == root
+
+
+def scene_record(scene: Scene) -> dict[str, Any]:
+    """What a checkpoint remembers of its scene: the folder's name, and a digest of the pose of each view by name.
+
+    Neither the size of the photos nor the place of the folder, masks or the choice of test views change it.
+    """
+    poses = {name: camera.viewmat.flatten().tolist() for name, camera in zip(scene.names, scene.cameras, strict=True)}
+    digests = {
+        name: sha256(repr([round(value, 4) + 0.0 for value in pose]).encode()).hexdigest()[:8]
+        for name, pose in poses.items()
+    }
+    return {"folder": scene.root.resolve().name, "views": digests}
+
+
+def check_scene(checkpoint: Mapping[str, Any], scene: Scene) -> None:
+    """Check that a checkpoint is of a scene: most views that both have are seen from the same place.
+
+    Raises:
+        ValueError: It is of another one.
+    """
+    stored, own = checkpoint[SCENE], scene_record(scene)
+    common = stored["views"].keys() & own["views"].keys()
+    same = sum(stored["views"][name] == own["views"][name] for name in common)
+    if not common or 2 * same < len(common):  # not all: rounding may turn out otherwise
+        raise ValueError(
+            f"the checkpoint is of another scene: it was trained on {stored['folder']} with {len(stored['views'])} "
+            f"views, and {same} of the {len(scene)} views of {scene.root} are among them with the same pose; pass "
+            "--data.root with the folder it was trained on, or --trainer.allow_other_scene=true if that is meant"
+        )
 
 
 class PlainCheckpointIO(TorchCheckpointIO):

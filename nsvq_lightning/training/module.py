@@ -42,7 +42,14 @@ from nsvq_lightning.training.branch import (
     check_continuation,
     continued_schedule,
 )
-from nsvq_lightning.training.checkpoints import PlainCheckpointIO, check_settings, plain
+from nsvq_lightning.training.checkpoints import (
+    SCENE,
+    PlainCheckpointIO,
+    check_scene,
+    check_settings,
+    plain,
+    scene_record,
+)
 from nsvq_lightning.training.edit import finite_splats
 from nsvq_lightning.training.optim import (
     LearningRates,
@@ -215,6 +222,11 @@ class SplatModule(LightningModule):
         """Whether a trainer is fitting the module now, not evaluating it."""
         return self._trainer is not None and self._trainer.state.fn == "fit"
 
+    @property
+    def _scene(self) -> Scene | None:
+        """The scene of the trainer's data module; None without one."""
+        return None if self._trainer is None else scene_of(self._trainer)
+
     def rows(self, attribute: str) -> Tensor:
         """Rows ``[N, D]`` of a quantized attribute, detached."""
         return attribute_rows(self.splats.raw(), attribute)
@@ -384,10 +396,12 @@ class SplatModule(LightningModule):
         return build_adam(param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add history, schedule and quantizers; plain data only, so that ``weights_only=True`` can read it."""
+        """Add history, schedule, quantizers and scene; plain data only, so that ``weights_only=True`` can read it."""
         checkpoint["history"] = self.history
         checkpoint[QUANTIZER_SETTINGS] = self.quantizer_settings
         checkpoint["schedule"] = asdict(self.schedule)
+        if self._scene is not None:
+            checkpoint[SCENE] = scene_record(self._scene)
         stored = checkpoint.get(self.CHECKPOINT_HYPER_PARAMS_KEY)
         if stored is not None:
             # Without the photos nobody knows what "auto" was.
@@ -397,8 +411,12 @@ class SplatModule(LightningModule):
         """Restore history and schedule; a fit keeps its own schedule, and may continue with other codebooks.
 
         Raises:
-            ValueError: A fit cannot continue from the checkpoint.
+            ValueError: A fit cannot continue from the checkpoint, or it is of another scene than the trainer's, which
+                ``allow_other_scene`` of :class:`nsvq_lightning.training.trainer.SplatTrainer` lets pass.
         """
+        scene, anyway = self._scene, getattr(self._trainer, "allow_other_scene", False)
+        if scene is not None and SCENE in checkpoint and not anyway:
+            check_scene(checkpoint, scene)
         self.history = list(checkpoint.get("history", []))
         if not self.is_fitting:
             if "schedule" in checkpoint:

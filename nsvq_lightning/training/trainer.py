@@ -51,15 +51,18 @@ class SplatTrainer(Trainer):
     Args:
         run_folder: Folder for all files of the run; None uses that of the logger if it has one for each run, else a new
             ``<default_root_dir>/<scene>/version_<n>``. An existing run is not overwritten.
+        allow_other_scene: Use a checkpoint on another scene than the one it was trained on.
     """
 
-    def __init__(self, *args: Any, run_folder: str | None = None, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, run_folder: str | None = None, allow_other_scene: bool = False, **kwargs: Any
+    ) -> None:
         if kwargs.get("profiler") is None:
             kwargs["profiler"] = _NoProfiler()
         super().__init__(*args, **kwargs)
         if kwargs.get("strategy", "auto") == "auto" and isinstance(self.strategy, DDPStrategy):
             super().__init__(*args, **(kwargs | {"strategy": "view_parallel"}))
-        self.run_folder = run_folder
+        self.run_folder, self.allow_other_scene = run_folder, allow_other_scene
         if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # Lightning's own
             self.strategy.checkpoint_io = PlainCheckpointIO()
 

@@ -17,6 +17,7 @@ from nsvq_lightning.commands import main as cli
 from nsvq_lightning.commands.configs import _without_folder, check_config, find_config, resolve_configs
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.commands.main import main
+from nsvq_lightning.data.synthetic import write_synthetic_scene
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.skips import is_on
@@ -328,6 +329,27 @@ def test_validate_scores_the_test_views(
         output = [f"--trainer.default_root_dir={tmp_path}", "--callbacks.progress=null"]
         assert main(["validate", *config, *arguments, *output]) == 0
         assert "val/psnr" in capsys.readouterr().out
+
+
+def test_a_checkpoint_of_another_scene_is_refused(
+    finished: Path, demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = write_synthetic_scene(tmp_path / "garden", views=8, width=48, height=36, points=300)
+    checkpoint = f"--ckpt_path={finished / 'checkpoints' / 'last.ckpt'}"
+    arguments = [
+        checkpoint,
+        f"--data.root={other}",
+        f"--trainer.default_root_dir={tmp_path}",
+        "--callbacks.progress=null",
+    ]
+    for command in (["validate", *arguments], fit(other, tmp_path, *CODES, checkpoint, steps=22)):
+        assert main(command) == 1
+        assert re.search(
+            rf"^error: .* trained on {demo_scene.name} with 9 views, and 1 of the 8 views of {other} are .*--data",
+            capsys.readouterr().err,
+            re.MULTILINE,
+        )
+    assert main(["validate", *arguments, "--trainer.allow_other_scene=true"]) == 0
 
 
 def test_callbacks_can_be_configured_exchanged_removed_and_added(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +12,15 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.training.checkpoints import PlainCheckpointIO, check_settings, read_checkpoint
+from nsvq_lightning.training.checkpoints import (
+    PlainCheckpointIO,
+    check_scene,
+    check_settings,
+    read_checkpoint,
+    scene_record,
+)
 from nsvq_lightning.training.module import SplatModule
 
 SCENE = {"splats.means": torch.arange(300.0).view(100, 3), "state._phase": torch.tensor(0)}
@@ -114,6 +123,24 @@ def test_what_the_user_has_named_is_loaded() -> None:
     with pytest.raises(FormatError, match=r"its model.quantizer.table is a/b.txt, .*: --model.quantizer.table=a/b.txt"):
         check_settings("a.ckpt", {"quantizer": {"class_path": NSVQ, "init_args": {"table": "a/b.txt"}}})
     check_settings("a.ckpt", {"quantizer": {"class_path": NSVQ, "init_args": {"table": "a/b.txt"}}}, ["a/b.txt"])
+
+
+def test_a_scene_is_the_same_with_other_photos_in_another_place(demo_scene: Path, tmp_path: Path) -> None:
+    checkpoint = {"scene": scene_record(load_scene(demo_scene))}
+    assert checkpoint["scene"]["folder"] == demo_scene.name
+    moved = shutil.copytree(demo_scene, tmp_path / "moved")
+    (moved / "masks").mkdir()
+    fewer = load_scene(moved, factor=2, test_every=3)
+    check_scene(checkpoint, fewer)
+    check_scene(checkpoint, replace(fewer, names=fewer.names[2:], cameras=fewer.cameras[2:]))
+    for other in (
+        replace(fewer, names=fewer.names[::-1]),
+        replace(fewer, names=tuple(f"cam/{name}" for name in fewer.names)),
+    ):
+        with pytest.raises(
+            ValueError, match=r"was trained on scene with 9 views, and [01] of the 9 views of .*moved are"
+        ):
+            check_scene(checkpoint, other)
 
 
 def test_what_is_no_checkpoint_of_this_package_is_refused(tmp_path: Path) -> None:
