@@ -23,6 +23,7 @@ from nsvq_lightning.callbacks.standard import STANDARD
 from nsvq_lightning.commands.option_help import class_help, command_help, first_sentence
 from nsvq_lightning.commands.registry import COMMANDS
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
+from nsvq_lightning.data.model_files import check_name
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.skips import SKIPS, switch, switched
 from nsvq_lightning.training.checkpoints import check_settings, read_checkpoint
@@ -108,6 +109,7 @@ class SplatCLI(LightningCLI):
     def __init__(self, args: list[str]) -> None:
         self._arguments = args
         for argument in args:
+            check_name(argument, "the command line", allow_outside=True)
             asked = re.fullmatch(r"--callbacks\.(\w+)\.help", argument)
             if asked and asked[1] in STANDARD:
                 sys.stdout.write(class_help(f"callbacks.{asked[1]}", STANDARD[asked[1]]))

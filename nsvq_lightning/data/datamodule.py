@@ -46,6 +46,7 @@ class ColmapDataModule(LightningDataModule):
         images_folder: Name of the image folder.
         model: What to read instead of ``sparse/0``: a number, a folder or a ``.json``.
         masks: Name of the folder of masks; None ignores them.
+        allow_outside: Also read photos and masks that the model names outside ``root``.
     """
 
     def __init__(
@@ -59,11 +60,13 @@ class ColmapDataModule(LightningDataModule):
         images_folder: str = "images",
         model: str | None = None,
         masks: str | None = "masks",
+        allow_outside: bool = False,
     ) -> None:
         super().__init__()
         self.root = Path(root)
         self.factor, self.max_width, self.test_every, self.seed = factor, max_width, test_every, seed
         self.cache_bytes, self.images_folder, self.model, self.masks = cache_bytes, images_folder, model, masks
+        self.allow_outside = allow_outside
         self._photos = DevicePhotos(cache_bytes)
 
     @cached_property
@@ -82,6 +85,7 @@ class ColmapDataModule(LightningDataModule):
             self.images_folder,
             self.model,
             self.masks,
+            self.allow_outside,
         )
         rank_zero_info(_summary(scene))
         return scene

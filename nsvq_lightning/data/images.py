@@ -143,7 +143,13 @@ def _decoded(path: Path, flags: int) -> NDArray[np.uint8]:
     Raises:
         SceneError: The file is damaged or has floating-point pixels.
     """
-    data = path.read_bytes()  # imread fails on names outside the locale's character set
+    try:
+        data = path.read_bytes()  # imread fails on names outside the locale's character set
+    except OSError as error:
+        raise SceneError(
+            f"image {path} cannot be read any more ({error.strerror}): it was there when the scene was loaded; copy it "
+            "there again"
+        ) from error
     try:
         orientation = _orientation(data)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)

@@ -9,9 +9,9 @@ import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePath
 
-__all__ = ["ModelFiles", "SceneError", "check_binary_files", "find_model", "has_model", "larger_models"]
+__all__ = ["ModelFiles", "SceneError", "check_binary_files", "check_name", "find_model", "has_model", "larger_models"]
 
 FOLDERS = ("sparse/0", "sparse", ".")
 """Where a model may be inside a scene folder, in order of preference."""
@@ -113,6 +113,29 @@ def larger_models(root: Path) -> str | None:
         f"sparse/0 has {counts['0']} images, {', '.join(larger)}: COLMAP could not join them; --data.model=N "
         "trains on sparse/N"
     )
+
+
+def check_name(name: str, source: object, allow_outside: bool = False) -> None:
+    """Check the name of a file that a model gives relative to its scene folder.
+
+    Args:
+        name: The name.
+        source: Where it is given, for the message.
+        allow_outside: Also allow files that are not in the scene folder.
+
+    Raises:
+        SceneError: It leaves the folder, or is not UTF-8.
+    """
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        raise SceneError(f"{source} names {name!r}, which is not UTF-8: rename that file or folder") from None
+    path = PurePath(name)
+    if not allow_outside and (path.anchor or ".." in path.parts):
+        raise SceneError(
+            f"{source} names {name}, which is not in the scene folder: copy it there, or allow it in fit and test with "
+            "--data.allow_outside=true"
+        )
 
 
 def check_binary_files(files: ModelFiles, params_of_model: Mapping[int, int]) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 from nsvq_lightning.data.colmap import import_pycolmap
 from nsvq_lightning.data.images import image_size
-from nsvq_lightning.data.model_files import SceneError
+from nsvq_lightning.data.model_files import SceneError, check_name
 
 __all__ = ["Verdict", "reconstruct"]
 
@@ -71,8 +71,10 @@ def reconstruct(
         threads: How many; −1 for one a core.
 
     Raises:
-        SceneError: Too few photos belong together.
+        SceneError: Too few photos belong together, or a name is not UTF-8, at which COLMAP would crash.
     """
+    for name in (str(scene.resolve()), *names):
+        check_name(name, "the scene to prepare", allow_outside=True)
     pycolmap = import_pycolmap()
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     pycolmap.set_random_seed(0)

@@ -130,6 +130,7 @@ def load_scene(
     images_folder: str = "images",
     model: str | None = None,
     masks: str | None = "masks",
+    allow_outside: bool = False,
 ) -> Scene:
     """Load a scene: photos, and the cameras of a COLMAP model (binary or text) or of a transforms file.
 
@@ -154,6 +155,7 @@ def load_scene(
         images_folder: Name of the image folder; a transforms file says itself where the photos are.
         model: Which model, see :func:`nsvq_lightning.data.transforms.read_poses`; None looks for one.
         masks: Name of the folder of masks, which need not exist; None ignores masks.
+        allow_outside: Also read photos and masks that the model names outside the scene folder.
 
     Raises:
         SceneError: The folder, the model or an image is missing or damaged, or the split leaves no train view.
@@ -161,7 +163,7 @@ def load_scene(
     """
     _check_arguments(factor, max_width, test_every)
     root = Path(root)
-    poses = read_poses(root, model)
+    poses = read_poses(root, model, allow_outside=allow_outside)
     larger = larger_models(root) if model is None and poses.source == "COLMAP" else None
     if larger is not None:
         log.warning("%s: %s", root, larger)

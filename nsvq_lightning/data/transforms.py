@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, import_pycolmap, read_model
 from nsvq_lightning.data.images import image_size
-from nsvq_lightning.data.model_files import LARGEST_SIDE, SceneError, has_model
+from nsvq_lightning.data.model_files import LARGEST_SIDE, SceneError, check_name, has_model
 from nsvq_lightning.data.point_cloud import read_points, share_seen
 from nsvq_lightning.rendering.camera import Camera
 
@@ -41,7 +41,9 @@ Kind = tuple[str, int, int, tuple[float, ...]]
 """COLMAP's name of a camera model, width, height, parameters."""
 
 
-def read_poses(root: Path, model: str | None = None, observations: bool = False) -> ColmapModel:
+def read_poses(
+    root: Path, model: str | None = None, observations: bool = False, allow_outside: bool = False
+) -> ColmapModel:
     """The cameras and points of a scene folder: of its COLMAP model or, if there is none, of its transforms file.
 
     Args:
@@ -49,12 +51,19 @@ def read_poses(root: Path, model: str | None = None, observations: bool = False)
         model: Which one to read: a number N for ``sparse/N``, a folder with a COLMAP model or a ``.json`` file, both
             inside ``root``; None looks for them.
         observations: Also read which image saw which point, see :func:`nsvq_lightning.data.colmap.read_model`.
+        allow_outside: Also allow photos and masks that are not in the scene folder.
 
     Raises:
-        SceneError: There is no such model, it is damaged, or has cameras that cannot be used.
+        SceneError: There is no such model, it is damaged, or has cameras or names that cannot be used.
     """
+    check_name(str(root.resolve()), "--data.root", allow_outside=True)
     files = transforms_files(root, model)
-    return _read_transforms(root, files) if files else read_model(root, observations, model)
+    if files:
+        return _read_transforms(root, files, allow_outside)
+    poses = read_model(root, observations, model)
+    for image in poses.images:
+        check_name(image.name, f"the COLMAP model of {root}", allow_outside)
+    return poses
 
 
 def transforms_files(root: Path, model: str | None = None) -> list[Path]:
@@ -83,6 +92,7 @@ class _Frame:
     file: Path
     position: int
     values: Mapping[str, Any]
+    allow_outside: bool
 
     def error(self, problem: str, remedy: str = "export the file again") -> SceneError:
         return SceneError(f"{self.file}: frame {self.position} {problem}: {remedy}")
@@ -104,14 +114,20 @@ class _Frame:
         given = self.values.get("file_path")
         if not isinstance(given, str) or not given:
             raise self.error("has no file_path")
-        name = _plain(given)
+        name = self._named(given)
         return next((name + suffix for suffix in _SUFFIXES if (self.file.parent / (name + suffix)).is_file()), name)
 
     @property
     def mask(self) -> Path | None:
         """File of its mask, if it names one."""
         given = self.values.get("mask_path")
-        return self.file.parent / _plain(given) if isinstance(given, str) and given else None
+        return self.file.parent / self._named(given) if isinstance(given, str) and given else None
+
+    def _named(self, given: str) -> str:
+        """A path inside the scene folder, unless others are allowed."""
+        name = _plain(given)
+        check_name(name, f"{self.file}: frame {self.position}", self.allow_outside)
+        return name
 
     def kind(self) -> Kind:
         """Its camera.
@@ -191,12 +207,12 @@ class _Frame:
         return viewmat
 
 
-def _read_transforms(root: Path, files: list[Path]) -> ColmapModel:
+def _read_transforms(root: Path, files: list[Path], allow_outside: bool) -> ColmapModel:
     heads, frames = [], []
     for file in files:
         head = _document(file)
         heads.append(head)
-        frames.append({frame.name: frame for frame in _frames(file, head)})
+        frames.append({frame.name: frame for frame in _frames(file, head, allow_outside)})
     test = _test_names(files, heads, frames)
     chosen = dict(sorted({name: frame for part in frames for name, frame in part.items()}.items()))
     if test is not None:
@@ -214,7 +230,7 @@ def _read_transforms(root: Path, files: list[Path]) -> ColmapModel:
         ColmapImage(name.removeprefix(f"{folder}/"), numbers[kinds[name]], frame.viewmat(), frame.mask)
         for name, frame in chosen.items()
     )
-    points, colors = _points(root, heads[0], images, cameras)
+    points, colors = _points(root, heads[0], images, cameras, allow_outside)
     return ColmapModel(
         images=images,
         cameras=cameras,
@@ -239,7 +255,7 @@ def _document(file: Path) -> dict[str, Any]:
     return document
 
 
-def _frames(file: Path, head: dict[str, Any]) -> Iterator[_Frame]:
+def _frames(file: Path, head: dict[str, Any], allow_outside: bool) -> Iterator[_Frame]:
     """The frames of a file.
 
     Raises:
@@ -250,7 +266,8 @@ def _frames(file: Path, head: dict[str, Any]) -> Iterator[_Frame]:
     for position, frame in enumerate(head["frames"]):
         if not isinstance(frame, dict):
             raise SceneError(f"{file}: frame {position} is no table of values: export the file again")
-        made = _Frame(file, position, {key: value for key, value in (shared | frame).items() if value is not None})
+        values = {key: value for key, value in (shared | frame).items() if value is not None}
+        made = _Frame(file, position, values, allow_outside)
         if made.name in names:
             raise made.error(f"is of {made.name}, which an earlier frame is of, too", "remove one of them")
         names.add(made.name)
@@ -289,7 +306,7 @@ def _test_names(
 
 
 def _points(
-    root: Path, head: dict[str, Any], images: tuple[ColmapImage, ...], cameras: dict[int, Any]
+    root: Path, head: dict[str, Any], images: tuple[ColmapImage, ...], cameras: dict[int, Any], allow_outside: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """The points that a file names, in the frame of its cameras; none if it names none.
 
@@ -298,6 +315,7 @@ def _points(
     """
     if not isinstance(name := head.get("ply_file_path"), str):
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    check_name(_plain(name), f"ply_file_path in {root}", allow_outside)
     points, colors = read_points(root / _plain(name))
     try:
         applied = np.array(head.get("applied_transform"), np.float64)[:3]

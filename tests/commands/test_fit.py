@@ -172,6 +172,7 @@ def test_a_checkpoint_of_another_phase_is_refused_with_the_way_out(
     ("arguments", "message"),
     [
         (["export", "--ckpt_path=no.ckpt"], "no.ckpt"),
+        (["fit", "--data.root=scene\udcff"], "which is not UTF-8: rename"),
         (["fit", "--model.codebooks=3k"], "choose one of 0.5k"),
         (["fit", "--trainer.max_steps=0"], "set trainer.max_steps"),
         (["fit", "--ckpt_path=broken.ckpt"], "broken.ckpt: truncated, or not a checkpoint"),

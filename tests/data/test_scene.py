@@ -13,7 +13,9 @@ import torch
 from lightning.fabric.utilities import move_data_to_device
 
 from nsvq_lightning.data.colmap import import_pycolmap
+from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.model_files import larger_models
+from nsvq_lightning.data.reconstruct import reconstruct
 from nsvq_lightning.data.scene import SceneError, load_scene, split_views
 
 SceneFactory = Callable[..., Path]
@@ -175,6 +177,40 @@ def test_missing_and_damaged_pictures(make_scene: SceneFactory) -> None:
     (root / "images" / "004.png").write_bytes(b"")
     with pytest.raises(SceneError, match=r"004\.png cannot be decoded"):
         load_scene(root)
+
+
+def test_a_photo_that_is_deleted_while_a_run_reads_it_is_named(make_scene: SceneFactory) -> None:
+    root = make_scene()
+    scene = load_scene(root, cache_bytes=0)
+    (root / "images" / "003.png").unlink()
+    with pytest.raises(SceneError, match=r"003\.png cannot be read any more \(No such file .*\): it was there when"):
+        scene.view(3)
+
+
+@pytest.mark.parametrize("name", [b"../3.pn", b"/03.png", b"x/../.p"])
+def test_photos_outside_the_folder_are_refused(name: bytes, make_scene: SceneFactory) -> None:
+    root = make_scene()
+    table = root / "sparse" / "0" / "images.bin"
+    table.write_bytes(table.read_bytes().replace(b"003.png", name))
+    with pytest.raises(SceneError, match=rf"the COLMAP model of {root} names {name.decode()}, which is not in"):
+        load_scene(root)
+    if name == b"../3.pn":
+        (root / "images" / "003.png").rename(root / "3.pn")
+        data = ColmapDataModule(str(root), allow_outside=True)
+        assert data.scene.names[0] == "../3.pn"
+        assert data.scene.view(0).image.shape == (32, 40, 3)
+
+
+def test_names_that_are_not_utf_8_are_refused(make_scene: SceneFactory) -> None:
+    root = make_scene()
+    table = root / "sparse" / "0" / "images.bin"
+    table.write_bytes(table.read_bytes().replace(b"003.png", b"\xff03.png"[:7]))
+    with pytest.raises(SceneError, match=r"images\.bin: the name of a photo is not UTF-8"):
+        load_scene(root)
+    with pytest.raises(SceneError, match=r"--data\.root names '.*\\udcff', which is not UTF-8: rename"):
+        load_scene(make_scene("plain").rename(root.with_name("scene\udcff")))
+    with pytest.raises(SceneError, match=r"the scene to prepare names 'a\\udcff\.jpg', which is not UTF-8"):
+        reconstruct(root, ["a\udcff.jpg"], print)
 
 
 def test_missing_image_folder(make_scene: SceneFactory) -> None:

@@ -203,6 +203,12 @@ def mirrored(root: Path) -> None:
         (lambda root: change(root / "transforms.json", frames=[]), "no list of frames"),
         (lambda root: change(root / "transforms.json", frames=[3]), "frame 0 is no table"),
         (lambda root: change(root / "transforms.json", ply_file_path="gone.ply"), r"gone\.ply do not exist"),
+        (lambda root: change(root / "transforms.json", {"file_path": "../a.png"}), r"names \.\./a\.png, which is"),
+        (lambda root: change(root / "transforms.json", {"file_path": "/etc/a.png"}), r"names /etc/a\.png, which is"),
+        (lambda root: change(root / "transforms.json", {"file_path": "..\\a.png"}), r"names \.\./a\.png, which is"),
+        (lambda root: change(root / "transforms.json", {"mask_path": "../m.png"}), r"names \.\./m\.png, which is"),
+        (lambda root: change(root / "transforms.json", {"file_path": "\udcff.png"}), "which is not UTF-8"),
+        (lambda root: change(root / "transforms.json", ply_file_path="../a.ply"), r"path in .* names \.\./a\.ply"),
         (lambda root: (root / "transforms.json").write_text("{"), r"transforms\.json cannot be read"),
     ],
 )  # fmt: skip
