@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import sys
@@ -95,6 +96,9 @@ class RunStart(SaveConfigCallback):
             if isinstance(callback, ModelCheckpoint) and callback.dirpath is None:
                 callback.dirpath = str(folder / "checkpoints")
         if trainer.is_global_zero:
+            root = self.config.get("data.init_args.root")
+            if isinstance(root, str):  # so that it is found from any folder
+                self.config["data.init_args.root"] = os.path.abspath(root)
             write_text(folder / self.config_filename, self.parser.dump(self.config, skip_none=False))
 
 

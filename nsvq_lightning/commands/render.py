@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from nsvq_lightning.commands.comma_lists import names
 from nsvq_lightning.commands.positive import positive
 from nsvq_lightning.commands.progress import progress
-from nsvq_lightning.commands.scene_argument import photos_of, scene_file
+from nsvq_lightning.commands.scene_argument import cameras_of, photos_of, scene_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -128,7 +128,8 @@ def _path(options: argparse.Namespace, splats: Splats, is_video: bool) -> tuple[
     fps = options.fps or FPS
     frames = options.frames or max(1, round((options.seconds or SECONDS) * fps))
     root = options.root or photos_of(options.scene)
-    kind = options.path or ("through" if root is not None else "orbit")
+    recorded = list(cameras_of(options.scene).values()) if root is None else []
+    kind = options.path or ("through" if root is not None or recorded else "orbit")
     if kind not in PATHS:
         cameras, own = read_camera_path(Path(kind))
         fps = options.fps or own
@@ -136,6 +137,8 @@ def _path(options: argparse.Namespace, splats: Splats, is_video: bool) -> tuple[
         return [reframed(camera, width, height) for camera in cameras], fps
     if root is not None:
         given = list(load_scene(root).cameras)
+    elif recorded:
+        given = recorded
     elif kind == "orbit":
         log.info("no photos: their cameras are guessed from the scene; --data.root names the folder of the photos")
         given = likely_cameras(splats, LIKELY)

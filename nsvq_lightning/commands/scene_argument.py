@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-__all__ = ["photos_of", "scene_file"]
+if TYPE_CHECKING:
+    from nsvq_lightning.rendering.camera import Camera
+
+__all__ = ["cameras_of", "photos_of", "scene_file"]
 
 
 def scene_file(path: Path) -> Path:
@@ -35,3 +39,15 @@ def photos_of(path: Path) -> Path | None:
     data = data.get("init_args", data) if isinstance(data, dict) else {}
     root = data.get("root")
     return Path(root) if isinstance(root, str) and Path(root).is_dir() else None
+
+
+def cameras_of(path: Path) -> dict[str, Camera]:
+    """Cameras by name that the run has recorded that a scene lies in, for when its photos are gone; none without it.
+
+    Raises:
+        ValueError: Its ``viewer.html`` is damaged.
+    """
+    from nsvq_lightning.report.viewer import page_cameras
+
+    page = (path if path.is_dir() else path.parent) / "viewer.html"
+    return page_cameras(page) if page.is_file() else {}

@@ -13,7 +13,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from nsvq_lightning.commands.scene_argument import photos_of, scene_file
+from nsvq_lightning.commands.scene_argument import cameras_of, photos_of, scene_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -113,6 +113,8 @@ def _cameras(options: argparse.Namespace, source: Source) -> dict[str, Camera]:
     root = options.root or photos_of(options.scene)
     if root is not None:
         return some_cameras(load_scene(root))
+    if recorded := cameras_of(options.scene):
+        return recorded
     if source.run is not None:
         raise ValueError(f"{source.run} does not say where its photos are: name their folder with --data.root")
     splats = load(source.file)

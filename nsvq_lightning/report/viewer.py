@@ -6,6 +6,7 @@ import base64
 import json
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
@@ -20,7 +21,7 @@ from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.nsvq.file import read_header
 from nsvq_lightning.rendering.camera import Camera
 
-__all__ = ["BACKGROUNDS", "camera_entry", "some_cameras", "viewer_page", "write_viewer"]
+__all__ = ["BACKGROUNDS", "camera_entry", "page_cameras", "some_cameras", "viewer_page", "write_viewer"]
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 """RGB of the backgrounds that have names."""
@@ -125,6 +126,33 @@ def camera_entry(camera: Camera) -> dict[str, Any]:
     pose = [float(f"{value:.9g}") + 0.0 for row in [*rows, [0.0, 0.0, 0.0, 1.0]] for value in row]
     intrinsics = dict(zip(("fx", "fy", "cx", "cy"), camera.intrinsics, strict=True))
     return {"camera_to_world": pose, "width": camera.width, "height": camera.height, **intrinsics}
+
+
+def page_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
+    """The cameras that a page of :func:`write_viewer` lists, by name; none if it is another page.
+
+    Raises:
+        ValueError: They are damaged.
+        OSError: It cannot be read.
+    """
+    found = re.search(
+        r'<script id="scene" type="application/json">(.*)</script>', Path(path).read_text(encoding="utf-8")
+    )
+    if found is None:
+        return {}
+    try:
+        return {str(entry["name"]): _entry_camera(entry) for entry in json.loads(found[1])["cameras"]}
+    except (ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(f"the cameras in {path} are damaged ({error}): name the photos with --data.root") from error
+
+
+def _entry_camera(entry: Mapping[str, Any]) -> Camera:
+    """The camera of a :func:`camera_entry`."""
+    pose = torch.tensor(entry["camera_to_world"], dtype=torch.float64).view(4, 4)
+    viewmat = (pose @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))).inverse()
+    fx, fy, cx, cy = (float(entry[name]) for name in ("fx", "fy", "cx", "cy"))
+    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return Camera(K, viewmat.float(), int(entry["width"]), int(entry["height"]))
 
 
 def _mean_up(cameras: Sequence[Camera]) -> list[float]:

@@ -544,11 +544,17 @@ def test_only_float32_trains(demo_scene: Path, tmp_path: Path, capsys: pytest.Ca
         assert f"trainer.precision is {precision}: " in capsys.readouterr().err
 
 
-def test_a_run_without_checkpoints_or_bar_leaves_none(demo_scene: Path, tmp_path: Path) -> None:
+def test_a_run_without_checkpoints_or_bar_leaves_none(
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(demo_scene.parent)
+    demo_scene = Path(demo_scene.name)
     assert main(fit(demo_scene, tmp_path, *CODES, "--trainer.enable_checkpointing=false", steps=3)) == 0
     folder = tmp_path / demo_scene.name / "version_0"
     assert (folder / "scene.nsvq").is_file()
     assert not (folder / "checkpoints").exists()
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    assert config["data"]["init_args"]["root"] == str(demo_scene.resolve())  # whatever folder it is read from
 
 
 def test_a_quantizer_of_the_current_folder_trains(
