@@ -4,36 +4,29 @@ Each decides from the module's schedule and the trainer's step alone, through
 :class:`nsvq_lightning.training.host.SplatHost`; none depends on another. :func:`standard` makes those of ``nsvq fit``.
 """
 
-from .budget import SplatBudget
-from .canonical import CanonicalCovariance
 from .checkpoint import RunCheckpoint
-from .codebooks import CodebookInit, CodebookReplacement
-from .contribution import ContributionPruning
-from .density import DensityControl
-from .density_rules import DensityRules
-from .dropout import SplatDropout
+from .density import DensityControl, DensityRules
 from .export import ExportScene
 from .exposure import ExposureCompensation
 from .finite import FiniteCodes
-from .freeze import FreezeCodes
 from .frequency import FrequencyLimit
-from .growth import BudgetedGrowth
-from .growth_rules import GrowthRules
+from .growth import BudgetedGrowth, GrowthRules, SplatBudget
 from .kernels import CompileAhead
 from .live import LiveScene
 from .metric_report import MetricReport
-from .opacity import OpacityRegularization
-from .phases import PhaseSchedule
 from .predictions import RenderWriter
 from .progress import SplatProgressBar
-from .rate_distortion import RateDistortion
-from .rates import RateDecay
-from .refit import CodebookRefit
-from .selection import OpacitySelection
-from .sh_degree import ShDegreeSchedule
-from .sh_penalty import ShPenalty
+from .pruning import ContributionPruning, OpacityRegularization, OpacitySelection
+from .quantization import (
+    CanonicalCovariance,
+    CodebookInit,
+    CodebookRefit,
+    CodebookReplacement,
+    FreezeCodes,
+    RateDistortion,
+)
+from .schedule import PhaseSchedule, RateDecay, ShDegreeSchedule
 from .standard import STANDARD, standard
-from .views import ViewsPerStep
 
 __all__ = [
     "STANDARD",
@@ -62,10 +55,7 @@ __all__ = [
     "RenderWriter",
     "RunCheckpoint",
     "ShDegreeSchedule",
-    "ShPenalty",
     "SplatBudget",
-    "SplatDropout",
     "SplatProgressBar",
-    "ViewsPerStep",
     "standard",
 ]

@@ -4,28 +4,26 @@ from __future__ import annotations
 
 from lightning.pytorch import Callback
 
-from .budget import SplatBudget
-from .canonical import CanonicalCovariance
 from .checkpoint import RunCheckpoint
-from .codebooks import CodebookInit, CodebookReplacement
-from .contribution import ContributionPruning
 from .density import DensityControl
 from .export import ExportScene
 from .finite import FiniteCodes
-from .freeze import FreezeCodes
+from .growth import SplatBudget
 from .kernels import CompileAhead
 from .live import LiveScene
 from .metric_report import MetricReport
-from .opacity import OpacityRegularization
-from .phases import PhaseSchedule
 from .predictions import RenderWriter
 from .progress import SplatProgressBar
-from .rate_distortion import RateDistortion
-from .rates import RateDecay
-from .refit import CodebookRefit
-from .selection import OpacitySelection
-from .sh_degree import ShDegreeSchedule
-from .sh_penalty import ShPenalty
+from .pruning import ContributionPruning, OpacityRegularization, OpacitySelection
+from .quantization import (
+    CanonicalCovariance,
+    CodebookInit,
+    CodebookRefit,
+    CodebookReplacement,
+    FreezeCodes,
+    RateDistortion,
+)
+from .schedule import PhaseSchedule, RateDecay, ShDegreeSchedule
 
 __all__ = ["STANDARD", "standard"]
 
@@ -37,7 +35,6 @@ STANDARD: dict[str, type[Callback]] = {
     "density": DensityControl,
     "selection": OpacitySelection,
     "opacity": OpacityRegularization,
-    "sh_penalty": ShPenalty,
     "contribution": ContributionPruning,
     "canonical": CanonicalCovariance,
     "codebook_init": CodebookInit,

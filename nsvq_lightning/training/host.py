@@ -69,8 +69,6 @@ class SplatHost(Protocol):
     """Makes of the rendered picture ``[H, W, 3]`` of a train view what its photo shows, before the loss; or None."""
     splat_budget: int | None
     """How many splats the scene is to have in the end; None for as many as density control makes."""
-    dropout: float
-    """Share of the splats that each training view leaves out at random."""
     evaluation_splats: SplatTensors | None
     """What test and predict steps render instead of the module's own splats."""
     history: list[dict[str, Any]]

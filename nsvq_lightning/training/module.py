@@ -32,7 +32,6 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, render, visible
 from nsvq_lightning.skips import is_on
-from nsvq_lightning.splats.dropout import dropped_out
 from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, sh_degree_of
 from nsvq_lightning.training.branch import (
     QUANTIZER_SETTINGS,
@@ -148,7 +147,6 @@ class SplatModule(LightningModule):
         self.pixel_map: Tensor | None = None
         self.appearance: Callable[[Tensor, View], Tensor] | None = None
         self.splat_budget: int | None = None
-        self.dropout = 0.0
         self.evaluation_splats: SplatTensors | None = None
         self.history: list[dict[str, Any]] = []
         self.view_metrics = image_metrics()
@@ -269,10 +267,7 @@ class SplatModule(LightningModule):
             observe: Strength of each pixel ``[H, W]``, see :func:`nsvq_lightning.render`.
         """
         background = self._random_background() if self.training and self.background == "random" else self._background()
-        splats = self._phase_splats(camera)
-        if self.training and self.dropout:
-            splats = splats._replace(opacities=dropped_out(splats.opacities, self.dropout, self._generator("dropout")))
-        return self._render(splats, camera, background, observe)
+        return self._render(self._phase_splats(camera), camera, background, observe)
 
     def _render(
         self, splats: SplatTensors, camera: Camera, background: Tensor | None, observe: Tensor | None = None

@@ -330,7 +330,7 @@ def test_functions_belong_to_the_first_part_that_fits() -> None:
         "nsvq_lightning.rendering.cpu.blend.blend": "blend",
         "nsvq_lightning.rendering.cpu.blend.total_slots": "blend backward",
         "nsvq_lightning.rendering.cpu.rasterizer._Blend.forward": "rasterizer, its Python",
-        "nsvq_lightning.callbacks.phases.PhaseSchedule.setup": "other callbacks",
+        "nsvq_lightning.callbacks.schedule.PhaseSchedule.setup": "other callbacks",
         "nsvq_lightning.training.module.SplatModule.training_step": "module, its Python",
         "/somewhere/else.py.function": step_profile.OTHER,
     }

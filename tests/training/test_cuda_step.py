@@ -120,5 +120,5 @@ def test_rows_codes_and_statistics(launches: list[str]) -> None:
     lookup(codebook, codes).sum().backward()
     sum_by_code(on_device(1000, 45), codes, 64, torch.float64)
     assert launches == ["part_kernel", "sum_kernel"] * 2
-    rules = importlib.import_module("nsvq_lightning.callbacks.density_rules")
+    rules = importlib.import_module("nsvq_lightning.callbacks.density")
     rules.add_view(on_device(1000), on_device(1000), on_device(1000, 2), on_device(1000, dtype=torch.int32), 800, 600)

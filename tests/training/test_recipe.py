@@ -1,4 +1,4 @@
-"""Growth, selection, budgets, views per step, falling rates, dropout: whole runs of 60 iterations."""
+"""Growth, selection, budgets, falling rates: whole runs of 60 iterations."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from checkpoints import CheckpointAt
 from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import Recipe, RunFactory
@@ -20,8 +19,6 @@ from nsvq_lightning.callbacks import (
     RateDecay,
     RunCheckpoint,
     SplatBudget,
-    SplatDropout,
-    ViewsPerStep,
 )
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.training.module import SplatModule
@@ -47,11 +44,6 @@ def options(**replaced: Callback) -> dict[str, Callback]:
         "rate_decay": RateDecay(final=0.1),
         **replaced,
     }
-
-
-def more() -> list[Callback]:
-    """Callbacks that no run has by default."""
-    return [ViewsPerStep(views=3, start=45), SplatDropout(share=0.1, end=30)]
 
 
 def scene_bytes(trainer: Trainer) -> bytes:
@@ -85,7 +77,7 @@ def witness() -> Witness:
 
 @pytest.fixture(scope="module")
 def finished(run: RunFactory, recipe: Recipe, witness: Witness) -> Trainer:
-    trainer, _ = run([*recipe(**options(checkpoint=CheckpointAt(*INTERRUPTED))).values(), *more(), witness])
+    trainer, _ = run([*recipe(**options(checkpoint=CheckpointAt(*INTERRUPTED))).values(), witness])
     return trainer
 
 
@@ -100,7 +92,7 @@ def test_a_resumed_run_is_the_run_not_interrupted(
     finished: Trainer, run: RunFactory, recipe: Recipe, interrupted_at: int
 ) -> None:
     path = run_folder(finished) / "checkpoints" / f"step-{interrupted_at}.ckpt"
-    resumed, _ = run([*recipe(**options(checkpoint=RunCheckpoint(every=0))).values(), *more()], ckpt_path=path)
+    resumed, _ = run(recipe(**options(checkpoint=RunCheckpoint(every=0))).values(), ckpt_path=path)
     assert scene_bytes(resumed) == scene_bytes(finished)
 
 
@@ -122,14 +114,10 @@ def test_rates_fall_at_the_end_and_rise_for_the_selection(finished: Trainer, wit
     assert colours[59] == pytest.approx(0.1 * colours[0])
 
 
-def test_the_trainer_gets_its_own_number_of_views_back(finished: Trainer) -> None:
-    assert finished.accumulate_grad_batches == 1
-
-
 def test_neutral_options_are_the_run_without_them(run: RunFactory, recipe: Recipe) -> None:
     neutral = {"budget": SplatBudget(), "selection": OpacitySelection(), "rate_decay": RateDecay()}
     without = recipe(**dict.fromkeys(neutral)).values()
-    present = [*recipe(**neutral).values(), ViewsPerStep(), SplatDropout()]
+    present = recipe(**neutral).values()
     assert scene_bytes(run(present)[0]) == scene_bytes(run(without)[0])
 
 
@@ -172,26 +160,13 @@ def test_few_photos_shorten_the_run(run: RunFactory, recipe: Recipe, caplog: pyt
     assert run(recipe(phases=plenty).values(), max_steps=3)[0].global_step == 3
 
 
-def test_dropout_changes_training_alone(run: RunFactory, recipe: Recipe) -> None:
-    _, module = run([*recipe().values(), SplatDropout(share=0.5, end=1)], max_steps=2)
-    assert module.dropout == 0.5
-    camera = module.trainer.datamodule.scene.cameras[0]  # type: ignore[attr-defined]
-    module.eval()
-    first = module(camera).image
-    assert torch.equal(first, module(camera).image)
-    module.train()
-    assert not torch.equal(first, module(camera).image)
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: SplatBudget(quality=1.0, splats=5), "a budget is one number, got quality and splats"),
         (lambda: SplatBudget(bytes=0), "bytes must be finite and above 0, got 0"),
         (lambda: PhaseSchedule(iterations_per_photo=0), "iterations_per_photo must be at least 1, got 0"),
-        (lambda: ViewsPerStep(views=0), "views must be at least 1, got 0"),
         (lambda: RateDecay(final=0.0), "final must be above 0 and at most 1, got 0.0"),
-        (lambda: SplatDropout(share=1.0), "share must be at least 0 and below 1, got 1.0"),
     ],
 )
 def test_settings_out_of_range_are_refused(make: Any, message: str) -> None:

@@ -142,7 +142,7 @@ def test_two_processes_train_what_one_process_with_two_views_trains(one: Finishe
 
 
 def grown(scene: Path, root: Path, *more: str) -> list[str]:
-    """The same run with budgeted growth, selection and dropout in place of the paper's density control."""
+    """The same run with budgeted growth and selection in place of the paper's density control."""
     growth = {"start": 0, "full": 20, "every": 4, "grad_threshold": 1e-6, "reset_every": 9, "reset_last": 9}
     growth |= {"first_prune": 3, "recovery": 3}
     paper = ("--callbacks.density", "--callbacks.phases.min_reset_interval")
@@ -153,7 +153,6 @@ def grown(scene: Path, root: Path, *more: str) -> list[str]:
         *("--callbacks.density=BudgetedGrowth", "--callbacks.density.finite_every=7"),
         *(f"--callbacks.density.growth.{name}={value}" for name, value in growth.items()),
         *("--splats=500", "--callbacks.selection.strength=0.01", *more),
-        *("--trainer.callbacks+=SplatDropout", "--trainer.callbacks.share=0.1"),
     ]
 
 

@@ -1,4 +1,4 @@
-"""The phase of the run, from the trainer's step."""
+"""What follows the iteration alone: the phase, the degree of the spherical harmonics, falling learning rates."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from typing import Any
 from lightning.pytorch import LightningModule, Trainer
 
 from nsvq_lightning.training.host import as_host
+from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.schedule import Phase, Schedule, next_iteration
 from nsvq_lightning.training.train_views import needed_scene
 
 from .hosted import HostedCallback
 
-__all__ = ["PhaseSchedule"]
+__all__ = ["PhaseSchedule", "RateDecay", "ShDegreeSchedule"]
+
 
 log = logging.getLogger(__name__)
 
@@ -159,3 +161,75 @@ def _limit_steps(trainer: Trainer, per_photo: int) -> None:
     if not 0 < trainer.max_steps <= limit:
         trainer.fit_loop.epoch_loop.max_steps = limit
         log.info("iterations: %d, %d for each of %d photos", limit, per_photo, len(scene.train))
+
+
+class ShDegreeSchedule(HostedCallback):
+    """Starts with SH degree 0 and adds a degree every ``every`` iterations, up to that of the splats.
+
+    Args:
+        every: Iterations of the reference run between two degrees (the paper's 1000).
+
+    Raises:
+        ValueError: ``every`` is below 1.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import ShDegreeSchedule
+        >>> from nsvq_lightning.training.schedule import Schedule
+        >>> degrees = ShDegreeSchedule(every=2000)  # --callbacks.sh_degree.every=2000
+        >>> [Schedule(total=4500).sh_degree_at(iteration, degrees.every, 3) for iteration in (1, 200, 400, 600, 800)]
+        [0, 1, 2, 3, 3]
+    """
+
+    def __init__(self, every: int = 1000) -> None:
+        if every < 1:
+            raise ValueError(f"every must be at least 1 iteration, got {every}")
+        self.every = every
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Set the degree of the iteration that starts."""
+        host = as_host(pl_module)
+        degree = host.schedule.sh_degree_at(next_iteration(trainer), self.every, host.splats.sh_degree)
+        # A run that starts from a trained scene keeps its degree.
+        host.active_sh_degree = max(degree, host.active_sh_degree)
+
+
+class RateDecay(HostedCallback):
+    """Lets all learning rates but that of the positions, which have their own, fall in the last iterations of a run.
+
+    They fall from their value to ``final`` times it, linearly in the logarithm.
+
+    Args:
+        final: Factor at the end of the run; 1 leaves the rates alone.
+        start: Iteration of the reference run at which they begin to fall; None for the start of fine-tuning.
+
+    Raises:
+        ValueError: ``final`` is not in (0, 1], or ``start`` is negative.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import RateDecay, standard
+        >>> callbacks = standard(rate_decay=RateDecay(final=0.1))  # --callbacks.rate_decay.final=0.1
+        >>> [callback.final for callback in callbacks if isinstance(callback, RateDecay)]
+        [0.1]
+    """
+
+    def __init__(self, final: float = 1.0, start: int | None = None) -> None:
+        if not 0.0 < final <= 1.0:
+            raise ValueError(f"final must be above 0 and at most 1, got {final}")
+        if start is not None and start < 0:
+            raise ValueError(f"start must be at least 0, got {start}")
+        self.final = final
+        self.start = start
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Scale the rates of this iteration."""
+        if self.final == 1.0:
+            return
+        host, iteration = as_host(pl_module), next_iteration(trainer)
+        ends = host.schedule.ends
+        start = ends[Phase.QUANTIZE] if self.start is None else self.start * host.schedule.scale
+        end = ends[Phase.FINETUNE]
+        progress = min(max((iteration - start) / max(end - start, 1), 0.0), 1.0)
+        if progress > 0.0:
+            for group in raw_optimizer(trainer).param_groups:
+                if group["name"] != "means":
+                    host.scale_rate(group["name"], self.final**progress)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nsvq_lightning.callbacks import OpacitySelection
-from nsvq_lightning.callbacks.selection import pressure
+from nsvq_lightning.callbacks.pruning import pressure
 from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.training.schedule import Schedule
