@@ -33,7 +33,7 @@ class ExposureCompensation(HostedCallback):
 
     Test views are rendered as they are: nobody knows their exposure. Their ``cc_psnr`` and ``cc_ssim`` in
     ``metrics.json`` are measured after a colour correction to the photo
-    (:func:`nsvq_lightning.quality.color.color_corrected`).
+    (:func:`nsvq_lightning.quality.metrics.color_corrected`).
 
     Args:
         rate: Learning rate at the start.

@@ -8,7 +8,7 @@ from typing import Any
 from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor
 
-from nsvq_lightning.compression.pixel_size import pixel_sizes
+from nsvq_lightning.compression.importance import pixel_sizes
 from nsvq_lightning.training.edit import raise_scales
 from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.schedule import Phase

@@ -21,10 +21,8 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.file import read_nsvq
-from nsvq_lightning.quality.color import color_corrected
-from nsvq_lightning.quality.loss import ssim
-from nsvq_lightning.quality.masking import kept
-from nsvq_lightning.quality.metrics import build_lpips, eight_bit, psnr
+from nsvq_lightning.quality.loss import kept, ssim
+from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_bit, psnr
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.report.evaluation import ViewScore, evaluate
 from nsvq_lightning.report.files import paper_level, summarize, write_curve, write_curve_csv, write_metrics, write_views

@@ -13,12 +13,10 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from nsvq_lightning.compression.covariance_error import form_errors
-from nsvq_lightning.compression.importance import row_weights
-from nsvq_lightning.compression.pixel_size import scale_floor
-from nsvq_lightning.compression.sensitivity import sensitivity
-from nsvq_lightning.quality.masking import kept
+from nsvq_lightning.compression.importance import row_weights, scale_floor, sensitivity
+from nsvq_lightning.quality.loss import kept
 from nsvq_lightning.quality.metrics import eight_bit
-from nsvq_lightning.quantize.attributes import QUANTIZED, check_attributes
+from nsvq_lightning.quantize.attributes import QUANTIZED, check_attributes, codes_of
 from nsvq_lightning.quantize.base import (
     Holding,
     Quantizer,
@@ -28,10 +26,9 @@ from nsvq_lightning.quantize.base import (
     is_limitable,
     is_refittable,
 )
-from nsvq_lightning.quantize.cheapest import cheapest, code_rates
-from nsvq_lightning.quantize.scene import codes_of
+from nsvq_lightning.quantize.nearest import cheapest, code_rates
 from nsvq_lightning.random import derive_seed, generator
-from nsvq_lightning.splats.forms import Form, canonical
+from nsvq_lightning.splats.canonical_covariance import Form, canonical
 from nsvq_lightning.training.edit import change_coordinates, raise_scales, reset_moments, trainable_rows
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.optim import codebook_group, raw_optimizer
@@ -62,12 +59,13 @@ Mode = Literal["none", "sign", "full", "auto"]
 class CanonicalCovariance(LatchedCallback):
     """After the last iteration before the quantize phase, gives like covariances like scales and rotations.
 
-    ``mode`` gives each one of its 48 equivalent pairs of scale and rotation (:mod:`nsvq_lightning.splats.forms`), so
-    that k-means groups them; renderings do not change. The form is not enforced afterwards: rows move continuously and
-    keep their codes, while a row that jumped to another equivalent pair would lose its code.
+    ``mode`` gives each one of its 48 equivalent pairs of scale and rotation
+    (:mod:`nsvq_lightning.splats.canonical_covariance`), so that k-means groups them; renderings do not change. The form
+    is not enforced afterwards: rows move continuously and keep their codes, while a row that jumped to another
+    equivalent pair would lose its code.
 
     ``floor`` raises scales too small to be visible to one value, then and throughout the quantize phase, so that no
-    codes are spent on distinguishing them (:func:`nsvq_lightning.compression.pixel_size.scale_floor`).
+    codes are spent on distinguishing them (:func:`nsvq_lightning.compression.importance.scale_floor`).
 
     With 4k codes on 187 k splats, right after k-means for scales and rotations, test PSNR was 30.47 dB with ``none``,
     30.61 dB with ``sign`` and 31.17 dB with ``full``, against 31.64 dB unquantized; ``auto`` chose the last.
@@ -450,7 +448,7 @@ class RateDistortion(LatchedCallback):
     """In the quantize phase, gives every splat the code with the least error + λ · bits instead of the nearest one.
 
     The error is that of the pictures: a code's squared distance times what it does to the train views
-    (:func:`nsvq_lightning.compression.sensitivity.sensitivity`). The bits are −log2 of how many splats have the code.
+    (:func:`nsvq_lightning.compression.importance.sensitivity`). The bits are −log2 of how many splats have the code.
     So a splat that is hardly seen, or nearly round, takes a code that many others have, which costs few bits once the
     file is entropy-coded; and training, which renders these codes, makes up for it. The rest of the phase is as
     before, and the codes that splats have in the end are frozen.

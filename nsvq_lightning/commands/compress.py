@@ -92,8 +92,7 @@ class Result:
 
 def _compress(options: argparse.Namespace) -> int:
     from nsvq_lightning.compression.ladder import Compressor
-    from nsvq_lightning.compression.pictures import decibels
-    from nsvq_lightning.compression.viewpoints import views_of
+    from nsvq_lightning.compression.viewpoints import decibels, views_of
     from nsvq_lightning.io.formats import read_scene
     from nsvq_lightning.io.nsvq.frame import with_origin
     from nsvq_lightning.training.run_folder import claim_version
@@ -171,7 +170,7 @@ def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> i
         Exit status of ``nsvq fit``, which writes a run into ``folder``.
     """
     from nsvq_lightning.commands.main import main as run
-    from nsvq_lightning.compression.pixel_size import INVISIBLE
+    from nsvq_lightning.compression.importance import INVISIBLE
 
     steps = 3000 if options.max_steps is None else options.max_steps
     precision = vars(candidate.storage.precision)

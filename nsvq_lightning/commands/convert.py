@@ -116,7 +116,7 @@ def _cleaned(scene: CompressedScene, options: argparse.Namespace) -> CompressedS
 def _up(options: argparse.Namespace) -> NDArray[np.float64]:
     if options.up_from is None:
         from nsvq_lightning.data.scene import load_scene
-        from nsvq_lightning.rendering.cameras import up_of
+        from nsvq_lightning.rendering.camera import up_of
 
         return up_of(load_scene(options.root).cameras)
     up = np.array(options.up_from)
@@ -169,8 +169,7 @@ def _errors(scene: CompressedScene, output: Path) -> str:
 
 def _measure(source: Path, output: Path, root: Path | None) -> None:
     from nsvq_lightning.compression.ladder import MEASURED
-    from nsvq_lightning.compression.pictures import decibels, picture_error, pictures
-    from nsvq_lightning.compression.viewpoints import views_of
+    from nsvq_lightning.compression.viewpoints import decibels, picture_error, pictures, views_of
 
     original = read_scene(source).finite()
     if len(original) == 0:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from nsvq_lightning.io.nsvq.precision import Precision
-from nsvq_lightning.splats.sh_degree import sh_coefficients
+from nsvq_lightning.splats.conventions import sh_coefficients
 
 __all__ = ["splats_for_bytes", "splats_for_photos"]
 

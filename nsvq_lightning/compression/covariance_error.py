@@ -12,7 +12,7 @@ from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
-from nsvq_lightning.splats.forms import FORMS, Form, canonical
+from nsvq_lightning.splats.canonical_covariance import FORMS, Form, canonical
 
 __all__ = ["covariance_error", "covariances", "form_errors"]
 

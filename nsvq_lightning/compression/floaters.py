@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.quality.masking import kept
+from nsvq_lightning.quality.loss import kept
 from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nsvq_lightning.io.compressed import QUANTIZABLE, CompressedScene
+from nsvq_lightning.quantize.attributes import attribute_rows, codes_of
 from nsvq_lightning.quantize.base import Quantizer
-from nsvq_lightning.quantize.scene import attribute_rows, codes_of
-from nsvq_lightning.splats.finite import dropped, finite_rows
+from nsvq_lightning.splats.arrays import dropped, finite_rows
 from nsvq_lightning.splats.splats import RawSplats, sh_degree_of
 
 __all__ = ["compress", "formula_bytes"]

@@ -1,4 +1,9 @@
-"""Which compiled kernels take a tensor. All fast paths ask here; the answer for a dtype and device never changes."""
+"""Which compiled kernels take a tensor, how Triton's are launched, and copies that wait for nothing but themselves.
+
+Triton itself is not imported. It compiles a kernel anew for integers that are 1 or multiples of 16. Numbers that change
+from step to step, such as that of the splats in view, are named in ``do_not_specialize``, or kernels would compile in
+the middle of a run.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +15,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-__all__ = ["kernels_for", "not_on_cuda", "triton_obstacle"]
+__all__ = ["COMPILE", "LateNumber", "kernels_for", "not_on_cuda", "triton_obstacle", "upload"]
 
 
 def kernels_for(like: Tensor) -> Literal["cpu", "cuda"] | None:
@@ -58,3 +63,46 @@ def _interpreted() -> bool:
 def _has_triton() -> bool:
     """Whether Triton is installed; a render with ``backend="cuda"`` asks each time."""
     return importlib.util.find_spec("triton") is not None
+
+
+def upload(tensor: Tensor, device: torch.device | str) -> Tensor:
+    """The tensor on a device, or itself if it is there already; the copy to a GPU runs beside what is queued there."""
+    device = torch.device(device)
+    if device.type == "cuda" and tensor.device.type == "cpu":
+        tensor = tensor.pin_memory()  # from other memory, the driver copies before the call returns
+    return tensor.to(device, non_blocking=True)
+
+
+class LateNumber:
+    """A number from a device, which can be read without waiting for what has been queued since.
+
+    ``tensor.item()`` waits until a GPU has done all its work, and the GPU then waits for the next launch. Here the copy
+    starts at once, and :meth:`read` waits for that copy alone.
+
+    Args:
+        value: Scalar tensor on any device.
+    """
+
+    def __init__(self, value: Tensor) -> None:
+        self._host, self._copied = value.detach(), None
+        if value.is_cuda:
+            self._host = torch.empty((), dtype=value.dtype, pin_memory=True)
+            self._host.copy_(value.detach(), non_blocking=True)
+            self._copied = torch.cuda.Event()
+            self._copied.record(torch.cuda.current_stream(value.device))
+
+    @property
+    def is_here(self) -> bool:
+        """Whether the number was on the host from the start, so that nobody ever waits for it."""
+        return self._copied is None
+
+    def read(self) -> float:
+        """The number."""
+        if self._copied is not None:
+            self._copied.synchronize()
+        return float(self._host)
+
+
+COMPILE = {"enable_fp_fusion": True}
+"""Options of every launch. Triton's default is about to change; values on which the forward and backward pass must
+agree to the bit are computed with an explicit ``fma``."""

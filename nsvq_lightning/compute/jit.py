@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numba.core import event
 
-from nsvq_lightning.compute.store import KernelStore
+from nsvq_lightning.compute.kernel_cache import KernelStore
 
 __all__ = ["F", "inline", "kernel", "kernels_ready", "thread_count"]
 
@@ -79,7 +79,7 @@ def inline(function: Callable[..., Any]) -> Any:
 
 
 def kernel(function: Callable[..., Any], parallel: bool = True, allocates: bool = True) -> Any:
-    """Compile a kernel once per machine, and keep it on the disk (:mod:`nsvq_lightning.compute.store`).
+    """Compile a kernel once per machine, and keep it on the disk (:mod:`nsvq_lightning.compute.kernel_cache`).
 
     Small kernels pass ``parallel=False``: waking the threads costs more than they take. A kernel that allocates no
     arrays may pass ``allocates=False``: the arrays that it passes to inlined helpers are then not reference-counted,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from nsvq_lightning.compute.transfer import upload
+from nsvq_lightning.compute.devices import upload
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel
 from nsvq_lightning.data.images import ROUNDED, ImageHead, ImageSource, ImageStore, image_head
 from nsvq_lightning.data.masks import find_masks

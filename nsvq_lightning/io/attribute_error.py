@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.opacity import opacity_of
 from nsvq_lightning.splats.arrays import SplatArrays
-from nsvq_lightning.splats.rotations import unit
+from nsvq_lightning.splats.conventions import unit
 
 __all__ = ["attribute_errors"]
 

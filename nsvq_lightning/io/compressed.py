@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.ply import plain_ply_bytes
-from nsvq_lightning.splats.arrays import SplatArrays, check_floats
-from nsvq_lightning.splats.finite import dropped, finite_rows
-from nsvq_lightning.splats.sh_degree import sh_coefficients
+from nsvq_lightning.splats.arrays import SplatArrays, check_floats, dropped, finite_rows
+from nsvq_lightning.splats.conventions import sh_coefficients
 
 if TYPE_CHECKING:
     from nsvq_lightning.splats.splats import Splats

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.splats.rotations import turned
-from nsvq_lightning.splats.sh_degree import sh_coefficients
+from nsvq_lightning.splats.conventions import sh_coefficients, turned
 
 __all__ = ["UP_AXES", "cropped", "rotated", "turn_up"]
 

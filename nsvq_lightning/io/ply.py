@@ -16,8 +16,7 @@ from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.opacity import finite_logits, logits_of_bytes
 from nsvq_lightning.io.ply_header import MIP_COMMENTS, PlyHeader, read_ply_header, splat_degree, splat_properties
 from nsvq_lightning.splats.arrays import SplatArrays
-from nsvq_lightning.splats.rotations import from_smallest_three
-from nsvq_lightning.splats.sh_degree import sh_coefficients
+from nsvq_lightning.splats.conventions import from_smallest_three, sh_coefficients
 
 __all__ = ["plain_ply_bytes", "read_ply", "read_ply_columns", "read_ply_size", "write_ply"]
 

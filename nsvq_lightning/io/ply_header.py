@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.splats.sh_degree import sh_coefficients, shN_degree
+from nsvq_lightning.splats.conventions import sh_coefficients, shN_degree
 
 __all__ = [
     "MIP_COMMENTS",

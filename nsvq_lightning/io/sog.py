@@ -32,8 +32,7 @@ from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.lloyd import best_levels, nearest_level
 from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
 from nsvq_lightning.io.sog_archive import META, SogArchive, picture_shape, write_archive
-from nsvq_lightning.splats.rotations import from_smallest_three, smallest_three, unit
-from nsvq_lightning.splats.sh_degree import sh_coefficients
+from nsvq_lightning.splats.conventions import from_smallest_three, sh_coefficients, smallest_three, unit
 
 __all__ = ["PALETTE_LIMIT", "in_sog_order", "read_sog", "read_sog_header", "write_sog"]
 

@@ -26,7 +26,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
 from nsvq_lightning.splats.arrays import SplatArrays
-from nsvq_lightning.splats.rotations import unit
+from nsvq_lightning.splats.conventions import unit
 
 __all__ = ["SPLAT_LAYOUT", "count_splats", "read_splat", "write_splat"]
 

@@ -40,8 +40,7 @@ from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
 from nsvq_lightning.io.placing import UP_AXES, rotated
 from nsvq_lightning.io.spz_frame import ANTIALIASED, MOST_FRACTION, SPZ_VERSIONS, SpzHeader, read_frame, write_frame
 from nsvq_lightning.splats.arrays import SplatArrays
-from nsvq_lightning.splats.rotations import from_smallest_three, smallest_three, unit
-from nsvq_lightning.splats.sh_degree import sh_coefficients
+from nsvq_lightning.splats.conventions import from_smallest_three, sh_coefficients, smallest_three, unit
 
 __all__ = ["DEFAULT_AXES", "DEFAULT_VERSION", "SPZ_AXES", "in_spz_order", "read_spz", "write_spz"]
 

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from nsvq_lightning.io import zstd
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.errors import FormatError, naming_file
-from nsvq_lightning.splats.sh_degree import sh_coefficients
+from nsvq_lightning.splats.conventions import sh_coefficients
 
 __all__ = [
     "ANTIALIASED",

@@ -1,4 +1,8 @@
-"""The photometric loss: (1 - λ)·L1 + λ·(1 - SSIM) (Kerbl et al. 2023, eq. 7)."""
+"""The photometric loss: (1 - λ)·L1 + λ·(1 - SSIM) (Kerbl et al. 2023, eq. 7), without the pixels that do not count.
+
+No loss and no metric depends on masked pixels. Both pictures are black there, as the structural similarity takes them
+to be beyond their borders, and means are over the pixels that count.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +13,19 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.quality.masking import kept, mean_of_kept
 from nsvq_lightning.quality.ssim import check_pair, in_range, plain_ssim
 
-__all__ = ["photometric_loss", "ssim"]
+__all__ = ["kept", "mean_of_kept", "photometric_loss", "ssim"]
+
+
+def kept(image: Tensor, mask: Tensor | None) -> Tensor:
+    """An image ``[H, W, 3]`` that is 0 where its mask ``[H, W]`` is; itself without a mask."""
+    return image if mask is None else image * mask[..., None]
+
+
+def mean_of_kept(mean: Tensor, mask: Tensor | None) -> Tensor:
+    """The mean over the pixels that count, from the mean over all pixels of something that is 0 elsewhere."""
+    return mean if mask is None else mean * (mask.numel() / mask.sum())
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -21,7 +34,7 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     Args:
         image: ``[H, W, 3]``, clamped to [0, 1].
         target: ``[H, W, 3]``, uint8 or in [0, 1].
-        mask: Which pixels count ``[H, W]`` bool, see :mod:`nsvq_lightning.quality.masking`; None if all do.
+        mask: Which pixels count ``[H, W]`` bool, see :mod:`nsvq_lightning.quality.loss`; None if all do.
 
     Returns:
         Scalar, 1 for equal images (Wang et al. 2004, eq. 13; beyond the border the images count as 0).
@@ -53,7 +66,7 @@ def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2, m
         image: Rendered ``[H, W, 3]``; values outside [0, 1] get no gradient.
         target: Photo ``[H, W, 3]``, uint8 or in [0, 1].
         dssim_weight: λ in [0, 1].
-        mask: Which pixels count ``[H, W]`` bool, see :mod:`nsvq_lightning.quality.masking`; None if all do.
+        mask: Which pixels count ``[H, W]`` bool, see :mod:`nsvq_lightning.quality.loss`; None if all do.
 
     Raises:
         ValueError: The shapes differ.

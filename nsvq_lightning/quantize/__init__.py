@@ -4,12 +4,10 @@ from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.quantize.attributes import QUANTIZED, QuantizedAttribute, codebook_sizes
 from nsvq_lightning.quantize.base import Holding, Quantizer, Refittable
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
-from nsvq_lightning.quantize.diveq import DiVeQ
 from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest, nearest_reference
-from nsvq_lightning.quantize.nsvq import NSVQ
-from nsvq_lightning.quantize.post_hoc import PostHoc
-from nsvq_lightning.quantize.straight_through import StraightThrough, TrainedStraightThrough
+from nsvq_lightning.quantize.nsvq import NSVQ, DiVeQ
+from nsvq_lightning.quantize.straight_through import PostHoc, StraightThrough, TrainedStraightThrough
 from nsvq_lightning.quantize.vector_quantize import VectorQuantizeAdapter
 
 __all__ = [

@@ -1,13 +1,30 @@
-"""The vector-quantized attributes of a splat, and how many codes the paper gives each."""
+"""Which attributes are quantized, with which codebooks, and a scene whose rows are replaced by their codes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
-__all__ = ["QUANTIZED", "QuantizedAttribute", "check_attributes", "codebook_sizes"]
+from nsvq_lightning.compute.rows import take_rows
+from nsvq_lightning.quantize.base import Quantizer, as_quantizer, held_codes
+from nsvq_lightning.skips import is_on
+from nsvq_lightning.splats.splats import RawSplats, Splats
+
+__all__ = [
+    "QUANTIZED",
+    "QuantizedAttribute",
+    "attribute_rows",
+    "build_quantizers",
+    "check_attributes",
+    "codebook_sizes",
+    "codes_of",
+    "decoded",
+    "noisy_rows",
+]
 
 
 @dataclass(frozen=True)
@@ -79,3 +96,90 @@ def codebook_sizes(name: str) -> dict[str, int]:
     if name not in settings:
         raise ValueError(f"unknown codebook setting {name!r}; choose one of {', '.join(settings)}")
     return {attribute.name: int(settings[name] * attribute.code_share) for attribute in QUANTIZED.values()}
+
+
+def build_quantizers(
+    quantizer: Callable[[int, int], nn.Module], codebooks: str | Mapping[str, int] | None, splats: Splats
+) -> dict[str, nn.Module]:
+    """Quantizers by attribute, in the order of ``QUANTIZED``.
+
+    Args:
+        quantizer: Makes one from (number of codes, dimension).
+        codebooks: The paper's name for the sizes, or number of codes by attribute, or None.
+        splats: Gives the dimensions; without higher SH coefficients there is no quantizer for them.
+
+    Raises:
+        ValueError: A codebook is for an unknown attribute, or has no code.
+        TypeError: What ``quantizer`` makes does not implement :class:`~nsvq_lightning.quantize.base.Quantizer`.
+    """
+    sizes = codebook_sizes(codebooks) if isinstance(codebooks, str) else dict(codebooks or {})
+    unknown = sorted(set(sizes) - set(QUANTIZED))
+    if unknown:
+        raise ValueError(f"codebooks: unknown attributes {', '.join(unknown)}; choose from {', '.join(QUANTIZED)}")
+    built: dict[str, nn.Module] = {}
+    for name in QUANTIZED:
+        dim = getattr(splats, name).shape[1:].numel()
+        if name not in sizes or dim == 0:
+            continue
+        if sizes[name] < 1:
+            raise ValueError(f"codebooks: {name} needs at least 1 code, got {sizes[name]}")
+        module = quantizer(sizes[name], dim)
+        as_quantizer(module)
+        built[name] = module
+    return built
+
+
+def attribute_rows(splats: RawSplats, attribute: str) -> Tensor:
+    """Rows ``[N, D]`` of a quantized attribute, detached."""
+    return QUANTIZED[attribute].rows(getattr(splats, attribute).detach())
+
+
+def codes_of(splats: RawSplats, attribute: str, quantizer: Quantizer) -> Tensor:
+    """Codes ``[N]`` of an attribute: the frozen ones, those that are held, or the nearest ones now."""
+    held = held_codes(quantizer, splats.means.shape[0])
+    if held is not None:
+        return held
+    frozen = quantizer.codes.shape[0] == splats.means.shape[0]
+    if frozen and is_on("frozen_search"):
+        return quantizer.codes
+    nearest = quantizer.encode(attribute_rows(splats, attribute))
+    return quantizer.codes if frozen else nearest
+
+
+def decoded(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> RawSplats:
+    """Every quantized attribute replaced by its codebook rows; gradients reach codebooks, positions and opacities."""
+    values = {
+        name: QUANTIZED[name].unrows(quantizer.decode(codes_of(splats, name, quantizer)), getattr(splats, name))
+        for name, quantizer in quantizers.items()
+    }
+    return splats._replace(**values)
+
+
+def noisy_rows(
+    splats: RawSplats,
+    rows: Tensor,
+    quantizers: Mapping[str, Quantizer],
+    noise: Callable[[str], torch.Generator],
+) -> RawSplats:
+    """Some of the splats, their quantized attributes replaced by the training stand-in (paper, section 3.2).
+
+    Args:
+        splats: Raw attributes of ``N`` splats.
+        rows: Which of them ``[V]``, int64, distinct.
+        quantizers: Quantizer by attribute; each counts the codes it uses.
+        noise: Generator for an attribute.
+
+    Returns:
+        ``V`` splats; gradients reach the chosen rows and the codebooks.
+    """
+    subset: dict[str, Any] = {}
+    for name, tensor in splats._asdict().items():
+        if name not in quantizers:
+            subset[name] = take_rows(tensor, rows)
+            continue
+        attribute = QUANTIZED[name]
+        # Call the module, not its forward: hooks of user-made quantizers must run.
+        call: Callable[..., tuple[Tensor, Tensor]] = quantizers[name]  # type: ignore[assignment]
+        quantized, _ = call(attribute.rows(tensor), noise(name), rows)
+        subset[name] = attribute.unrows(quantized, tensor)
+    return RawSplats(**subset)

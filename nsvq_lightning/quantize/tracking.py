@@ -36,8 +36,7 @@ from nsvq_lightning.compute.lanes import (
     store,
 )
 from nsvq_lightning.compute.memory import INT64, check_array
-from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, BoxMemory, box_search, empty_memory
-from nsvq_lightning.quantize.boxes import build_boxes
+from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, BoxMemory, box_search, build_boxes, empty_memory
 from nsvq_lightning.quantize.nearest import check_rows, nearest
 from nsvq_lightning.quantize.scores import LIST, centre_codes, score_search, true_distance
 

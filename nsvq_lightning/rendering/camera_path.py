@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import RotationSpline
 
-from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.cameras import looked_at, poses, up_of
+from nsvq_lightning.rendering.camera import Camera, looked_at, poses, up_of
 
 __all__ = ["orbit", "read_camera_path", "reframed", "smooth_path"]
 

@@ -24,7 +24,7 @@ from nsvq_lightning.rendering.constants import (
     TRANSMITTANCE_MIN,
 )
 from nsvq_lightning.rendering.sh import sh_colors
-from nsvq_lightning.splats.rotations import MIN_SQUARED_NORM
+from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors
 
 __all__ = ["Projection", "project", "render_reference", "rotation_matrices", "times_vectors", "visible_rows"]

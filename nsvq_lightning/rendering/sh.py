@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from nsvq_lightning.splats.sh_degree import sh_coefficients
+from nsvq_lightning.splats.conventions import sh_coefficients
 
 __all__ = ["C0", "C1", "C2", "C3", "sh_basis", "sh_colors", "sh_rotation"]
 

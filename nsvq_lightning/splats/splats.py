@@ -11,7 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from nsvq_lightning.splats.sh_degree import sh_coefficients, shN_degree
+from nsvq_lightning.splats.conventions import sh_coefficients, shN_degree
 
 __all__ = ["ATTRIBUTES", "RawSplats", "SplatTensors", "Splats", "check_shapes", "sh_degree_of"]
 

@@ -16,18 +16,17 @@ from torch import Tensor, nn
 from torchmetrics import Metric
 
 from nsvq_lightning.compression.stored import compress
+from nsvq_lightning.compute.devices import LateNumber, upload
 from nsvq_lightning.compute.environment import threads_spin
-from nsvq_lightning.compute.transfer import LateNumber, upload
 from nsvq_lightning.data.scene import ONE_PLACE, Scene, View
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.nsvq.precision import Storage
-from nsvq_lightning.quality.loss import photometric_loss
-from nsvq_lightning.quality.masking import kept
+from nsvq_lightning.quality.loss import kept, photometric_loss
 from nsvq_lightning.quality.metrics import eight_bit, image_metrics, psnr
+from nsvq_lightning.quantize.attributes import attribute_rows, build_quantizers, decoded, noisy_rows
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.quantize.nsvq import NSVQ
-from nsvq_lightning.quantize.scene import attribute_rows, build_quantizers, decoded, noisy_rows
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, render, visible

@@ -18,11 +18,11 @@ from lightning.pytorch.cli import instantiate_module
 
 from nsvq_lightning.compression.importance import row_weights
 from nsvq_lightning.io.formats import load, save
-from nsvq_lightning.quantize.scene import decoded, noisy_rows
+from nsvq_lightning.quantize.attributes import decoded, noisy_rows
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import visible
-from nsvq_lightning.splats.sh_degree import sh_coefficients
+from nsvq_lightning.splats.conventions import sh_coefficients
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase

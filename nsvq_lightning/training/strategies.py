@@ -13,7 +13,7 @@ from lightning.pytorch.strategies import DDPStrategy, StrategyRegistry
 from torch import Tensor
 from torch.distributed import all_reduce, broadcast
 
-from nsvq_lightning.compute.transfer import upload
+from nsvq_lightning.compute.devices import upload
 from nsvq_lightning.training.replicas import follow_first
 
 __all__ = ["ViewParallelStrategy"]

@@ -13,8 +13,7 @@ from lightning.pytorch import Callback, Trainer
 
 from nsvq_lightning.callbacks import ExposureCompensation, PhaseSchedule
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.quality.color import color_corrected
-from nsvq_lightning.quality.metrics import psnr
+from nsvq_lightning.quality.metrics import color_corrected, psnr
 from nsvq_lightning.training.module import SplatModule
 
 STOPS = (0.0, 0.4, -0.4, 0.3, -0.3, 0.2, -0.2, 0.0, 0.0)

@@ -10,7 +10,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.callbacks import FrequencyLimit, PhaseSchedule
-from nsvq_lightning.compression.pixel_size import pixel_sizes
+from nsvq_lightning.compression.importance import pixel_sizes
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.formats import read_scene, save

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from nsvq_lightning.compression.floaters import floaters
-from nsvq_lightning.compression.pictures import look_at
+from nsvq_lightning.compression.viewpoints import look_at
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats

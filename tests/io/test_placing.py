@@ -9,11 +9,10 @@ from compressed_scenes import scene as coded
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from nsvq_lightning.compression.pictures import look_at
+from nsvq_lightning.compression.viewpoints import look_at
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.placing import UP_AXES, cropped, rotated, turn_up
-from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.cameras import up_of
+from nsvq_lightning.rendering.camera import Camera, up_of
 from nsvq_lightning.rendering.rasterize import render
 from tests.support.splat_scenes import ball
 

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from viewer_scenes import angles, assert_same, coded_scene, nearest_in, needs_zstd, plain_scene, sigmoid
 
 from nsvq_lightning.commands.info import main as info
-from nsvq_lightning.compression.pictures import decibels, picture_error, pictures
+from nsvq_lightning.compression.viewpoints import decibels, picture_error, pictures
 from nsvq_lightning.io import CompressedScene, FormatError, SplatArrays, load, read_scene, save
 from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.sog import write_sog

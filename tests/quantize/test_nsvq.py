@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.quantize import NSVQ, nearest, substitution
-from nsvq_lightning.quantize.noise import draw_seed, normal_vectors
 from nsvq_lightning.quantize.nsvq import noise_substitution
-from nsvq_lightning.quantize.substitution import substitute, substitute_backward
+from nsvq_lightning.quantize.substitution import draw_seed, normal_vectors, substitute, substitute_backward
 from nsvq_lightning.random import generator
 
 DIMS = [4, 9, 45, *(pytest.param(dim, marks=pytest.mark.slow) for dim in (1, 16))]

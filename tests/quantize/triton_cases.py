@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 import torch
 
-from nsvq_lightning.quantize import noise
+from nsvq_lightning.quantize import substitution
 from nsvq_lightning.quantize.cuda import tracking as tracking_module
 from nsvq_lightning.quantize.cuda.nearest import nearest_codes
-from nsvq_lightning.quantize.cuda.noise import normal_vectors
-from nsvq_lightning.quantize.cuda.substitution import substitute
+from nsvq_lightning.quantize.cuda.substitution import normal_vectors, substitute
 from nsvq_lightning.quantize.cuda.sums import sorted_by_code, sum_rows
 from nsvq_lightning.quantize.cuda.tracking import DeviceTracker
 from nsvq_lightning.quantize.kmeans import kmeans
@@ -188,7 +187,7 @@ def test_codes_beyond_sixteen_bits(num_codes: int) -> None:
 @pytest.mark.parametrize("seed", [0, 2**31 - 1, 2**63 - 1])
 def test_noise_is_that_of_the_cpu(seed: int) -> None:
     found = normal_vectors(seed, 6, torch.device(DEVICE)).cpu().numpy()
-    np.testing.assert_allclose(found, noise.normal_vectors(seed, 6), rtol=2e-6, atol=2e-6)
+    np.testing.assert_allclose(found, substitution.normal_vectors(seed, 6), rtol=2e-6, atol=2e-6)
 
 
 def test_noise_is_normal() -> None:

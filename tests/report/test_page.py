@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from nsvq_lightning.report.curve_svg import curve_svg
-from nsvq_lightning.report.page import RunPage
+from nsvq_lightning.report.page import RunPage, curve_svg
 from nsvq_lightning.report.pictures import comparison, file_stem, write_png
 from nsvq_lightning.training.schedule import Schedule
 

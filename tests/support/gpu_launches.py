@@ -26,7 +26,7 @@ from triton.runtime.jit import JITFunction, create_function_from_signature
 
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quantize.cuda.nearest import nearest_codes
-from nsvq_lightning.quantize.cuda.noise import normal_vectors
+from nsvq_lightning.quantize.cuda.substitution import normal_vectors
 from nsvq_lightning.quantize.cuda.sums import sum_rows
 from nsvq_lightning.quantize.cuda.tracking import SNAPSHOT_STEPS, DeviceTracker
 from nsvq_lightning.quantize.nsvq import NSVQ
@@ -126,7 +126,7 @@ CASES: dict[str, Callable[[], object]] = {
     "sums_3": lambda: sums(3, torch.float32),
     "sums_45": lambda: sums(45, torch.float64),
 }
-USERS = ("quality.loss", "compute.rows", "quantize.nearest", "quantize.tracking", "quantize.nsvq", "quantize.sums")
+USERS = ("quality.loss", "compute.rows", "quantize.nearest", "quantize.tracking", "quantize.nsvq", "quantize.kmeans")
 """The modules that choose kernels by device."""
 
 compiled: dict[str, dict[str, Any]] = {}

@@ -88,8 +88,7 @@ def _gradient(dim: int) -> dict[str, Any]:
 
 
 def _box_search() -> dict[str, Any]:
-    from nsvq_lightning.quantize.box_search import BoxMemory
-    from nsvq_lightning.quantize.boxes import build_boxes
+    from nsvq_lightning.quantize.box_search import BoxMemory, build_boxes
 
     codebook = _normal(300, 3, seed=1)
     memory = BoxMemory(_codes(70, 300).astype(np.int32), _normal(70, 3), np.full(70, 0.2))
@@ -232,7 +231,7 @@ NUMBA: dict[str, list[Case]] = {
     f"{_CPU}.statistics.add_view": [Case(_statistics)],
     f"{_CPU}.statistics.add_observed": [Case(_observed)],
     f"{_Q}.box_search.box_search": [Case(_box_search, rows=("x", "rows"), numbers=("rows",))],
-    f"{_Q}.boxes.build_boxes": [
+    f"{_Q}.box_search.build_boxes": [
         Case(lambda: {"codebook": _normal(300, 3)}, rows=("codebook",), columns=("codebook",)),
         Case(
             lambda: {"codebook": _normal(300, 3), "order": np.arange(300, dtype=np.int32)[::-1].copy()},
@@ -240,9 +239,9 @@ NUMBA: dict[str, list[Case]] = {
             numbers=("order",),
         ),
     ],
-    f"{_Q}.cheapest.cheapest": [Case(_priced, rows=("x", "prices"), types=("x", "codebook"))],
+    f"{_Q}.nearest.cheapest": [Case(_priced, rows=("x", "prices"), types=("x", "codebook"))],
     f"{_Q}.kmeans.distinct_rows": [Case(lambda: {"x": _tensor(70, 3)}, rows=("x",), columns=("x",), types=("x",))],
-    f"{_Q}.noise.normal_vectors": [Case(lambda: {"seed": 5, "vectors": 4})],
+    f"{_Q}.substitution.normal_vectors": [Case(lambda: {"seed": 5, "vectors": 4})],
     f"{_Q}.scores.centre_codes": [
         Case(lambda: {"codebook": _normal(50, 12)}, rows=("codebook",), columns=("codebook",))
     ],
@@ -254,14 +253,14 @@ NUMBA: dict[str, list[Case]] = {
     f"{_Q}.substitution.substitute_backward": [
         Case(lambda dim=dim: _gradient(dim), rows=("x", "codebook"), numbers=("rows", "codes")) for dim in (3, 20)
     ],
-    f"{_Q}.sums.count_hits": [
+    f"{_Q}.kmeans.count_hits": [
         Case(
             lambda: {"codes": torch.from_numpy(_codes()), "usage": torch.zeros(9, dtype=torch.int64)},
             rows=("codes", "usage"),
             numbers=("codes",),
         )
     ],
-    f"{_Q}.sums.sum_by_code": [
+    f"{_Q}.kmeans.sum_by_code": [
         Case(
             lambda: {"values": _tensor(40, 5), "codes": torch.from_numpy(_codes()), "num_codes": 9},
             columns=("values",),
@@ -423,7 +422,7 @@ TRITON: dict[str, list[Case]] = {
             call=_search_on_device,
         )
     ],
-    f"{_Q}.cuda.noise.normal_vectors": [Case(lambda: {"seed": 5, "vectors": 4, "device": torch.device("cpu")})],
+    f"{_Q}.cuda.substitution.normal_vectors": [Case(lambda: {"seed": 5, "vectors": 4, "device": torch.device("cpu")})],
     f"{_Q}.cuda.substitution.substitute": [
         Case(lambda dim=dim: {"seed": 5} | _tensors(_substitution(dim)), rows=("x", "codebook")) for dim in (3, 20)
     ],

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.compression.pictures import look_at, middle_of
+from nsvq_lightning.compression.viewpoints import look_at, middle_of
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 

@@ -24,7 +24,7 @@ from nsvq_lightning.callbacks import (
 )
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.compression.covariance_error import covariances
-from nsvq_lightning.compression.pixel_size import scale_floor
+from nsvq_lightning.compression.importance import scale_floor
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.training.module import SplatModule

@@ -19,10 +19,9 @@ import torch
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.quality.loss import photometric_loss, ssim
-from nsvq_lightning.quantize.diveq import DiVeQ
-from nsvq_lightning.quantize.nsvq import NSVQ
+from nsvq_lightning.quantize.kmeans import lookup, sum_by_code
+from nsvq_lightning.quantize.nsvq import NSVQ, DiVeQ
 from nsvq_lightning.quantize.straight_through import StraightThrough, TrainedStraightThrough
-from nsvq_lightning.quantize.sums import lookup, sum_by_code
 from nsvq_lightning.random import generator
 
 USERS = (
@@ -31,8 +30,8 @@ USERS = (
     "quantize.nearest",
     "quantize.tracking",
     "quantize.nsvq",
-    "quantize.sums",
-    "callbacks.density_rules",
+    "quantize.kmeans",
+    "callbacks.density",
 )
 """The modules that choose kernels by device."""
 

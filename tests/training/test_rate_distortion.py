@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nsvq_lightning.callbacks import DensityControl, RateDistortion, RunCheckpoint
 from nsvq_lightning.quantize import TrainedStraightThrough
-from nsvq_lightning.quantize.cheapest import code_rates
+from nsvq_lightning.quantize.nearest import code_rates
 from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.module import SplatModule
 

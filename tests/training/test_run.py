@@ -29,7 +29,7 @@ from nsvq_lightning.callbacks import (
     PhaseSchedule,
     RunCheckpoint,
 )
-from nsvq_lightning.compute.transfer import LateNumber
+from nsvq_lightning.compute.devices import LateNumber
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.nsvq.file import read_header, read_nsvq, write_nsvq

@@ -27,7 +27,7 @@ from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
-USERS = ("quality.loss", "compute.rows", "quantize.nearest", "quantize.tracking", "quantize.nsvq", "quantize.sums")
+USERS = ("quality.loss", "compute.rows", "quantize.nearest", "quantize.tracking", "quantize.nsvq", "quantize.kmeans")
 PACKAGE = Path(nsvq_lightning.__file__).parent
 IDLE = {"detach", "view", "select", "slice", "t", "unbind", "transpose", "as_strided", "expand", "alias", "unsqueeze"}
 IDLE |= {"empty", "new_empty", "empty_like", "_record_function_enter_new", "_record_function_exit"}

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from nsvq_lightning.commands.benchmark.scope import Scope
 from nsvq_lightning.commands.benchmark.sizes import SIZES, Size
-from nsvq_lightning.compression.pictures import look_at, middle_of
+from nsvq_lightning.compression.viewpoints import look_at, middle_of
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.splats.finite import finite_rows
+from nsvq_lightning.splats.arrays import finite_rows
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
 __all__ = [

@@ -12,7 +12,7 @@ from nsvq_lightning.commands.benchmark.error_measures import relative_l2
 from nsvq_lightning.commands.benchmark.workloads import Workload, synthetic_workload
 from nsvq_lightning.commands.doctor.backends import usable_backends
 from nsvq_lightning.commands.doctor.finding import Finding, good, problem
-from nsvq_lightning.compute.store import kernel_folder
+from nsvq_lightning.compute.kernel_cache import kernel_folder
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats
 

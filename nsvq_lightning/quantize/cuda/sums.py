@@ -8,7 +8,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from nsvq_lightning.compute.launch import COMPILE
+from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 
 __all__ = ["sorted_by_code", "sum_rows"]

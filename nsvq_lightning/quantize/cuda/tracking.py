@@ -14,7 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nsvq_lightning.compute.launch import COMPILE
+from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quantize.box_search import ROUNDING
 from nsvq_lightning.quantize.cuda.nearest import CODES, ROWS, by_column, compare, least_of

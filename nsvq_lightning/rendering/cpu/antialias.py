@@ -32,7 +32,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu.projection import BLUR, BLUR_SQUARED, HUGE_FOOTPRINT, affine, axes_of, image_axes
 from nsvq_lightning.rendering.cpu.projection_backward import axes_backward
 from nsvq_lightning.rendering.cpu.rasterizer import pack_camera
-from nsvq_lightning.rendering.cpu.vectors import cross, dot3, vector_range
+from nsvq_lightning.rendering.cpu.records import cross, dot3, vector_range
 
 __all__ = ["light_kept_cpu"]
 

@@ -23,8 +23,7 @@ from nsvq_lightning.compute.lanes import (
 )
 from nsvq_lightning.compute.rows import clear
 from nsvq_lightning.rendering import sh
-from nsvq_lightning.rendering.cpu.records import POSITION, RECORD, RED
-from nsvq_lightning.rendering.cpu.vectors import dot3
+from nsvq_lightning.rendering.cpu.records import POSITION, RECORD, RED, dot3
 
 C0, C1 = F(sh.C0), F(sh.C1)
 C2A, C2B, C2C = (F(value) for value in sh.C2)

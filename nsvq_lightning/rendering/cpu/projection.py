@@ -60,14 +60,17 @@ from nsvq_lightning.rendering.cpu.records import (
     WIDTH,
     X,
     Y,
+    cross,
+    dot3,
+    rotate,
+    vector_range,
 )
-from nsvq_lightning.rendering.cpu.vectors import cross, dot3, rotate, vector_range
-from nsvq_lightning.splats import rotations
+from nsvq_lightning.splats import conventions
 
 NEAR = F(constants.NEAR)
 BLUR = F(constants.BLUR)
 BLUR_SQUARED = F(constants.BLUR**2)
-MIN_SQUARED_NORM = F(rotations.MIN_SQUARED_NORM)
+MIN_SQUARED_NORM = F(conventions.MIN_SQUARED_NORM)
 FINITE = F(constants.FINITE)
 HUGE_FOOTPRINT, LARGEST_FOOTPRINT = F(constants.HUGE_FOOTPRINT), F(constants.LARGEST_FOOTPRINT)
 HUGE_QUATERNION, SHRINK = F(constants.HUGE_QUATERNION), F(constants.SHRINK)

@@ -47,8 +47,12 @@ from nsvq_lightning.rendering.cpu.records import (
     A,
     B,
     C,
+    cross,
+    dot3,
+    rotate,
+    rotate_back,
+    vector_range,
 )
-from nsvq_lightning.rendering.cpu.vectors import cross, dot3, rotate, rotate_back, vector_range
 
 COVARIANCE_SCALE = F(2 * np.log(2.0) ** 2)
 """Converts moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)²."""

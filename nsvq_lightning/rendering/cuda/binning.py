@@ -13,7 +13,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nsvq_lightning.compute.launch import COMPILE
+from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 
 __all__ = ["Tiles", "list_tiles"]

@@ -16,7 +16,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nsvq_lightning.compute.launch import COMPILE
+from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.rendering.cuda.binning import Tiles
 from nsvq_lightning.rendering.cuda.projection import Lens, load3

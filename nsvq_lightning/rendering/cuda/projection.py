@@ -13,9 +13,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nsvq_lightning.compute.launch import COMPILE
+from nsvq_lightning.compute.devices import COMPILE, upload
 from nsvq_lightning.compute.memory import check_tensor
-from nsvq_lightning.compute.transfer import upload
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda.harmonics import color, color_backward
@@ -42,7 +41,7 @@ from nsvq_lightning.rendering.cuda.records import (
     X,
     Y,
 )
-from nsvq_lightning.splats import rotations
+from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.splats import ATTRIBUTES, sh_degree_of
 
 __all__ = ["Lens", "Projected", "project", "project_backward", "project_radii"]
@@ -51,7 +50,7 @@ NEAR = tl.constexpr(constants.NEAR)
 BLUR = tl.constexpr(constants.BLUR)
 BLUR_SQUARED = tl.constexpr(constants.BLUR**2)
 FRUSTUM_MARGIN = tl.constexpr(constants.FRUSTUM_MARGIN)
-MIN_SQUARED_NORM = tl.constexpr(rotations.MIN_SQUARED_NORM)
+MIN_SQUARED_NORM = tl.constexpr(conventions.MIN_SQUARED_NORM)
 FINITE = tl.constexpr(constants.FINITE)
 HUGE_FOOTPRINT = tl.constexpr(constants.HUGE_FOOTPRINT)
 LARGEST_FOOTPRINT = tl.constexpr(constants.LARGEST_FOOTPRINT)

@@ -22,8 +22,8 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import LEVELS, read_nsvq, write_nsvq
 from nsvq_lightning.io.ply import read_ply, write_ply
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, Quantizer
+from nsvq_lightning.quantize.attributes import build_quantizers
 from nsvq_lightning.quantize.base import as_quantizer
-from nsvq_lightning.quantize.scene import build_quantizers
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.arrays import SplatArrays

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nsvq_lightning.compute.transfer import LateNumber, upload
+from nsvq_lightning.compute.devices import LateNumber, upload
 
 
 def test_a_tensor_that_is_there_stays_itself() -> None:

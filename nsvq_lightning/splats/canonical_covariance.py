@@ -13,9 +13,10 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from nsvq_lightning.splats.rotations import MIN_SQUARED_NORM
+from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM
 
 __all__ = ["FORMS", "Canonical", "Form", "canonical"]
+
 
 Form = Literal["none", "sign", "full"]
 FORMS: tuple[Form, ...] = ("none", "sign", "full")

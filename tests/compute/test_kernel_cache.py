@@ -1,4 +1,4 @@
-"""Which changes compile a stored kernel again, which do not, and where kernels are kept."""
+"""What the digest of a kernel covers, which changes compile a stored kernel again, and where kernels are kept."""
 
 from __future__ import annotations
 
@@ -12,7 +12,24 @@ import numba
 import numpy as np
 import pytest
 
-from nsvq_lightning.compute.store import VERSIONS, kernel_folder
+from nsvq_lightning.compute import lanes
+from nsvq_lightning.compute.kernel_cache import VERSIONS, digest, kernel_folder
+
+
+def test_meaning_of_operators_counts_for_all_that_names_their_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    def kernel(a: Any, b: Any) -> Any:
+        return lanes.load(a, 0) * lanes.load(b, 0)
+
+    before = digest(kernel)
+    assert digest(kernel) == before
+    monkeypatch.setattr("nsvq_lightning.compute.kernel_cache._source", lambda module: f"another {module}")
+    assert digest(kernel) != before
+
+
+def test_what_cannot_be_followed_is_refused() -> None:
+    with pytest.raises(TypeError, match="cannot be detected"):
+        digest(object())
+
 
 CONSTANTS = "SCALE = 2.0  # of the sum\n"
 HELPERS = '''
@@ -137,6 +154,19 @@ def test_another_environment_finds_them(write: Any, tmp_path: Path, monkeypatch:
     assert Path(moved.__file__).parent == other
     assert moved.total(np.ones(3)) == 9.0
     assert is_kept(moved.total)
+
+
+def test_a_helper_whose_module_got_another_name_is_no_obstacle(
+    write: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its code is the same, so the file is found, but names a module that is gone."""
+    assert write().total(np.ones(3)) == 9.0
+    renamed = (tmp_path / "stamped_helpers.py").rename(tmp_path / "stamped_renamed.py")
+    kernels = tmp_path / "stamped_kernels.py"
+    kernels.write_text(kernels.read_text().replace("stamped_helpers", renamed.stem))
+    for name in ("stamped_helpers", "stamped_kernels"):
+        del sys.modules[name]
+    assert importlib.import_module("stamped_kernels").total(np.ones(3)) == 9.0
 
 
 def test_a_change_of_its_options_compiles_it_again(write: Any) -> None:
