@@ -285,7 +285,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="COLOR",
         help="black, white, or R,G,B in [0, 1]",
     )
-    parser.add_argument("--backend", default="auto", metavar="NAME", help="auto, cpu, cuda, gsplat or reference")
+    parser.add_argument("--backend", default="auto", metavar="NAME", help="auto, cpu, cuda or reference")
     return parser
 
 

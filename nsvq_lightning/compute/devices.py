@@ -15,7 +15,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-__all__ = ["COMPILE", "LateNumber", "kernels_for", "not_on_cuda", "triton_obstacle", "upload"]
+__all__ = ["COMPILE", "LateNumber", "kernels_for", "triton_obstacle", "upload"]
 
 
 def kernels_for(like: Tensor) -> Literal["cpu", "cuda"] | None:
@@ -38,13 +38,13 @@ def _kernels_for(dtype: torch.dtype, device: str) -> Literal["cpu", "cuda"] | No
 
 def triton_obstacle(like: Tensor) -> str | None:
     """Why Triton's kernels cannot take tensors such as ``like``, with a remedy; None where they can."""
-    problem = None if _interpreted() and like.dtype == torch.float32 else not_on_cuda(like)
+    problem = None if _interpreted() and like.dtype == torch.float32 else _not_on_cuda(like)
     if problem is None and not _has_triton():
         return "it needs Triton, which comes with CUDA builds of PyTorch for Linux (pip install triton)"
     return problem
 
 
-def not_on_cuda(like: Tensor) -> str | None:
+def _not_on_cuda(like: Tensor) -> str | None:
     """Why GPU kernels cannot take tensors such as ``like``, with a remedy; None for float32 on a CUDA device."""
     if like.is_cuda and like.dtype == torch.float32:
         return None

@@ -14,7 +14,6 @@ from torch import Tensor
 from nsvq_lightning.compute.devices import kernels_for, triton_obstacle
 from nsvq_lightning.rendering.antialias import compensated
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.gsplat import support as gsplat_support
 from nsvq_lightning.rendering.reference import render_reference, visible_rows
 from nsvq_lightning.splats.splats import ATTRIBUTES, SplatTensors, check_shapes, sh_degree_of
 
@@ -24,7 +23,7 @@ log = logging.getLogger(__name__)
 
 _Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
-BACKENDS = ("auto", "reference", "cpu", "cuda", "gsplat")
+BACKENDS = ("auto", "reference", "cpu", "cuda")
 """Names that ``render(backend=...)`` takes; ``auto`` is this package's fastest one for the device of the splats."""
 
 
@@ -70,7 +69,6 @@ def render(
         sh_degree: Highest degree of the spherical harmonics that is evaluated; all stored ones by default.
         background: RGB ``[3]`` behind the splats; black by default.
         observe: Strength of each pixel ``[H, W]``; the backward pass then also sums up what ``Render.observed`` holds.
-            Back-end ``gsplat`` cannot do this.
         antialiased: Make splats fainter as the rasterizer's blur makes them larger, so that those smaller than a pixel
             look alike from near and far (:func:`nsvq_lightning.rendering.antialias.compensated`). For scenes that were
             trained so.
@@ -82,7 +80,7 @@ def render(
     Raises:
         ValueError: Unknown back-end, or a back-end that cannot take the device or type of the splats; attributes that
             differ in device or type, or whose shapes do not fit; ``sh_degree`` above the stored degree; a background
-            that is not ``[3]``; a map to observe that is not ``[H, W]``, or with back-end ``gsplat``.
+            that is not ``[3]``; a map to observe that is not ``[H, W]``.
     """
     _check_alike(splats)
     stored = sh_degree_of(splats.shN)
@@ -102,8 +100,6 @@ def render(
         return Render(*_rasterizer(name)(splats, camera, degree, background))
     if tuple(observe.shape) != (camera.height, camera.width):
         raise ValueError(f"observe must be [{camera.height}, {camera.width}], got {list(observe.shape)}")
-    if name == "gsplat":
-        raise ValueError("back-end 'gsplat' cannot observe its backward pass; use backend='auto'")
     observed = means.new_zeros(means.shape[0], 3).requires_grad_()
     pixel_map = observe.detach().to(means).contiguous()
     return Render(*_rasterizer(name)(splats, camera, degree, background, pixel_map, observed), observed)
@@ -144,7 +140,7 @@ def resolve_backend(backend: str, like: Tensor) -> str:
     """The back-end that ``backend`` stands for with tensors such as ``like``.
 
     ``auto`` is ``cpu`` for float32 on the CPU, ``cuda`` for float32 on a CUDA device where Triton is installed, and
-    otherwise ``reference``: plain torch, for any dtype and any device of torch, and slow. It is never ``gsplat``.
+    otherwise ``reference``: plain torch, for any dtype and any device of torch, and slow.
 
     Raises:
         ValueError: It is unknown, or cannot take this device or floating-point type.
@@ -160,7 +156,7 @@ def resolve_backend(backend: str, like: Tensor) -> str:
 
 
 def fast_backends(like: Tensor) -> list[str]:
-    """Back-ends other than plain torch that take tensors such as ``like``; this may load gsplat."""
+    """Back-ends other than plain torch that take tensors such as ``like``."""
     return [name for name in BACKENDS if name not in ("auto", "reference") and _obstacle(name, like) is None]
 
 
@@ -189,9 +185,7 @@ def _obstacle(backend: str, like: Tensor) -> str | None:
     """Why a back-end cannot take tensors such as ``like``, with a remedy; None where it can."""
     if backend == "cpu" and not (like.device.type == "cpu" and like.dtype == torch.float32):
         return f"it renders float32 tensors on the CPU, got {like.dtype} on {like.device}; move the splats"
-    if backend == "cuda":
-        return triton_obstacle(like)
-    return gsplat_support.obstacle(like) if backend == "gsplat" else None
+    return triton_obstacle(like) if backend == "cuda" else None
 
 
 def _rasterizer(backend: str) -> Callable[..., _Outputs]:

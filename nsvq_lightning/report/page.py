@@ -23,7 +23,6 @@ from nsvq_lightning.training.schedule import Phase, Schedule
 from nsvq_lightning.version import __version__
 
 from .files import PHASE_COLOURS
-from .pictures import file_stem
 
 __all__ = ["RunPage", "curve_svg"]
 

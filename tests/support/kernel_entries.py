@@ -21,7 +21,7 @@ import nsvq_lightning
 
 __all__ = ["entry_points"]
 
-OPTIONAL = {"gsplat", "triton"}
+OPTIONAL = {"triton"}
 MAKER = "kernel"
 """Name of the function that compiles: who names it makes a kernel."""
 

@@ -12,7 +12,7 @@ Gradients = dict[str, torch.Tensor]
 
 OBSERVED = "Σ |∂L/∂x|", "Σ |∂L/∂y|", "Σ weight · map"
 """Columns of what is observed, as the names of gradients."""
-DEVICES = dict.fromkeys(("cuda", "gsplat"), "cuda") if torch.cuda.is_available() else {}
+DEVICES = {"cuda": "cuda"} if torch.cuda.is_available() else {}
 """Where a back-end is run, if not on the CPU."""
 
 

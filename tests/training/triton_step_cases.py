@@ -125,7 +125,7 @@ BACK = ["spread_kernel", "gradient_kernel", "blend_backward_kernel", "total_kern
 SEARCH = ["drift_kernel", "check_kernel", "queue_kernel", "search_kernel", "snapshot_kernel", "substitute_kernel"]
 SUMS = ["part_kernel", "sum_kernel"]
 # The number of splats in view, that of their pairs with tiles, and, behind the backward pass, the loss.
-READS = {"projection.project": 1, "binning.list_tiles": 1, "transfer.read": 1}
+READS = {"projection.project": 1, "binning.list_tiles": 1, "devices.read": 1}
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ READS = {"projection.project": 1, "binning.list_tiles": 1, "transfer.read": 1}
             Phase.QUANTIZE,
             ["project_kernel", *4 * SEARCH, *RENDER, *LOSS, *BACK, *4 * ["radial_kernel", *SUMS]],
             # Which splats are in view is asked before their codes are; the seeds of the noise are drawn on the host.
-            READS | {"rasterizer.visible_cuda": 1, "noise.draw_seed": 4},
+            READS | {"rasterizer.visible_cuda": 1, "substitution.draw_seed": 4},
             110,
         ),
         (Phase.FINETUNE, [*RENDER, *LOSS, *BACK, *(4 * SUMS)], READS, 58),

@@ -29,8 +29,6 @@ def check_backends() -> Iterator[Finding]:
     """The renderers: Numba on the CPU, and those for a GPU."""
     yield _cpu()
     yield _gpu()
-    if find_spec("gsplat") is None:
-        yield note("gsplat", "not installed, and not needed; with a GPU: pip install 'nsvq-lightning[gsplat]'")
 
 
 def _cpu() -> Finding:

@@ -42,7 +42,7 @@ __all__ = ["copy_speed", "least_bytes", "run", "run_on"]
 
 log = logging.getLogger(__name__)
 
-COMPARED = ("cuda", "gsplat")
+COMPARED = ("cuda",)
 """Back-ends whose absence is reported with its reason."""
 COPIED = 2**28
 """Bytes of the copy that says how fast the memory is: more than any cache holds."""

@@ -157,7 +157,7 @@ def _rows(workload: Workload, scope: Scope) -> list[Measurement]:
     asked = accuracies(sh_degree_of(workload.splats.shN))
     names = fast_backends(workload.splats.means)
     fast = [Method(name, accuracy) for name in names for accuracy in asked]
-    fast += [Method(name, OBSERVED) for name in names if name != "gsplat"]
+    fast += [Method(name, OBSERVED) for name in names]
     plain = Method(REFERENCE)
     # In a quick run even 20k splats are too much for plain torch: it is compared on the crop.
     jobs = [(workload, [*fast, plain] if small and not scope.quick else fast)]
