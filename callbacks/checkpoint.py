@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from torch.optim import Optimizer
 
@@ -63,13 +63,18 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
         self.every = every
         self.keep = keep
         self.folder = folder
-        self.last_path: Path | None = None
-        """Checkpoint to continue from: the last one written, or at first the one this run was continued from."""
+        self.best_model_path = ""
+        """Path of ``last_path`` under the name by which Lightning looks for ``ckpt_path="best"``."""
         self._boundary = StepBoundary()
         self._signals = HeldSignals()
         self._saved = -1
         self._training = False
         self._amending = False
+
+    @property
+    def last_path(self) -> Path | None:
+        """Checkpoint to continue from: the last one written, or at first the one this run was continued from."""
+        return Path(self.best_model_path) if self.best_model_path else None
 
     def is_due(self, schedule: Schedule, iteration: int) -> bool:
         """Whether to save after this iteration; the end of the run is saved separately.
@@ -80,17 +85,20 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
         return every > 0 and (iteration % every == 0 or iteration in schedule.ends)
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Forget an earlier fit."""
+        """Forget an earlier fit; come after all other checkpoint callbacks, whose best one Lightning then finds."""
         super().setup(trainer, pl_module, stage)
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
+        # A new list: Lightning is going through the old one.
+        trainer.callbacks = [*(each for each in callbacks if each is not self), self]  # type: ignore[attr-defined]
         if stage == "fit":
-            self.last_path, self._saved = None, -1
+            self.best_model_path, self._saved = "", -1
             self._boundary.drop()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start to hold back signals."""
         super().on_train_start(trainer, pl_module)
         if trainer.ckpt_path is not None:
-            self.last_path, self._saved = Path(trainer.ckpt_path), trainer.global_step
+            self.best_model_path, self._saved = str(trainer.ckpt_path), trainer.global_step
         self._training = True
         self._signals.hold(trainer)
 
@@ -162,7 +170,7 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
             if self.keep:
                 _write(trainer, folder / f"step-{trainer.global_step}.ckpt")
             _write(trainer, folder / "last.ckpt")
-        self.last_path, self._saved = folder / "last.ckpt", trainer.global_step
+        self.best_model_path, self._saved = str(folder / "last.ckpt"), trainer.global_step
 
 
 def _write(trainer: Trainer, path: Path) -> None:

@@ -6,7 +6,8 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import BasePredictionWriter
 
 from nsvq_lightning.report.pictures import file_stem, write_png
 from nsvq_lightning.training.run_folder import is_trial, run_folder
@@ -17,7 +18,7 @@ __all__ = ["RenderWriter"]
 log = logging.getLogger(__name__)
 
 
-class RenderWriter(Callback):
+class RenderWriter(BasePredictionWriter):
     """Writes every predicted view as a PNG named after its photo.
 
     Args:
@@ -31,6 +32,7 @@ class RenderWriter(Callback):
     """
 
     def __init__(self, folder: str | None = None) -> None:
+        super().__init__()  # after each batch
         self.folder = folder
         self._target = Path()
 
@@ -40,6 +42,7 @@ class RenderWriter(Callback):
         Raises:
             FileExistsError: It holds another run.
         """
+        super().setup(trainer, pl_module, stage)
         if stage == "predict" and self.folder is None:
             run_folder(trainer)
 
@@ -49,21 +52,13 @@ class RenderWriter(Callback):
         if not is_trial(trainer):
             self._target.mkdir(parents=True, exist_ok=True)
 
-    def on_predict_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
-    ) -> None:
+    def write_on_batch_end(self, trainer: Trainer, pl_module: LightningModule, prediction: Any, *args: Any) -> None:
         """Write one picture."""
         if is_trial(trainer):
             return
         scene = scene_of(trainer)
-        stem = file_stem(outputs["name"], scene.names if scene is not None else ())
-        write_png(self._target / f"{stem}.png", outputs["image"])
+        stem = file_stem(prediction["name"], scene.names if scene is not None else ())
+        write_png(self._target / f"{stem}.png", prediction["image"])
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Say where the pictures are."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from lightning.pytorch import Callback
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint, ProgressBar, RichProgressBar, TQDMProgressBar
 
 from .checkpoint import RunCheckpoint
 from .density import DensityControl
@@ -57,8 +58,46 @@ them; contribution pruning before the report, whose figures are then those of th
 """
 
 
+class _IfWanted(Callback):
+    """Stands for our progress bar or checkpoints until the trainer has read its flags, which may refuse either.
+
+    The trainer has then made a plain one of its own, whose place ours takes, or none. Checkpoints also come beside a
+    checkpoint callback of the user's; a progress bar of the user's is the only one.
+    """
+
+    def __init__(self, callback: Callback) -> None:
+        self._callback = callback
+        self._kind = Checkpoint if isinstance(callback, Checkpoint) else ProgressBar
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Take the place, once."""
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
+        if not any(isinstance(each, self._kind) for each in callbacks):
+            return
+        place = callbacks.index(self)
+        # In place, and only behind this one: Lightning is going through the list.
+        plain = [each for each in callbacks[place:] if _is_plain(each, self._kind)]
+        for each in plain:
+            callbacks.remove(each)
+        if plain or self._kind is Checkpoint:
+            callbacks[place] = self._callback
+            self._callback.setup(trainer, pl_module, stage)
+
+
+def _is_plain(callback: Callback, kind: type[Callback]) -> bool:
+    """Whether the callback is like those that a trainer makes for itself."""
+    if kind is ProgressBar:
+        return type(callback) in (TQDMProgressBar, RichProgressBar)
+    if type(callback) is not ModelCheckpoint:
+        return False
+    return all(vars(callback)[name] == value for name, value in vars(ModelCheckpoint()).items())
+
+
 def standard(**replaced: Callback | None) -> list[Callback]:
     """The callbacks of ``nsvq fit``, with their defaults.
+
+    Progress bar and checkpoints take the place of the trainer's own, unless its flags (``enable_progress_bar``,
+    ``enable_checkpointing``, ``barebones``) leave them out. Those that you name are in the list as they are.
 
     Args:
         replaced: Callbacks that replace those of the same name in :data:`STANDARD`; None leaves one out.
@@ -77,5 +116,9 @@ def standard(**replaced: Callback | None) -> list[Callback]:
     unknown = sorted(set(replaced) - set(STANDARD))
     if unknown:
         raise ValueError(f"there is no standard callback {', '.join(unknown)}; there are {', '.join(STANDARD)}")
-    made = (replaced[name] if name in replaced else kind() for name, kind in STANDARD.items())
+    made = (replaced[name] if name in replaced else _made(kind) for name, kind in STANDARD.items())
     return [callback for callback in made if callback is not None]
+
+
+def _made(kind: type[Callback]) -> Callback:
+    return _IfWanted(kind()) if issubclass(kind, Checkpoint | ProgressBar) else kind()

@@ -122,13 +122,19 @@ def splat_host(module: LightningModule) -> SplatHost:
     """The module as a host.
 
     Raises:
-        TypeError: It lacks a member of :class:`SplatHost`.
+        TypeError: It lacks a member of :class:`SplatHost`, or holds another host, which a callback would never set.
     """
+    inner = [type(each).__name__ for each in module.children() if not missing_members(each, SplatHost)]
+    if inner:
+        raise TypeError(
+            f"{type(module).__name__} cannot host the splat callbacks: it holds a {inner[0]} and passes on to it, but "
+            f"what callbacks set stays outside; derive {type(module).__name__} from {inner[0]} instead"
+        )
     missing = missing_members(module, SplatHost)
     if missing:
         raise TypeError(
             f"{type(module).__name__} cannot host the splat callbacks, it lacks: {', '.join(missing)}; "
-            "use nsvq_lightning.SplatModule or offer the members of nsvq_lightning.training.host.SplatHost"
+            "derive it from nsvq_lightning.SplatModule or offer the members of nsvq_lightning.training.host.SplatHost"
         )
     return as_host(module)
 

@@ -47,6 +47,23 @@ def test_a_module_without_splats_is_refused_before_anything_starts(kind: type[Ca
         kind().setup(StandIn(module, []), module, "fit")
 
 
+class Delegate(LightningModule):
+    """Answers for the module that it holds; what is set on it does not reach that one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inner = host()
+
+    def __getattr__(self, name: str) -> Any:
+        return super().__getattr__(name) if name == "inner" else getattr(self.inner, name)
+
+
+def test_a_module_that_passes_on_to_a_host_is_told_to_derive_from_it() -> None:
+    module = Delegate()
+    with pytest.raises(TypeError, match=r"Delegate cannot host .* holds a SplatModule .* derive Delegate from Splat"):
+        callbacks.PhaseSchedule().setup(StandIn(module, []), module, "fit")
+
+
 @pytest.mark.parametrize("kind", HOSTED)
 @pytest.mark.parametrize("names", [{}, {"codebook_scales": "codebook"}])
 def test_an_optimiser_whose_groups_have_other_names_is_refused(kind: type[Callback], names: dict[str, str]) -> None:

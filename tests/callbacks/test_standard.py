@@ -1,0 +1,68 @@
+"""The callbacks of ``nsvq fit`` in a trainer of Lightning's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import BasePredictionWriter, ModelCheckpoint, TQDMProgressBar
+
+from nsvq_lightning.callbacks import MetricReport, RenderWriter, RunCheckpoint, SplatProgressBar, standard
+from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.training.module import SplatModule
+
+
+def fit(scene: Path, folder: Path, *more: Any, **flags: Any) -> Trainer:
+    """Ten iterations with the standard callbacks, and a test of the best checkpoint if there is one."""
+    flags = {"logger": False, "enable_model_summary": False} | flags
+    callbacks = [*standard(report=MetricReport(every=5, lpips=False, pictures=False)), *more]
+    trainer = Trainer(
+        max_steps=10,
+        max_epochs=-1,
+        limit_val_batches=0,
+        accelerator="cpu",
+        default_root_dir=folder,
+        callbacks=callbacks,
+        **flags,
+    )
+    module, data = SplatModule(sh_degree=0, codebooks={"scales": 4}), ColmapDataModule(str(scene), factor=4)
+    trainer.fit(module, data)
+    if trainer.checkpoint_callback is not None:
+        trainer.test(module, data, ckpt_path="best", verbose=False)
+    return trainer
+
+
+@pytest.mark.parametrize(
+    ("flags", "kinds"),
+    [
+        ({}, [SplatProgressBar, RunCheckpoint]),
+        ({"enable_progress_bar": False}, [RunCheckpoint]),
+        ({"enable_checkpointing": False}, [SplatProgressBar]),
+        ({"barebones": True}, []),
+    ],
+)
+def test_a_trainer_has_the_bar_and_the_checkpoints_that_its_flags_allow(
+    flags: dict[str, Any], kinds: list[type], demo_scene: Path, tmp_path: Path
+) -> None:
+    trainer = fit(demo_scene, tmp_path, **flags)
+    found = [
+        type(each) for each in trainer.callbacks if isinstance(each, TQDMProgressBar | ModelCheckpoint | RunCheckpoint)
+    ]  # type: ignore[attr-defined]
+    assert found == kinds
+    names = {path.name for path in tmp_path.rglob("*.ckpt")}
+    assert names == ({"last.ckpt"} if RunCheckpoint in kinds else set())
+
+
+def test_a_checkpoint_callback_of_the_users_is_the_trainers(demo_scene: Path, tmp_path: Path) -> None:
+    best = ModelCheckpoint(monitor="report/psnr", mode="max", dirpath=tmp_path / "best")
+    trainer = fit(demo_scene, tmp_path, best, enable_progress_bar=False)
+    assert trainer.checkpoint_callbacks[0] is best
+    assert Path(best.best_model_path).is_file()
+    assert isinstance(trainer.checkpoint_callbacks[-1], RunCheckpoint)
+    assert trainer.checkpoint_callbacks[-1].last_path is not None
+
+
+def test_pictures_are_written_as_lightning_writes_predictions() -> None:
+    assert isinstance(RenderWriter(), BasePredictionWriter)
