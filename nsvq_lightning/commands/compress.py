@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nsvq_lightning.commands.messages import Parser
 from nsvq_lightning.commands.positive import positive
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
@@ -202,7 +203,7 @@ def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> i
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="nsvq compress",
         description="Make a splat file small: codebooks by k-means, entropy coding. Photos are not needed.",
         epilog=EPILOG,

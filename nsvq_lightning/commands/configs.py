@@ -7,7 +7,7 @@ from pathlib import Path, PurePath
 
 from nsvq_lightning.top_level import folder_of
 
-__all__ = ["check_config", "configs_among", "find_config", "resolve_configs", "written_by_run"]
+__all__ = ["check_config", "configs_among", "find_config", "resolve_configs", "shipped_configs", "written_by_run"]
 
 CONFIG_OPTIONS = ("--config", "-c")
 
@@ -73,6 +73,11 @@ def find_config(name: str) -> str:
         if shipped.is_file():
             return str(shipped)
     return name
+
+
+def shipped_configs() -> list[str]:
+    """Names of the configs that come with the package, without their suffix."""
+    return sorted(path.stem for path in folder_of("configs").glob("*.yaml"))
 
 
 def _without_folder(path: PurePath) -> str:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nsvq_lightning.commands.messages import Parser
 from nsvq_lightning.commands.progress import progress
 from nsvq_lightning.io.attribute_error import attribute_errors
 from nsvq_lightning.io.compressed import CompressedScene
@@ -185,7 +186,7 @@ def _measure(source: Path, output: Path, root: Path | None) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     suffixes = ", ".join(FORMATS)
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="nsvq convert",
         description="Write a scene file in another format; the suffixes select the formats.",
         epilog=EPILOG,

@@ -19,10 +19,13 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveCon
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 import nsvq_lightning.callbacks as callbacks
-import nsvq_lightning.quantize  # noqa: F401  short class names resolve to what is imported
+import nsvq_lightning.quantize as quantize
 from nsvq_lightning.callbacks.standard import STANDARD
+from nsvq_lightning.commands.configs import shipped_configs
+from nsvq_lightning.commands.messages import in_plain_words, nearest, unknown_option
 from nsvq_lightning.commands.option_help import class_help, command_help, first_sentence
 from nsvq_lightning.commands.registry import COMMANDS
+from nsvq_lightning.commands.shorthands import SHORTHANDS
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
 from nsvq_lightning.data.model_files import check_name
 from nsvq_lightning.io.atomic import write_text
@@ -44,6 +47,9 @@ TRAINER_DEFAULTS: dict[str, Any] = {
     "enable_model_summary": False,
     "default_root_dir": "runs",
 }
+
+CLASSES = (*callbacks.__all__, *quantize.__all__, "ColmapDataModule", "DemoDataModule")
+"""Names that options take as they are: short class names resolve to what is imported."""
 
 NAMED_CHECKPOINTS = frozenset({"hpc", "registry"})
 """Words that Lightning accepts instead of a checkpoint's path; ``last`` and ``best`` refer to its own callback."""
@@ -73,8 +79,17 @@ class QuietParser(LightningArgumentParser):
             message += " (--data.root=path/to/scene)"
         elif message.startswith('Parser key "data":') and Path(message.rpartition("Given value: ")[2]).is_dir():
             message = "--data takes the name of a data module; the folder of a scene is --data.root=path/to/scene"
-        elif "subcommand: invalid choice" in message:
-            message = f"{message.partition(' (')[0]} (choose from {', '.join(COMMANDS)})"
+        elif missing := re.match(r"Parser key \"config\": File does not exist: '(.*)'", message):
+            names = shipped_configs()
+            path = Path(missing[1])
+            message = f"there is no config {path}{nearest(path.stem, names)}\nShipped ones: {', '.join(names)}"
+        else:
+            message = in_plain_words(message, CLASSES)
+            parsers = getattr(self._subcommands_action, "_name_parser_map", {"": self}).values()
+            options = [option for parser in parsers for option in parser._option_string_actions]
+            if program == "nsvq fit":
+                options += [f"--{name}" for name in SHORTHANDS]
+            message += unknown_option(message, options)
         sys.stderr.write(f"error: {message}\nAll options: {program} --help\n")
         self.exit(2)
 

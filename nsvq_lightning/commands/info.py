@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from nsvq_lightning.commands.messages import Parser
 from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.errors import FormatError
 
@@ -24,9 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0, or 1 after a one-line error if the file cannot be read.
     """
-    parser = argparse.ArgumentParser(
-        prog="nsvq info", description="Describe a scene file: .nsvq, .ply, .sog, .spz or .splat."
-    )
+    parser = Parser(prog="nsvq info", description="Describe a scene file: .nsvq, .ply, .sog, .spz or .splat.")
     parser.add_argument("file", type=Path, metavar="FILE", help="scene file")
     parser.add_argument("--json", action="store_true", help="print the description as JSON")
     options = parser.parse_args(argv)

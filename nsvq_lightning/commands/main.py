@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TextIO
 
 from nsvq_lightning.commands.configs import check_config, configs_among, resolve_configs, written_by_run
+from nsvq_lightning.commands.messages import nearest
 from nsvq_lightning.commands.registry import COMMANDS, overview
 from nsvq_lightning.commands.shorthands import expand
 from nsvq_lightning.version import __version__
@@ -29,6 +30,7 @@ NOT_ACTIONABLE = (
     "LeafSpec",
     "Checkpoint directory .* exists and is not empty",
     "`tensorboardX` has been removed",
+    "Couldn't infer the batch indices",  # RenderWriter names pictures after their photos
 )
 """Fragments of Lightning's and torch's warnings that a user of this command can do nothing about."""
 
@@ -58,7 +60,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments[0] in COMMANDS and (module := COMMANDS[arguments[0]].module) is not None:
             command: Callable[[Sequence[str]], int] = import_module(module).main
             return command(arguments[1:])
-        return _run_lightning(expand(resolve_configs(arguments)))
+        if arguments[0] not in COMMANDS and not arguments[0].startswith("-"):
+            meant = nearest(arguments[0], COMMANDS)
+            sys.stderr.write(f"error: there is no command {arguments[0]!r}{meant}\nAll commands: nsvq --help\n")
+            return 2
+        return _run_lightning(resolve_configs(arguments))
     except ModuleNotFoundError as error:
         if error.name != "cv2":
             raise
@@ -81,7 +87,7 @@ def _run_lightning(arguments: list[str]) -> int:
     try:
         for config in configs:
             check_config(config)
-        SplatCLI(arguments)
+        SplatCLI(expand(arguments))
     except SIGTERMException:  # a kind of SystemExit
         return 128 + signal.SIGTERM  # Lightning itself would exit with the status of success
     except SystemExit as end:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nsvq_lightning.commands.messages import Parser
 from nsvq_lightning.commands.positive import positive
 from nsvq_lightning.commands.progress import Progress
 
@@ -203,7 +204,7 @@ def _check(scene: Path) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="nsvq prepare",
         description="Find out where photos were taken from, by COLMAP, and make a scene of them that can be trained.",
         epilog=EPILOG,

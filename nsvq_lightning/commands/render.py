@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nsvq_lightning.commands.comma_lists import names
+from nsvq_lightning.commands.messages import Parser
 from nsvq_lightning.commands.positive import positive
 from nsvq_lightning.commands.progress import progress
 from nsvq_lightning.commands.scene_argument import cameras_of, photos_of, scene_file
@@ -242,7 +243,7 @@ def _writer(path: Path, name: str, width: int, height: int, fps: float) -> Itera
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="nsvq render",
         description="Render pictures or a video along a path of cameras.",
         epilog=EPILOG,

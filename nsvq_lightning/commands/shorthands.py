@@ -19,17 +19,24 @@ SHORTHANDS: dict[str, str] = {
 def expand(arguments: Sequence[str]) -> list[str]:
     """The arguments with every shorthand replaced by the options it stands for: its own number, and none of the others.
 
-    Without a value the option is left to the parser, which then misses one.
+    Raises:
+        ValueError: Two shorthands are given, of which only one can hold, or one without its number.
     """
     expanded: list[str] = []
+    given: str | None = None
     rest = list(arguments)
     while rest:
         argument = rest.pop(0)
         option, equals, value = argument.partition("=")
         name = option.removeprefix("--")
-        if not option.startswith("--") or name not in SHORTHANDS or not (equals or rest):
+        if not option.startswith("--") or name not in SHORTHANDS:
             expanded.append(argument)
             continue
+        if given not in (None, name):
+            raise ValueError(f"--{given} and --{name} both say how large the scene is to be: give one of them")
+        given = name
+        if not (equals or rest):
+            raise ValueError(f"{option} needs a number")
         value = value if equals else rest.pop(0)
         expanded += [f"{BUDGET}.{other}={value if other == name else 'null'}" for other in SHORTHANDS]
     return expanded

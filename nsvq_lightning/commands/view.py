@@ -13,6 +13,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from nsvq_lightning.commands.messages import Parser
 from nsvq_lightning.commands.scene_argument import cameras_of, photos_of, scene_file
 
 if TYPE_CHECKING:
@@ -202,7 +203,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="nsvq view",
         description="Look at a scene in the browser, with the cameras of its photos.",
         epilog=EPILOG,

@@ -489,10 +489,23 @@ def test_wrong_settings_name_the_file_they_came_from(
     [
         (["fit", "--data", "{folder}"], "the folder of a scene is --data.root=path/to/scene"),
         (["fit", "--data", "no.Such"], "no.Such"),
+        (["fit", "--bytes=abc"], "error: bytes: expected a whole number or null, got 'abc'\n"),
+        (["fit", "--data.root=x", "--data.factor", "3"], "error: factor: expected 1, 2, 4, 8 or null, got '3'\n"),
+        (["fit", "--data.root=x", "--trainer.max_steps=x"], "trainer.max_steps: expected a whole number, got 'x'\n"),
+        (["fit", "--data.root=x", "--model.background=gray"], "expected auto, black, white or random, got 'gray'\n"),
+        (["fit", "--data.root=x", "--callbacks.density=NoSuch"], "density: expected Callback or null, got 'NoSuch'\n"),
+        (["fit", "--data.root=x", "--callbacks.density=BudgetGrowth"], "'BudgetGrowth'; did you mean BudgetedGrowth?"),
+        (["fit", "--data.root=x", "--model.quantizer=NSVX"], "got 'NSVX'; did you mean NSVQ?"),
+        (["fit", "--data.root=x", "--model.quantizer=nsvq_lightning.quantize.NSVX"], "did you mean NSVQ?"),
+        (["fit", "--data.root=x", "--callbacks.densty=null"], "did you mean --callbacks.density?"),
+        (["fit", "--data.root=x", "--callbacks.density.max_splat=5"], "did you mean --max_splats?"),
+        (["fit", "--data.root=x", "--qualty=2"], "did you mean --quality?"),
         (
-            ["compres", "a.ply", "b.nsvq"],
-            "choose from prepare, fit, test, validate, predict, export, info, convert, compress",
+            ["fit", "--data.root=x", "--config", "fats.yaml"],
+            "fats.yaml; did you mean fast?\nShipped ones: best, ",
         ),
+        (["view", "{folder}", "--prot=3"], "did you mean --port?"),
+        (["benchmark", "render", "--repeat=2", "--ouput=x"], "did you mean --output?"),
     ],
 )
 def test_likely_slips_are_told_what_was_meant(
@@ -502,6 +515,15 @@ def test_likely_slips_are_told_what_was_meant(
         main([argument.format(folder=tmp_path) for argument in arguments])
     assert stop.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_commands_that_do_not_exist_or_contradict_themselves_are_told_so(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compres", "a.ply", "b.nsvq"]) == 2
+    assert "there is no command 'compres'; did you mean compress?" in capsys.readouterr().err
+    assert main(["fit", "--splats", "1000", "--quality=2"]) == 1
+    assert "--splats and --quality both say how large the scene is" in capsys.readouterr().err
+    assert main(["fit", "--splats"]) == 1
+    assert "--splats needs a number" in capsys.readouterr().err
 
 
 def test_a_folder_that_cannot_be_used_leaves_no_run_behind(tmp_path: Path) -> None:

@@ -55,6 +55,13 @@ def test_a_configuration_may_bring_everything(tmp_path: Path) -> None:
     assert run.steps == 9
 
 
+def test_the_short_options_of_fit_hold_for_every_run(scenes: tuple[Path, Path]) -> None:
+    (run,) = plan(Request(scenes[:1], options=("--splats", "3000")))
+    assert run.settings["callbacks"]["budget"]["init_args"] == {"quality": None, "splats": 3000, "bytes": None}
+    with pytest.raises(ValueError, match="--splats and --bytes both say"):
+        plan(Request(scenes[:1], options=("--splats=3000", "--bytes=100000")))
+
+
 def test_what_cannot_be_is_said_at_once(scenes: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"choose one of 0\.5k"):
         plan(Request(scenes, codebooks=("3k",)))

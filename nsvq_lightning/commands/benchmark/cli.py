@@ -18,6 +18,7 @@ from nsvq_lightning.commands.benchmark.sizes import LARGE, STANDARD
 from nsvq_lightning.commands.benchmark.suite_list import ALL, SUITES, Unavailable, load_suite, suite_names
 from nsvq_lightning.commands.benchmark.tables import as_json, as_markdown
 from nsvq_lightning.commands.comma_lists import integers, names
+from nsvq_lightning.commands.messages import Parser
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.skips import SKIPS
 
@@ -76,7 +77,7 @@ def _fail(message: str) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="nsvq benchmark",
         description="Measure run time against error: each part beside its plain counterpart and a float64 oracle.",
         epilog="suites:\n" + "\n".join(f"  {name:10} {suite.about}" for name, suite in SUITES.items()) + EXAMPLES,

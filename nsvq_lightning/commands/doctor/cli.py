@@ -9,6 +9,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nsvq_lightning.commands.messages import Parser
+
 if TYPE_CHECKING:
     from nsvq_lightning.commands.doctor.finding import Finding
 
@@ -91,7 +93,7 @@ def _self_test() -> Iterator[Finding]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="nsvq doctor",
         description="Check whether this machine is fit for training, by a test against a float64 oracle, and whether a "
         "COLMAP folder is a good scene.",

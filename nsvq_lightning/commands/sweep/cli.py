@@ -12,6 +12,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
 
 from nsvq_lightning.commands.comma_lists import integers, names
+from nsvq_lightning.commands.messages import Parser
 
 if TYPE_CHECKING:
     from nsvq_lightning.commands.sweep.plan import Run
@@ -75,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="nsvq sweep",
         usage="nsvq sweep --output FOLDER [options] [options of nsvq fit]",
         description="Train every combination of scenes, configurations, quantizers, codebook sizes and seeds; write a "

@@ -12,6 +12,7 @@ from typing import Any
 from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.commands.configs import resolve_configs
 from nsvq_lightning.commands.fit import SplatCLI
+from nsvq_lightning.commands.shorthands import expand
 from nsvq_lightning.training.branch import QUANTIZE_RULES
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.version import __version__
@@ -68,12 +69,12 @@ def resolve(arguments: Sequence[str]) -> Settings:
 
     Raises:
         SystemExit: The arguments are wrong; a line on stderr says how.
-        ValueError: They name a checkpoint to go on from.
+        ValueError: They name a checkpoint to go on from, or two sizes of the scene.
     """
     with warnings.catch_warnings():
         # Lightning warns of arguments that are not the process's, jsonargparse of the name `skip_none`.
         warnings.simplefilter("ignore")
-        settings = _Reader(["fit", *resolve_configs(arguments)]).settings
+        settings = _Reader(["fit", *expand(resolve_configs(arguments))]).settings
     if settings["ckpt_path"] is not None:
         raise ValueError(f"a sweep has checkpoints of its own; leave ckpt_path={settings['ckpt_path']} out")
     for name in ("default_root_dir", "run_folder"):
