@@ -63,7 +63,10 @@ class LiveScene(WritingCallback):
         host, began = as_host(pl_module), time.monotonic()
         with host.stopwatch.paused(host.device):
             splats = type(host.splats).from_tensors(*host.hard_splats(host.phase)).to("cpu")
-            config = {"antialiased": getattr(pl_module, "antialiased", False)}
+            state = {"iteration": trainer.global_step, "of": trainer.max_steps, "phase": host.phase.name.lower()}
+            if host.history:
+                state["psnr"] = f"{host.history[-1]['psnr']:.2f}"
+            config = {"antialiased": getattr(pl_module, "antialiased", False), "live": state}
             scene = CompressedScene.from_arrays(SplatArrays.from_splats(splats), config=config)
             save(scene, folder / live.LIVE_SCENE, Storage("paper"))
         self._answered, ended = asked, time.monotonic()

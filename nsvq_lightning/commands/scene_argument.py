@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nsvq_lightning.commands.configs import check_config
+
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
 
@@ -15,8 +17,11 @@ def scene_file(path: Path) -> Path:
     """The scene file that is meant.
 
     Raises:
+        FileNotFoundError: There is nothing of that name.
         ValueError: It is a folder without ``scene.nsvq``, or a checkpoint.
     """
+    if not path.exists():
+        raise FileNotFoundError(f"there is no file or folder {path}")
     if path.is_dir():
         file = path / "scene.nsvq"
         if not file.is_file():
@@ -28,16 +33,20 @@ def scene_file(path: Path) -> Path:
 
 
 def photos_of(path: Path) -> Path | None:
-    """Folder of the photos that a scene was trained on, as the run that it lies in says; None if nothing says it."""
+    """Folder of the photos that a scene was trained on, as the run that it lies in says; None if nothing says it.
+
+    Raises:
+        ValueError: Beside it is a ``config.yaml`` that is no table of settings.
+    """
     config = (path if path.is_dir() else path.parent) / "config.yaml"
     if not config.is_file():
         return None
     import yaml
 
-    settings = yaml.safe_load(config.read_text(encoding="utf-8"))
-    data = settings.get("data") if isinstance(settings, dict) else None
-    data = data.get("init_args", data) if isinstance(data, dict) else {}
-    root = data.get("root")
+    check_config(str(config))
+    data = yaml.safe_load(config.read_text(encoding="utf-8")).get("data")
+    data = data.get("init_args", data) if isinstance(data, dict) else None
+    root = data.get("root") if isinstance(data, dict) else None
     return Path(root) if isinstance(root, str) and Path(root).is_dir() else None
 
 

@@ -6,12 +6,15 @@ import argparse
 import logging
 import sys
 import tempfile
+import threading
 import webbrowser
 from collections.abc import Sequence
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+from urllib.parse import urlsplit
 
 from nsvq_lightning.commands.messages import Parser
 from nsvq_lightning.commands.scene_argument import cameras_of, photos_of, scene_file
@@ -28,6 +31,14 @@ SECONDS = 3.0
 """Time between two looks at a fit."""
 LIKELY = 12
 """Cameras that are guessed for a scene without photos."""
+PATIENCE = 20.0
+"""Seconds after which a connection is closed on which nothing moves."""
+MOST = 64
+"""Connections at a time; more are closed at once."""
+PART = 1 << 16
+"""Bytes that are sent in one go, for each of which a slow client has the whole patience."""
+THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
+ALL_ADDRESSES = ("0.0.0.0", "::")
 
 EPILOG = """\
 examples:
@@ -143,9 +154,9 @@ def _serve(options: argparse.Namespace, source: Source) -> None:
 
     live = SECONDS if source.run is not None else 0.0
     page = viewer_page(_cameras(options, source), _title(options), live=live).encode()
-    handler = type("Handler", (_Handler,), {"page": page, "source": source})
+    handler = type("Handler", (_Handler,), {"page": page, "source": source, "host": options.host})
     try:
-        server = ThreadingHTTPServer((options.host, options.port), handler)
+        server = _Server((options.host, options.port), handler)
     except OSError as error:
         raise OSError(f"cannot listen on {options.host}:{options.port} ({error}); choose another --port") from None
     with server:
@@ -154,10 +165,33 @@ def _serve(options: argparse.Namespace, source: Source) -> None:
         sys.stdout.flush()
         if options.open:
             webbrowser.open(address)
+        server.serve_forever()
+
+
+class _Server(ThreadingHTTPServer):
+    """Serves a bounded number of connections, and says nothing of those that break."""
+
+    request_queue_size = MOST
+
+    def __init__(self, *arguments: Any) -> None:
+        self._free = threading.BoundedSemaphore(MOST)
+        super().__init__(*arguments)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
         try:
-            server.serve_forever()
-        except KeyboardInterrupt:
-            sys.stdout.write("\n")
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        if not isinstance(sys.exception(), OSError):  # a client that hangs up, or takes nothing any more
+            super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -165,9 +199,15 @@ class _Handler(BaseHTTPRequestHandler):
 
     page: bytes
     source: Source
+    host: str
+    timeout = PATIENCE
+    followed = False
+    """Whether splats of the running fit have been shown."""
 
     def do_GET(self) -> None:
-        if self.path == "/":
+        if not _is_own(self.headers.get("Host", ""), self.host):
+            self._answer(403, "text/plain; charset=utf-8", b"open the address that nsvq view has printed")
+        elif self.path == "/":
             self._answer(200, "text/html; charset=utf-8", self.page)
         elif self.path in ("/scene.nsvq", "/version"):
             self._scene(self.path == "/version")
@@ -175,18 +215,22 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(404, "text/plain; charset=utf-8", b"there is no such page")
 
     def _scene(self, is_question: bool) -> None:
-        from nsvq_lightning.training.live import ask
+        from nsvq_lightning.training import live
 
-        if is_question and self.source.run is not None and not self.source.file.exists():
-            ask(self.source.run)
+        if is_question and self.source.run is not None:
+            # What was asked of a run that has ended in between is taken back.
+            (live.end if self.source.file.exists() else live.ask)(self.source.run)
         file = self.source.current()
         try:
             if file is None:
-                self._answer(503, "text/plain; charset=utf-8", b"waiting for the run to show its splats")
+                waiting = "waiting for the run to show its splats"
+                text = "the run trains no more; its scene is not there yet" if self.followed else waiting
+                self._answer(503, "text/plain; charset=utf-8", text.encode())
             elif is_question:
                 self._answer(200, "text/plain", f"{file.name} {file.stat().st_mtime_ns}".encode())
             else:
                 self._answer(200, "application/octet-stream", file.read_bytes())
+                type(self).followed = file != self.source.file
         except FileNotFoundError:  # the run has ended in between
             self._answer(503, "text/plain; charset=utf-8", b"the scene is being written")
 
@@ -196,10 +240,31 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(content)))
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
-        self.wfile.write(content)
+        for start in range(0, len(content), PART):
+            self.wfile.write(content[start : start + PART])
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing of each request."""
+
+
+def _is_own(header: str, bound: str) -> bool:
+    """Whether a request names this server: a web page could otherwise read the scene through a name of its own.
+
+    Args:
+        header: The request's Host.
+        bound: The address or name that the server was told to listen on. On all addresses, each of them is its own.
+    """
+    try:
+        name = urlsplit(f"//{header}").hostname or ""
+        return name in (*THIS_MACHINE, bound.lower()) or (bound in ALL_ADDRESSES and bool(ip_address(name)))
+    except ValueError:
+        return False
+
+
+def _port(text: str) -> int:
+    if not (text.isdecimal() and int(text) < 1 << 16):
+        raise argparse.ArgumentTypeError(f"must be from 0 to 65535, got {text}")
+    return int(text)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -219,7 +284,7 @@ def _parser() -> argparse.ArgumentParser:
         help="folder of the photos, whose cameras are offered; that of the run by default",
     )
     parser.add_argument("-o", "--output", type=Path, metavar="OUT.html", help="write one page with the scene instead")
-    parser.add_argument("--port", type=int, default=PORT, help=f"{PORT} by default; 0 for any that is free")
+    parser.add_argument("--port", type=_port, default=PORT, help=f"{PORT} by default; 0 for any that is free")
     parser.add_argument(
         "--host", default="127.0.0.1", help="127.0.0.1, this machine only, by default; 0.0.0.0 for all of the network"
     )

@@ -12,6 +12,7 @@ from nsvq_lightning.callbacks import live as live_callback
 from nsvq_lightning.commands.benchmark.fitting import fit
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io import load
+from nsvq_lightning.io.nsvq.file import read_header
 from nsvq_lightning.training import live
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import run_folder
@@ -26,6 +27,7 @@ class Viewer(Callback):
         self.asking = asking
         self.seen: dict[int, Any] = {}
         self.expected: dict[int, Any] = {}
+        self.said: dict[int, Any] = {}
         self.folder = Path()
 
     def on_train_batch_start(self, trainer: Any, pl_module: Any, batch: Any, batch_idx: int) -> None:
@@ -37,6 +39,7 @@ class Viewer(Callback):
         path = self.folder / live.LIVE_SCENE
         if path.exists():
             self.seen[batch_idx] = load(path)
+            self.said[batch_idx] = read_header(path).config["live"]
             path.unlink()
             hard = pl_module.hard_splats(pl_module.phase)
             self.expected[batch_idx] = type(hard)(*(tensor.clone() for tensor in hard))
@@ -59,6 +62,7 @@ def test_splats_are_written_when_somebody_asks(demo_scene: Path, tmp_path: Path)
     viewer = Viewer({1, 5, 9})
     _fit(viewer, demo_scene, tmp_path)
     assert list(viewer.seen) == [2, 6, 10]
+    assert viewer.said[6] == {"iteration": 7, "of": 12, "phase": "finetune"}
     for index, splats in viewer.seen.items():
         for name, tensor in viewer.expected[index]._asdict().items():
             assert torch.equal(getattr(splats, name).detach(), tensor), (index, name)

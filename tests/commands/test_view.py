@@ -1,22 +1,27 @@
 from __future__ import annotations
 
+import socket
 import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from http.server import ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
 from chromium import chromium, needs_chromium
 from splat_scenes import random_splats
 
+from nsvq_lightning.commands import view
 from nsvq_lightning.commands.main import main
-from nsvq_lightning.commands.view import Source, _Handler
+from nsvq_lightning.commands.scene_argument import photos_of
+from nsvq_lightning.commands.view import Source, _Handler, _is_own, _Server
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import read_nsvq, save
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.report.viewer import some_cameras, viewer_page
+from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.training import live
 
 
@@ -39,8 +44,8 @@ def run(tmp_path: Path) -> Path:
 def address(run: Path, demo_scene: Path) -> Iterator[str]:
     """A server that follows the run."""
     page = viewer_page(some_cameras(load_scene(demo_scene)), "run", live=0.2).encode()
-    handler = type("Handler", (_Handler,), {"page": page, "source": Source(run / "scene.nsvq", run)})
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+    attributes = {"page": page, "source": Source(run / "scene.nsvq", run), "host": "127.0.0.1", "timeout": 0.5}
+    with _Server(("127.0.0.1", 0), type("Handler", (_Handler,), attributes)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"
         server.shutdown()
@@ -59,6 +64,7 @@ def test_a_running_fit_is_asked_until_its_scene_is_there(run: Path, address: str
     assert live.asked(run) > first
     assert _get(f"{address}/scene.nsvq") == (200, (run / live.LIVE_SCENE).read_bytes())
     live.end(run)
+    assert _get(f"{address}/version") == (503, b"the run trains no more; its scene is not there yet")
     save(random_splats(6), run / "scene.nsvq")
     status, last = _get(f"{address}/version")
     assert (status, last != version) == (200, True)
@@ -66,6 +72,73 @@ def test_a_running_fit_is_asked_until_its_scene_is_there(run: Path, address: str
     assert _get(f"{address}/scene.nsvq") == (200, (run / "scene.nsvq").read_bytes())
     assert _get(f"{address}/")[1].startswith(b"<!doctype html>")
     assert _get(f"{address}/../secret")[0] == 404
+
+
+@pytest.mark.parametrize(
+    ("header", "bound", "is_own"),
+    [
+        ("localhost:7007", "127.0.0.1", True),
+        ("127.0.0.1", "127.0.0.1", True),
+        ("[::1]:7007", "127.0.0.1", True),
+        ("box.lan:7007", "Box.lan", True),
+        ("192.168.1.5:7007", "0.0.0.0", True),
+        ("[fe80::1]", "::", True),
+        ("192.168.1.5:7007", "127.0.0.1", False),
+        ("evil.example:7007", "127.0.0.1", False),
+        ("evil.example", "0.0.0.0", False),
+        ("localhost.evil.example", "0.0.0.0", False),
+        ("", "127.0.0.1", False),
+        ("[", "0.0.0.0", False),
+    ],
+)
+def test_only_the_names_of_the_server_are_served(header: str, bound: str, is_own: bool) -> None:
+    assert _is_own(header, bound) is is_own
+
+
+def test_a_page_of_another_name_gets_nothing(run: Path, address: str) -> None:
+    save(random_splats(5), run / "scene.nsvq")
+    for path in ("/", "/scene.nsvq", "/version"):
+        request = urllib.request.Request(address + path, headers={"Host": "evil.example"})
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(request, timeout=10)
+
+
+def test_connections_that_say_nothing_are_closed_and_bounded(
+    run: Path, address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, port = threading.active_count(), int(address.rpartition(":")[2])
+    silent = [socket.create_connection(("127.0.0.1", port)) for _ in range(view.MOST + 20)]
+    deadline = time.monotonic() + 10
+    while not all(_is_closed(each) for each in silent) and time.monotonic() < deadline:
+        assert threading.active_count() - before <= view.MOST
+        time.sleep(0.05)
+    assert all(_is_closed(each) for each in silent)
+    for each in silent:
+        each.close()
+    assert _get(f"{address}/")[0] == 200
+
+
+def _is_closed(connection: socket.socket) -> bool:
+    """Whether the server has closed the connection, of which it has sent nothing."""
+    connection.setblocking(False)
+    try:
+        return connection.recv(1) == b""
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        return True
+
+
+def test_a_client_that_hangs_up_is_no_traceback(run: Path, address: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "scene.nsvq").write_bytes(bytes(20_000_000))
+    client = socket.create_connection(("127.0.0.1", int(address.rpartition(":")[2])))
+    client.sendall(b"GET /scene.nsvq HTTP/1.0\r\nHost: localhost\r\n\r\n")
+    client.recv(10)
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # a reset
+    client.close()
+    time.sleep(0.3)
+    assert _get(f"{address}/")[0] == 200
+    assert capsys.readouterr().err == ""
 
 
 @needs_chromium
@@ -77,7 +150,9 @@ def test_the_page_shows_each_version(run: Path, address: str, tmp_path: Path) ->
         first = tab.run("nsvqViewer.picture()")
         assert "40 splats" in tab.run("document.getElementById('facts').textContent")
         camera = tab.run("nsvqViewer.camera()")
-        save(random_splats(55, seed=2), run / live.LIVE_SCENE, Storage("paper"))
+        arrays = SplatArrays.from_splats(random_splats(55, seed=2))
+        state = {"iteration": 40, "of": 90, "phase": "quantize", "psnr": "21.50"}
+        save(CompressedScene.from_arrays(arrays, config={"live": state}), run / live.LIVE_SCENE, Storage("paper"))
         wait = """new Promise((resolve, reject) => {
             const seen = () => document.getElementById("facts").textContent.startsWith("55 splats");
             setInterval(() => seen() && nsvqViewer.camera(nsvqViewer.camera()).then(resolve), 50);
@@ -86,6 +161,12 @@ def test_the_page_shows_each_version(run: Path, address: str, tmp_path: Path) ->
         tab.run(wait)
         assert tab.run("nsvqViewer.picture()") != first
         assert tab.run("nsvqViewer.camera()") == camera
+        facts = tab.run("document.getElementById('facts').textContent")
+        assert facts.endswith(" · iteration 40 of 90 · quantize · test PSNR 21.50 dB")
+        save(random_splats(60, seed=2), run / "scene.nsvq")
+        live.end(run)
+        tab.run(wait.replace("55", "60"))
+        assert tab.run("document.getElementById('facts').textContent").endswith(" MB · the run has ended")
 
 
 def test_any_scene_becomes_one_page(tmp_path: Path, demo_scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -102,7 +183,14 @@ def test_any_scene_becomes_one_page(tmp_path: Path, demo_scene: Path, capsys: py
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
-    [(["gone.nsvq"], "gone.nsvq"), (["."], "holds no scene.nsvq"), ([".", "--live"], "does not say where its photos")],
+    [
+        (["gone.nsvq"], "there is no file or folder gone.nsvq"),
+        (["no/run"], "there is no file or folder no/run"),
+        (["."], "holds no scene.nsvq"),
+        ([".", "--live"], "does not say where its photos"),
+        (["list/scene.nsvq"], "config list/config.yaml holds list"),
+        (["broken/scene.nsvq"], "config broken/config.yaml is not YAML"),
+    ],
 )
 def test_errors_are_one_line(
     arguments: list[str],
@@ -112,11 +200,28 @@ def test_errors_are_one_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    for name, settings in (("list", "[1, 2]"), ("broken", "data: {")):
+        Path(name).mkdir()
+        Path(name, "config.yaml").write_text(settings)
+        save(random_splats(3), Path(name, "scene.nsvq"))
     assert main(["view", *arguments, "--no-open"]) == 1
     said = capsys.readouterr().err
     assert said.startswith("nsvq view: ")
     assert words in said
     assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("settings", ["data: 3", "data: {init_args: [1]}", "data: {root: 5}", "model: {}"])
+def test_a_config_of_something_else_names_no_photos(settings: str, tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text(settings)
+    assert photos_of(tmp_path / "scene.nsvq") is None
+
+
+def test_a_port_that_cannot_be_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["view", "scene.nsvq", "--port", "99999"])
+    assert stop.value.code == 2
+    assert "argument --port: must be from 0 to 65535, got 99999" in capsys.readouterr().err
 
 
 def test_a_port_in_use_is_told(

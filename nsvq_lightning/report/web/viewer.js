@@ -527,15 +527,20 @@ function bytesOf(base64) {
 /** Where the scene comes from if it is not in the page: see served.js. */
 const server = window.nsvqServer;
 
-/** The decoded scene and the engine that sorts it. */
-async function load() {
+/** The decoded scene and the engine that sorts it; `version` is what the server calls it. */
+async function load(version) {
   const engine = await startEngine(element("decoder").textContent);
   try {
     const file = server ? await server.bytes() : bytesOf(element("file").textContent.trim()), bytes = file.length;
     say(`Decoding ${(bytes / 1e6).toFixed(2)} MB…`);
     await shown();
     const splats = await engine.decode(file.buffer);
-    element("facts").textContent = `${splats.count.toLocaleString("en")} splats · ${(bytes / 1e6).toFixed(2)} MB`;
+    const { iteration, of, phase, psnr } = splats.header.config?.live ?? {};
+    const facts = [`${splats.count.toLocaleString("en")} splats`, `${(bytes / 1e6).toFixed(2)} MB`];
+    if (iteration) facts.push(`iteration ${iteration} of ${of}`, phase);
+    if (psnr) facts.push(`test PSNR ${psnr} dB`);
+    if (version.startsWith("scene.nsvq")) facts.push("the run has ended");
+    element("facts").textContent = facts.join(" · ");
     return { engine, splats };
   } catch (error) {
     engine.end();
@@ -567,7 +572,7 @@ async function main() {
     throw new Error("This browser has no WebGL 2, which this page needs. Update it, or try another one.");
   }
   let version = server?.seconds ? await server.newVersion("", say) : "";
-  let { engine, splats } = await load();
+  let { engine, splats } = await load(version);
   say("Sending splats to the GPU…");
   await shown();
   const canvas = element("canvas"), view = new ViewPoint(scene.up);
@@ -627,7 +632,7 @@ async function main() {
     for (;;) {
       version = await server.newVersion(version, say);
       try {
-        const next = await load();
+        const next = await load(version);
         renderer.release();
         engine.end();
         ({ engine, splats } = next);
@@ -801,7 +806,7 @@ async function main() {
     show(Number(event.target.value));
     canvas.focus();
   });
-  element("more").open = !matchMedia("(pointer: coarse)").matches;
+  element("more").open = !matchMedia("(pointer: coarse), (max-width: 640px), (max-height: 480px)").matches;
   addEventListener("hashchange", () => say(follow()));
   canvas.addEventListener("pointerdown", () => say(""));
   new ResizeObserver(resize).observe(canvas);
