@@ -90,8 +90,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _convert(options: argparse.Namespace, chosen: dict[str, Any]) -> None:
     output: Path = options.output
+    if not output.parent.is_dir():  # now, not after the minutes that floaters take
+        raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
     scene = _cleaned(read_scene(options.input).finite(), options)
-    output.parent.mkdir(parents=True, exist_ok=True)
     size = save(scene, output, **chosen)
     # What reading the output back would say of it is known here.
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)

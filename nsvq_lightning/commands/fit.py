@@ -247,7 +247,13 @@ class SplatCLI(LightningCLI):
     def _run_subcommand(self, subcommand: str) -> None:
         """Run a subcommand; say how to continue if training was stopped, for whatever reason."""
         if subcommand != "export":
-            reserve(self.trainer, self.config[subcommand].get("ckpt_path") if subcommand == "fit" else None)
+            try:
+                reserve(self.trainer, self.config[subcommand].get("ckpt_path") if subcommand == "fit" else None)
+            except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
+                raise OSError(
+                    f"the folder of the run, {error.filename}, cannot be made ({error.strerror}): name another one "
+                    "with --trainer.run_folder, or none for a new one in runs/"
+                ) from error
         try:
             super()._run_subcommand(subcommand)
         except BaseException:

@@ -23,6 +23,8 @@ __all__ = ["main"]
 TRACEBACK = "NSVQ_TRACEBACK"
 """Environment variable that makes errors show their traceback."""
 
+INTERRUPTED = 128 + signal.SIGINT
+
 NOT_ACTIONABLE = (
     "does not have many workers",  # views come from a cache in memory; each worker would hold a copy
     "args parameter is intended",  # we pass the arguments after looking up configs
@@ -45,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments; those of the process if None.
 
     Returns:
-        Exit status: 0, 1 after an error in the user's files or Ctrl-C, 143 after SIGTERM.
+        Exit status: 0, 1 after an error in the user's files, 130 after Ctrl-C, 143 after SIGTERM.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in ("--help", "-h", "help"):
@@ -65,6 +67,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stderr.write(f"error: there is no command {arguments[0]!r}{meant}\nAll commands: nsvq --help\n")
             return 2
         return _run_lightning(resolve_configs(arguments))
+    except KeyboardInterrupt:
+        sys.stderr.write("\n")  # below the ^C that the terminal shows
+        return INTERRUPTED
     except ModuleNotFoundError as error:
         if error.name != "cv2":
             raise
@@ -91,6 +96,8 @@ def _run_lightning(arguments: list[str]) -> int:
     except SIGTERMException:  # a kind of SystemExit
         return 128 + signal.SIGTERM  # Lightning itself would exit with the status of success
     except SystemExit as end:
+        if isinstance(end.__context__, KeyboardInterrupt):  # Lightning exits with 1
+            return INTERRUPTED
         if end.code == 2 and configs:  # the parser's messages name the option, not the file it came from
             sys.stderr.write(f"Settings came from {', '.join(configs)} and the command line\n")
             if old := [config for config in configs if written_by_run(config)]:

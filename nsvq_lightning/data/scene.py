@@ -17,6 +17,7 @@ from torch import Tensor
 
 from nsvq_lightning.compute.devices import upload
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel
+from nsvq_lightning.data.frames import PHOTOS
 from nsvq_lightning.data.images import ROUNDED, ImageHead, ImageSource, ImageStore, image_head
 from nsvq_lightning.data.masks import find_masks
 from nsvq_lightning.data.model_files import SceneError, larger_models
@@ -250,7 +251,8 @@ def _image_folder(root: Path, name: str, factor: int | None) -> tuple[Path, int]
         return scaled, 1
     folder = root / name
     if not folder.is_dir():
-        folders = sorted(path.name for path in root.iterdir() if path.is_dir())
+        photos = sorted(path for path in root.glob("*/*") if path.suffix.lower() in PHOTOS)
+        folders = list(dict.fromkeys(path.parent.name for path in photos))
         scaled_copies = [other for other in folders if other.startswith(f"{name}_")]
         if scaled_copies:
             hint = f"; there is {', '.join(scaled_copies)}: set factor"

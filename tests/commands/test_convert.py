@@ -25,6 +25,7 @@ def exported(scene: CompressedScene, folder: Path, storage: Storage, *formats: s
 
 def test_every_readable_format_becomes_every_writable_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = coded_scene(30, 1)
+    (tmp_path / "new").mkdir()
     for source in FORMATS:
         save(scene, tmp_path / f"a{source}")
         for target in FORMATS:
@@ -120,6 +121,7 @@ def test_measuring_says_how_the_pictures_differ(tmp_path: Path, capsys: pytest.C
         (["missing.ply", "b.spz"], "missing.ply"),
         (["bad.spz", "b.ply"], "bad.spz: "),
         (["a.nsvq", "b.obj"], "unknown suffix '.obj'"),
+        (["a.nsvq", "new/b.ply"], "cannot write new/b.ply: the folder new does not exist; create it first"),
         (["a.nsvq", "b.sog", "--palette", "0"], "palette must be in 1..65536"),
     ],
 )
@@ -138,7 +140,7 @@ def test_errors_in_files_are_one_line_and_status_1(
     assert error.startswith("nsvq convert: ")
     assert message in error
     assert error.count("\n") == 1
-    assert not list(tmp_path.glob("b.*"))
+    assert {path.name for path in tmp_path.iterdir()} == {"a.nsvq", "bad.spz"}
 
 
 @pytest.mark.parametrize(

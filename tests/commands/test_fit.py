@@ -533,6 +533,14 @@ def test_a_folder_that_cannot_be_used_leaves_no_run_behind(tmp_path: Path) -> No
     assert not runs.exists()
 
 
+def test_a_run_folder_that_cannot_be_made_is_a_sentence(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    assert main(fit(demo_scene, tmp_path, f"--trainer.run_folder={tmp_path / 'file' / 'run'}")) == 1
+    assert f"the folder of the run, {tmp_path / 'file' / 'run'}, cannot be made (" in capsys.readouterr().err
+
+
 def test_errors_are_one_line_and_name_the_option(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["fit", "--data.root=x", "--model.shdegree=2"])

@@ -220,6 +220,12 @@ def test_missing_image_folder(make_scene: SceneFactory) -> None:
         load_scene(root)
     assert len(load_scene(root, factor=2)) == 9
     assert len(load_scene(root, images_folder="images_2")) == 9
+    shutil.move(root / "images_2", root / "photos")
+    with pytest.raises(SceneError, match=r"set images_folder to one of photos$"):
+        load_scene(root)
+    shutil.rmtree(root / "photos")
+    with pytest.raises(SceneError, match=r"does not exist: copy the photos there$"):
+        load_scene(root)
 
 
 def test_split_without_train_views(make_scene: SceneFactory) -> None:

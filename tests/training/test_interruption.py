@@ -353,6 +353,19 @@ def test_the_command_says_how_to_continue(
     assert (folder / demo_scene.name / "version_1" / "scene.nsvq").read_bytes() == command_scene
 
 
+def test_ctrl_c_is_the_status_130_of_every_command(
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(module: SplatModule, batch: Any, batch_idx: int) -> Any:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SplatModule, "training_step", interrupted)
+        assert main(arguments_of(demo_scene, tmp_path)) == 128 + signal.SIGINT
+    monkeypatch.setattr("nsvq_lightning.commands.info.describe", lambda path: interrupted(path, None, 0))
+    assert main(["info", "scene.ply"]) == 128 + signal.SIGINT
+
+
 def test_the_command_that_continues_again_names_one_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     for before in (["--ckpt_path", "old.ckpt"], ["--ckpt_path=old.ckpt"], []):
         command = continuation(["fit", *before, "--data.root=a b"], Path("new.ckpt"))
