@@ -47,9 +47,8 @@ def test_a_trainer_has_the_bar_and_the_checkpoints_that_its_flags_allow(
     flags: dict[str, Any], kinds: list[type], demo_scene: Path, tmp_path: Path
 ) -> None:
     trainer = fit(demo_scene, tmp_path, **flags)
-    found = [
-        type(each) for each in trainer.callbacks if isinstance(each, TQDMProgressBar | ModelCheckpoint | RunCheckpoint)
-    ]  # type: ignore[attr-defined]
+    callbacks = trainer.callbacks  # type: ignore[attr-defined]
+    found = [type(each) for each in callbacks if isinstance(each, TQDMProgressBar | ModelCheckpoint | RunCheckpoint)]
     assert found == kinds
     names = {path.name for path in tmp_path.rglob("*.ckpt")}
     assert names == ({"last.ckpt"} if RunCheckpoint in kinds else set())
