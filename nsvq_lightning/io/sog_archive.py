@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.limits import FEW_SPLATS, check_room
 
 __all__ = ["META", "ZIP_MAGIC", "SogArchive", "picture_shape", "write_archive"]
 
@@ -24,8 +25,8 @@ META = "meta.json"
 ZIP_MAGIC = b"PK\x03\x04"
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 _META_LIMIT = 1 << 20
-_MOST_A_BYTE = 1024
-"""Limit on texels per byte of the file: pictures of one colour take almost no bytes, real scenes several per splat."""
+_TEXEL_BYTES = 8
+"""Most bytes of a picture for each texel that the file may hold; uncompressed, a texel has four."""
 
 
 def picture_shape(count: int) -> tuple[int, int]:
@@ -77,7 +78,7 @@ class SogArchive:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self._texels = _MOST_A_BYTE * os.path.getsize(path)
+        self._size = os.path.getsize(path)
         try:
             self._zip = zipfile.ZipFile(path)
         except (zipfile.BadZipFile, ValueError, NotImplementedError, EOFError) as error:
@@ -100,8 +101,9 @@ class SogArchive:
         Raises:
             FormatError: It is missing, damaged, or not a JSON object.
         """
+        text = self._bytes(META, _META_LIMIT)
         try:
-            meta = json.loads(self._bytes(META, _META_LIMIT))
+            meta = json.loads(text)
         except (ValueError, RecursionError) as error:
             raise FormatError(f"damaged: {META} is not JSON ({error})") from None
         if not isinstance(meta, dict):
@@ -114,10 +116,7 @@ class SogArchive:
         Raises:
             FormatError: There are too many.
         """
-        if texels > self._texels:
-            raise FormatError(
-                f"truncated or damaged: {texels} splats or texels cannot be in {self._texels // _MOST_A_BYTE} bytes"
-            )
+        check_room("splats or texels", texels, self._size)
 
     def texels(self, name: str, count: int) -> NDArray[np.uint8]:
         """The first ``count`` texels ``[count, 4]`` of a picture.
@@ -127,7 +126,7 @@ class SogArchive:
         """
         from PIL import Image
 
-        data = self._bytes(name, self._texels)
+        data = self._bytes(name, _TEXEL_BYTES * max(FEW_SPLATS, self._size))
         try:
             with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
                 if image.width * image.height < count:
@@ -141,9 +140,13 @@ class SogArchive:
 
     def _bytes(self, name: str, most: int) -> bytes:
         try:
-            if self._zip.getinfo(name).file_size > most:
-                raise FormatError(f"damaged: {name} cannot have {self._zip.getinfo(name).file_size} bytes")
-            return self._zip.read(name)
+            entry = self._zip.getinfo(name)
+            if entry.file_size > most:
+                raise FormatError(f"damaged: {name} cannot have {entry.file_size} bytes")
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # whose length can be limited
+                raise FormatError(f"{name} is compressed by method {entry.compress_type} of zip, not 0 (none) or 8")
+            with self._zip.open(entry) as file:
+                return file.read(entry.file_size)  # not read(name), which unpacks all there is, whatever its length
         except KeyError:
             raise FormatError(f"not a whole .sog file: the archive has no {name}") from None
         except FormatError:

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from nsvq_lightning.io import zstd
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.errors import FormatError, naming_file
+from nsvq_lightning.io.limits import check_room
 from nsvq_lightning.splats.conventions import sh_coefficients
 
 __all__ = [
@@ -58,8 +59,8 @@ _HEADER = struct.Struct("<4sIIBBBB")
 _TABLE_OFFSET = struct.Struct("<I12x")
 _HEAD = _HEADER.size + _TABLE_OFFSET.size
 _ENTRY = struct.Struct("<QQ")
-_MOST_A_BYTE = 1032
-"""Most bytes that one byte of a deflate stream can expand to."""
+_MOST_EXTENDED = 1 << 20
+"""Bytes of extensions that are read; those in use have less than a hundred."""
 ANTIALIASED = 1
 """The flag of a scene that was trained with anti-aliasing."""
 _EXTENDED = 2
@@ -197,6 +198,7 @@ def _parse_head(start: bytes, file_bytes: int) -> tuple[SpzHeader, int]:
     header = _parse(start[: _HEADER.size])
     if header.version < 4 or len(start) < _HEAD:
         raise FormatError(f"truncated or damaged: version {header.version} in {file_bytes} bytes without gzip")
+    check_room("splats", header.count, file_bytes)
     streams, (offset,) = start[_HEADER.size - 1], _TABLE_OFFSET.unpack_from(start, _HEADER.size)
     if streams != len(header.streams):
         raise FormatError(f"damaged: {streams} streams where there must be {len(header.streams)}")
@@ -240,12 +242,9 @@ def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
         if len(contents[name]) < size:
             raise FormatError(f"truncated: {name} of {header.count} splats has {len(contents[name])} of {size} bytes")
     # Extensions follow the arrays; reading to the end of the stream verifies its checksum.
-    extensions = b""
-    while not gunzip.eof:
-        part = _inflate(gunzip, gunzip.unconsumed_tail, 1 << 16)
-        if not part and not gunzip.eof:
-            raise FormatError("truncated: the gzip stream has no end")
-        extensions = extensions or part
+    extensions = _inflate(gunzip, gunzip.unconsumed_tail, _MOST_EXTENDED)
+    if not gunzip.eof:
+        raise FormatError(f"truncated, or more than {_MOST_EXTENDED} bytes of extensions: the gzip stream has no end")
     return _with_axes(header, extensions), contents
 
 
@@ -254,8 +253,7 @@ def _parse_stream(gunzip: zlib._Decompress, data: bytes, file_bytes: int) -> Spz
     header = _parse(_inflate(gunzip, data, _HEADER.size))
     if header.version > 3:
         raise FormatError(f"damaged: version {header.version} in a gzip stream, which only versions 1 to 3 are")
-    if sum(header.streams.values()) > _MOST_A_BYTE * file_bytes:
-        raise FormatError(f"truncated or damaged: {header.count} splats cannot be in {file_bytes} bytes")
+    check_room("splats", header.count, file_bytes)
     return header
 
 

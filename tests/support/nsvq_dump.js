@@ -1,4 +1,4 @@
-// node nsvq_dump.js READER FILE...: the attributes of each file as float32, one after another; an error ends it.
+// node nsvq_dump.js READER FILE...: the attributes of each file as float32, one after another; errors go to stderr.
 const fs = require("fs");
 const { decode } = require(process.argv[2]);
 

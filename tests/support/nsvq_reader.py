@@ -12,6 +12,10 @@ import struct
 import numpy as np
 
 
+def refuse(what):
+    raise AssertionError(what)
+
+
 def unframe(data):
     assert data[:8] == b"\x89NSVQ\r\n\x1a"
     assert len(data) >= 32
@@ -19,7 +23,7 @@ def unframe(data):
     version, length = struct.unpack_from("<II", data, 24)
     assert version in (1, 2)
     assert 32 + length <= len(data)
-    header = json.loads(data[32 : 32 + length].decode("utf-8"))
+    header = json.loads(data[32 : 32 + length].decode("utf-8"), parse_constant=refuse)
     streams, at = {}, 32 + length
     for row in header["streams"]:
         name, size = (row["name"], row["length"]) if isinstance(row, dict) else row[:2]
@@ -38,6 +42,84 @@ def attribute_table(header):
 
 
 DIMS = {"means": 3, "opacities": 1, "quats": 4, "scales": 3, "sh0": 3}
+LATER = ["quats", "sh0", "shN"]
+ORDERS = {
+    "raw": ["means", "opacities", "quats", "scales", "sh0", "shN"],
+    "cells": ["opacities", "scales", "means", *LATER],
+    "grid": ["scales", "means", "opacities", *LATER],
+}
+FEW_SPLATS, FEW_ROWS = 2**20, 2**16
+
+
+def natural(value):
+    return type(value) is int and value >= 0
+
+
+def number(value):
+    return type(value) in (int, float)
+
+
+def check(header, streams):
+    level, count, degree, origin, metrics = (header[k] for k in ("level", "splats", "sh_degree", "origin", "metrics"))
+    assert level in ("compact", "paper")
+    assert natural(count)
+    assert natural(degree)
+    assert degree <= 3
+    assert type(origin) is list
+    assert len(origin) == 3
+    assert all(number(value) and math.isfinite(value) for value in origin)
+    assert type(header["config"]) is dict
+    assert type(metrics) is dict
+    assert all(value is None or number(value) for value in metrics.values())
+    table, compact = attribute_table(header), level == "compact"
+    assert [*table] == ORDERS[table["means"]["storage"]]
+    assert len(table) == len(header["attributes"])
+    assert compact == (table["means"]["storage"] != "raw")
+    for name, entry in table.items():
+        dim, storage, codes, step = (entry[key] for key in ("dim", "storage", "codes", "step"))
+        assert natural(dim)
+        assert dim == DIMS.get(name, 3 * ((degree + 1) ** 2 - 1))
+        own = {"means": ("cells", "grid"), "opacities": ("levels",)}.get(name, ("steps",)) if compact else ("raw",)
+        assert storage in own or (storage == "codes" and name not in ("means", "opacities") and dim > 0)
+        most = {"codes": 2**32, "levels": 2**20}.get(storage, 0)
+        assert natural(codes)
+        assert min(most, 1) <= codes <= most
+        assert 0 <= step < math.inf
+        assert (step > 0) == (compact and storage != "levels")
+    expected = expected_streams(table.values(), count, compact)
+    for row, (name, encoding, length) in zip(header["streams"], expected, strict=True):
+        row = [row["name"], row["length"], row["encoding"]] if isinstance(row, dict) else row
+        assert row == [name, row[1], encoding]
+        assert natural(row[1])
+        assert length in (row[1], None)
+    if compact:
+        assert len(streams["means.far"]) % 12 == 0
+        assert len(streams["means.far"]) <= 12 * count
+        assert count <= max(FEW_SPLATS, sum(map(len, streams.values())))
+        for name, entry in table.items():
+            assert entry["storage"] != "codes" or entry["codes"] <= max(FEW_ROWS, len(streams[f"{name}.codebook"]))
+
+
+def expected_streams(rows, count, compact):
+    """Name, encoding and length of each stream; the length is None where the header alone says it."""
+    coded = [row for row in rows if row["storage"] == "codes"]
+    if not compact:
+        bits = sum((row["codes"] - 1).bit_length() for row in coded)
+        return [
+            *((row["name"], "float32", 4 * count * row["dim"]) for row in rows if row["storage"] == "raw"),
+            *([("codes", "bits", -(-count * bits // 8))] if coded else []),
+            *((f"{row['name']}.codebook", "float32", 4 * row["codes"] * row["dim"]) for row in coded),
+        ]
+    found = []
+    for row in rows:
+        name, storage = row["name"], row["storage"]
+        if name == "means":
+            found += [("means.grid", "grid", 32), ("means", "keys", None), ("means.far", "float32", None)]
+        elif storage == "codes":
+            found += [(f"{name}.codebook", "integers", None), (name, "paths", None)]
+        else:
+            found.append((name, "paths" if storage == "levels" else "integers", None))
+    return found
 
 
 def float_rows(data, dim):
@@ -165,11 +247,10 @@ def decode_integers(data, rows, columns):
             if length > 1:
                 size = 2 + decoder.bit(("second", j, length))
                 size = (size << (length - 2)) + decoder.plain(length - 2)
-            values[i, j] = -size if negative else size
+            value = (-size if negative else size) + (int(values[i - 1, j]) if data[j] and i else 0)
+            assert abs(value) < 2**52
+            values[i, j] = value
     decoder.end()
-    for j in range(columns):
-        if data[j]:
-            values[:, j] = np.cumsum(values[:, j])
     return values
 
 
@@ -198,7 +279,7 @@ def depths_of(scales, scale_step, doublings, levels=None, level_count=0):
     if levels is not None:
         mantissas, exponents = np.frexp((np.arange(level_count) + 0.5) / level_count)
         x = x - 0.5 * ((2.0 * mantissas - 2.0) + exponents)[levels]
-    return [21 - min(max(math.floor(value), 0), 21) for value in x.tolist()]
+    return [21 - math.floor(min(max(value, 0.0), 21.0)) for value in x.tolist()]
 
 
 def decode_keys(data, depths):
@@ -258,6 +339,7 @@ def decode_compact(header, streams):
     for name in first:
         decode(name, rows_before(count))
     *base, doublings = struct.unpack("<qqqd", streams["means.grid"])
+    assert math.isfinite(doublings)
     far = float_rows(streams["means.far"], 3)
     levels = (leaves["opacities"], table["opacities"]["codes"]) if cells else ()
     depths = depths_of(integers["scales"], table["scales"]["step"], doublings, *levels)[: count - len(far)]
@@ -277,7 +359,7 @@ def decode_compact(header, streams):
 def read_nsvq(path):
     with open(path, "rb") as file:
         header, streams = unframe(file.read())
-    assert header["level"] in ("compact", "paper")
+    check(header, streams)
     rows = (decode_compact if header["level"] == "compact" else decode_paper)(header, streams)
     count, higher = header["splats"], (header["sh_degree"] + 1) ** 2 - 1
     if higher == 0:

@@ -29,6 +29,7 @@ size alone, and the opacities come after the positions, with near splats as neig
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -38,6 +39,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.compressed import QUANTIZABLE, CompressedScene, attribute_dims
 from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.limits import FEW_ROWS, check_room
 from nsvq_lightning.io.morton import AXIS_BITS, Grid, morton_keys, nearest_before, unmorton
 from nsvq_lightning.io.nsvq.codebook_order import leaf_paths
 from nsvq_lightning.io.nsvq.entropy import (
@@ -56,8 +58,6 @@ from nsvq_lightning.io.nsvq.tasks import workers
 __all__ = ["decode_compact", "encode_compact"]
 
 _GRID = struct.Struct("<qqqd")
-_MOST_A_BYTE = 4096
-"""Limit on splats or codebook rows per byte of stream; probabilities have a floor, so valid files have fewer."""
 
 _POSITIONS = ("means.grid", "means", "means.far")
 _STREAMS = {"grid": _POSITIONS, "cells": _POSITIONS, "codes": ("{}.codebook", "{}"), "steps": ("{}",)}
@@ -222,6 +222,8 @@ def _decode_codebook(entry: AttributeEntry, streams: Mapping[str, memoryview]) -
 
 def _decode_places(step: float, stored: Mapping[str, Stored], streams: Mapping[str, memoryview]) -> _Places:
     *base, doublings = _GRID.unpack(streams["means.grid"])
+    if not math.isfinite(doublings):
+        raise FormatError(f"damaged: the cells of the positions have {doublings} doublings, not a finite number")
     grid, far = Grid(step, (base[0], base[1], base[2])), len(streams["means.far"]) // _FAR_BYTES
     depths = grid.depths(doublings_of(stored, doublings))
     depths = depths[: len(depths) - far]
@@ -259,7 +261,7 @@ def _checked_tables(header: Header) -> dict[str, AttributeEntry]:
         raise FormatError(f"damaged: the attribute table must list {', '.join(dims)}, got {header.attributes}")
     lengths = {stream.name: stream.length for stream in header.streams}
     for entry in header.attributes:
-        if not _possible(entry, lengths):
+        if not _possible(entry):
             raise FormatError(f"damaged: impossible attribute {entry}")
     if [(stream.name, stream.encoding) for stream in header.streams] != _stream_names(header.attributes):
         raise FormatError("damaged: the stream table does not fit the attribute table")
@@ -269,12 +271,15 @@ def _checked_tables(header: Header) -> dict[str, AttributeEntry]:
         or lengths["means.far"] // _FAR_BYTES > header.splats
     ):
         raise FormatError("damaged: the streams of the positions do not have their sizes")
-    if header.splats > _MOST_A_BYTE * sum(lengths.values()):
-        raise FormatError(f"damaged: {header.splats} splats in {sum(lengths.values())} bytes")
+    check_room("splats", header.splats, sum(lengths.values()))
+    for entry in header.attributes:
+        if entry.storage == "codes":
+            name = f"{entry.name}.codebook"
+            check_room(f"rows of {name}", entry.codes, lengths[name], FEW_ROWS)
     return entries
 
 
-def _possible(entry: AttributeEntry, lengths: Mapping[str, int]) -> bool:
+def _possible(entry: AttributeEntry) -> bool:
     if entry.name == "means":
         return entry.storage in _BEFORE_POSITIONS and entry.codes == 0 and entry.step > 0
     if entry.storage == "steps":
@@ -283,5 +288,4 @@ def _possible(entry: AttributeEntry, lengths: Mapping[str, int]) -> bool:
         return False
     if entry.name == "opacities":
         return entry.storage == "levels" and entry.codes <= MOST_OPACITY_LEVELS and entry.step == 0
-    enough = entry.codes <= _MOST_A_BYTE * lengths.get(f"{entry.name}.codebook", 0)
-    return entry.storage == "codes" and entry.step > 0 and enough and entry.dim > 0
+    return entry.storage == "codes" and entry.step > 0 and entry.dim > 0

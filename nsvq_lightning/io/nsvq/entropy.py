@@ -48,8 +48,11 @@ _RELATIONS = 9
 
 _START = uint64(0xFFFFFFFFFFFFFFFF)
 _WORD_BITS = 32
-_TOO_LARGE = 1 << 62
+_TOO_LARGE = 1 << 52
+"""Integers are below it in size: they and their sums are exact in float64."""
 _KEY_MASK = uint64((1 << KEY_BITS) - 1)
+_OUTSIDE = -1
+"""What a reader returns instead of the number of words when it meets a value out of range."""
 
 
 def encode_paths(paths: NDArray[np.int64], bits: int, neighbours: NDArray[np.int32]) -> bytes:
@@ -125,18 +128,21 @@ def decode_keys(data: bytes | memoryview, depths: NDArray[np.int64]) -> NDArray[
     """Invert :func:`encode_keys` with the same ``depths``.
 
     Raises:
-        FormatError: There are more or fewer bytes than N keys take.
+        FormatError: There are more or fewer bytes than N keys take, or a key is not below 2⁶³.
         ValueError: As for :func:`encode_keys`.
         TypeError: The depths are not int64.
     """
     _check_depths(depths)
     keys, words = np.empty(len(depths), np.uint64), _words(data)
-    _check_used(words, _read_keys(words, depths, keys, new_contexts(_KEY_CONTEXTS)))
+    used = _read_keys(words, depths, keys, new_contexts(_KEY_CONTEXTS))
+    if used == _OUTSIDE:
+        raise FormatError("damaged: a position is outside its grid")
+    _check_used(words, used)
     return keys
 
 
 def encode_integers(values: NDArray[np.int64]) -> bytes:
-    """Bytes of integers ``[N, D]`` of absolute value below 2⁶².
+    """Bytes of integers ``[N, D]`` of absolute value below 2⁵².
 
     Each column is written as values or as differences from row to row, whichever is smaller; one byte per column says
     which. An integer is written as its number of bits, by an adaptive model of its column, its sign, the bit after the
@@ -148,7 +154,7 @@ def encode_integers(values: NDArray[np.int64]) -> bytes:
     """
     check_array("values", values, values.shape, INT64)
     if values.ndim != 2 or (values.size and max(-int(values.min()), int(values.max())) >= _TOO_LARGE):
-        raise ValueError(f"values must have shape [N, D] and be below 2^62 in size, got {list(values.shape)}")
+        raise ValueError(f"values must have shape [N, D] and be below 2^52 in size, got {list(values.shape)}")
     steps = np.diff(values, axis=0, prepend=0)
     by_steps = _size(steps) < _size(values)
     chosen = np.where(by_steps, steps, values)
@@ -161,14 +167,17 @@ def decode_integers(data: bytes | memoryview, rows: int, columns: int) -> NDArra
     """Invert :func:`encode_integers`.
 
     Raises:
-        FormatError: There are more or fewer bytes than these integers take.
+        FormatError: There are more or fewer bytes than these integers take, or one is not below 2⁵² in size.
     """
     if len(data) < columns:
         raise FormatError(f"damaged: {len(data)} bytes for {columns} columns of integers")
     by_steps = np.frombuffer(data[:columns], np.uint8).astype(bool)
     values, words = np.empty((rows, columns), np.int64), _words(data[columns:])
-    _check_used(words, _read_integers(words, values, new_contexts(_INTEGER_CONTEXTS * columns)))
-    return np.where(by_steps, np.cumsum(values, axis=0), values)
+    used = _read_integers(words, by_steps, values, new_contexts(_INTEGER_CONTEXTS * columns))
+    if used == _OUTSIDE:
+        raise FormatError("damaged: an integer is not below 2^52 in size")
+    _check_used(words, used)
+    return values
 
 
 # Words and bytes
@@ -191,8 +200,14 @@ def _words(data: bytes | memoryview) -> NDArray[np.uint32]:
 
 def _check_used(words: NDArray[np.uint32], used: int) -> None:
     """Refuse a stream that is not used up; the decoder reads one word ahead."""
-    if used > len(words) + 1 or used < len(words):
+    if used != len(words) + 1:
         raise FormatError(f"damaged: an entropy-coded stream of {len(words)} words, of which {used - 1} were read")
+
+
+@inline
+def _ended(words, used):  # type: ignore[no-untyped-def]
+    """Whether more words were read than there are: what follows is worth no time."""
+    return used > len(words) + 1
 
 
 # Paths
@@ -246,6 +261,8 @@ def _read_paths(words, bits, neighbours, paths, contexts):  # type: ignore[no-un
             path = 2 * path + bit
         rest, code, width, used = decode_plain(plain, code, width, words, used)
         paths[i] = (path << plain) + np.int64(rest)
+        if _ended(words, used):
+            break
     return used
 
 
@@ -331,13 +348,17 @@ def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
         shift = uint64(KEY_BITS - depths[i])
         start = _key_context(depths[i], before)
         length, code, width, used = _read_length(start, contexts, code, width, words, used)
-        # Only an altered stream has a difference longer than its key.
-        length = min(length, depths[i])
+        if length > depths[i]:
+            return _OUTSIDE
         rest, code, width, used = decode_plain(length - 1, code, width, words, used)
         step = (uint64(1) << uint64(length - 1)) | rest if length else uint64(0)
-        last = (((last >> shift) + step) << shift) & _KEY_MASK
+        last = ((last >> shift) + step) << shift  # of two numbers below 2^63: no carry is lost
+        if last > _KEY_MASK:
+            return _OUTSIDE
         before = length + np.int64(shift) if length else 0
         keys[i] = last
+        if _ended(words, used):
+            break
     return used
 
 
@@ -379,7 +400,7 @@ def _write_integers(values, words, contexts):  # type: ignore[no-untyped-def]
 
 
 @partial(kernel, parallel=False, allocates=False)
-def _read_integers(words, values, contexts):  # type: ignore[no-untyped-def]
+def _read_integers(words, by_steps, values, contexts):  # type: ignore[no-untyped-def]
     code, width, used = decode_start(words)
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
@@ -393,5 +414,12 @@ def _read_integers(words, values, contexts):  # type: ignore[no-untyped-def]
                 second, code, width, used = decode_bit(context, contexts, code, width, words, used)
                 rest, code, width, used = decode_plain(length - 2, code, width, words, used)
                 size = ((uint64(2) | uint64(second)) << uint64(length - 2)) | rest
-            values[i, j] = -np.int64(size) if sign else np.int64(size)
+            value = -np.int64(size) if sign else np.int64(size)
+            if by_steps[j] and i > 0:
+                value += values[i - 1, j]
+            if not -_TOO_LARGE < value < _TOO_LARGE:
+                return _OUTSIDE
+            values[i, j] = value
+        if _ended(words, used):
+            break
     return used

@@ -116,7 +116,7 @@ class Header:
             FormatError: An entry is missing or has the wrong type.
         """
         try:
-            table = json.loads(text)
+            table = json.loads(text.decode(), parse_constant=_no_number)
         except (ValueError, RecursionError) as error:
             raise FormatError(f"damaged: the header is not JSON ({error})") from None
         header = cls(
@@ -134,6 +134,10 @@ class Header:
         if len({stream.name for stream in header.streams}) != len(header.streams):
             raise FormatError("damaged: two streams have the same name")
         return header
+
+
+def _no_number(name: str) -> None:
+    raise ValueError(f"it holds {name}, which JSON does not have")
 
 
 def _rows(table: object, key: str, kind: type[AttributeEntry | StreamEntry]) -> list[dict[str, Any]]:

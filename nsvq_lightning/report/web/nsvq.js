@@ -10,7 +10,7 @@
   const PREFIX = 32;
   const TWO32 = 2 ** 32;
   const LARGEST = 2 ** 52; // integers below it add up exactly in a double
-  const PER_BYTE = 4096; // splats or rows of a codebook that a byte of a file can account for
+  const FEW_SPLATS = 2 ** 20, FEW_ROWS = 2 ** 16; // what any file may hold; beyond, each splat or row takes a byte or more
   const DIMS = { means: 3, opacities: 1, quats: 4, scales: 3, sh0: 3 };
   const ORDERS = {
     paper: ["means", "opacities", "quats", "scales", "sh0", "shN"],
@@ -105,7 +105,7 @@
     if (PREFIX + length > data.length) refuse("its header is longer than the file");
     let header;
     try {
-      header = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(data.subarray(PREFIX, PREFIX + length)));
+      header = JSON.parse(new TextDecoder("utf-8", { fatal: true, ignoreBOM: true }).decode(data.subarray(PREFIX, PREFIX + length)));
     } catch (error) {
       refuse(`its header cannot be read (${error.message})`);
     }
@@ -115,6 +115,7 @@
   // The header
 
   const natural = value => Number.isSafeInteger(value) && value >= 0;
+  const isTable = value => typeof value === "object" && value !== null && !Array.isArray(value);
   const same = (first, second) => first.length === second.length && first.every((value, i) => value === second[i]);
   const bitsOf = count => (count <= 1 ? 0 : count > 2 ** 31 ? 32 : 32 - Math.clz32(count - 1));
 
@@ -133,6 +134,8 @@
     if (level !== "compact" && level !== "paper") refuse(`its level ${level} is unknown`);
     if (!natural(splats) || !natural(degree) || degree > 3) refuse("its header lacks the number of splats or the SH degree");
     if (!Array.isArray(origin) || origin.length !== 3 || !origin.every(Number.isFinite)) refuse("its origin is not three numbers");
+    if (!isTable(header.config) || !isTable(header.metrics)) refuse("its header lacks the settings or the metrics");
+    if (!Object.values(header.metrics).every(value => value === null || typeof value === "number")) refuse("its metrics are not numbers");
     const attributes = rowsOf(header.attributes, ["name", "dim", "storage", "codes", "step"]);
     const kind = level === "paper" ? level : (attributes.find(row => row.name === "means") || {}).storage;
     const table = {}, expected = [];
@@ -170,8 +173,8 @@
     }
     if (at !== body.length) refuse("bytes follow its last stream");
     for (const { name, codes } of coded)
-      if (level === "compact" && codes > PER_BYTE * streams[`${name}.codebook`].length) refuse(`its codebook of ${name} is too large`);
-    if (level === "compact" && splats > PER_BYTE * body.length) refuse("it has too many splats for its length");
+      if (level === "compact" && codes > Math.max(FEW_ROWS, streams[`${name}.codebook`].length)) refuse(`its codebook of ${name} is too large`);
+    if (level === "compact" && splats > Math.max(FEW_SPLATS, body.length)) refuse("it has too many splats for its length");
     return { level, kind, splats, degree, origin, table, streams };
   }
 
@@ -198,7 +201,7 @@
       state[LOW] = 0;
       state[CODE_HIGH] = state[CODE_LOW];
       state[CODE_LOW] = this.used < this.words.length ? this.words[this.used] : 0;
-      this.used++;
+      if (this.used++ > this.words.length) this.end(); // what would follow is worth no time
     }
 
     bit(context) {

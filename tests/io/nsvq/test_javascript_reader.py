@@ -10,11 +10,13 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+import nsvq_reader
 import numpy as np
 import pytest
 from compressed_scenes import SIZES, scene
 
-from nsvq_lightning.io import CompressedScene, read_nsvq, write_nsvq
+from nsvq_lightning.io import CompressedScene, FormatError, read_nsvq, write_nsvq
+from nsvq_lightning.io.nsvq.frame import read_frame
 from nsvq_lightning.io.nsvq.precision import LEVELS, Precision
 from nsvq_lightning.splats.arrays import SplatArrays
 
@@ -131,9 +133,12 @@ def _changed(path: Path, change: Any, version: int = 2, body: bytes | None = Non
     (length,) = struct.unpack_from("<I", data, 28)
     header = json.loads(data[32 : 32 + length])
     change(header)
-    text = json.dumps(header).encode()
-    rest = struct.pack("<II", version, len(text)) + text + (data[32 + length :] if body is None else body)
-    path.write_bytes(data[:8] + hashlib.blake2b(rest, digest_size=16).digest() + rest)
+    _framed(path, json.dumps(header).encode(), data[32 + length :] if body is None else body, version)
+
+
+def _framed(path: Path, text: bytes, body: bytes, version: int = 2) -> None:
+    rest = struct.pack("<II", version, len(text)) + text + body
+    path.write_bytes(b"\x89NSVQ\r\n\x1a" + hashlib.blake2b(rest, digest_size=16).digest() + rest)
 
 
 @pytest.mark.parametrize(
@@ -181,3 +186,82 @@ def test_noise_in_the_streams_ends_with_an_error_or_numbers(tmp_path: Path) -> N
         _changed(path, lambda _: None, body=body.tobytes())
         done = subprocess.run(["node", str(DUMP), str(READER), str(path)], capture_output=True, timeout=60, check=False)
         assert done.returncode == 0 or b"not a valid .nsvq file" in done.stderr
+
+
+def _with_stream(path: Path, name: str, change: Any) -> None:
+    """Replace a stream of a file."""
+    streams = {key: bytes(data) for key, data in read_frame(path)[1].items()}
+    streams[name] = change(streams[name])
+
+    def fit(header: dict[str, Any]) -> None:
+        for row in header["streams"]:
+            row[1] = len(streams[row[0]])
+
+    _changed(path, fit, body=b"".join(streams.values()))
+
+
+def _with_text(path: Path, change: Any) -> None:
+    """Replace the JSON of a file."""
+    data = path.read_bytes()
+    (length,) = struct.unpack_from("<I", data, 28)
+    _framed(path, change(data[32 : 32 + length]), data[32 + length :])
+
+
+def _grid(number: float) -> Any:
+    return lambda data: data[:24] + struct.pack("<d", number)
+
+
+CHANGES: dict[str, tuple[Any, str]] = {
+    "a word too many": (lambda p: _with_stream(p, "means", lambda s: s + bytes(4)), "of which"),
+    "a word too many after codes": (lambda p: _with_stream(p, "sh0", lambda s: s + bytes(4)), "of which"),
+    "keys beyond the grid": (lambda p: _with_stream(p, "means", lambda s: bytes(len(s))), "outside its grid"),
+    "integers too large": (lambda p: _with_stream(p, "quats.codebook", lambda s: s[:4] + bytes(400)), r"2\^52"),
+    "grid not a number": (lambda p: _with_stream(p, "means.grid", _grid(np.nan)), "nan doublings"),
+    "grid infinite": (lambda p: _with_stream(p, "means.grid", _grid(-np.inf)), "-inf doublings"),
+    "infinity": (lambda p: _changed(p, lambda h: h["metrics"].update(psnr=np.inf)), "Infinity"),
+    "not a number": (lambda p: _changed(p, lambda h: h["config"].update(a=np.nan)), "NaN"),
+    "byte-order mark": (lambda p: _with_text(p, lambda t: b"\xef\xbb\xbf" + t), "not JSON"),
+    "UTF-16": (lambda p: _with_text(p, lambda t: t.decode().encode("utf-16-le")), "not JSON"),
+    "no config": (lambda p: _changed(p, lambda h: h.pop("config")), "config"),
+    "metrics of words": (lambda p: _changed(p, lambda h: h["metrics"].update(psnr="high")), "metrics"),
+    "many splats": (lambda p: _changed(p, lambda h: h.update(splats=2**20 + 1)), "1048577 splats cannot be in"),
+    "many rows": (
+        lambda p: _changed(p, lambda h: h["attributes"][3].__setitem__(3, 2**16 + 1)),
+        "65537 rows of quats.codebook cannot be in",
+    ),
+}
+
+
+def test_all_readers_refuse_the_same_files(tmp_path: Path) -> None:
+    """The package, the Python of the page and the JavaScript: what the page refuses, and noise in the streams."""
+    paths = [tmp_path / f"{index:02}.nsvq" for index in range(len(CHANGES) + 24)]
+    for path, (change, words) in zip(paths, CHANGES.values(), strict=False):
+        write_nsvq(path, scene(60))
+        change(path)
+        with pytest.raises(FormatError, match=words):
+            read_nsvq(path)
+    for seed, path in enumerate(paths[len(CHANGES) :]):
+        write_nsvq(path, scene(60, SIZES if seed % 3 else {}), LEVELS[seed % 2])
+        generator = np.random.default_rng(seed)
+        name = str(generator.choice([name for name, stream in read_frame(path)[1].items() if len(stream)]))
+
+        def noise(stream: bytes, generator: np.random.Generator = generator) -> bytes:
+            at = int(generator.integers(len(stream)))
+            return stream[:at] + generator.bytes(1) + stream[at + 1 :]
+
+        _with_stream(path, name, noise)
+    command = ["node", str(DUMP), str(READER), *map(str, paths)]
+    lines = subprocess.run(command, capture_output=True, timeout=60, check=False).stderr.decode().splitlines()
+    refused = []
+    for path in paths:
+        try:
+            read_nsvq(path)
+        except FormatError:
+            refused.append(path)
+        try:
+            nsvq_reader.read_nsvq(path)
+        except Exception:
+            assert path in refused, f"the page refuses {path}"
+        else:
+            assert path not in refused, f"the page reads {path}"
+    assert len(lines) == len(refused) > len(CHANGES)
