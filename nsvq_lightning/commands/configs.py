@@ -2,14 +2,32 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
+from functools import cache
+from itertools import chain
 from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any
 
 from nsvq_lightning.top_level import folder_of
 
-__all__ = ["check_config", "configs_among", "find_config", "resolve_configs", "shipped_configs", "written_by_run"]
+if TYPE_CHECKING:
+    from yaml.nodes import Node
+
+__all__ = [
+    "check_config",
+    "configs_among",
+    "find_config",
+    "limit_aliases",
+    "read_config",
+    "resolve_configs",
+    "shipped_configs",
+    "written_by_run",
+]
 
 CONFIG_OPTIONS = ("--config", "-c")
+_MOST_BYTES, _MOST_VALUES = 1 << 17, 100_000
+"""Of a config, and of its values with every alias written out; configs of this package have 10 kB and 300 values."""
 
 
 def resolve_configs(arguments: Sequence[str]) -> list[str]:
@@ -37,23 +55,71 @@ def _configs(arguments: Sequence[str]) -> Iterator[tuple[int, str]]:
         expects_config = not expects_config and argument in CONFIG_OPTIONS
 
 
-def check_config(path: str) -> None:
-    """Refuse a file that cannot be a config; the parser reports a name that is not a file.
+def check_config(path: str) -> dict[str, Any]:
+    """Settings of a config, none where the name is not that of a file, which the parser reports.
 
     Raises:
         ValueError: It is not text, not YAML, or not a table of settings.
     """
-    import yaml
-
     if not Path(path).is_file():
-        return
-    try:
-        settings = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error
+        return {}
+    settings = read_config(Path(path))
     if not isinstance(settings, dict):
         found = "nothing" if settings is None else type(settings).__name__
         raise ValueError(f"config {path} holds {found}: give settings by name, like 'trainer: {{max_steps: 1000}}'")
+    return settings
+
+
+def read_config(path: Path) -> object:
+    """Content of a YAML file of settings.
+
+    Raises:
+        ValueError: It is not text or not YAML, or too large; what aliases repeat counts as often as they are named.
+    """
+    import yaml
+
+    if path.stat().st_size > _MOST_BYTES:
+        raise ValueError(f"config {path} has {path.stat().st_size} bytes, more than {_MOST_BYTES}: give another file")
+    try:
+        loader = yaml.SafeLoader(path.read_text(encoding="utf-8"))
+        node = loader.get_single_node()
+        values = _values(node, {})
+        settings = None if node is None or values > _MOST_VALUES else loader.construct_document(node)
+    except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error
+    if values > _MOST_VALUES:
+        raise ValueError(f"config {path} has more than {_MOST_VALUES} values by its aliases (*name): correct the file")
+    return settings
+
+
+@cache  # otherwise, each call would wrap the loader once more
+def limit_aliases() -> None:
+    """Let the parser refuse what :func:`read_config` does, in files that a config names and in its texts, too."""
+    import yaml
+    from jsonargparse._loaders_dumpers import get_yaml_default_loader  # all of its ways to read YAML use this class
+
+    loader = get_yaml_default_loader()  # type: ignore[no-untyped-call]
+    compose = loader.get_single_node
+
+    def checked(self: object) -> Node | None:
+        node: Node | None = compose(self)
+        if _values(node, {}) > _MOST_VALUES:
+            raise yaml.YAMLError(f"more than {_MOST_VALUES} values by aliases (*name): correct it")
+        return node
+
+    loader.get_single_node = checked
+
+
+def _values(node: Node | None, known: dict[int, float]) -> float:
+    """Number of values in a node of YAML with all its aliases written out; infinite for one that holds itself."""
+    if node is None:
+        return 0
+    if id(node) not in known:
+        known[id(node)] = math.inf
+        pairs = node.id == "mapping"
+        parts = chain.from_iterable(node.value) if pairs else node.value if node.id == "sequence" else ()
+        known[id(node)] = 1 + sum(_values(part, known) for part in parts)
+    return known[id(node)]
 
 
 def written_by_run(path: str) -> bool:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import TextIO
 
-from nsvq_lightning.commands.configs import check_config, configs_among, resolve_configs, written_by_run
+from nsvq_lightning.commands.configs import check_config, configs_among, limit_aliases, resolve_configs, written_by_run
 from nsvq_lightning.commands.messages import nearest
 from nsvq_lightning.commands.registry import COMMANDS, overview
 from nsvq_lightning.commands.shorthands import expand
@@ -70,6 +70,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         sys.stderr.write("\n")  # below the ^C that the terminal shows
         return INTERRUPTED
+    except (MemoryError, RuntimeError) as error:
+        if os.environ.get(TRACEBACK) or not _lacks_memory(error):
+            raise
+        sys.stderr.write(
+            "error: there is not enough memory: close other programs, or take fewer splats (--splats), smaller photos "
+            f"(--data.factor) or a smaller scene ({TRACEBACK}=1 shows where)\n"
+        )
+        return 1
     except ModuleNotFoundError as error:
         if error.name != "cv2":
             raise
@@ -89,6 +97,7 @@ def _run_lightning(arguments: list[str]) -> int:
     if os.getcwd() not in sys.path:  # last, unlike `python -m`: for the user's own quantizers and callbacks
         sys.path.append(os.getcwd())
     configs = configs_among(arguments)
+    limit_aliases()
     try:
         for config in configs:
             check_config(config)
@@ -114,6 +123,11 @@ def _run_lightning(arguments: list[str]) -> int:
         sys.stderr.write(f"error: {error}\n({TRACEBACK}=1 shows where)\n")
         return 1
     return 0
+
+
+def _lacks_memory(error: Exception) -> bool:
+    """Whether memory ran out: of Python and NumPy, or of torch, which says so in words, on a CPU and on a GPU."""
+    return isinstance(error, MemoryError) or "allocate memory" in str(error) or "out of memory" in str(error)
 
 
 def _is_ours(error: BaseException) -> bool:

@@ -41,10 +41,7 @@ def photos_of(path: Path) -> Path | None:
     config = (path if path.is_dir() else path.parent) / "config.yaml"
     if not config.is_file():
         return None
-    import yaml
-
-    check_config(str(config))
-    data = yaml.safe_load(config.read_text(encoding="utf-8")).get("data")
+    data = check_config(str(config)).get("data")
     data = data.get("init_args", data) if isinstance(data, dict) else None
     root = data.get("root") if isinstance(data, dict) else None
     return Path(root) if isinstance(root, str) and Path(root).is_dir() else None

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-import PIL.Image
 import PIL.ImageOps
 from cv2.typing import MatLike
 
+from nsvq_lightning.data.images import opened
 from nsvq_lightning.data.model_files import SceneError
 from nsvq_lightning.io.atomic import atomic_path, atomic_write
 
@@ -69,7 +69,7 @@ def copy_photos(photos: Sequence[Path], folder: Path, done: Callable[[int], None
     for count, path in enumerate(photos, 1):
         target = folder / path.name
         try:
-            with PIL.Image.open(path) as image:
+            with opened(path) as image:
                 turned = image.getexif().get(ORIENTATION, 1) != 1
                 if not turned:
                     image.load()

@@ -33,6 +33,7 @@ __all__ = [
     "encode_png",
     "image_head",
     "image_size",
+    "opened",
     "read_image",
     "read_mask",
 ]
@@ -43,8 +44,9 @@ ROUNDED = 0.01
 # COLMAP works on the pixels as stored, so the EXIF orientation must not be applied.
 _READ = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
-_MOST_A_BYTE = 10_000
-"""Pixels per byte of the file; no photo comes near, and an empty PNG of one bit per pixel has 8000."""
+_FEW_PIXELS, _MOST_A_BYTE = 1 << 25, 32
+"""Pixels that any file may have, however short, such as a white mask; beyond, most pixels per byte of the file. Photos
+have less than 10. So many are decoded in less than 1 GB."""
 
 _DAMAGED = (OSError, ValueError, SyntaxError, KeyError)
 """What Pillow raises for a file that is damaged or not a picture."""
@@ -87,7 +89,7 @@ def image_head(path: Path) -> ImageHead:
         SceneError: The file is not an image, or its head declares more pixels than it can hold.
     """
     try:
-        with _opened(path) as image:
+        with opened(path) as image:
             width, height = image.size
             # Pillow decodes a whole PNG to look for a tag that is hardly ever there.
             tags = {} if image.format == "PNG" else image.getexif()
@@ -97,8 +99,6 @@ def image_head(path: Path) -> ImageHead:
             has_alpha = image.mode in _ALPHA_MODES or "transparency" in image.info
     except _DAMAGED as error:
         raise _undecodable(path, str(error)) from error
-    if width * height > _MOST_A_BYTE * path.stat().st_size:
-        raise _undecodable(path, f"its head declares {width}x{height} pixels in {path.stat().st_size} bytes")
     return ImageHead((width, height), orientation, has_alpha)
 
 
@@ -112,8 +112,17 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[PIL.Image.Image]:
-    """Open the head of a picture of any size, past Pillow's pixel limit, which phones exceed; nothing is decoded."""
+def opened(path: Path, room: int = _FEW_PIXELS) -> Iterator[PIL.Image.Image]:
+    """Open the head of a picture, past Pillow's pixel limit, which phones exceed; nothing is decoded.
+
+    Args:
+        path: Image file.
+        room: Pixels that it may have in any case.
+
+    Raises:
+        OSError: It is not a picture, or its head declares more pixels than that and than the file can hold; the other
+            errors of ``_DAMAGED`` mean the same.
+    """
     with _LIMIT:
         usual, PIL.Image.MAX_IMAGE_PIXELS = PIL.Image.MAX_IMAGE_PIXELS, None
         try:
@@ -121,6 +130,12 @@ def _opened(path: Path) -> Iterator[PIL.Image.Image]:
         finally:
             PIL.Image.MAX_IMAGE_PIXELS = usual
     with image:
+        size = path.stat().st_size
+        if image.width * image.height > max(_FEW_PIXELS, room, _MOST_A_BYTE * size):
+            raise OSError(
+                f"its head declares {image.width}x{image.height} pixels in {size} bytes, more than {_FEW_PIXELS} and "
+                f"than {_MOST_A_BYTE} a byte"
+            )
         yield image
 
 
@@ -133,15 +148,16 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(_decoded(path, _READ), cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def _decoded(path: Path, flags: int) -> NDArray[np.uint8]:
+def _decoded(path: Path, flags: int, room: int = 0) -> NDArray[np.uint8]:
     """Decode an image as OpenCV does, to 8 bits, with the pixels as stored.
 
     Args:
         path: Image file.
         flags: Of ``cv2.imdecode``.
+        room: Pixels that it may have in any case.
 
     Raises:
-        SceneError: The file is damaged or has floating-point pixels.
+        SceneError: The file is damaged, has floating-point pixels, or declares more pixels than it can hold.
     """
     try:
         data = path.read_bytes()  # imread fails on names outside the locale's character set
@@ -150,6 +166,11 @@ def _decoded(path: Path, flags: int) -> NDArray[np.uint8]:
             f"image {path} cannot be read any more ({error.strerror}): it was there when the scene was loaded; copy it "
             "there again"
         ) from error
+    try:
+        with opened(path, room):
+            pass
+    except _DAMAGED as error:
+        raise _undecodable(path, str(error)) from error
     try:
         orientation = _orientation(data)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -160,7 +181,7 @@ def _decoded(path: Path, flags: int) -> NDArray[np.uint8]:
     if image is None:
         raise _undecodable(path, f"truncated, damaged or of an unknown format, {len(data)} bytes")
     if image.dtype == np.uint16:
-        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+        image = cv2.convertScaleAbs(image, alpha=1 / 257)  # rounds; none of the 65536 is near a half
     if image.dtype != np.uint8:
         raise _undecodable(path, f"its pixels are {image.dtype}; accepted are 8 and 16 bit integers")
     return _turned_back(image, orientation)
@@ -191,7 +212,8 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     Raises:
         SceneError: The file is damaged, or has another aspect ratio than the photo.
     """
-    grey = _decoded(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    grey = _decoded(path, flags, room=width * height)
     kept: NDArray[np.uint8] = (grey > int(grey.max()) / 2).astype(np.uint8)
     if abs(kept.shape[1] * height / (kept.shape[0] * width) - 1) > ROUNDED:
         raise SceneError(
@@ -333,8 +355,10 @@ class ImageSource:
         image, alpha = (_upright(part, self.orientation) for part in _with_alpha(self.path))
         if self.backdrop is None:
             return image, alpha >= _OPAQUE
-        share = alpha[..., None].astype(np.float32) / 255
-        return np.rint(image * share + self.backdrop * (1 - share)).astype(np.uint8), None
+        share = alpha.astype(np.float32) / 255
+        for channel in range(3):  # one by one: as numbers of 32 bits, they take several times the memory
+            image[..., channel] = np.rint(image[..., channel] * share + self.backdrop * (1 - share))
+        return image, None
 
 
 class ImageStore:

@@ -451,6 +451,12 @@ def test_configs_are_found_as_files_first_then_by_name(tmp_path: Path) -> None:
     ]
 
 
+def _nines(first: str, next_: str) -> bytes:
+    """A short config of ten lines, each of which holds the one before nine times."""
+    lines = [f"k{i}: &k{i} {next_ % ', '.join([f'*k{i - 1}'] * 9)}" for i in range(1, 10)]
+    return "\n".join([f"k0: &k0 {first}", *lines]).encode()
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -459,6 +465,10 @@ def test_configs_are_found_as_files_first_then_by_name(tmp_path: Path) -> None:
         (b"5", "holds int: give"),
         (b"a: [1, {", "is not YAML .*: correct the file"),
         (b"\xff\xfe\0", "is not YAML .*can't decode"),
+        (b"#" * 200_000, "has 200000 bytes"),
+        (b"a: &a {b: *a}", "has more than 100000 values by its aliases"),
+        (_nines("[1]", "[%s]"), "has more than 100000 values"),
+        (_nines("{c: 1}", "{<<: [%s]}"), "has more than 100000 values"),
     ],
 )
 def test_what_cannot_be_a_config(tmp_path: Path, content: bytes, message: str) -> None:
@@ -467,6 +477,16 @@ def test_what_cannot_be_a_config(tmp_path: Path, content: bytes, message: str) -
     with pytest.raises(ValueError, match=rf"mine\.yaml {message}"):
         check_config(str(path))
     check_config(str(tmp_path / "none.yaml"))  # the parser's to complain about
+
+
+def test_a_config_that_a_config_names_may_not_explode_either(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "inner.yaml").write_bytes(_nines("[1]", "[%s]"))
+    (tmp_path / "outer.yaml").write_text(json.dumps({"data": str(tmp_path / "inner.yaml")}))
+    with pytest.raises(SystemExit):
+        main(["fit", "--config", str(tmp_path / "outer.yaml")])
+    assert re.search(r"inner\.yaml: more than 100000 values by aliases", capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("head", ["", "# lightning.pytorch==2.6.6\n"])

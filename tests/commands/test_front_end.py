@@ -124,6 +124,23 @@ def test_settings_that_cannot_be_are_one_line(
     assert sorted(path.name for path in tmp_path.iterdir() if path.name != "__pycache__") == ["nn_modules.py"]
 
 
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes")]
+)
+def test_a_lack_of_memory_is_one_line(
+    error: Exception, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(path: Path) -> None:
+        raise error
+
+    monkeypatch.setattr("nsvq_lightning.commands.info.describe", fail)
+    assert main(["info", "a.ply"]) == 1
+    assert re.fullmatch(r"error: there is not enough memory: close .* \(--splats\).*\n", capsys.readouterr().err)
+    monkeypatch.setenv("NSVQ_TRACEBACK", "1")
+    with pytest.raises(type(error)):
+        main(["info", "a.ply"])
+
+
 def test_several_devices_are_view_parallel_unless_told_otherwise(tmp_path: Path) -> None:
     settings = {"accelerator": "cpu", "logger": False, "enable_checkpointing": False, "default_root_dir": tmp_path}
     assert type(SplatTrainer(devices=2, **settings).strategy).__name__ == "ViewParallelStrategy"
