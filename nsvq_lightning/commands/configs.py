@@ -27,7 +27,7 @@ __all__ = [
 
 CONFIG_OPTIONS = ("--config", "-c")
 _MOST_BYTES, _MOST_VALUES = 1 << 17, 100_000
-"""Of a config, and of its values with every alias written out; configs of this package have 10 kB and 300 values."""
+"""Of a config, and of its values with every alias written out; that of a run has 6 kB and 500 values."""
 
 
 def resolve_configs(arguments: Sequence[str]) -> list[str]:

@@ -45,8 +45,8 @@ ROUNDED = 0.01
 _READ = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 _FEW_PIXELS, _MOST_A_BYTE = 1 << 25, 32
-"""Pixels that any file may have, however short, such as a white mask; beyond, most pixels per byte of the file. Photos
-have less than 10. So many are decoded in less than 1 GB."""
+"""Pixels that any file may have, however short, such as a white mask; beyond, most pixels per byte of the file. 32
+leave a quarter of a bit for each. So many are decoded in less than 1 GB."""
 
 _DAMAGED = (OSError, ValueError, SyntaxError, KeyError)
 """What Pillow raises for a file that is damaged or not a picture."""

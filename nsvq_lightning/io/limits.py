@@ -12,7 +12,7 @@ __all__ = ["FEW_ROWS", "FEW_SPLATS", "check_room"]
 
 FEW_SPLATS = 1 << 20
 """Splats that any file may hold, however short, such as one of equal splats; beyond, each takes a byte or more. So many
-are read in less than 1 GB and 3 seconds."""
+are read in less than 1 GB."""
 FEW_ROWS = 1 << 16
 """The same for the rows of a codebook in level ``compact`` of ``.nsvq``, and the bytes of its stream."""
 
