@@ -23,6 +23,11 @@ FIRST = ("test_view_parallel.py", "test_triton.py", "test_kernel_entries.py", "t
 """Files that take longest: one that starts last would be waited for."""
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """The option of ``test_stress.py``."""
+    parser.addoption("--stress-table", metavar="PATH", help="where test_stress.py writes what extreme scenes do")
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile kernels before test processes start, in two processes: both would compile the same ones otherwise."""
     if hasattr(session.config, "workerinput") or not getattr(session.config.option, "numprocesses", None):

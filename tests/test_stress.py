@@ -4,15 +4,25 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from extremes import (
+    BROKEN_ROWS,
+    beside,
+    extremes,
+    quantizer_errors,
+    quantizers,
+    step,
+    stress_errors,
+    stress_table,
+)
 
-from nsvq_lightning.commands.benchmark.extremes import BROKEN, BROKEN_ROWS
-from nsvq_lightning.commands.benchmark.scope import Scope
-from nsvq_lightning.commands.benchmark.suites import quantize, stability
-from nsvq_lightning.commands.benchmark.suites.render import Method, trace
+from nsvq_lightning.commands.benchmark import quantize
+from nsvq_lightning.commands.benchmark.render import painter, trace
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.rasterize import render
@@ -20,7 +30,7 @@ from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats, Splats
 from nsvq_lightning.training.edit import LARGEST_LOG_SCALE, drop_non_finite
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 
-SCENES = {scene.name: scene for scene in stability.cases(Scope((1,), quick=True))}
+SCENES = extremes()
 BACKENDS = ("cpu", "reference")
 COARSE = {"scene at 1e+03": 1e-3, "scene at 1e+06": 1.0}
 """Largest relative errors where float32 does not know the positions themselves."""
@@ -28,10 +38,19 @@ MEANS_SOMETHING = {"scales -inf", "opacities inf", "sh0 -inf"}
 """A point, an opaque splat and a black one."""
 
 
-@pytest.mark.parametrize("name", [name for name, scene in SCENES.items() if scene.kind != BROKEN])
+@pytest.fixture(scope="module", autouse=True)
+def table_that_is_asked_for(request: pytest.FixtureRequest) -> Iterator[None]:
+    """``pytest tests/test_stress.py --stress-table PATH`` leaves a table of all scenes, larger ones than are tested."""
+    yield
+    path = request.config.getoption("--stress-table")
+    if path is not None:
+        Path(path).write_text(stress_table(extremes(200, 10_000)), encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", [name for name, scene in SCENES.items() if not scene.culprit])
 def test_an_extreme_scene_is_rendered_and_trained_as_in_float64(name: str) -> None:
     scene, tolerance = SCENES[name], COARSE.get(name, 1e-4)
-    ours = stability.errors(scene, "cpu")
+    ours = stress_errors(scene, "cpu")
     assert ours["not finite"] == ours["step refused"] == ours["rows named"] == ours["other rows lost"] == 0
     assert ours["max error"] <= tolerance * max(1.0, ours["largest value"])
     # Rotations of a splat 1e12 long have gradients of 1e-16 of the others'.
@@ -40,10 +59,10 @@ def test_an_extreme_scene_is_rendered_and_trained_as_in_float64(name: str) -> No
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("name", [name for name, scene in SCENES.items() if scene.kind == BROKEN])
+@pytest.mark.parametrize("name", [name for name, scene in SCENES.items() if scene.culprit])
 def test_a_number_that_is_none_hurts_no_other_splat_and_is_named(name: str, backend: str) -> None:
     scene = SCENES[name]
-    values, outcome = stability.errors(scene, backend), stability.step(scene, backend)
+    values, outcome = stress_errors(scene, backend), step(scene, backend)
     assert outcome.lost == 0
     assert outcome.named == {scene.culprit: BROKEN_ROWS}
     if values["not finite"]:
@@ -57,9 +76,9 @@ def test_a_number_that_is_none_hurts_no_other_splat_and_is_named(name: str, back
 @pytest.mark.parametrize("name", [n for n, s in SCENES.items() if s.culprit not in ("", "sh0", "shN")])
 def test_splats_without_a_place_or_shape_change_nothing(name: str) -> None:
     scene = SCENES[name]
-    beside = trace(scene.workload, stability.Beside("reference", scene.planted), torch.float64).image
-    alone = trace(scene.workload, Method("reference"), torch.float64).image
-    assert torch.equal(beside, alone) == (name not in MEANS_SOMETHING)
+    both = trace(scene.workload, beside("reference", scene.planted), torch.float64).image
+    alone = trace(scene.workload, painter("reference"), torch.float64).image
+    assert torch.equal(both, alone) == (name not in MEANS_SOMETHING)
 
 
 @pytest.mark.parametrize("attribute", ATTRIBUTES)
@@ -76,10 +95,10 @@ def test_culprits_are_dropped_with_a_message(attribute: str, caplog: pytest.LogC
     assert len(splats) == healthy
 
 
-@pytest.mark.parametrize("name", stability.quantizers())
+@pytest.mark.parametrize("name", quantizers())
 def test_a_quantizer_with_nothing_to_do_or_to_choose(name: str) -> None:
-    attribute = stability.quantizers()[name]
-    values = stability.quantizer_errors({name: attribute}, "NSVQ")
+    attribute = quantizers()[name]
+    values = quantizer_errors(attribute)
     assert values["not finite"] == values["wrong codes"] == 0
     assert values["gradient error"] < 1e-5
     assert values["length error"] < 1e-4
@@ -167,8 +186,16 @@ def test_two_points_a_hair_apart_get_the_smallest_scale() -> None:
 
 
 def test_scenes_are_the_same_at_every_call() -> None:
-    again = {scene.name: scene for scene in stability.cases(Scope((1,), quick=True))}
+    again = extremes()
     assert again.keys() == SCENES.keys()
     for name, scene in again.items():
         pairs = zip(scene.workload.splats, SCENES[name].workload.splats, strict=True)
         assert all(torch.equal(first, second) for first, second in pairs)
+
+
+def test_table_has_a_row_for_each_scene_and_backend() -> None:
+    head, _, *rows = stress_table({name: SCENES[name] for name in ("one splat", "sh0 nan")}).splitlines()
+    assert [cell.strip() for cell in head.split("|")[1:4]] == ["scene", "back-end", "max error"]
+    cells = [[cell.strip() for cell in row.split("|")[1:-1]] for row in rows]
+    assert [row[:2] for row in cells] == [[n, b] for n in ("one splat", "sh0 nan") for b in BACKENDS]
+    assert [row[-3:] for row in cells] == [["0", "0", "0"], ["0", "0", "0"], *[["1", str(BROKEN_ROWS), "0"]] * 2]

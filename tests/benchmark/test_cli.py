@@ -1,58 +1,57 @@
 from __future__ import annotations
 
 import json
-import logging
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-import torch
 
-from nsvq_lightning.commands.benchmark import cli, timing
-from nsvq_lightning.commands.benchmark.suites import loss
+from nsvq_lightning.commands.benchmark import Scope, cli, render, timing
+from nsvq_lightning.commands.benchmark.cli import SUITES
 from nsvq_lightning.commands.main import main as nsvq
-from nsvq_lightning.commands.registry import COMMANDS
+from nsvq_lightning.skips import SKIPS
 
-SMALL = ["loss", "--quick", "--repeats", "1", "--threads", "1"]
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(timing, "SGEMM_SIDE", 16)
-    monkeypatch.setattr(loss, "SIZE", (40, 48))
+    monkeypatch.setattr(render, "PHOTO", (40, 48, 3))
+    monkeypatch.setattr(render, "workloads", lambda _: [])
 
 
-def test_tables_go_to_the_output(capsys: pytest.CaptureFixture[str]) -> None:
-    assert nsvq(["benchmark", *SMALL]) == 0
-    printed = capsys.readouterr().out
-    assert printed.startswith("# nsvq benchmark\n")
-    assert "### forward + backward, 48x40, 1 thread\n" in printed
-
-
-def test_json_goes_to_the_output_and_everything_to_the_folder(
+def test_results_go_to_the_output_and_everything_to_the_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = tmp_path / "new" / "folder"
-    assert cli.main([*SMALL, "--json", "--output", str(folder)]) == 0
+    arguments = ["benchmark", "render", "--quick", "--repeats", "1", "--threads", "1"]
+    assert nsvq(arguments) == 0
     printed = capsys.readouterr().out
-    assert {path.name for path in folder.iterdir()} == {"benchmark.json", "benchmark.md", "loss.png"}
+    assert printed.startswith("# nsvq benchmark\n")
+    assert f"### {render.LOSS}, 48x40, 1 thread\n" in printed
+    folder = tmp_path / "new" / "folder"
+    assert nsvq([*arguments, "--json", "--output", str(folder)]) == 0
+    printed = capsys.readouterr().out
+    assert {path.name for path in folder.iterdir()} == {"benchmark.json", "benchmark.md", "render.png"}
     assert (folder / "benchmark.json").read_text() == printed
-    results = json.loads(printed)
-    assert [row["method"] for row in results["rows"]] == ["fused", "plain torch"]
-    assert results["settings"]["repeats"] == 1
+    assert [row["method"] for row in json.loads(printed)["rows"]] == ["fused, cpu", "plain torch, cpu"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["lose"], "unknown benchmark suite 'lose'; choose from render"),
-        (["loss", "--switches", "blocks,blokcs"], "got blokcs"),
-        (["loss", "--init-from", "scene.ply"], "needs a COLMAP folder"),
-        (["loss", "--threads", "1,two"], "got '1,two'"),
-        (["loss", "--threads", "4096"], "at most"),
-        (["loss", "--repeats", "0"], "repeats must be at least 1, got 0"),
-        (["render", "--workloads", "A20k,Z"], "got Z"),
+        (
+            ["train,rendre"],
+            "unknown benchmark suite 'train,rendre'; choose from render, quantize, codec, train, or all",
+        ),
+        (["train", "--switches", "blocks,blokcs"], "got blokcs"),
+        (["render", "--init-from", "scene.ply"], "needs a COLMAP folder"),
+        (["render", "--threads", "1,two"], "got '1,two'"),
+        (["render", "--threads", "4096"], "at most"),
+        (["render", "--repeats", "0"], "repeats must be at least 1, got 0"),
+        (["render", "--steps", "3"], "steps must be at least 4, one for each phase, got 3"),
+        (["render", "--workloads", "A20k,Z"], "some of A20k, B100k, C500k, D1M, E3M, got Z"),
     ],
 )
 def test_wrong_arguments_are_explained(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -67,14 +66,18 @@ def test_unreadable_scene_is_one_line(
     name: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "bad.ply").write_bytes(b"ply\nformat nothing\n")
-    assert cli.main([*SMALL, "--scene", str(tmp_path / name)]) == 1
+    assert cli.main(["render", "--quick", "--scene", str(tmp_path / name)]) == 1
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
 
 
-def test_both_scripts_know_the_word() -> None:
-    assert COMMANDS["benchmark"].module == cli.__name__
+def test_full_and_quick_runs_have_their_own_defaults() -> None:
+    full, quick = (Scope.of(quick=quick, most_threads=4, scene=None) for quick in (False, True))
+    assert (full.threads, full.repeats, full.workloads) == ((1, 4), 15, ("A20k", "B100k", "C500k"))
+    assert (quick.threads, quick.repeats, quick.workloads) == ((4,), 3, ("A20k",))
+    given = Scope.of(quick=True, most_threads=2, threads=(2, 1), repeats=9, steps=None)
+    assert (given.threads, given.repeats, given.steps) == ((2, 1), 9, quick.steps)
 
 
 def test_help_does_not_load_torch() -> None:
@@ -83,20 +86,21 @@ def test_help_does_not_load_torch() -> None:
         "try:\n    main(['benchmark', '--help'])\n"
         "finally:\n    assert not {'torch', 'numba', 'lightning'} & set(sys.modules)\n"
     )
-    root = Path(__file__).resolve().parents[2]
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=DOCS.parent)
     assert "--quick" in done.stdout
 
 
-def test_suite_that_cannot_run_here_is_left_out_with_its_reason(
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with caplog.at_level(logging.INFO, logger=cli.__name__):
-        assert cli.main(["gpu", "--quick", "--output", str(tmp_path)]) == 0
-    assert "skipped, torch finds no CUDA device" in caplog.messages[-1]
-    assert "## gpu" not in capsys.readouterr().out
-    assert {path.name for path in tmp_path.iterdir()} == {"benchmark.json", "benchmark.md"}
+def test_every_suite_and_switch_has_measured_tables() -> None:
+    index, explained = (DOCS / "benchmark.md").read_text(), (DOCS / "skips.md").read_text()
+    assert {page.stem for page in (DOCS / "measured").glob("*.md")} == set(SUITES)
+    assert all(f"[measured](measured/{name}.md)" in index for name in SUITES)
+    for name, skip in SKIPS.items():
+        assert f"| `{name}` | {skip.work} | {skip.when} |\n" in explained
+        assert f"| `{name}` " in (DOCS / "measured" / "train.md").read_text()
+
+
+@pytest.mark.slow
+def test_quick_run_of_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    assert cli.main(["all", "--quick", "--output", str(tmp_path)]) == 0
+    assert {path.stem for path in tmp_path.glob("*.png")} == set(SUITES)

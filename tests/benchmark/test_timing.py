@@ -6,10 +6,8 @@ import time
 import pytest
 import torch
 
-from nsvq_lightning.commands.benchmark import timing
-from nsvq_lightning.commands.benchmark.measurement import Timing
-from nsvq_lightning.commands.benchmark.scope import Scope
-from nsvq_lightning.commands.benchmark.timing import Case, measure
+from nsvq_lightning.commands.benchmark import Scope, timing
+from nsvq_lightning.commands.benchmark.timing import Case, Timing, measure
 
 
 @pytest.fixture(autouse=True)
@@ -26,11 +24,6 @@ def test_cases_take_turns_in_a_rotating_order_after_one_call_that_is_not_counted
     assert {name: len(result.samples) for name, result in timings.items()} == {"a": 3, "b": 3}
     assert len(timings["a"].sgemm) == 3
     assert timings["a"].sgemm == timings["b"].sgemm
-
-
-def test_times_are_milliseconds_without_the_preparation() -> None:
-    result = measure([Case("nap", lambda: time.sleep(0.02), lambda: time.sleep(0.2))], Scope((1,), repeats=2), 1)
-    assert 20 <= result["nap"].minimum < 200
 
 
 def test_gpu_is_timed_by_events_around_the_call(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,9 +49,10 @@ def test_gpu_is_timed_by_events_around_the_call(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_slow_case_sits_out_once_its_time_is_used_up() -> None:
-    cases = [Case("slow", lambda: time.sleep(0.03)), Case("fast", lambda: None)]
+    cases = [Case("slow", lambda: time.sleep(0.03), lambda: time.sleep(0.1)), Case("fast", lambda: None)]
     timings = measure(cases, Scope((1,), repeats=6, seconds=0.05), 1)
     assert len(timings["slow"].samples) == 2
+    assert 30 <= min(timings["slow"].samples) < 100  # ms, without the preparation
     assert len(timings["fast"].samples) == len(timings["fast"].sgemm) == 6
 
 
@@ -79,18 +73,7 @@ def test_threads_and_collector_are_put_back(monkeypatch: pytest.MonkeyPatch) -> 
     assert gc.isenabled()
 
 
-def test_names_must_differ() -> None:
-    with pytest.raises(ValueError, match="different names"):
-        measure([Case("a", lambda: None), Case("a", lambda: None)], Scope((1,)), 1)
-
-
 def test_summary_of_known_samples() -> None:
     known = Timing((5.0, 1.0, 2.0, 4.0, 3.0), (10.0, 30.0, 20.0))
-    assert (known.median, known.minimum, known.quartiles, known.ratio) == (3.0, 1.0, (2.0, 4.0), 0.15)
+    assert (known.median, known.quartiles, known.ratio) == (3.0, (2.0, 4.0), 0.15)
     assert Timing((7.0,), (7.0,)).quartiles == (7.0, 7.0)
-    assert known.as_json()["samples_ms"] == [5.0, 1.0, 2.0, 4.0, 3.0]
-
-
-def test_timing_needs_samples() -> None:
-    with pytest.raises(ValueError, match="at least one sample"):
-        Timing((), (1.0,))

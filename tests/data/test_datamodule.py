@@ -10,9 +10,9 @@ from typing import cast
 import pytest
 import torch
 from lightning.pytorch import LightningModule, Trainer
+from runs import quiet_trainer
 from torch import Tensor, nn
 
-from nsvq_lightning.commands.benchmark.fitting import quiet_trainer
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
 from nsvq_lightning.data.sampler import ViewSampler
 from nsvq_lightning.data.scene import SceneError, View

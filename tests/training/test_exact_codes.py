@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 import torch
+from runs import fit
 from torch import Tensor, nn
 
 from nsvq_lightning.callbacks import CodebookInit, CodebookReplacement, PhaseSchedule
-from nsvq_lightning.commands.benchmark.fitting import fit
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.quantize import CodebookQuantizer, nearest_reference
 from nsvq_lightning.splats.splats import Splats

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 import torch
 from lightning.pytorch import Trainer
+from runs import fit
 from torch import Tensor, nn
 
 from nsvq_lightning.callbacks import PhaseSchedule
-from nsvq_lightning.commands.benchmark.fitting import fit
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.formats import save

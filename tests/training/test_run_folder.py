@@ -12,10 +12,9 @@ from typing import Any
 import pytest
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import CSVLogger, Logger
-from runs import RunFactory
+from runs import RunFactory, quiet_trainer
 
 from nsvq_lightning.callbacks import ExportScene, MetricReport, PhaseSchedule, RenderWriter, RunCheckpoint
-from nsvq_lightning.commands.benchmark.fitting import quiet_trainer
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io.atomic import atomic_write

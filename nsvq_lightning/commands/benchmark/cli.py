@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import logging
 import os
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
 
-from nsvq_lightning.commands.benchmark.measurement import Measurement
-from nsvq_lightning.commands.benchmark.scope import Scope
-from nsvq_lightning.commands.benchmark.sizes import LARGE, STANDARD
-from nsvq_lightning.commands.benchmark.suite_list import ALL, SUITES, Unavailable, load_suite, suite_names
-from nsvq_lightning.commands.benchmark.tables import as_json, as_markdown
+from nsvq_lightning.commands.benchmark import SIZES, Scope
 from nsvq_lightning.commands.comma_lists import integers, names
 from nsvq_lightning.commands.messages import Parser
 from nsvq_lightning.io.atomic import write_text
@@ -26,14 +22,21 @@ __all__ = ["main"]
 
 log = logging.getLogger(__name__)
 
+SUITES = {
+    "render": "back-ends of the rasterizer and of the loss, forward and backward, against float64",
+    "quantize": "a step of NSVQ, the search for the nearest code, and k-means",
+    "codec": "writing and reading scene files; a trained scene made small, beside other formats",
+    "train": "whole runs, with switches on and off; the parts of a step; how it grows with splats and pixels",
+}
+"""What each suite measures; its name is that of its module, which has a function ``run(scope)`` and ``PANELS``."""
+ALL = "all"
 EXAMPLES = """
 
 examples:
   nsvq benchmark all --quick
   nsvq benchmark render --output results
   nsvq benchmark train --scene path/to/colmap/folder --switches all
-  nsvq benchmark profile --scene path/to/colmap/folder --init-from scene.ply
-  nsvq benchmark compress --scene path/to/colmap/folder --init-from scene.ply --beside scene.sog,scene.spz
+  nsvq benchmark codec --scene path/to/colmap/folder --init-from scene.ply --beside scene.sog,scene.spz
 """
 
 
@@ -53,25 +56,35 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(argv)
     try:
-        suites, scope = suite_names(options.suite), _scope(options)
+        suites, scope = _suites(options.suite), _scope(options)
     except ValueError as error:
         parser.error(str(error))
     logging.basicConfig(format="%(message)s")
     log.setLevel(logging.INFO)
     try:
-        fault = _fault_of_scene(scope)
-        if fault is not None:
-            return _fail(fault)
-        results = _measure(suites, scope)
-        if options.output is not None:
-            _write(results, options.output)
+        _read_scene(scope)
+    except (OSError, ValueError) as error:
+        return _fail(error)
+    try:
+        sys.stdout.write(_measured(suites, scope, options))
     except OSError as error:
-        return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
-    sys.stdout.write(results.json() if options.json else results.markdown())
+        return _fail(error)
     return 0
 
 
-def _fail(message: str) -> int:
+def _suites(choice: str) -> tuple[str, ...]:
+    """The suites that a word of the command line stands for: one, some with commas between them, or ``all``."""
+    chosen = tuple(SUITES) if choice == ALL else names(choice)
+    unknown = [name for name in chosen if name not in SUITES]
+    if unknown or not chosen:
+        raise ValueError(f"unknown benchmark suite {choice!r}; choose from {', '.join(SUITES)}, or {ALL}")
+    return chosen
+
+
+def _fail(error: Exception) -> int:
+    message = str(error)
+    if isinstance(error, OSError) and error.filename:
+        message = f"{error.filename}: {error.strerror}"
     sys.stderr.write(f"nsvq benchmark: {message}\n")
     return 1
 
@@ -80,41 +93,25 @@ def _parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="nsvq benchmark",
         description="Measure run time against error: each part beside its plain counterpart and a float64 oracle.",
-        epilog="suites:\n" + "\n".join(f"  {name:10} {suite.about}" for name, suite in SUITES.items()) + EXAMPLES,
+        epilog="suites:\n" + "\n".join(f"  {name:10} {about}" for name, about in SUITES.items()) + EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("suite", metavar="SUITE", help=f"one, some with commas between them, or {ALL}")
     what = parser.add_argument_group("what is measured")
-    what.add_argument(
-        "--workloads",
-        type=names,
-        metavar="NAME,NAME",
-        help=f"synthetic scenes of render, codec, gpu ({','.join(STANDARD)}; gpu also {','.join(LARGE)}; quick A20k)",
-    )
+    known = f"some of {','.join(SIZES)} (A20k,B100k,C500k; quick A20k)"
+    what.add_argument("--workloads", type=names, metavar="NAME,NAME", help=f"synthetic scenes, {known}")
     what.add_argument(
         "--scene", type=Path, metavar="PATH", help="scene file or COLMAP folder instead of synthetic ones"
     )
-    what.add_argument(
-        "--init-from",
-        type=Path,
-        metavar="FILE",
-        help="scene file whose splats are used with the photos of the COLMAP folder, instead of its points",
-    )
-    what.add_argument(
-        "--beside",
-        type=_paths,
-        metavar="FILE,FILE",
-        help="files of the same scene by other programs, which compress measures beside ours",
-    )
-    what.add_argument(
-        "--config",
-        metavar="NAME",
-        help="config of the runs of profile and train (fast.yaml, without photos demo.yaml)",
-    )
+    help_ = "scene file whose splats are used with the photos of the COLMAP folder, instead of its points"
+    what.add_argument("--init-from", type=Path, metavar="FILE", help=help_)
+    help_ = "files of the same scene by other programs, which codec measures beside ours"
+    what.add_argument("--beside", type=_paths, metavar="FILE,FILE", help=help_)
+    help_ = "config of the runs of train (fast.yaml, without photos demo.yaml)"
+    what.add_argument("--config", metavar="NAME", help=help_)
     what.add_argument("--steps", type=int, metavar="N", help="iterations of each run of train (1000; quick 40)")
-    what.add_argument(
-        "--switches", type=_switches, metavar="NAME,NAME", help="switches that train inverts one by one, or all"
-    )
+    help_ = "switches that train inverts one by one, or all"
+    what.add_argument("--switches", type=_switches, metavar="NAME,NAME", help=help_)
     effort = parser.add_argument_group("how much")
     effort.add_argument("--quick", action="store_true", help="small workloads, few repeats: all within a minute")
     effort.add_argument("--repeats", type=int, metavar="N", help="timed calls of each case (15; quick 3)")
@@ -137,69 +134,35 @@ def _scope(options: argparse.Namespace) -> Scope:
     # Imported here so that --help and wrong arguments answer at once.
     import numba
 
-    return Scope.of(
-        quick=options.quick,
-        most_threads=int(numba.config.NUMBA_NUM_THREADS),
-        threads=options.threads,
-        repeats=options.repeats,
-        workloads=options.workloads,
-        scene=options.scene,
-        init_from=options.init_from,
-        steps=options.steps,
-        switches=options.switches,
-        config=options.config,
-        beside=options.beside,
-    )
+    given = {name: value for name, value in vars(options).items() if name not in ("suite", "output", "json")}
+    return Scope.of(most_threads=int(numba.config.NUMBA_NUM_THREADS), **given)
 
 
-def _fault_of_scene(scope: Scope) -> str | None:
+def _read_scene(scope: Scope) -> None:
     """Read the user's scene before anything is measured: a wrong file must end in one line."""
     from nsvq_lightning.commands.benchmark.workloads import workloads
 
-    if scope.scene is None:
-        return None
-    try:
+    if scope.scene is not None:
         workloads(scope)
-    except ValueError as error:
-        return str(error)
-    return None
 
 
-class _Results(NamedTuple):
-    """What was measured, where, and how thoroughly."""
+def _measured(suites: Sequence[str], scope: Scope, options: argparse.Namespace) -> str:
+    """Measure, write the files that are asked for, and return what is printed."""
+    from nsvq_lightning.commands.benchmark.report import as_json, as_markdown, describe_machine, draw_suite
+    from nsvq_lightning.commands.benchmark.timing import Measurement
 
-    machine: Mapping[str, Any]
-    scope: Scope
-    rows: Sequence[Measurement]
-
-    def json(self) -> str:
-        return json.dumps(as_json(*self), indent=2, ensure_ascii=False) + "\n"
-
-    def markdown(self) -> str:
-        return as_markdown(*self)
-
-
-def _measure(suites: Sequence[str], scope: Scope) -> _Results:
-    from nsvq_lightning.commands.benchmark.hardware import describe_machine
-
-    machine = describe_machine()
-    rows: list[Measurement] = []
+    machine, modules, rows = describe_machine(), {}, list[Measurement]()
     for name in suites:
         start = time.perf_counter()
-        try:
-            rows += load_suite(name)(scope)
-        except Unavailable as reason:
-            log.info("%s (%s): skipped, %s", name, SUITES[name].about, reason)
-            continue
-        log.info("%s (%s): %.1f s", name, SUITES[name].about, time.perf_counter() - start)
-    return _Results(machine, scope, rows)
-
-
-def _write(results: _Results, folder: Path) -> None:
-    from nsvq_lightning.commands.benchmark.suite_picture import draw_suite
-
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / "benchmark.json", results.json())
-    write_text(folder / "benchmark.md", results.markdown())
-    for name in dict.fromkeys(row.suite for row in results.rows):
-        draw_suite(folder / f"{name}.png", [row for row in results.rows if row.suite == name], SUITES[name])
+        modules[name] = importlib.import_module(f"nsvq_lightning.commands.benchmark.{name}")
+        rows += modules[name].run(scope)
+        log.info("%s (%s): %.1f s", name, SUITES[name], time.perf_counter() - start)
+    text = json.dumps(as_json(machine, scope, rows), indent=2, ensure_ascii=False) + "\n"
+    tables = as_markdown(machine, scope, rows)
+    if options.output is not None:
+        options.output.mkdir(parents=True, exist_ok=True)
+        write_text(options.output / "benchmark.json", text)
+        write_text(options.output / "benchmark.md", tables)
+        for name, module in modules.items():
+            draw_suite(options.output / f"{name}.png", [row for row in rows if row.suite == name], module.PANELS)
+    return text if options.json else tables

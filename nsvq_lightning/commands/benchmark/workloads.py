@@ -11,27 +11,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark.scope import Scope
-from nsvq_lightning.commands.benchmark.sizes import SIZES, Size
-from nsvq_lightning.compression.viewpoints import look_at, middle_of
+from nsvq_lightning.commands.benchmark import SIZES, Scope
+from nsvq_lightning.compression.pictures import look_at, middle_of
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.splats.arrays import finite_rows
+from nsvq_lightning.splats.finite import finite_rows
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
-__all__ = [
-    "Workload",
-    "folder_workload",
-    "scene_workload",
-    "single_workload",
-    "sized_workload",
-    "synthetic_workload",
-    "workloads",
-]
+__all__ = ["Workload", "relative_l2", "scene_workload", "single_workload", "synthetic_workload", "workloads"]
 
 Floats = NDArray[np.float64]
-
 
 SEED = 7
 BACKGROUND = (0.2, 0.3, 0.4)
@@ -80,8 +70,21 @@ class Workload:
         background, image_gradient = self.background.to(device), self.image_gradient.to(device)
         return replace(self, splats=splats, background=background, image_gradient=image_gradient)
 
+    @property
+    def size(self) -> str:
+        """Pixels across and down, as ``400x300``."""
+        return f"{self.camera.width}x{self.camera.height}"
+
     def __str__(self) -> str:
-        return f"{self.name} {self.camera.width}x{self.camera.height}"
+        return f"{self.name} {self.size}"
+
+
+def relative_l2(value: Tensor, truth: Tensor) -> float:
+    """‖value − truth‖ / ‖truth‖ in float64; the plain ‖value‖ where the truth is 0."""
+    truth = truth.detach().double()
+    distance = torch.linalg.vector_norm(value.detach().double() - truth)
+    scale = torch.linalg.vector_norm(truth)
+    return float(distance / scale if scale > 0 else distance)
 
 
 def workloads(scope: Scope) -> list[Workload]:
@@ -94,7 +97,7 @@ def workloads(scope: Scope) -> list[Workload]:
     if scope.scene is None:
         return [synthetic_workload(name) for name in scope.workloads]
     if scope.scene.is_dir():
-        return [folder_workload(scope.scene, scope.init_from)]
+        return [_folder_workload(scope.scene, scope.init_from)]
     return [scene_workload(scope.scene)]
 
 
@@ -110,26 +113,15 @@ def single_workload(scope: Scope, full: str) -> Workload:
     return workloads(scope)[0]
 
 
-def synthetic_workload(name: str, seed: int = SEED) -> Workload:
+def synthetic_workload(name: str) -> Workload:
     """A scene of surfaces, a loose volume and a far shell; sizes, rotations, opacities and colours are random.
 
     Args:
-        name: One of :data:`nsvq_lightning.commands.benchmark.sizes.SIZES`.
-        seed: Seed of every draw.
-
-    Raises:
-        ValueError: There is no workload of that name.
+        name: One of :data:`nsvq_lightning.commands.benchmark.SIZES`.
     """
-    if name not in SIZES:
-        raise ValueError(f"unknown workload {name!r}; choose one of {', '.join(SIZES)}")
-    return sized_workload(name, SIZES[name], seed)
-
-
-def sized_workload(name: str, size: Size, seed: int = SEED) -> Workload:
-    """A synthetic scene of any size, see :func:`synthetic_workload`."""
-    n, width, height, scale = size
+    n, width, height, scale = SIZES[name]
     # One stream, so the order of the draws is part of the definition.
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
     means = _positions(n, rng)
     scales = math.log(scale) + rng.normal(size=(n, 1)) * 0.5 + rng.normal(size=(n, 3)) * 0.5
     quats = _directions(rng, n, 4)
@@ -139,9 +131,7 @@ def sized_workload(name: str, size: Size, seed: int = SEED) -> Workload:
     harmonics[:, 0] = rng.normal(size=(n, 3)) * 0.9
     attributes = (means, quats, scales, opacities, harmonics[:, :1], harmonics[:, 1:])
     camera = _camera(width, height, np.zeros(3), DISTANCE)
-    return Workload(
-        name, RawSplats(*map(_tensor, attributes)), camera, torch.tensor(BACKGROUND), _image_gradient(camera, seed)
-    )
+    return _seen_by(camera, RawSplats(*map(_tensor, attributes)), name)
 
 
 def scene_workload(path: Path) -> Workload:
@@ -156,10 +146,10 @@ def scene_workload(path: Path) -> Workload:
     splats = _finite_splats(path)
     centre, reach = middle_of(splats.means.numpy())
     camera = _camera(800, 533, centre, 2 * reach)
-    return Workload(path.name, splats, camera, torch.tensor(BACKGROUND), _image_gradient(camera, SEED))
+    return _seen_by(camera, splats, path.name)
 
 
-def folder_workload(root: Path, init_from: Path | None = None) -> Workload:
+def _folder_workload(root: Path, init_from: Path | None = None) -> Workload:
     """A COLMAP folder's first train view, of the splats in a scene file or of those that its points become.
 
     Raises:
@@ -175,7 +165,7 @@ def folder_workload(root: Path, init_from: Path | None = None) -> Workload:
         raw = Splats.from_points(scene.points, scene.colors, sh_degree=3).raw()
         splats = RawSplats(*(tensor.detach() for tensor in raw))
     name = root.resolve().name if init_from is None else f"{root.resolve().name} {init_from.name}"
-    return Workload(name, splats, camera, torch.tensor(BACKGROUND), _image_gradient(camera, SEED))
+    return _seen_by(camera, splats, name)
 
 
 def _finite_splats(path: Path) -> RawSplats:
@@ -218,15 +208,12 @@ def _positions(count: int, rng: np.random.Generator) -> Floats:
 
 def _camera(width: int, height: int, target: Floats, distance: float) -> Camera:
     """A camera that looks at ``target`` from above and aside, y down."""
-    direction = (
-        math.cos(ELEVATION) * math.sin(AZIMUTH),
-        -math.sin(ELEVATION),
-        -math.cos(ELEVATION) * math.cos(AZIMUTH),
-    )
-    return look_at(target, target + distance * np.array(direction), width, height, math.radians(FIELD_OF_VIEW))
+    across = math.cos(ELEVATION)
+    direction = np.array([across * math.sin(AZIMUTH), -math.sin(ELEVATION), -across * math.cos(AZIMUTH)])
+    return look_at(target, target + distance * direction, width, height, math.radians(FIELD_OF_VIEW))
 
 
-def _image_gradient(camera: Camera, seed: int) -> Tensor:
+def _seen_by(camera: Camera, splats: RawSplats, name: str) -> Workload:
     shape = camera.height, camera.width, 3
-    noise = np.random.default_rng(seed + 1).normal(size=shape)
-    return _tensor(noise / math.prod(shape))
+    gradient = _tensor(np.random.default_rng(SEED + 1).normal(size=shape) / math.prod(shape))
+    return Workload(name, splats, camera, torch.tensor(BACKGROUND), gradient)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from nsvq_lightning.commands.benchmark.hardware import describe_machine
+from nsvq_lightning.commands.benchmark.report import describe_machine
 from nsvq_lightning.commands.doctor.finding import Finding, good, note
 from nsvq_lightning.compute import lanes
 from nsvq_lightning.rendering.rasterize import fast_backends

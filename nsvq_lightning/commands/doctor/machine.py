@@ -12,7 +12,7 @@ from pathlib import Path
 import numba
 import torch
 
-from nsvq_lightning.commands.benchmark.hardware import describe_machine
+from nsvq_lightning.commands.benchmark.report import describe_machine
 from nsvq_lightning.commands.doctor.finding import Finding, good, note, problem
 from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.compute.jit import thread_count

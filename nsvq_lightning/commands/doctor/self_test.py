@@ -8,8 +8,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark.error_measures import relative_l2
-from nsvq_lightning.commands.benchmark.workloads import Workload, synthetic_workload
+from nsvq_lightning.commands.benchmark.workloads import Workload, relative_l2, synthetic_workload
 from nsvq_lightning.commands.doctor.backends import usable_backends
 from nsvq_lightning.commands.doctor.finding import Finding, good, problem
 from nsvq_lightning.compute.kernel_cache import kernel_folder

@@ -1,0 +1,206 @@
+"""The results, and what they were measured on, as JSON, as Markdown tables, and as a picture for each suite."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from llvmlite import binding
+
+from nsvq_lightning.commands.benchmark import Scope
+from nsvq_lightning.commands.benchmark.timing import Measurement
+from nsvq_lightning.commands.panels import panels
+from nsvq_lightning.compute.environment import usable_cores
+from nsvq_lightning.report.figures import colours_of, draw_keys, markdown_table, markers_of, write_figure
+from nsvq_lightning.version import __version__
+
+__all__ = ["Panel", "as_json", "as_markdown", "describe_machine", "draw_suite", "number"]
+
+PANEL_HEIGHT = 4.2
+"""Inches."""
+SIMD_BITS = (("avx512f", 512), ("avx2", 256), ("avx", 256), ("neon", 128), ("sse2", 128))
+"""Widest vectors by the feature that gives them, widest first."""
+NOTABLE = ("avx512f", "avx512_bf16", "avx512bf16", "amx-tile", "avx2", "fma", "f16c", "neon", "sve")
+
+
+def describe_machine() -> dict[str, Any]:
+    """Processor, vector width, versions and how busy the machine was, as JSON values."""
+    features = {name for name, present in binding.get_host_cpu_features().items() if present}
+    if platform.machine().lower() in ("arm64", "aarch64"):
+        features.add("neon")  # always there, but on a Mac LLVM may name no feature at all
+    return {
+        "cpu": _cpu_model(),
+        "llvm_cpu": binding.get_host_cpu_name(),
+        "cores": os.cpu_count(),
+        "usable_cores": usable_cores(),
+        "simd_bits": next((bits for name, bits in SIMD_BITS if name in features), 32),
+        "simd": [name for name in NOTABLE if name in features],
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "system": f"{platform.system()} {platform.machine()}",
+        "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "versions": {
+            "nsvq-lightning": __version__,
+            "python": platform.python_version(),
+            **{name: importlib.metadata.version(name) for name in ("numpy", "torch", "numba", "llvmlite")},
+        },
+    }
+
+
+def _cpu_model() -> str:
+    """Name of the processor; the platform module knows only its architecture on Linux."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor() or platform.machine())
+
+
+def as_json(machine: Mapping[str, Any], scope: Scope, rows: Sequence[Measurement]) -> dict[str, Any]:
+    """Everything that was measured, samples included, as JSON values.
+
+    Args:
+        machine: From :func:`describe_machine`.
+        scope: What was measured, and how thoroughly.
+        rows: Measurements.
+    """
+    settings = asdict(scope) | {"beside": [str(path) for path in scope.beside]}
+    for name in ("scene", "init_from"):
+        settings[name] = None if settings[name] is None else str(settings[name])
+    return {"machine": dict(machine), "settings": settings, "rows": [row.as_json() for row in rows]}
+
+
+def as_markdown(machine: Mapping[str, Any], scope: Scope, rows: Sequence[Measurement]) -> str:
+    """The machine, then one table for every operation of every suite."""
+    parts = ["# nsvq benchmark", *_machine_lines(machine, scope)]
+    for suite in dict.fromkeys(row.suite for row in rows):
+        parts.append(f"## {suite}")
+        for operation in dict.fromkeys(row.operation for row in rows if row.suite == suite):
+            parts += _table([row for row in rows if (row.suite, row.operation) == (suite, operation)])
+    return "\n\n".join(parts) + "\n"
+
+
+def _machine_lines(machine: Mapping[str, Any], scope: Scope) -> Iterator[str]:
+    load = machine["load_average"]
+    busy = "" if load is None else f", load average {load:.1f} at the start"
+    simd = f"{machine['simd_bits']}-bit vectors ({', '.join(machine['simd']) or 'no extension'})"
+    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
+    cores = f"{machine['usable_cores']} of {machine['cores']} cores"
+    yield f"{machine['cpu']} ({machine['llvm_cpu']}), {cores}, {simd}{gpu}, {machine['system']}{busy}"
+    yield ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
+    yield (
+        f"Rounds: {scope.repeats}; threads: {', '.join(map(str, scope.threads))}{'; quick' * scope.quick}. "
+        "ms: median of the calls; quartiles and n beside it. sgemm: the median as a multiple of a 2048³ float32 matrix "
+        "product of torch that took turns with it."
+    )
+
+
+def _table(rows: Sequence[Measurement]) -> Iterator[str]:
+    """Title, table and notes of one operation; what is the same in all rows is said once, in the title."""
+    own = ["workload", "method", "threads"]
+    title = f"### {rows[0].operation}"
+    if len({row.workload for row in rows}) == 1:
+        own.remove("workload")
+        title += f", {rows[0].workload}"
+    if len({row.threads for row in rows}) == 1:
+        own.remove("threads")
+        title += f", {rows[0].threads} thread{'s' * (rows[0].threads != 1)}"
+    yield title
+    names = list(dict.fromkeys(name for row in rows for name in row.values))
+    cells = []
+    for row in rows:
+        timing = row.timing
+        times = [number(timing.median), "–".join(map(number, timing.quartiles)), number(min(timing.samples))]
+        times += [str(len(timing.samples)), number(timing.ratio)]
+        values = [number(row.values[name]) if name in row.values else "" for name in names]
+        cells.append([*(str(getattr(row, name)) for name in own), *times, *values])
+    yield markdown_table([*own, "ms", "quartiles", "min", "n", "sgemm", *names], cells, words=("workload", "method"))
+    notes = dict.fromkeys(row.note for row in rows if row.note)
+    for note in notes:
+        about = dict.fromkeys(row.workload for row in rows if row.note == note)
+        yield f"{'; '.join(about)}: {note}." if len(notes) > 1 else f"{note[0].upper()}{note[1:]}."
+
+
+def number(value: float) -> str:
+    """Three significant digits, counts in full: ``0.0123``, ``4.1e-07``, ``80,000``."""
+    if value == 0:
+        return "0"
+    if value == round(value) and abs(value) < 1e15:
+        return f"{value:,.0f}"
+    if abs(value) < 1e-3 or abs(value) >= 1e7:
+        return f"{value:.2g}"
+    if abs(value) >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.3g}"
+
+
+class Panel(NamedTuple):
+    """What a panel of the picture shows of the rows of one operation.
+
+    Attributes:
+        operation: Which.
+        value: Name of a value, or ``ms``.
+        against: What stands on the other axis: ``ms``, a value, or ``seconds`` for the course of a run.
+    """
+
+    operation: str
+    value: str
+    against: str = "ms"
+
+    def points(self, row: Measurement) -> Sequence[tuple[float, float]]:
+        """Where the row is in the panel, ``(x, y)``; nowhere if it is of another operation or lacks a value."""
+        if row.operation != self.operation:
+            return ()
+        if self.against == "seconds":
+            return row.course
+        known = {"ms": row.timing.median, **row.values}
+        return [(known[self.against], known[self.value])] if {self.against, self.value} <= known.keys() else ()
+
+
+def draw_suite(path: Path, rows: Sequence[Measurement], wanted: Sequence[Panel]) -> None:
+    """Draw the rows of one suite: a colour for each method, a marker for each workload, hollow where threads are fewer.
+
+    Axes are logarithmic; where a value is 0 its axis has a linear strip at the bottom, and dB are linear. Rows whose
+    methods have the same name up to a colon are joined by a line.
+
+    Args:
+        path: PNG file, replaced atomically; none is written if no row is in a panel.
+        rows: Those of one suite.
+        wanted: The panels, those without rows are left out.
+    """
+    drawn = [panel for panel in wanted if any(panel.points(row) for row in rows)]
+    if not drawn:
+        return
+    rows = [row for row in rows if any(panel.points(row) for panel in drawn)]
+    colours = colours_of(list(dict.fromkeys(row.method.partition(":")[0] for row in rows)))
+    markers = markers_of(list(dict.fromkeys(row.workload for row in rows)))
+    most = max(row.threads for row in rows)
+    figure, axes = panels(len(drawn), PANEL_HEIGHT, max(len(colours), len(markers)))
+    for axis, panel in zip(axes, drawn, strict=True):
+        lines: dict[tuple[str, str, int], list[tuple[float, float]]] = {}
+        for row in rows:
+            lines.setdefault((row.method.partition(":")[0], row.workload, row.threads), []).extend(panel.points(row))
+        for (method, workload, threads), points in lines.items():
+            face = colours[method] if threads == most else "none"
+            style = {"marker": markers[workload], "color": colours[method], "markerfacecolor": face}
+            axis.plot([x for x, _ in points], [y for _, y in points], linewidth=1, **style)
+        axis.set(xscale="log", xlabel=panel.against, ylabel=panel.value)
+        axis.set_title(f"{rows[0].suite}: {panel.operation}", fontsize="medium")
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_formatter("{x:g}")
+        axis.tick_params(axis="x", which="minor", labelsize=7, rotation=45)
+        axis.grid(alpha=0.3, which="major")
+        heights = [y for points in lines.values() for _, y in points]
+        if min(heights) > 0 and "dB" not in panel.value:
+            axis.set_yscale("log")
+        elif min(heights) == 0:
+            axis.set_yscale("symlog", linthresh=min((y for y in heights if y > 0), default=1.0))
+    fewer = any(row.threads < most for row in rows)
+    draw_keys(figure, colours, markers, f"fewer than {most} threads" if fewer else None)
+    write_figure(path, figure)
