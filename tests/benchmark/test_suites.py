@@ -43,10 +43,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runs, "QUICK_DEMO", ("--data.views=9", "--data.width=48", "--data.height=36"))
 
 
-Rows = dict[tuple[str, str], dict[str, float]]
-
-
-def _checked(name: str, rows: list[Measurement]) -> Rows:
+def _checked(name: str, rows: list[Measurement]) -> dict[tuple[str, str], dict[str, float]]:
     """Values by operation and method; the last workload's, if there are several."""
     assert {row.suite for row in rows} == {name}
     keys = [(row.workload, row.method, row.operation, row.threads) for row in rows]
@@ -68,7 +65,6 @@ def test_rasterizer_and_loss_are_as_exact_as_plain_torch(scene: Path) -> None:
     for method in ("cpu", "plain torch"):
         assert values["forward", method]["max error"] < 1e-5
         assert values["forward + backward", method]["gradient error"] < 1e-4
-        assert values["forward + backward", method].keys() == {"gradient error", *RawSplats._fields}
     assert values[render.LOSS, "fused, cpu"]["gradient error"] < 1e-4
     assert rows[0].note.startswith("errors on the middle")
     assert len({row.workload for row in rows if row.method == "plain torch"}) == 1
@@ -106,18 +102,14 @@ def test_quantizer_search_and_kmeans_are_right(scene: Path) -> None:
         assert 0 < many.values["distortion"] < few.values["distortion"] < 1
 
 
-def test_wrong_codes_are_counted_with_what_they_add() -> None:
+def test_codes_are_judged_by_their_distances() -> None:
     x, codebook = torch.tensor([[0.0], [1.0], [2.1]]), torch.tensor([[0.5], [2.0], [2.0]])
     # Distances 0.5 + 0.5 + 0.1; the second code is 1 away from row 1; code 2 equals code 1.
     values = quantize.code_errors(x, codebook, torch.tensor([0, 1, 2]))
     assert values == {"wrong codes": 1, "added distance": pytest.approx(0.5 / 1.1)}
-
-
-def test_distortion_is_a_share_of_the_variance() -> None:
     rows = torch.tensor([[0.0, 1.0], [2.0, 1.0], [10.0, 1.0], [12.0, 1.0]])
     # Squared distances of 1 to the centres of the pairs; variance (36 + 16 + 16 + 36) / 4.
     assert quantize.distortion(rows, torch.tensor([[1.0, 1.0], [11.0, 1.0]])) == pytest.approx(1 / 26)
-    assert quantize.distortion(rows, rows) == 0
 
 
 def test_wrong_quantize_step_is_found() -> None:
@@ -153,28 +145,21 @@ def test_files_lose_what_their_levels_say_beside_those_of_other_programs(
 
 
 def test_runs_with_and_without_a_switch(monkeypatch: pytest.MonkeyPatch) -> None:
-    switches, seen, measured = ("sh_bands", "metrics"), set(), train._test_psnr
+    seen, measured = set(), train._test_psnr
 
     def seeing_switches(module: SplatModule) -> float:
-        seen.add(tuple(is_on(name) for name in switches))
+        seen.add(is_on("sh_bands"))
         return measured(module)
 
     monkeypatch.setattr(train, "_test_psnr", seeing_switches)
-    rows = {row.method: row for row in train.run_rows(_tiny(switches=switches))}
-    _checked("train", list(rows.values()))
-    assert seen == {(True, True), (False, True), (True, False)}
-    shipped, exact = rows["as shipped"], rows["no skip of sh_bands"]
+    shipped, exact = rows = list(train.run_rows(_tiny(switches=("sh_bands",))))
+    _checked("train", rows)
+    assert [row.method for row in rows] == ["as shipped", "no skip of sh_bands"]
+    assert seen == {True, False}
     assert shipped.values["other numbers"] == exact.values["other numbers"] == 0
-    assert shipped.values["PSNR dB"] == exact.values["PSNR dB"] > 5
-    assert shipped.values["times as shipped"] == 1
-    assert "saves %" not in shipped.values
+    assert shipped.values["PSNR dB"] == exact.values["PSNR dB"] == shipped.course[-1][1] > 5
     assert exact.values["saves %"] == pytest.approx(100 * (1 - 1 / exact.values["times as shipped"]))
-    assert {"warmup ms", "prune ms", "quantize ms", "finetune ms"} < shipped.values.keys()
-    assert [point[0] for point in shipped.course] == sorted(point[0] for point in shipped.course)
-    assert shipped.course[-1][1] == shipped.values["PSNR dB"]
     assert len(shipped.timing.samples) == TINY.steps
-    names = [variant.name for variant in train.variants(Scope((1, 2), switches=switches))]
-    assert names == ["as shipped", "1 thread", "no skip of sh_bands", "no skip of metrics"]
 
 
 def test_different_numbers_are_counted_by_their_bits() -> None:
@@ -205,12 +190,7 @@ def test_what_is_between_steps_is_not_in_their_time(monkeypatch: pytest.MonkeyPa
 @pytest.mark.skipif(
     sys.version_info >= (3, 12) and not numba.config.ENABLE_SYS_MONITORING, reason="kernels show in no profile"
 )
-@pytest.mark.parametrize("threads", [(1,), (1, 2)])
-def test_parts_add_up_to_the_step_and_every_pattern_finds_its_functions(
-    threads: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if max(threads) > int(numba.config.NUMBA_NUM_THREADS):
-        pytest.skip("needs two threads")
+def test_parts_add_up_to_the_step_and_every_pattern_finds_its_functions(monkeypatch: pytest.MonkeyPatch) -> None:
     found: dict[str, set[str]] = {}
 
     def noted(function: str) -> str:
@@ -218,19 +198,19 @@ def test_parts_add_up_to_the_step_and_every_pattern_finds_its_functions(
         return part_of(function)
 
     monkeypatch.setattr(runs, "part_of", noted)
+    threads = (1, 2) if int(numba.config.NUMBA_NUM_THREADS) > 1 else (1,)
     rows = list(train.part_rows(_tiny(threads=threads, config="nsvq_1k.yaml", steps=24)))
     for part, patterns in PARTS.items():
         idle = [pattern for pattern in patterns if not fnmatch.filter(found.get(part, ()), pattern)]
         assert not idle, f"no function belongs to {part} by {idle}: have they been renamed or moved?"
-    operations = [f"parts of a {phase.name.lower()} step" for phase in Phase]
-    assert list(dict.fromkeys(row.operation for row in rows)) == operations
-    for operation in operations:
+    assert {row.operation for row in rows} == {f"parts of a {phase.name.lower()} step" for phase in Phase}
+    for operation in dict.fromkeys(row.operation for row in rows):
         whole, *parts = [row for row in rows if row.operation == operation]
-        assert (whole.method, whole.values["share %"]) == (train.WHOLE, pytest.approx(100))
+        assert whole.method == train.WHOLE
         assert sum(row.values["share %"] for row in parts) == pytest.approx(100)
-        values = {row.method: row.values for row in parts}
-        assert ("quantizer: noise" in values) == (operation == operations[2])
-        assert -1 < values[OUTSIDE]["share %"] < 10
+        shares = {row.method: row.values["share %"] for row in parts}
+        assert ("quantizer: noise" in shares) == ("quantize" in operation)
+        assert -1 < shares[OUTSIDE] < 10
         assert ("times faster" in whole.values) == (len(threads) > 1)
         assert all(0 <= row.values.get("serial %", 0) <= 100 for row in parts)
 
@@ -239,13 +219,4 @@ def test_serial_share_is_amdahls() -> None:
     assert train.serial_share(1, 10.0, 2, 5.0) == 0
     assert train.serial_share(1, 10.0, 2, 10.0) == 1
     assert train.serial_share(1, 10.0, 2, 5.5) == pytest.approx(0.1)  # 10 · (0.1 + 0.9 / 2)
-    assert train.serial_share(2, 5.5, 4, 3.25) == pytest.approx(0.1)
     assert train.serial_share(1, 10.0, 2, 4.0) == 0  # a cache more
-
-
-@pytest.mark.slow
-def test_sizes_are_measured_in_processes_of_their_own() -> None:
-    rows = list(train.size_rows(_tiny(workloads=("A20k", "B100k"))))
-    _checked("train", rows)
-    assert [row.method for row in rows] == ["step: A20k", "step: B100k"]
-    assert 100 < rows[0].values["peak MB"] < rows[1].values["peak MB"] < 3000

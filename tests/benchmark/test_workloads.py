@@ -25,18 +25,11 @@ def test_a_name_always_gives_the_same_numbers() -> None:
 def test_crop_shows_the_middle_of_the_view() -> None:
     workload = synthetic_workload("A20k")
     small = workload.crop(64, 40)
-    whole = render(workload.splats, workload.camera).image
-    cropped = render(small.splats, small.camera).image
-
-    def difference(top: int, left: int) -> float:
-        return float((cropped - whole[top : top + 40, left : left + 64]).abs().mean())
-
-    # Not equal: the Jacobian of splats outside is clamped beyond a margin of the view, which a crop moves.
-    assert difference(130, 168) < 1e-3
-    assert min(difference(131, 168), difference(130, 169)) > 20 * difference(130, 168)
+    whole, cropped = (render(each.splats, each.camera).image for each in (workload, small))
+    # The Jacobian of splats outside is clamped beyond a margin of the view, which a crop moves.
+    errors = [float((cropped - whole[top : top + 40, 168:232]).abs().mean()) for top in (130, 131)]
+    assert errors[0] < 1e-3 < 20 * errors[0] < errors[1]
     assert torch.equal(small.image_gradient, workload.image_gradient[130:170, 168:232])
-    with pytest.raises(ValueError, match="cannot crop 400x300 to 401x10"):
-        workload.crop(401, 10)
 
 
 def test_scene_file_is_seen_whole_and_without_broken_splats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,17 +50,13 @@ def test_scene_file_is_seen_whole_and_without_broken_splats(tmp_path: Path, monk
 
 
 def test_folder_is_seen_by_its_first_train_camera(demo_scene: Path, tmp_path: Path) -> None:
-    scene = load_scene(demo_scene)
-    (workload,) = workloads(Scope((1,), scene=demo_scene))
-    assert str(workload) == "scene 96x72"
-    assert torch.equal(workload.camera.viewmat, scene.cameras[scene.train[0]].viewmat)
-    assert torch.equal(workload.splats.means, scene.points)
-    path = tmp_path / "trained.ply"
+    scene, path = load_scene(demo_scene), tmp_path / "trained.ply"
     save(RawSplats(*(tensor[:50] for tensor in synthetic_workload("A20k").splats)), path)
-    (other,) = workloads(Scope((1,), scene=demo_scene, init_from=path))
-    assert str(other) == "scene trained.ply 96x72"
-    assert torch.equal(other.camera.viewmat, workload.camera.viewmat)
-    assert len(other.splats.means) == 50
+    (points,), (trained,) = (workloads(Scope((1,), scene=demo_scene, init_from=given)) for given in (None, path))
+    assert (str(points), str(trained)) == ("scene 96x72", "scene trained.ply 96x72")
+    assert torch.equal(points.camera.viewmat, scene.cameras[scene.train[0]].viewmat)
+    assert torch.equal(points.splats.means, scene.points)
+    assert len(trained.splats.means) == 50
 
 
 def test_errors_are_relative() -> None:
