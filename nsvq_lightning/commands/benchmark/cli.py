@@ -100,9 +100,7 @@ def _parser() -> argparse.ArgumentParser:
     what = parser.add_argument_group("what is measured")
     known = f"some of {','.join(SIZES)} (A20k,B100k,C500k; quick A20k)"
     what.add_argument("--workloads", type=names, metavar="NAME,NAME", help=f"synthetic scenes, {known}")
-    what.add_argument(
-        "--scene", type=Path, metavar="PATH", help="scene file or COLMAP folder instead of synthetic ones"
-    )
+    what.add_argument("--scene", type=Path, metavar="PATH", help="scene file or COLMAP folder, not synthetic ones")
     help_ = "scene file whose splats are used with the photos of the COLMAP folder, instead of its points"
     what.add_argument("--init-from", type=Path, metavar="FILE", help=help_)
     help_ = "files of the same scene by other programs, which codec measures beside ours"

@@ -29,7 +29,7 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
-__all__ = ["OTHER", "OUTSIDE", "PARTS", "Step", "StepClock", "StepSampler", "config_name", "config_run", "part_of"]
+__all__ = ["OTHER", "OUTSIDE", "PARTS", "Step", "StepClock", "StepSampler", "config_run", "part_of", "run_name"]
 
 WATCHING = ("report", "export", "predictions", "checkpoint", "kernels", "progress")
 """Callbacks of ``nsvq fit`` that write files or lines but train nothing; the benchmark measures by itself."""
@@ -94,7 +94,7 @@ def config_run(scope: Scope, threads: int, between: Between, options: Sequence[s
     with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder, use_threads(threads), _quiet():
         arguments = [
             "fit",
-            f"--config={find_config(config_name(scope))}",
+            f"--config={find_config(_config(scope))}",
             *data,
             f"--trainer.default_root_dir={folder}",
             f"--trainer.max_steps={scope.steps}",
@@ -107,8 +107,13 @@ def config_run(scope: Scope, threads: int, between: Between, options: Sequence[s
     return module
 
 
-def config_name(scope: Scope) -> str:
-    """The config of the runs."""
+def run_name(scope: Scope) -> str:
+    """The run in the tables."""
+    scene = "demo" if scope.photos is None else scope.photos.resolve().name
+    return f"{scene}, {Path(_config(scope)).name}, {scope.steps} steps"
+
+
+def _config(scope: Scope) -> str:
     return scope.config or ("fast.yaml" if scope.photos else "demo.yaml")
 
 

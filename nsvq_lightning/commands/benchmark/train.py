@@ -23,15 +23,7 @@ from torch import Tensor
 
 from nsvq_lightning.commands.benchmark import SIZES, Scope
 from nsvq_lightning.commands.benchmark.report import Panel
-from nsvq_lightning.commands.benchmark.runs import (
-    OTHER,
-    OUTSIDE,
-    PARTS,
-    Step,
-    StepSampler,
-    config_name,
-    config_run,
-)
+from nsvq_lightning.commands.benchmark.runs import OTHER, OUTSIDE, PARTS, Step, StepSampler, config_run, run_name
 from nsvq_lightning.commands.benchmark.timing import Case, Measurement, Timing, measure, milliseconds, sgemm
 from nsvq_lightning.commands.benchmark.workloads import synthetic_workload
 from nsvq_lightning.data.datamodule import ColmapDataModule
@@ -69,11 +61,6 @@ def run(scope: Scope) -> Iterator[Measurement]:
     else:
         log.warning("train: no profile: it shows kernels only if NUMBA_ENABLE_SYS_MONITORING=1 when Numba is loaded")
     yield from size_rows(scope)
-
-
-def _run_name(scope: Scope) -> str:
-    scene = "demo" if scope.photos is None else scope.photos.resolve().name
-    return f"{scene}, {Path(config_name(scope)).name}, {scope.steps} steps"
 
 
 # Whole runs
@@ -131,7 +118,7 @@ def run_rows(scope: Scope) -> Iterator[Measurement]:
         for variant in chosen[turn:] + chosen[:turn]:
             trained[variant.name].append(_train(variant, scope))
     for variant in chosen:
-        yield _run_row(_run_name(scope), variant, trained[variant.name], trained[SHIPPED])
+        yield _run_row(run_name(scope), variant, trained[variant.name], trained[SHIPPED])
 
 
 def _train(variant: Variant, scope: Scope) -> Trained:
@@ -234,7 +221,7 @@ def part_rows(scope: Scope) -> Iterator[Measurement]:
                 values["times faster"] = few_ms / many_ms
                 values["serial %"] = 100 * serial_share(few, few_ms, many, many_ms)
             timing, operation = Timing(tuple(times), tuple(products)), f"parts of a {phase.name.lower()} step"
-            yield Measurement("train", _run_name(scope), name, operation, many, timing, values, note)
+            yield Measurement("train", run_name(scope), name, operation, many, timing, values, note)
 
 
 def _middle(sampler: StepSampler, phase: Phase) -> set[int]:
