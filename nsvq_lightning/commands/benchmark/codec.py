@@ -28,9 +28,8 @@ from nsvq_lightning.commands.benchmark.timing import (
 from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.commands.compress import DEFAULT_TUNING, VIEWS
 from nsvq_lightning.compression.ladder import LADDER, PLAIN, Compressor, Rung
-from nsvq_lightning.compression.pictures import decibels, pictures
 from nsvq_lightning.compression.stored import compress
-from nsvq_lightning.compression.viewpoints import views_of
+from nsvq_lightning.compression.viewpoints import decibels, pictures, views_of
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.formats import load, save

@@ -15,7 +15,7 @@ from nsvq_lightning.commands.benchmark.report import Panel
 from nsvq_lightning.commands.benchmark.timing import Case, Measurement, measure, use_threads
 from nsvq_lightning.commands.benchmark.workloads import relative_l2, single_workload
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, CodebookQuantizer, kmeans, nearest, nearest_reference
-from nsvq_lightning.quantize.scene import build_quantizers
+from nsvq_lightning.quantize.attributes import build_quantizers
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.optim import LearningRates

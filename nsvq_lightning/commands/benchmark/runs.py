@@ -162,7 +162,7 @@ PARTS = {
     "rasterizer, its Python": ("nsvq_lightning.rendering.*",),
     "loss": ("nsvq_lightning.quality.*",),
     "Adam": ("nsvq_lightning.training.optim.*", "torch.optim.*"),
-    "quantizer: noise": tuple(f"nsvq_lightning.quantize.{name}.*" for name in ("substitution", "noise", "nsvq")),
+    "quantizer: noise": tuple(f"nsvq_lightning.quantize.{name}.*" for name in ("substitution", "nsvq")),
     "quantizer: search and decode": ("nsvq_lightning.quantize.*",),
     "buffers, checks and rows of kernels": ("nsvq_lightning.compute.*",),
     "callbacks": ("nsvq_lightning.callbacks.*",),
