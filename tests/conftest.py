@@ -14,10 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from demo_room import write_synthetic_scene
 from guards import guarded
 
 from nsvq_lightning.data.colmap import import_pycolmap
-from nsvq_lightning.data.synthetic import write_synthetic_scene
 
 FIRST = ("test_view_parallel.py", "test_triton.py", "test_kernel_entries.py", "test_interruption.py", "test_fuzz.py")
 """Files that take longest: one that starts last would be waited for."""

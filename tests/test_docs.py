@@ -70,7 +70,7 @@ COMMAND_LINES = dict(commands())
 def workplace(tmp_path: Path, demo_scene: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with everything that the pages name."""
     monkeypatch.chdir(tmp_path)
-    for name in ("path/to/scene", "my/scene", "scenes/demo", "fox"):
+    for name in ("path/to/scene", "my/scene", "nsvq_lightning/data/demo", "fox"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).symlink_to(demo_scene, target_is_directory=True)
     shutil.copytree(ROOT / "configs", tmp_path / "configs")

@@ -13,7 +13,8 @@ NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 ALL = ("compress_ply", "own_quantizer", "quickstart", "read_a_sweep")
 SMALL = (
     (r"^steps = \d+", "steps = 60"),
-    (r"DemoDataModule\((.*)\)", r"DemoDataModule(\1, views=9, width=64, height=48)"),
+    (r"DemoDataModule\(\)", "DemoDataModule(factor=4)"),
+    (r"--data\.root=\{DEMO\}\"", '--data.root={DEMO}", "--data.factor=4"'),
     (r'^sizes = ".*"', 'sizes = "1k,0.5k"'),
 )
 """What is smaller in a test."""

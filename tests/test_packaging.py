@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from collections.abc import Iterator
@@ -98,12 +99,16 @@ def without_links(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def _built(root: Path, kind: str) -> dict[str, bytes]:
-    """Files of the package in a wheel, ``standard`` or ``editable``."""
+def _build(root: Path, function: str) -> None:
+    """Build into ``dist`` with a function of Hatchling."""
     pytest.importorskip("hatchling", reason="builds the wheel; it is in the test extra")
-    function = "build_wheel" if kind == "standard" else "build_editable"
     call = f"from hatchling.build import {function} as build; build('dist')"
     subprocess.run([sys.executable, "-c", call], cwd=root, check=True)
+
+
+def _built(root: Path, kind: str) -> dict[str, bytes]:
+    """Files of the package in a wheel, ``standard`` or ``editable``."""
+    _build(root, "build_wheel" if kind == "standard" else "build_editable")
     (wheel,) = (root / "dist").glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         return {name: archive.read(name) for name in archive.namelist() if name.startswith("nsvq_lightning/")}
@@ -117,6 +122,15 @@ def test_wheel_is_whole_with_links_and_without(without_links: Path, links: bool)
     expected = {f"nsvq_lightning/{path.relative_to(ROOT).as_posix()}": path for path in _files(*TOP_LEVEL)}
     expected |= {path.relative_to(ROOT).as_posix(): path for path in _files("nsvq_lightning")}
     assert _built(without_links, "standard") == {name: path.read_bytes() for name, path in expected.items()}
+
+
+def test_source_distribution_has_the_demo(without_links: Path) -> None:
+    _build(without_links, "build_sdist")
+    (source,) = (without_links / "dist").glob("*.tar.gz")
+    with tarfile.open(source) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert {path.relative_to(ROOT).as_posix() for path in _files("nsvq_lightning/data/demo")} <= names
+    assert "nsvq_lightning/data/demo/images/view_039.webp" in names
 
 
 def test_editable_install_copies_nothing(without_links: Path) -> None:

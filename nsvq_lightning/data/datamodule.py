@@ -16,9 +16,11 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset
 from nsvq_lightning.data.device_photos import DevicePhotos
 from nsvq_lightning.data.sampler import ViewSampler
 from nsvq_lightning.data.scene import Factor, Scene, SceneError, View, load_scene
-from nsvq_lightning.data.synthetic import write_synthetic_scene
 
-__all__ = ["ColmapDataModule", "DemoDataModule"]
+__all__ = ["DEMO", "ColmapDataModule", "DemoDataModule"]
+
+DEMO = Path(__file__).parent / "demo"
+"""Folder of the demo scene, a COLMAP scene as any other; nothing is ever written there."""
 
 T = TypeVar("T")
 
@@ -158,57 +160,15 @@ class ColmapDataModule(LightningDataModule):
 
 
 class DemoDataModule(ColmapDataModule):
-    """The embedded demo scene: a ray-traced room, written as a COLMAP folder when it is first needed.
+    """The embedded demo scene: 40 photos of a small room, which the package contains.
 
     Args:
-        root: Folder of the scene; ``prepare_data`` builds it if it does not exist.
-        views: Number of views, at least 2.
-        width: Image width in pixels.
-        height: Image height in pixels.
-        test_every: Every ``test_every``-th view is a test view, at least 2.
-        seed: Seed of the order of the train views.
-        cache_bytes: Memory for decoded images in bytes.
+        root: Scene folder.
+        **options: As of :class:`ColmapDataModule`.
     """
 
-    def __init__(
-        self,
-        root: str = "scenes/demo",
-        views: int = 40,
-        width: int = 320,
-        height: int = 240,
-        test_every: int = 8,
-        seed: int = 0,
-        cache_bytes: int = 4 << 30,
-    ) -> None:
-        super().__init__(root, factor=1, test_every=test_every, seed=seed, cache_bytes=cache_bytes)
-        self.views, self.width, self.height = views, width, height
-
-    def prepare_data(self) -> None:
-        """Build the scene if it does not exist, and load it."""
-        if not self.root.exists():
-            rank_zero_info(f"rendering the demo scene into {self.root} (once, takes some seconds)")
-            try:
-                write_synthetic_scene(self.root, views=self.views, width=self.width, height=self.height)
-            except OSError:
-                if not self.root.exists():  # otherwise another node has built it in the meantime
-                    raise
-        super().prepare_data()
-
-    def setup(self, stage: str | None = None) -> None:
-        """Load the scene.
-
-        Raises:
-            SceneError: The folder holds a scene of another size.
-        """
-        super().setup(stage)
-        camera = self.scene.cameras[0]
-        found, wanted = (len(self.scene), camera.width, camera.height), (self.views, self.width, self.height)
-        if found != wanted:
-            raise SceneError(
-                f"{self.root} holds {found[0]} views of {found[1]}x{found[2]}, not the demo scene of {wanted[0]} views "
-                f"of {wanted[1]}x{wanted[2]}: train on your own photos with --config nsvq_4k.yaml, or give --data.root "
-                "another folder for the demo scene"
-            )
+    def __init__(self, root: str = str(DEMO), **options: Any) -> None:
+        super().__init__(root, **options)
 
 
 class _TrainViews(IterableDataset[View]):

@@ -40,7 +40,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(render, "ORACLE_WORK", {True: 1e7})
     monkeypatch.setattr(render, "PHOTO", (40, 48, 3))
     monkeypatch.setattr(quantize, "CHECKED_ROWS", 500)
-    monkeypatch.setattr(runs, "QUICK_DEMO", ("--data.views=9", "--data.width=48", "--data.height=36"))
+    monkeypatch.setattr(runs, "QUICK_DEMO", ("--data.factor=8",))
 
 
 def _checked(name: str, rows: list[Measurement]) -> dict[tuple[str, str], dict[str, float]]:

@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import PIL.Image
 import pytest
+from demo_room import write_synthetic_scene
 
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.data import reconstruct
 from nsvq_lightning.data.scene import load_scene
-from nsvq_lightning.data.synthetic import write_synthetic_scene
 
 
 def _noise(path: Path, seed: int = 0) -> None:

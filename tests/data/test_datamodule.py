@@ -13,7 +13,7 @@ from lightning.pytorch import LightningModule, Trainer
 from runs import quiet_trainer
 from torch import Tensor, nn
 
-from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
+from nsvq_lightning.data.datamodule import DEMO, ColmapDataModule, DemoDataModule
 from nsvq_lightning.data.sampler import ViewSampler
 from nsvq_lightning.data.scene import SceneError, View
 
@@ -130,14 +130,13 @@ def test_scene_with_a_single_train_view(make_scene: SceneFactory) -> None:
     assert [view.name for view in islice(data.train_dataloader(), 3)] == ["001.png"] * 3
 
 
-def test_demo_is_built_once_and_checked(tmp_path: Path) -> None:
-    root = tmp_path / "runs" / "demo"
-    data = DemoDataModule(str(root), views=3, width=32, height=24)
+def test_demo_is_read_where_it_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = {path: path.stat().st_mtime_ns for path in DEMO.rglob("*")}
+    data = DemoDataModule(factor=2)
     data.prepare_data()
-    stamp = (root / "sparse" / "0" / "points3D.bin").stat().st_mtime_ns
-    data.prepare_data()
-    assert (root / "sparse" / "0" / "points3D.bin").stat().st_mtime_ns == stamp
     data.setup()
-    assert tuple(data.scene.view(0).image.shape) == (24, 32, 3)
-    with pytest.raises(SceneError, match="holds 3 views of 32x24, not the demo scene of 40 views"):
-        DemoDataModule(str(root)).setup()
+    assert (len(data.scene), data.scene.test) == (40, (0, 8, 16, 24, 32))
+    assert tuple(data.scene.view(0).image.shape) == (120, 160, 3)
+    assert {path: path.stat().st_mtime_ns for path in DEMO.rglob("*")} == before
+    assert list(tmp_path.iterdir()) == []

@@ -135,8 +135,6 @@ def test_no_file_of_the_package_is_written_in_place() -> None:
     allowed = {
         ("training/run_folder.py", "open"),
         ("io/atomic.py", "open"),
-        ("data/synthetic.py", "write_binary"),
-        ("data/synthetic.py", "write_bytes"),
         ("commands/sweep/training.py", "open"),
         ("report/figures.py", "savefig"),  # into memory
     }

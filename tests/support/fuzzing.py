@@ -265,8 +265,9 @@ def _mend_sog(data: bytes) -> bytes:
 
 
 def _build_colmap(folder: Path, suffix: str) -> list[Path]:
+    from demo_room import write_synthetic_scene
+
     from nsvq_lightning.data.colmap import import_pycolmap
-    from nsvq_lightning.data.synthetic import write_synthetic_scene
 
     model = write_synthetic_scene(folder / "scene", views=3, width=16, height=12, points=8) / "sparse" / "0"
     if suffix == ".txt":

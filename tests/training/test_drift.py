@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 import torch
+from demo_room import write_synthetic_scene
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from nsvq_lightning.callbacks import DensityControl, DensityRules
 from nsvq_lightning.data.scene import load_scene
-from nsvq_lightning.data.synthetic import write_synthetic_scene
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training.module import SplatModule

@@ -15,7 +15,6 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -33,7 +32,7 @@ __all__ = ["OTHER", "OUTSIDE", "PARTS", "Step", "StepClock", "StepSampler", "con
 
 WATCHING = ("report", "export", "predictions", "checkpoint", "kernels", "progress")
 """Callbacks of ``nsvq fit`` that write files or lines but train nothing; the benchmark measures by itself."""
-QUICK_DEMO = ("--data.views=9", "--data.width=96", "--data.height=72")
+QUICK_DEMO = ("--data.factor=4",)
 
 
 class Step(NamedTuple):
@@ -87,8 +86,7 @@ def config_run(scope: Scope, threads: int, between: Between, options: Sequence[s
     """
     data: tuple[str, ...] = ("--data=ColmapDataModule", f"--data.root={scope.photos}")
     if scope.photos is None:
-        size = QUICK_DEMO if scope.quick else ()
-        data = ("--data=DemoDataModule", f"--data.root={Path(_demo_scenes().name, 'demo' + ''.join(size))}", *size)
+        data = ("--data=DemoDataModule", *(QUICK_DEMO if scope.quick else ()))
     if scope.init_from is not None:
         data += (f"--model.init_from={scope.init_from}",)
     with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder, use_threads(threads), _quiet():
@@ -115,12 +113,6 @@ def run_name(scope: Scope) -> str:
 
 def _config(scope: Scope) -> str:
     return scope.config or ("fast.yaml" if scope.photos else "demo.yaml")
-
-
-@cache
-def _demo_scenes() -> tempfile.TemporaryDirectory[str]:
-    """The first run of a size writes its scene here, later ones find it; goes when the process ends."""
-    return tempfile.TemporaryDirectory(prefix="nsvq-benchmark-scenes-")
 
 
 class _Run(SplatCLI):

@@ -1,22 +1,36 @@
-"""The furniture of the demo scene: a textured room with boxes, balls and pictures, its lamp and its cameras.
+"""The demo scene: a textured room with boxes, balls and pictures, its lamp and its cameras, as a COLMAP folder.
 
-Textures are photographs that ship inside the scikit-image wheel, so nothing is downloaded. World axes follow
-COLMAP's camera axes: y points down, the floor is y = 0, one unit is a metre.
+``python tests/support/demo_room.py`` writes what the package contains of it; tests make smaller ones. Textures are
+photographs in the public domain that come with scikit-image. World axes follow COLMAP's camera axes: y points down, the
+floor is y = 0, one unit is a metre.
 """
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import PIL.Image
+import torch
 from numpy.typing import NDArray
+from raytrace import Array, Lamp, Quad, Room, Sphere, Surface
 from skimage import data as photos
 
-from nsvq_lightning.data.raytrace import Lamp, Room
-from nsvq_lightning.data.surfaces import Array, Quad, Sphere, Surface
+from nsvq_lightning.data.colmap import import_pycolmap
+from nsvq_lightning.data.datamodule import DEMO
+from nsvq_lightning.random import generator
 
-__all__ = ["demo_poses", "demo_room", "to_srgb"]
+__all__ = ["Lens", "demo_poses", "demo_room", "render_view", "surface_points", "write_synthetic_scene"]
+
+_SUPERSAMPLING = 2
+_POINT_NOISE = 0.002  # metres; about the error of a triangulated point at this size
+_VIEWS_A_POINT = 3  # COLMAP's mapper does not keep points with shorter tracks
 
 HALF, HEIGHT = 3.0, 2.7
 """Half the side of the room and its height."""
@@ -31,6 +45,7 @@ def to_srgb(linear: Array) -> NDArray[np.uint8]:
     return (encoded * 255 + 0.5).astype(np.uint8)
 
 
+@cache
 def demo_room() -> Room:
     """The room with its baked light."""
     lamp = Lamp(_vector(0.5, -HEIGHT + 0.03, -0.4), side=1.0, power=7.5, ambient=0.34)
@@ -195,3 +210,164 @@ def _panel(lamp: Lamp) -> Surface:
     s = lamp.side
     corner = lamp.centre + _vector(-s / 2, -0.01, -s / 2)
     return Quad(corner, _vector(s, 0, 0), _vector(0, 0, s), np.ones((2, 2, 3), np.float32), glow=1.0)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Pinhole camera of all views; its principal point is off-centre, as in a real camera."""
+
+    width: int
+    height: int
+
+    @property
+    def params(self) -> tuple[float, float, float, float]:
+        """``fx, fy, cx, cy`` in pixels."""
+        focal = 0.78 * self.width
+        return focal, focal, 0.5 * self.width + 0.011 * self.width, 0.5 * self.height - 0.009 * self.height
+
+    def rays(self, pose: NDArray[np.float64], oversample: int) -> tuple[Array, Array]:
+        """Centre ``[3]`` and unit directions ``[height·width·oversample², 3]`` in world coordinates."""
+        fx, fy, cx, cy = self.params
+        x = ((np.arange(self.width * oversample) + 0.5) / oversample - cx) / fx
+        y = ((np.arange(self.height * oversample) + 0.5) / oversample - cy) / fy
+        grid = np.meshgrid(x, y)
+        directions = np.stack([*grid, np.ones_like(grid[0])], -1).reshape(-1, 3) @ pose[:3, :3]
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        return _centre(pose), directions.astype(np.float32)
+
+    def project(self, pose: NDArray[np.float64], points: Array) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Pixels ``[P, 2]`` of world points ``[P, 3]``, and whether they are in the picture."""
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        fx, fy, cx, cy = self.params
+        depth = np.maximum(local[:, 2], 1e-6)
+        pixels = np.stack([fx * local[:, 0] / depth + cx, fy * local[:, 1] / depth + cy], axis=-1)
+        inside = (local[:, 2] > 0.1) & (pixels > 0).all(1) & (pixels < (self.width, self.height)).all(1)
+        return pixels, inside
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Surface points ``xyz``, ``rgb`` (``[P, 3]``), seen by the views at ``pixels [V, P, 2]`` where ``seen [V, P]``."""
+
+    xyz: Array
+    rgb: NDArray[np.uint8]
+    pixels: NDArray[np.float64]
+    seen: NDArray[np.bool_]
+
+
+def write_synthetic_scene(
+    root: Path,
+    views: int = 40,
+    width: int = 320,
+    height: int = 240,
+    points: int = 4000,
+    seed: int = 0,
+    suffix: str = ".png",
+    tracks: bool = True,
+) -> Path:
+    """Render the demo room and write it as a COLMAP scene (``images/*``, ``sparse/0/*.bin``).
+
+    Args:
+        root: Folder to create.
+        views: Number of views on an orbit around the room's middle.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        points: Number of sparse points.
+        seed: Seed of the points; the pictures do not depend on it.
+        suffix: Format of the pictures.
+        tracks: Whether the model says which view sees which point, and where.
+
+    Returns:
+        ``root``.
+    """
+    room, lens, poses = demo_room(), Lens(width, height), demo_poses(views)
+    names = [f"view_{i:03d}{suffix}" for i in range(views)]
+    (root / "images").mkdir(parents=True)
+    for name, pose in zip(names, poses, strict=True):
+        picture = PIL.Image.fromarray(render_view(room, pose, width, height))
+        picture.save(root / "images" / name, quality=92, method=6)  # as WebP; PNG knows no quality
+    found = surface_points(room, lens, poses, points, seed)
+    found.seen[:] &= tracks
+    _write_model(root / "sparse" / "0", lens, names, poses, found)
+    return root
+
+
+def render_view(room: Room, pose: NDArray[np.float64], width: int, height: int) -> NDArray[np.uint8]:
+    """Anti-aliased sRGB picture ``[H, W, 3]`` of the room from a world-to-camera ``pose [4, 4]``."""
+    n = _SUPERSAMPLING
+    linear = room.colours(*Lens(width, height).rays(pose, n)).clip(0, 1)
+    return to_srgb(linear.reshape(height, n, width, n, 3).mean(axis=(1, 3)))
+
+
+def _centre(pose: NDArray[np.float64]) -> Array:
+    return (-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32)
+
+
+def surface_points(room: Room, lens: Lens, poses: NDArray[np.float64], count: int, seed: int) -> _Points:
+    """Random surface points that at least three views see (or all views, if there are fewer)."""
+    rng = generator(seed, 0, "demo points")
+    candidates = 3 * count
+    areas = torch.tensor([s.size[0] * s.size[1] * (0.0 if s.glow else 1.0) for s in room.surfaces])
+    # the square root favours small things, as corners and texture do in a real reconstruction
+    number = torch.multinomial(areas.sqrt(), candidates, replacement=True, generator=rng).numpy()
+    uv = torch.rand(candidates, 2, generator=rng).numpy()
+    noise = (_POINT_NOISE * torch.randn(candidates, 3, generator=rng)).numpy()
+    xyz, rgb = np.zeros((candidates, 3), np.float32), np.zeros((candidates, 3), np.uint8)
+    for i, surface in enumerate(room.surfaces):
+        mine = number == i
+        xyz[mine] = surface.points(uv[mine])
+        rgb[mine] = to_srgb(room.diffuse(i, uv[mine]))
+    sightings = [_sight(room, lens, pose, xyz) for pose in poses]
+    pixels, seen = np.stack([s[0] for s in sightings]), np.stack([s[1] for s in sightings])
+    chosen = np.flatnonzero(seen.sum(0) >= min(_VIEWS_A_POINT, len(poses)))[:count]
+    return _Points(xyz[chosen] + noise[chosen], rgb[chosen], pixels[:, chosen], seen[:, chosen])
+
+
+def _sight(
+    room: Room, lens: Lens, pose: NDArray[np.float64], xyz: Array
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Pixels ``[P, 2]`` of points ``[P, 3]``, and whether the view sees them unoccluded."""
+    pixels, inside = lens.project(pose, xyz)
+    centre = _centre(pose)
+    inside[inside] = room.trace(centre, xyz[inside] - centre).t > 0.995
+    return pixels, inside
+
+
+def _write_model(folder: Path, lens: Lens, names: list[str], poses: NDArray[np.float64], points: _Points) -> None:
+    pycolmap = import_pycolmap()
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(
+        model="PINHOLE", width=lens.width, height=lens.height, params=list(lens.params), camera_id=1
+    )
+    model.add_camera_with_trivial_rig(camera)
+    tracks: list[list[tuple[int, int]]] = [[] for _ in points.xyz]
+    for number, (name, pose) in enumerate(zip(names, poses, strict=True), start=1):
+        rows = np.flatnonzero(points.seen[number - 1])
+        for column, row in enumerate(rows):
+            tracks[row].append((number, column))
+        image = pycolmap.Image(name=name, keypoints=points.pixels[number - 1, rows], camera_id=1, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+    for xyz, rgb, track in zip(points.xyz, points.rgb, tracks, strict=True):
+        model.add_point3D(xyz.astype(np.float64), _track(pycolmap, track), rgb)
+    model.update_point_3d_errors()
+    folder.mkdir(parents=True)
+    model.write_binary(str(folder))
+
+
+def _track(pycolmap: Any, elements: list[tuple[int, int]]) -> Any:
+    track = pycolmap.Track()
+    for image, point in elements:
+        track.add_element(image, point)
+    return track
+
+
+def main() -> None:
+    """Write the scene that the package contains."""
+    shutil.rmtree(DEMO, ignore_errors=True)
+    write_synthetic_scene(DEMO, suffix=".webp", tracks=False)
+    for table in ("rigs", "frames"):  # repeat what the other tables say, for COLMAP 4
+        (DEMO / "sparse" / "0" / f"{table}.bin").unlink()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,24 +1,39 @@
+"""The demo scene of the package, and what tests make their scenes with."""
+
 from __future__ import annotations
 
-import filecmp
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from demo_room import Lens, demo_poses, demo_room, render_view, surface_points
+from raytrace import Lamp, Quad, Room, Sphere
+from skimage.metrics import peak_signal_noise_ratio
 
-from nsvq_lightning.data import synthetic
-from nsvq_lightning.data.colmap import import_pycolmap
-from nsvq_lightning.data.raytrace import Lamp, Room
+from nsvq_lightning.data.colmap import import_pycolmap, read_model
+from nsvq_lightning.data.datamodule import DEMO, DemoDataModule
 from nsvq_lightning.data.scene import load_scene
-from nsvq_lightning.data.surfaces import Quad, Sphere
-from nsvq_lightning.data.synthetic import write_synthetic_scene
 
 GREY = np.full((2, 2, 3), 0.5, np.float32)
 
 
 def _vector(*xyz: float) -> np.ndarray:
     return np.array(xyz, np.float32)
+
+
+def test_the_package_contains_what_its_maker_makes() -> None:
+    room, lens, poses = demo_room(), Lens(320, 240), demo_poses(40)
+    points = surface_points(room, lens, poses, 4000, seed=0)
+    model = read_model(DEMO)
+    np.testing.assert_allclose([image.viewmat for image in model.images], poses, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(model.points, points.xyz, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(model.colors, points.rgb)
+    assert model.cameras[1].params.tolist() == pytest.approx(lens.params)
+    scene = DemoDataModule().scene
+    for view in (0, 21):  # the error is that of WebP
+        assert peak_signal_noise_ratio(render_view(room, poses[view], 320, 240), scene.view(view).image.numpy()) > 36
+    assert sum(path.stat().st_size for path in DEMO.rglob("*")) < 1_200_000
 
 
 def test_it_is_a_colmap_scene(demo_scene: Path) -> None:
@@ -47,38 +62,12 @@ def test_pictures_show_the_points_in_their_colours(demo_scene: Path) -> None:
     assert torch.cat(differences).median() < 0.05
 
 
-def test_pictures_are_neither_dark_nor_burnt_nor_flat(demo_scene: Path) -> None:
-    scene = load_scene(demo_scene)
+def test_pictures_are_neither_dark_nor_burnt_nor_flat() -> None:
+    scene = DemoDataModule().scene
     pixels = torch.stack([scene.view(i).image for i in range(len(scene))]).float()
     assert 60 < pixels.mean() < 170
     assert (pixels >= 255).all(-1).float().mean() < 0.05
     assert pixels.std() > 35
-
-
-def test_same_arguments_same_bytes(demo_scene: Path, tmp_path: Path) -> None:
-    again = write_synthetic_scene(tmp_path / "again", views=9, width=96, height=72, points=500)
-    files = sorted(path.relative_to(demo_scene) for path in demo_scene.rglob("*") if path.is_file())
-    assert len(files) >= 12
-    _, different, failed = filecmp.cmpfiles(demo_scene, again, [str(file) for file in files], shallow=False)
-    assert different == failed == []
-
-
-def test_nothing_is_left_of_an_interrupted_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(*args: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(synthetic, "demo_room", lambda: None)
-    monkeypatch.setattr(synthetic, "render_view", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        write_synthetic_scene(tmp_path / "scene", views=2, width=8, height=8, points=1)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_no_folder_is_overwritten(demo_scene: Path) -> None:
-    with pytest.raises(FileExistsError, match="remove it or give another folder"):
-        write_synthetic_scene(demo_scene)
-    with pytest.raises(ValueError, match="views >= 2"):
-        write_synthetic_scene(demo_scene.parent / "other", views=1)
 
 
 def test_surfaces_know_their_coordinates() -> None:
