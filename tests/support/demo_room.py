@@ -23,7 +23,6 @@ from raytrace import Array, Lamp, Quad, Room, Sphere, Surface
 from skimage import data as photos
 
 from nsvq_lightning.data.colmap import import_pycolmap
-from nsvq_lightning.data.datamodule import DEMO
 from nsvq_lightning.random import generator
 
 __all__ = ["Lens", "demo_poses", "demo_room", "render_view", "surface_points", "write_synthetic_scene"]
@@ -363,6 +362,8 @@ def _track(pycolmap: Any, elements: list[tuple[int, int]]) -> Any:
 
 def main() -> None:
     """Write the scene that the package contains."""
+    from nsvq_lightning.data.datamodule import DEMO  # imports Lightning, which most tests can do without
+
     shutil.rmtree(DEMO, ignore_errors=True)
     write_synthetic_scene(DEMO, suffix=".webp", tracks=False)
     for table in ("rigs", "frames"):  # repeat what the other tables say, for COLMAP 4
