@@ -6,15 +6,10 @@ Each decides from the module's schedule and the trainer's step alone, through
 
 from .checkpoint import RunCheckpoint
 from .density import DensityControl, DensityRules
-from .export import ExportScene
-from .exposure import ExposureCompensation
-from .finite import FiniteCodes
-from .frequency import FrequencyLimit
 from .growth import BudgetedGrowth, GrowthRules, SplatBudget
-from .kernels import CompileAhead
-from .live import LiveScene
-from .metric_report import MetricReport
-from .predictions import RenderWriter
+from .options import ExposureCompensation, FrequencyLimit
+from .outputs import ExportScene, LiveScene, RenderWriter
+from .precompile import CompileAhead
 from .progress import SplatProgressBar
 from .pruning import ContributionPruning, OpacityRegularization, OpacitySelection
 from .quantization import (
@@ -22,9 +17,11 @@ from .quantization import (
     CodebookInit,
     CodebookRefit,
     CodebookReplacement,
+    FiniteCodes,
     FreezeCodes,
     RateDistortion,
 )
+from .report import MetricReport
 from .schedule import PhaseSchedule, RateDecay, ShDegreeSchedule
 from .standard import STANDARD, standard
 

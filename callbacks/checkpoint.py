@@ -1,31 +1,217 @@
-"""Checkpoints of a run."""
+"""Checkpoints of a run: after a complete iteration, when a signal asks for a stop, and after an exception."""
 
 from __future__ import annotations
 
 import logging
+import signal
+import threading
+from collections.abc import Iterator
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, NamedTuple
 
+import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.loops.loop import _Loop
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from nsvq_lightning.io.atomic import atomic_path
-from nsvq_lightning.training.host import as_host
+from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.optim import raw_optimizer
+from nsvq_lightning.training.replicas import sum_over_processes
 from nsvq_lightning.training.run_folder import is_trial, run_folder
-from nsvq_lightning.training.schedule import Schedule
+from nsvq_lightning.training.schedule import Phase, Schedule
+from nsvq_lightning.training.state import RunState
 
-from .boundary import StepBoundary
-from .hosted import WritingCallback
-from .latch import LatchedCallback
-from .signals import HeldSignals
+from .base import StepCallback, WritingCallback
 
-__all__ = ["RunCheckpoint"]
+__all__ = ["GracefulStop", "RunCheckpoint", "StepSnapshot"]
+
 
 log = logging.getLogger(__name__)
 
+HELD = (signal.SIGINT, signal.SIGTERM)
+APART = 16
+"""Steps between two exchanges of signals among several GPUs."""
 
-class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
+
+class GracefulStop:
+    """Holds back the first SIGINT and the first SIGTERM until :meth:`deliver`; a second one acts at once.
+
+    With several processes a second one does nothing: launchers forward signals that a process has already received, and
+    a process that stopped in the middle of an iteration would leave the others waiting.
+
+    Delivering calls the previous handler, so the trainer and the interpreter still decide what a signal does. Ignored
+    signals stay ignored; outside the main thread, where Python allows no handlers, nothing is held back.
+    """
+
+    def __init__(self) -> None:
+        self._handlers: dict[int, Any] = {}
+        self._pending: list[int] = []
+        self._several = False
+
+    def hold(self, trainer: Trainer) -> None:
+        """Start to hold signals back."""
+        self._several = trainer.world_size > 1
+        if self._handlers or threading.current_thread() is not threading.main_thread():
+            return
+        for number in HELD:
+            handler = signal.getsignal(number)
+            if callable(handler):
+                self._handlers[number] = handler
+                signal.signal(number, self._receive)
+
+    def received(self, trainer: Trainer, *, now: bool = False) -> list[int]:
+        """Signals received by any process in the meantime: a collective, which every process must call.
+
+        Several GPUs ask each other only in one step of 16, because the answer is waited for.
+
+        Args:
+            trainer: The trainer.
+            now: Ask in any case; what one process says, all must say.
+        """
+        if trainer.world_size == 1:
+            return list(self._pending)
+        if trainer.strategy.root_device.type != "cpu" and trainer.global_step % APART and not now:
+            return []
+        own = torch.tensor([number in self._pending for number in HELD], dtype=torch.float32)
+        counts = sum_over_processes(trainer, own.to(trainer.strategy.root_device)).tolist()
+        return [number for number, count in zip(HELD, counts, strict=True) if count]
+
+    def deliver(self, received: list[int]) -> None:
+        """Call the previous handlers of the signals."""
+        for number in received:
+            if number in self._pending:
+                self._pending.remove(number)
+            if number in self._handlers:
+                self._handlers[number](number, None)
+
+    def release(self) -> None:
+        """Restore the previous handlers."""
+        for number, handler in self._handlers.items():
+            if signal.getsignal(number) == self._receive:
+                signal.signal(number, handler)
+        self._handlers, self._pending = {}, []
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        if number not in self._pending:
+            self._pending.append(number)
+            more = "" if self._several else "; a second one stops at once, without a checkpoint"
+            log.warning("%s: stopping after this iteration%s", signal.Signals(number).name, more)
+        elif not self._several:
+            self._pending.remove(number)
+            self._handlers[number](number, frame)
+
+
+Fingerprint = list[tuple[int, int, int]]
+
+
+class _Count(NamedTuple):
+    """A counter of codes, its version when it was copied, and the copy."""
+
+    tensor: Tensor
+    version: int
+    copy: Tensor
+
+    @property
+    def is_current(self) -> bool:
+        return self.tensor._version == self.version
+
+
+class StepSnapshot:
+    """Remembers what an iteration changes before its update, so that an incomplete one can be undone.
+
+    Until its update an iteration may change the phase, the SH degree, the usage counts of the codes, the trainer's
+    counters and the state of callbacks: a copy of these, which is small, is kept. All else (splats, codebooks, frozen
+    codes, side tables, Adam's moments) must be unchanged, judged by identity, address and version of every tensor. Once
+    the update begins, or a view of the next iteration is in the statistics, the state is lost: call :meth:`drop`.
+    """
+
+    def __init__(self) -> None:
+        self.iteration = -1
+        self._kept: Fingerprint | None = None
+        self._loop: object = None
+        self._places: list[dict[str, Any]] = []
+        self._progress: list[dict[str, int]] = []
+        self._callbacks: dict[str, Any] = {}
+        self._scalars = Phase.WARMUP, 0
+        self._counts: list[_Count] = []
+
+    def take(self, trainer: Trainer, module: LightningModule) -> None:
+        """Remember the state now, at the end of an iteration."""
+        host = as_host(module)
+        self.iteration = trainer.global_step
+        self._kept = _fingerprint(trainer, module)
+        if self._loop is not trainer.fit_loop:
+            self._loop, self._places = trainer.fit_loop, list(_places(trainer.fit_loop))
+        self._progress = [{k: v for k, v in place.items() if type(v) in (int, bool)} for place in self._places]
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
+        states = {callback.state_key: callback.state_dict() for callback in callbacks}
+        self._callbacks = {key: state for key, state in states.items() if state}
+        self._scalars = host.phase, host.active_sh_degree
+        before = {id(count.tensor): count for count in self._counts if count.is_current}
+        self._counts = [
+            before.get(id(tensor)) or _Count(tensor, tensor._version, tensor.clone()) for tensor in _counters(host)
+        ]
+
+    def drop(self) -> None:
+        """Forget the state: it can no longer be restored."""
+        self._kept = None
+
+    def restore(self, trainer: Trainer, module: LightningModule) -> bool:
+        """Restore the state of module and trainer; returns whether that was possible."""
+        host = as_host(module)
+        if self._kept is None or self._kept != _fingerprint(trainer, module):
+            return False
+        host.phase, host.active_sh_degree = self._scalars
+        for count in self._counts:
+            count.tensor.copy_(count.copy)
+        for place, numbers in zip(self._places, self._progress, strict=True):
+            place.update(numbers)
+        return True
+
+    def amend(self, checkpoint: dict[str, Any]) -> None:
+        """Restore the states of callbacks in a checkpoint that is about to be written."""
+        checkpoint["callbacks"] = self._callbacks
+
+
+def _fingerprint(trainer: Trainer, module: LightningModule) -> Fingerprint:
+    """Identity, address and version of every tensor that an iteration must not change before its update."""
+    changing = {id(tensor) for tensor in _counters(as_host(module))}
+    tensors: list[object] = [value for state in raw_optimizer(trainer).state.values() for value in state.values()]
+    # Not module.parameters() and module.buffers(), which take three times as long, and this runs in every step.
+    parts: list[nn.Module | None] = [module]
+    for part in parts:
+        if part is None:
+            continue
+        parts += part._modules.values()
+        tensors += part._parameters.values()
+        if not isinstance(part, RunState):
+            tensors += part._buffers.values()
+    return [
+        (id(tensor), tensor.data_ptr(), tensor._version)
+        for tensor in tensors
+        if isinstance(tensor, Tensor) and id(tensor) not in changing
+    ]
+
+
+def _counters(host: SplatHost) -> Iterator[Tensor]:
+    for quantizer in host.quantizers.values():
+        yield from (quantizer.usage, quantizer.window)
+
+
+def _places(loop: object) -> Iterator[dict[str, Any]]:
+    """The attribute dictionaries of one of Lightning's loops, of its inner loops and of their counters."""
+    yield vars(loop)
+    for value in vars(loop).values():
+        if isinstance(value, _Loop) or is_dataclass(value):
+            yield from _places(value)
+
+
+class RunCheckpoint(WritingCallback, StepCallback, Checkpoint):
     """Saves the whole state of the run in ``checkpoints/last.ckpt``: regularly, at ends of phases, and when it stops.
 
     ``fit --ckpt_path …/last.ckpt`` continues exactly where it was saved. Lightning calls checkpoint callbacks after all
@@ -65,8 +251,8 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
         self.folder = folder
         self.best_model_path = ""
         """Path of ``last_path`` under the name by which Lightning looks for ``ckpt_path="best"``."""
-        self._boundary = StepBoundary()
-        self._signals = HeldSignals()
+        self._snapshot = StepSnapshot()
+        self._stop = GracefulStop()
         self._saved = -1
         self._training = False
         self._amending = False
@@ -92,7 +278,7 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
         trainer.callbacks = [*(each for each in callbacks if each is not self), self]  # type: ignore[attr-defined]
         if stage == "fit":
             self.best_model_path, self._saved = "", -1
-            self._boundary.drop()
+            self._snapshot.drop()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start to hold back signals."""
@@ -100,50 +286,50 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
         if trainer.ckpt_path is not None:
             self.best_model_path, self._saved = str(trainer.ckpt_path), trainer.global_step
         self._training = True
-        self._signals.hold(trainer)
+        self._stop.hold(trainer)
 
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
         """The update begins: from here until the end of the iteration there is no state to save."""
-        self._boundary.drop()
+        self._snapshot.drop()
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Save when it is time; stop here if a signal came."""
         iteration = trainer.global_step
-        if iteration == 0 or not self._latch.first_time(iteration):
-            self._boundary.drop()  # of the next iteration some micro-batches are done
+        if iteration == 0 or not self._once.first_time(iteration):
+            self._snapshot.drop()  # of the next iteration some micro-batches are done
             return
         if trainer.world_size == 1:
-            self._boundary.take(trainer, pl_module)
+            self._snapshot.take(trainer, pl_module)
         if iteration == trainer.max_steps:
             return  # the end of training belongs to the checkpoint, too: it is saved then, and signals wait
-        received = self._signals.received(trainer)
+        received = self._stop.received(trainer)
         # One process writes its checkpoint when it has stopped; several can do so together only now.
         if self.is_due(as_host(pl_module).schedule, iteration) or (received and trainer.world_size > 1):
             self._save(trainer, pl_module)
-        self._signals.deliver(received)
+        self._stop.deliver(received)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save the end of the run."""
         if trainer.global_step > 0:
             self._save(trainer, pl_module)
         self._training = False
-        self._signals.deliver(self._signals.received(trainer, now=True))
-        self._signals.release()
+        self._stop.deliver(self._stop.received(trainer, now=True))
+        self._stop.release()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Save the last complete iteration if it still exists; say where to continue from."""
-        self._signals.release()
+        self._stop.release()
         if not self._training or is_trial(trainer):
             return
         self._training = False
-        if self._boundary.iteration != self._saved and self._boundary.restore(trainer, pl_module):
+        if self._snapshot.iteration != self._saved and self._snapshot.restore(trainer, pl_module):
             self._amending = True
             try:
                 self._save(trainer, pl_module)
             except Exception as error:  # the user must see what stopped the run
-                log.warning("the checkpoint of iteration %d could not be written: %s", self._boundary.iteration, error)
+                log.warning("the checkpoint of iteration %d could not be written: %s", self._snapshot.iteration, error)
             finally:
                 self._amending = False
         if self.last_path is not None:
@@ -154,12 +340,12 @@ class RunCheckpoint(WritingCallback, LatchedCallback, Checkpoint):
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         """After an incomplete iteration, store counters and callbacks as they were before it."""
         if self._amending:
-            self._boundary.amend(checkpoint)
+            self._snapshot.amend(checkpoint)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Restore the signal handlers in any case."""
         super().teardown(trainer, pl_module, stage)
-        self._signals.release()
+        self._stop.release()
 
     def _save(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if is_trial(trainer):

@@ -28,8 +28,7 @@ from nsvq_lightning.training.replicas import check_replicas, sum_over_processes
 from nsvq_lightning.training.schedule import Phase, next_iteration
 from nsvq_lightning.training.train_views import train_contributions
 
-from .finite import FiniteSearch, keep_finite_splats
-from .latch import LatchedCallback
+from .base import FiniteSearch, StepCallback, keep_finite_splats
 
 __all__ = [
     "Densification",
@@ -233,7 +232,7 @@ def lower_opacities(opacities: Tensor, ceiling: float) -> Tensor:
 log = logging.getLogger(__name__)
 
 
-class Densification(LatchedCallback, ABC):
+class Densification(StepCallback, ABC):
     """Base of the callbacks that add and remove splats by what the views of the last iterations have shown.
 
     A subclass names its side tables, asks the module for what a view must bring (:meth:`ask`), adds a view to the
@@ -331,7 +330,7 @@ class Densification(LatchedCallback, ABC):
         if self.has_asked(host):
             self._observe(trainer, host, self._view(trainer, host, outputs or {}))
         iteration = trainer.global_step
-        if iteration == 0 or not self._latch.first_time(iteration):
+        if iteration == 0 or not self._once.first_time(iteration):
             return
         if self._search.is_due(trainer):
             keep_finite_splats(trainer, host)

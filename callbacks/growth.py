@@ -26,8 +26,8 @@ from nsvq_lightning.training.replicas import check_replicas
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.training.train_views import needed_scene
 
+from .base import HostedCallback
 from .density import Densification
-from .hosted import HostedCallback
 from .quantization import RateDistortion
 
 __all__ = [

@@ -20,9 +20,8 @@ from nsvq_lightning.training.replicas import check_replicas
 from nsvq_lightning.training.schedule import Phase, next_iteration
 from nsvq_lightning.training.train_views import train_contributions
 
+from .base import HostedCallback, StepCallback
 from .growth import draw_rows
-from .hosted import HostedCallback
-from .latch import LatchedCallback
 
 __all__ = ["ContributionPruning", "OpacityRegularization", "OpacitySelection", "pressure"]
 
@@ -72,7 +71,7 @@ START_OF_LINE = 0.8
 """Where the line starts, as a share of the opacity of the last splat within the budget."""
 
 
-class OpacitySelection(LatchedCallback):
+class OpacitySelection(StepCallback):
     """Removes splats in the prune phase until a budget is left: those that do not hold their opacity under pressure.
 
     A term in the loss pushes all opacities down while their learning rate is raised; splats that matter for the photos
@@ -188,7 +187,7 @@ class OpacitySelection(LatchedCallback):
     ) -> None:
         """Prune when due, and end the selection once the budget is reached."""
         host, iteration = as_host(pl_module), trainer.global_step
-        if iteration == 0 or not self._latch.first_time(iteration) or not self._is_selecting(host, iteration):
+        if iteration == 0 or not self._once.first_time(iteration) or not self._is_selecting(host, iteration):
             return
         since, length = self._place(host, iteration)
         budget = self.limit(host)
@@ -265,7 +264,7 @@ def pressure(opacities: Tensor, strength: float, *, gentle: bool) -> Tensor:
     return 2 * strength * (above / held).mean() * (1 / held + slope) / count
 
 
-class ContributionPruning(LatchedCallback):
+class ContributionPruning(StepCallback):
     """Once before the quantize phase, removes the splats that contribute least to the train views.
 
     The contribution of a splat is its blending weight, summed over all pixels
@@ -318,7 +317,7 @@ class ContributionPruning(LatchedCallback):
         """Prune after iteration ``at``, now that all callbacks have finished with it."""
         host = as_host(pl_module)
         iteration = next_iteration(trainer) - 1
-        if self.share and iteration == host.schedule.iteration(self.at) and self._latch.first_time(iteration):
+        if self.share and iteration == host.schedule.iteration(self.at) and self._once.first_time(iteration):
             self._prune(trainer, host)
 
     def _prune(self, trainer: Trainer, host: SplatHost) -> None:

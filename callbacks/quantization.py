@@ -24,6 +24,7 @@ from nsvq_lightning.quantize.base import (
     held_codes,
     is_holding,
     is_limitable,
+    is_mendable,
     is_refittable,
 )
 from nsvq_lightning.quantize.nearest import cheapest, code_rates
@@ -36,15 +37,14 @@ from nsvq_lightning.training.replicas import check_replicas, follow_first, from_
 from nsvq_lightning.training.schedule import Phase, next_iteration
 from nsvq_lightning.training.train_views import needed_scene, train_cameras, train_contributions
 
-from .finite import keep_finite_splats
-from .hosted import HostedCallback
-from .latch import LatchedCallback, StepLatch
+from .base import FiniteSearch, HostedCallback, OncePerStep, StepCallback, keep_finite_splats
 
 __all__ = [
     "CanonicalCovariance",
     "CodebookInit",
     "CodebookRefit",
     "CodebookReplacement",
+    "FiniteCodes",
     "FreezeCodes",
     "RateDistortion",
     "perplexity",
@@ -56,7 +56,7 @@ log = logging.getLogger(__name__)
 Mode = Literal["none", "sign", "full", "auto"]
 
 
-class CanonicalCovariance(LatchedCallback):
+class CanonicalCovariance(StepCallback):
     """After the last iteration before the quantize phase, gives like covariances like scales and rotations.
 
     ``mode`` gives each one of its 48 equivalent pairs of scale and rotation
@@ -135,7 +135,7 @@ class CanonicalCovariance(LatchedCallback):
         acts = self.mode != "none" or self.floor > 0
         if not acts or not quantized or first is None or iteration != first - 1:
             return
-        if self._latch.first_time(iteration):
+        if self._once.first_time(iteration):
             if self.floor and "scales" in quantized:
                 self._raise(trainer, host)
             form = self._chosen(trainer, host) if self.mode == "auto" else self.mode
@@ -183,7 +183,7 @@ def perplexity(usage: Tensor) -> float:
     return float(entropy.exp()) if bool(usage.any()) else 0.0
 
 
-class CodebookInit(LatchedCallback):
+class CodebookInit(StepCallback):
     """At the first iteration of the quantize phase, fit every codebook to the rows of all splats (k-means).
 
     NaN and infinite splats are dropped first, whenever they were last searched for.
@@ -227,7 +227,7 @@ class CodebookInit(LatchedCallback):
         """Fit when the quantize phase starts."""
         host = as_host(pl_module)
         iteration = next_iteration(trainer)
-        if iteration != host.schedule.first_of(Phase.QUANTIZE) or not self._latch.first_time(iteration):
+        if iteration != host.schedule.first_of(Phase.QUANTIZE) or not self._once.first_time(iteration):
             return
         keep_finite_splats(trainer, host)
         weights = row_weights(train_contributions(trainer, host)) if self.weights == "contribution" else None
@@ -245,7 +245,7 @@ class CodebookInit(LatchedCallback):
             log.info("iteration %d: codebooks for %d splats: %s", iteration, len(host.splats), sizes)
 
 
-class CodebookReplacement(LatchedCallback):
+class CodebookReplacement(StepCallback):
     """Replaces inactive codes with copies of active ones, at first often, then less often (paper, section 3.2).
 
     All numbers are iterations of the reference run; the paper's are every 100 from 20 100 to 22 000, then every 500 up
@@ -318,7 +318,7 @@ class CodebookReplacement(LatchedCallback):
         """Replace the inactive codes of every codebook when it is time."""
         host = as_host(pl_module)
         iteration = trainer.global_step
-        if not self.is_due(host, iteration) or not self._latch.first_time(iteration):
+        if not self.is_due(host, iteration) or not self._once.first_time(iteration):
             return
         if self.jitter is not None:
             keep_finite_splats(trainer, host)
@@ -444,7 +444,7 @@ LEAST = 0.05
 """Share of the mean that no splat's sensitivity is below: a test view may see what no train view sees."""
 
 
-class RateDistortion(LatchedCallback):
+class RateDistortion(StepCallback):
     """In the quantize phase, gives every splat the code with the least error + λ · bits instead of the nearest one.
 
     The error is that of the pictures: a code's squared distance times what it does to the train views
@@ -477,13 +477,13 @@ class RateDistortion(LatchedCallback):
         self.strength = strength
         self.attributes = tuple(attributes)
         self._prices: dict[str, Tensor] = {}
-        self._turn = StepLatch()
+        self._turn = OncePerStep()
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Forget an earlier fit."""
         super().setup(trainer, pl_module, stage)
         if stage == "fit":
-            self._prices, self._turn = {}, StepLatch()
+            self._prices, self._turn = {}, OncePerStep()
 
     def state_dict(self) -> dict[str, Any]:
         """The last iterations acted on, and what a bit costs each splat."""
@@ -504,7 +504,7 @@ class RateDistortion(LatchedCallback):
         if not self.strength or host.schedule.phase_at(iteration) is not Phase.QUANTIZE:
             return
         due = iteration == host.schedule.first_of(Phase.QUANTIZE) or not self._fits(host)
-        if due and self._latch.first_time(iteration):
+        if due and self._once.first_time(iteration):
             self._measure(trainer, host, iteration)
             self._choose(host, slice(None))
 
@@ -557,7 +557,66 @@ class RateDistortion(LatchedCallback):
             cast(Holding, quantizer).hold(codes)
 
 
-class FreezeCodes(LatchedCallback):
+class FiniteCodes(StepCallback):
+    """Searches codebooks for NaN and infinite values, from the quantize phase on, and mends such codes with a warning.
+
+    As with non-finite splats (:class:`~nsvq_lightning.callbacks.DensityControl`), the run continues. A code cannot be
+    dropped, as that would renumber the others: the quantizer gives it a new value
+    (:class:`nsvq_lightning.quantize.base.Mendable`), and its Adam moments are reset.
+
+    Args:
+        every: Iterations between two searches; a step whose loss is not finite always causes one.
+
+    Raises:
+        ValueError: ``every`` is below 1.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import FiniteCodes, standard
+        >>> callbacks = standard(codebook_finite=FiniteCodes(every=50))  # --callbacks.codebook_finite.every=50
+        >>> [type(callback).__name__ for callback in callbacks].count("FiniteCodes")
+        1
+        >>> FiniteCodes(every=0)
+        Traceback (most recent call last):
+        ValueError: every must be at least 1, got 0
+    """
+
+    def __init__(self, every: int = 100) -> None:
+        super().__init__()
+        self._search = FiniteSearch(every)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Search when due.
+
+        Raises:
+            FloatingPointError: All codes of an attribute are non-finite, or its quantizer cannot mend them.
+        """
+        host, iteration = as_host(pl_module), trainer.global_step
+        if iteration == 0 or host.schedule.phase_at(iteration) < Phase.QUANTIZE:
+            return
+        if self._once.first_time(iteration) and self._search.is_due(trainer):
+            self._mend(trainer, host, iteration)
+
+    def _mend(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
+        for name, quantizer in host.quantizers.items():
+            broken = (~torch.isfinite(quantizer.codebook.detach()).all(1)).nonzero()[:, 0]
+            if len(broken) == 0:
+                continue
+            found = f"step {iteration}: {len(broken)} of {len(quantizer.codebook)} codes of {name} are non-finite"
+            if len(broken) == len(quantizer.codebook) or not is_mendable(quantizer):
+                raise FloatingPointError(f"{found}; lower the learning rates")
+            quantizer.mend(broken, host.rows(name), generator(host.seed, iteration, "mend", name))
+            reset_moments(raw_optimizer(trainer), codebook_group(name), broken)
+            log.warning("%s (%s); mended", found, _numbers(broken.tolist()))
+
+
+def _numbers(rows: list[int]) -> str:
+    shown = ", ".join(map(str, rows[:5]))
+    return f"rows {shown}{', …' * (len(rows) > 5)}"
+
+
+class FreezeCodes(StepCallback):
     """At the first iteration of fine-tuning, freezes the code of every splat: the one it holds, or else the nearest.
 
     If a quantizer has an attribute ``fitted`` (whether its codebook has been placed), it must be true by then.
@@ -599,7 +658,7 @@ class FreezeCodes(LatchedCallback):
         iteration, first = next_iteration(trainer), host.schedule.first_of(Phase.FINETUNE)
         if first is None or iteration < first:
             return
-        if iteration == first and self._latch.first_time(iteration):
+        if iteration == first and self._once.first_time(iteration):
             self._freeze(trainer, host, host.quantizers)
         elif stale := self._stale(host):
             self._warn(iteration, stale)

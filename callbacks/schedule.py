@@ -12,7 +12,7 @@ from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.schedule import Phase, Schedule, next_iteration
 from nsvq_lightning.training.train_views import needed_scene
 
-from .hosted import HostedCallback
+from .base import HostedCallback
 
 __all__ = ["PhaseSchedule", "RateDecay", "ShDegreeSchedule"]
 

@@ -7,13 +7,9 @@ from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint, ProgressBar
 
 from .checkpoint import RunCheckpoint
 from .density import DensityControl
-from .export import ExportScene
-from .finite import FiniteCodes
 from .growth import SplatBudget
-from .kernels import CompileAhead
-from .live import LiveScene
-from .metric_report import MetricReport
-from .predictions import RenderWriter
+from .outputs import ExportScene, LiveScene, RenderWriter
+from .precompile import CompileAhead
 from .progress import SplatProgressBar
 from .pruning import ContributionPruning, OpacityRegularization, OpacitySelection
 from .quantization import (
@@ -21,9 +17,11 @@ from .quantization import (
     CodebookInit,
     CodebookRefit,
     CodebookReplacement,
+    FiniteCodes,
     FreezeCodes,
     RateDistortion,
 )
+from .report import MetricReport
 from .schedule import PhaseSchedule, RateDecay, ShDegreeSchedule
 
 __all__ = ["STANDARD", "standard"]

@@ -20,8 +20,7 @@ from nsvq_lightning.callbacks import (
     PhaseSchedule,
     ShDegreeSchedule,
 )
-from nsvq_lightning.callbacks.finite import keep_finite_splats
-from nsvq_lightning.callbacks.latch import StepLatch
+from nsvq_lightning.callbacks.base import OncePerStep, keep_finite_splats
 from nsvq_lightning.callbacks.quantization import perplexity
 from nsvq_lightning.quantize import NSVQ, StraightThrough
 from nsvq_lightning.random import generator
@@ -95,7 +94,7 @@ def test_perplexity_by_hand(usage: list[int], expected: float) -> None:
 
 
 def test_the_latch_opens_once_an_iteration() -> None:
-    latch = StepLatch()
+    latch = OncePerStep()
     assert [latch.first_time(i) for i in (0, 0, 1, 1, 2)] == [True, False, True, False, True]
 
 

@@ -12,7 +12,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import Recipe, RunFactory
 
 from nsvq_lightning.callbacks import CompileAhead
-from nsvq_lightning.callbacks import kernels as callback_module
+from nsvq_lightning.callbacks import precompile as callback_module
 from nsvq_lightning.quantize import NSVQ, CodebookQuantizer, DiVeQ, PostHoc, StraightThrough, TrainedStraightThrough
 from nsvq_lightning.training import rehearsal
 from nsvq_lightning.training.module import SplatModule

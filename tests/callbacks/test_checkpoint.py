@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nsvq_lightning.callbacks.signals import HeldSignals
+from nsvq_lightning.callbacks.checkpoint import GracefulStop
 
 
 def trainer(world_size: int, other: tuple[float, float] = (0.0, 0.0), device: str = "cpu", step: int = 1) -> Any:
@@ -36,7 +36,7 @@ def acted() -> Iterator[list[int]]:
 
 @pytest.mark.parametrize(("world_size", "at_once"), [(1, 1), (2, 0)])
 def test_a_second_signal_acts_at_once_in_one_process_alone(world_size: int, at_once: int, acted: list[int]) -> None:
-    held = HeldSignals()
+    held = GracefulStop()
     held.hold(trainer(world_size))
     signal.raise_signal(signal.SIGTERM)
     assert acted == []
@@ -50,7 +50,7 @@ def test_a_second_signal_acts_at_once_in_one_process_alone(world_size: int, at_o
 
 
 def test_a_signal_of_another_process_is_taken_for_ones_own(acted: list[int]) -> None:
-    held = HeldSignals()
+    held = GracefulStop()
     held.hold(trainer(2))
     assert held.received(trainer(2)) == []
     assert held.received(trainer(2, other=(0.0, 1.0))) == [signal.SIGTERM]
@@ -60,7 +60,7 @@ def test_a_signal_of_another_process_is_taken_for_ones_own(acted: list[int]) -> 
 
 
 def test_several_gpus_ask_each_other_now_and_then() -> None:
-    held, other = HeldSignals(), (0.0, 1.0)
+    held, other = GracefulStop(), (0.0, 1.0)
     answers = [held.received(trainer(1, device="meta", step=step)) for step in (1, 16)]
     assert answers == [[], []]  # alone, nobody is asked
     assert held.received(trainer(2, other, device="meta", step=15)) == []

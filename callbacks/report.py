@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from torch import Tensor
 from torchmetrics import Metric
 
@@ -35,10 +36,23 @@ from nsvq_lightning.training.run_folder import is_trial, run_folder
 from nsvq_lightning.training.schedule import next_iteration
 from nsvq_lightning.training.train_views import scene_of
 
-from .hosted import WritingCallback
-from .watchers import tell_watchers
+from .base import WritingCallback
 
-__all__ = ["MetricReport"]
+__all__ = ["MetricReport", "notify_monitors"]
+
+
+def notify_monitors(trainer: Trainer, module: LightningModule) -> None:
+    """Let early stopping and checkpoints that monitor ``report/…`` act now.
+
+    They wait for the end of an epoch or a validation, depending on their settings and the trainer's, and act in one of
+    these hooks. Here the sampler is endless and no validation runs, so neither ever comes.
+    """
+    watchers: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
+    for watcher in watchers:
+        if isinstance(watcher, EarlyStopping | ModelCheckpoint) and (watcher.monitor or "").startswith("report/"):
+            watcher.on_train_epoch_end(trainer, module)
+            watcher.on_validation_end(trainer, module)
+
 
 log = logging.getLogger(__name__)
 
@@ -138,7 +152,7 @@ class MetricReport(WritingCallback):
             return
         with host.stopwatch.paused(host.device), self._timed("evaluations"):
             self._evaluate(trainer, host, iteration, datamodule.test_dataloader())
-            tell_watchers(trainer, module)
+            notify_monitors(trainer, module)
 
     @torch.no_grad()
     def _evaluate(self, trainer: Trainer, host: SplatHost, iteration: int, views: Any) -> None:

@@ -19,6 +19,7 @@ from nsvq_lightning.training.module import SplatModule
 
 __all__ = ["CompileAhead"]
 
+
 log = logging.getLogger(__name__)
 
 

@@ -9,7 +9,7 @@ from lightning.pytorch import Callback
 from runs import fit
 
 from nsvq_lightning.callbacks import LiveScene, PhaseSchedule
-from nsvq_lightning.callbacks import live as live_callback
+from nsvq_lightning.callbacks import outputs as live_callback
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io import load
 from nsvq_lightning.io.nsvq.file import read_header

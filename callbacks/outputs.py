@@ -1,0 +1,201 @@
+"""What a run writes besides its report: scene files, predicted pictures, and the scene to look at while it trains."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import BasePredictionWriter
+
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.formats import FORMATS, save
+from nsvq_lightning.io.nsvq.file import as_stored
+from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.report.pictures import file_stem, write_png
+from nsvq_lightning.report.viewer import BACKGROUNDS, some_cameras, write_viewer
+from nsvq_lightning.splats.arrays import SplatArrays
+from nsvq_lightning.training import live
+from nsvq_lightning.training.host import as_host
+from nsvq_lightning.training.run_folder import is_trial, run_folder
+from nsvq_lightning.training.train_views import scene_of
+
+from .base import WritingCallback
+
+__all__ = ["ExportScene", "LiveScene", "RenderWriter"]
+
+
+log = logging.getLogger(__name__)
+
+
+EXPORT_FORMATS = tuple(suffix.removeprefix(".") for suffix in FORMATS)
+"""Formats that can be written."""
+DEFAULT_EXPORT = ("nsvq", "ply")
+"""The compressed scene, and its decoded splats for viewers."""
+
+
+class ExportScene(WritingCallback):
+    """Writes the scene when training ends.
+
+    The compressed scene is ``scene.nsvq``, and ``scene.ply`` has its decoded splats, for any viewer. With
+    ``scene.nsvq`` comes ``viewer.html``, a page that holds it and shows it in a browser.
+
+    Args:
+        formats: Suffixes without the dot; ``sog``, ``spz`` and ``splat`` are smaller files for viewers.
+        folder: Where; None is the folder of the run.
+
+    Raises:
+        ValueError: An unknown format.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import ExportScene
+        >>> ExportScene(["nsvq", "sog"]).formats  # --callbacks.export.formats=[nsvq,sog]
+        ('nsvq', 'sog')
+        >>> ExportScene(["obj"])
+        Traceback (most recent call last):
+        ValueError: unknown export formats obj; choose from ply, nsvq, sog, spz, splat
+    """
+
+    def __init__(self, formats: Sequence[str] = DEFAULT_EXPORT, folder: str | None = None) -> None:
+        unknown = sorted(set(formats) - set(EXPORT_FORMATS))
+        if unknown:
+            raise ValueError(f"unknown export formats {', '.join(unknown)}; choose from {', '.join(EXPORT_FORMATS)}")
+        self.formats = tuple(formats)
+        self.folder = folder
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write the files, on the first process."""
+        folder = run_folder(trainer) if self.folder is None else Path(self.folder)
+        if is_trial(trainer) or not trainer.is_global_zero:
+            return
+        host = as_host(pl_module)
+        scene = host.compressed().finite()
+        # The files of viewers hold what the compressed one decodes to: found once, however many there are.
+        decoded = as_stored(scene, host.storage) if set(self.formats) - {"nsvq"} else scene
+        folder.mkdir(parents=True, exist_ok=True)
+        for suffix in self.formats:
+            path = folder / f"scene.{suffix}"
+            size = save(scene, path, host.storage) if suffix == "nsvq" else save(decoded, path)
+            log.info("wrote %s (%d bytes)", path, size)
+        photos = getattr(getattr(trainer, "datamodule", None), "scene", None)
+        if "nsvq" in self.formats and photos is not None:
+            page = folder / "viewer.html"
+            title = page.resolve().parent.parent.name
+            background = BACKGROUNDS.get(host.background, BACKGROUNDS["black"])
+            size = write_viewer(page, folder / "scene.nsvq", some_cameras(photos), title, background)
+            log.info("wrote %s (%d bytes)", page, size)
+
+
+class RenderWriter(BasePredictionWriter):
+    """Writes every predicted view as a PNG named after its photo.
+
+    Args:
+        folder: Where; None is ``predictions`` in the folder of the run.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import RenderWriter, standard
+        >>> writer = RenderWriter(folder="views")  # --callbacks.predictions.folder=views
+        >>> [callback.folder for callback in standard(predictions=writer) if isinstance(callback, RenderWriter)]
+        ['views']
+    """
+
+    def __init__(self, folder: str | None = None) -> None:
+        super().__init__()  # after each batch
+        self.folder = folder
+        self._target = Path()
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Take the folder of the run.
+
+        Raises:
+            FileExistsError: It holds another run.
+        """
+        super().setup(trainer, pl_module, stage)
+        if stage == "predict" and self.folder is None:
+            run_folder(trainer)
+
+    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Make the folder in a hook that all processes call: some have fewer views than others."""
+        self._target = run_folder(trainer) / "predictions" if self.folder is None else Path(self.folder)
+        if not is_trial(trainer):
+            self._target.mkdir(parents=True, exist_ok=True)
+
+    def write_on_batch_end(self, trainer: Trainer, pl_module: LightningModule, prediction: Any, *args: Any) -> None:
+        """Write one picture."""
+        if is_trial(trainer):
+            return
+        scene = scene_of(trainer)
+        stem = file_stem(prediction["name"], scene.names if scene is not None else ())
+        write_png(self._target / f"{stem}.png", prediction["image"])
+
+    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say where the pictures are."""
+        if not is_trial(trainer):
+            log.info("rendered views are in %s", self._target)
+
+
+CHECKED_EVERY = 20
+"""Iterations after which the callback sees whether somebody asks; it takes some microseconds."""
+SHARE = 0.05
+"""Largest share of the time that goes into showing."""
+
+
+class LiveScene(WritingCallback):
+    """Shows the splats of a running fit to ``nsvq view --live``.
+
+    It writes them into the folder of the run when somebody asks, and not otherwise. They are those that a file written
+    at that moment would hold, stored without loss in ``live.nsvq``. At most a twentieth of the time goes into it, and
+    none of that counts as training time. The file goes when the run ends.
+
+    Example:
+        >>> from nsvq_lightning.callbacks import STANDARD, LiveScene
+        >>> STANDARD["live"] is LiveScene  # --callbacks.live=null leaves it out
+        True
+    """
+
+    def __init__(self) -> None:
+        self._running = False
+        self._answered = 0
+        self._next = 0.0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Forget who asked an earlier part of the run."""
+        super().on_train_start(trainer, pl_module)
+        self._running = not is_trial(trainer)
+        self._answered, self._next = live.asked(run_folder(trainer)), 0.0
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Answer a viewer."""
+        due = batch_idx % CHECKED_EVERY == 0 and time.monotonic() >= self._next
+        if not (self._running and due and trainer.is_global_zero):
+            return
+        folder = run_folder(trainer)
+        asked = live.asked(folder)
+        if asked == self._answered:
+            return
+        host, began = as_host(pl_module), time.monotonic()
+        with host.stopwatch.paused(host.device):
+            splats = type(host.splats).from_tensors(*host.hard_splats(host.phase)).to("cpu")
+            state = {"iteration": trainer.global_step, "of": trainer.max_steps, "phase": host.phase.name.lower()}
+            if host.history:
+                state["psnr"] = f"{host.history[-1]['psnr']:.2f}"
+            config = {"antialiased": getattr(pl_module, "antialiased", False), "live": state}
+            scene = CompressedScene.from_arrays(SplatArrays.from_splats(splats), config=config)
+            save(scene, folder / live.LIVE_SCENE, Storage("paper"))
+        self._answered, ended = asked, time.monotonic()
+        self._next = ended + (ended - began) / SHARE
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave the finished scene alone."""
+        if self._running and trainer.is_global_zero:
+            live.end(run_folder(trainer))
+        self._running = False
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Leave nothing behind that only a running fit has."""
+        self.on_fit_end(trainer, pl_module)
