@@ -273,7 +273,7 @@ class MetricReport(WritingCallback):
 
 def _preview(path: Path, image: Tensor, photo: Tensor) -> None:
     """Write the photo beside the render."""
-    write_png(path, torch.cat([photo, image], dim=1))
+    write_png(path, torch.cat([eight_bit(photo), image], dim=1))
 
 
 def _mean(scores: list[ViewScore], name: str) -> float:

@@ -31,6 +31,7 @@ from nsvq_lightning.callbacks import (
 )
 from nsvq_lightning.compute.devices import LateNumber
 from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.data.images import read_image
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.nsvq.file import read_header, read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.precision import Storage
@@ -114,6 +115,14 @@ def test_the_file_has_the_size_of_the_formula(whole: Whole, tmp_path: Path) -> N
     write_nsvq(path, whole.module.compressed(), "paper")
     assert path.stat().st_size == 16 * n + (n * 18 + 7) // 8 + codebooks + read_header(path).size
     assert len(load(whole.folder / "scene.ply")) == n
+
+
+def test_the_preview_shows_the_photo_beside_the_render(whole: Whole) -> None:
+    data: ColmapDataModule = whole.trainer.datamodule  # type: ignore[attr-defined]
+    view = data.scene.view(data.scene.test[0])
+    preview = read_image(whole.folder / "preview.png")
+    assert np.array_equal(preview[:, : view.camera.width], view.image)
+    assert preview.shape[1] == 2 * view.camera.width
 
 
 def test_the_report_measures_the_decoded_file(whole: Whole, demo_scene: Path) -> None:
