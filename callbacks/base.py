@@ -141,7 +141,7 @@ class FiniteSearch:
     """Decides when to search for NaN and infinite values: at intervals, and after a step without an update.
 
     After a step with a non-finite loss no parameter has a gradient, on any process
-    (:class:`nsvq_lightning.SplatModule`, :class:`nsvq_lightning.training.strategies.ViewParallelStrategy`). So all
+    (:class:`nsvq_lightning.SplatModule`, :class:`nsvq_lightning.training.distributed.ViewParallelStrategy`). So all
     processes decide alike without communication.
 
     Args:

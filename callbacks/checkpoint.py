@@ -19,9 +19,9 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from nsvq_lightning.io.atomic import atomic_path
+from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.optim import raw_optimizer
-from nsvq_lightning.training.replicas import sum_over_processes
 from nsvq_lightning.training.run_folder import is_trial, run_folder
 from nsvq_lightning.training.schedule import Phase, Schedule
 from nsvq_lightning.training.state import RunState

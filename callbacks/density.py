@@ -20,13 +20,13 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.splats import RawSplats
+from nsvq_lightning.training.distributed import check_replicas, sum_over_processes
 from nsvq_lightning.training.edit import append_rows, keep_rows, replace_attribute, reset_moments
-from nsvq_lightning.training.footprint import say_footprint
 from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.memory_estimate import say_footprint
 from nsvq_lightning.training.optim import raw_optimizer
-from nsvq_lightning.training.replicas import check_replicas, sum_over_processes
+from nsvq_lightning.training.scene_access import train_contributions
 from nsvq_lightning.training.schedule import Phase, next_iteration
-from nsvq_lightning.training.train_views import train_contributions
 
 from .base import FiniteSearch, StepCallback, keep_finite_splats
 

@@ -19,12 +19,12 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.splats import RawSplats
+from nsvq_lightning.training.distributed import check_replicas
 from nsvq_lightning.training.edit import append_rows, keep_rows
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.optim import raw_optimizer
-from nsvq_lightning.training.replicas import check_replicas
+from nsvq_lightning.training.scene_access import needed_scene
 from nsvq_lightning.training.schedule import Phase
-from nsvq_lightning.training.train_views import needed_scene
 
 from .base import HostedCallback
 from .density import Densification

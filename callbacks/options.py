@@ -12,11 +12,11 @@ from torch import Tensor
 
 from nsvq_lightning.compression.importance import pixel_sizes
 from nsvq_lightning.data.scene import View
+from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.edit import raise_scales
 from nsvq_lightning.training.host import as_host
-from nsvq_lightning.training.replicas import sum_over_processes
+from nsvq_lightning.training.scene_access import needed_scene, train_cameras
 from nsvq_lightning.training.schedule import Phase, next_iteration
-from nsvq_lightning.training.train_views import needed_scene, train_cameras
 
 from .base import HostedCallback
 

@@ -18,10 +18,10 @@ from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.report.pictures import file_stem, write_png
 from nsvq_lightning.report.viewer import BACKGROUNDS, some_cameras, write_viewer
 from nsvq_lightning.splats.arrays import SplatArrays
-from nsvq_lightning.training import live
+from nsvq_lightning.training import live_preview
 from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.run_folder import is_trial, run_folder
-from nsvq_lightning.training.train_views import scene_of
+from nsvq_lightning.training.scene_access import scene_of
 
 from .base import WritingCallback
 
@@ -165,7 +165,7 @@ class LiveScene(WritingCallback):
         """Forget who asked an earlier part of the run."""
         super().on_train_start(trainer, pl_module)
         self._running = not is_trial(trainer)
-        self._answered, self._next = live.asked(run_folder(trainer)), 0.0
+        self._answered, self._next = live_preview.asked(run_folder(trainer)), 0.0
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -175,7 +175,7 @@ class LiveScene(WritingCallback):
         if not (self._running and due and trainer.is_global_zero):
             return
         folder = run_folder(trainer)
-        asked = live.asked(folder)
+        asked = live_preview.asked(folder)
         if asked == self._answered:
             return
         host, began = as_host(pl_module), time.monotonic()
@@ -186,14 +186,14 @@ class LiveScene(WritingCallback):
                 state["psnr"] = f"{host.history[-1]['psnr']:.2f}"
             config = {"antialiased": getattr(pl_module, "antialiased", False), "live": state}
             scene = CompressedScene.from_arrays(SplatArrays.from_splats(splats), config=config)
-            save(scene, folder / live.LIVE_SCENE, Storage("paper"))
+            save(scene, folder / live_preview.LIVE_SCENE, Storage("paper"))
         self._answered, ended = asked, time.monotonic()
         self._next = ended + (ended - began) / SHARE
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Leave the finished scene alone."""
         if self._running and trainer.is_global_zero:
-            live.end(run_folder(trainer))
+            live_preview.end(run_folder(trainer))
         self._running = False
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:

@@ -13,12 +13,12 @@ from torch.optim import Optimizer
 
 from nsvq_lightning.compression.importance import least_contributing, most_contributing
 from nsvq_lightning.random import generator
+from nsvq_lightning.training.distributed import check_replicas
 from nsvq_lightning.training.edit import keep_rows
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.optim import raw_optimizer
-from nsvq_lightning.training.replicas import check_replicas
+from nsvq_lightning.training.scene_access import train_contributions
 from nsvq_lightning.training.schedule import Phase, next_iteration
-from nsvq_lightning.training.train_views import train_contributions
 
 from .base import HostedCallback, StepCallback
 from .growth import draw_rows

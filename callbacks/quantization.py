@@ -30,12 +30,12 @@ from nsvq_lightning.quantize.base import (
 from nsvq_lightning.quantize.nearest import cheapest, code_rates
 from nsvq_lightning.random import derive_seed, generator
 from nsvq_lightning.splats.canonical_covariance import Form, canonical
+from nsvq_lightning.training.distributed import check_replicas, follow_first, from_first_process, sum_over_processes
 from nsvq_lightning.training.edit import change_coordinates, raise_scales, reset_moments, trainable_rows
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.optim import codebook_group, raw_optimizer
-from nsvq_lightning.training.replicas import check_replicas, follow_first, from_first_process, sum_over_processes
+from nsvq_lightning.training.scene_access import needed_scene, train_cameras, train_contributions
 from nsvq_lightning.training.schedule import Phase, next_iteration
-from nsvq_lightning.training.train_views import needed_scene, train_cameras, train_contributions
 
 from .base import FiniteSearch, HostedCallback, OncePerStep, StepCallback, keep_finite_splats
 

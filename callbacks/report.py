@@ -28,13 +28,12 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.report.evaluation import ViewScore, evaluate
 from nsvq_lightning.report.files import paper_level, summarize, write_curve, write_curve_csv, write_metrics, write_views
 from nsvq_lightning.report.page import RunPage
-from nsvq_lightning.report.picture_logs import log_pictures
-from nsvq_lightning.report.pictures import comparison, file_stem, write_png
+from nsvq_lightning.report.pictures import comparison, file_stem, log_pictures, write_png
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.host import SplatHost, as_host
 from nsvq_lightning.training.run_folder import is_trial, run_folder
+from nsvq_lightning.training.scene_access import scene_of
 from nsvq_lightning.training.schedule import next_iteration
-from nsvq_lightning.training.train_views import scene_of
 
 from .base import WritingCallback
 

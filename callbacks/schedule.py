@@ -9,8 +9,8 @@ from lightning.pytorch import LightningModule, Trainer
 
 from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.optim import raw_optimizer
+from nsvq_lightning.training.scene_access import needed_scene
 from nsvq_lightning.training.schedule import Phase, Schedule, next_iteration
-from nsvq_lightning.training.train_views import needed_scene
 
 from .base import HostedCallback
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nsvq_lightning.commands.messages import Parser
-from nsvq_lightning.commands.positive import positive
+from nsvq_lightning.commands.arguments import Parser, positive
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
 
@@ -95,7 +94,7 @@ def _compress(options: argparse.Namespace) -> int:
     from nsvq_lightning.compression.ladder import Compressor
     from nsvq_lightning.compression.viewpoints import decibels, views_of
     from nsvq_lightning.io.formats import read_scene
-    from nsvq_lightning.io.nsvq.frame import with_origin
+    from nsvq_lightning.io.nsvq.header import with_origin
     from nsvq_lightning.training.run_folder import claim_version
 
     source: Path = options.input

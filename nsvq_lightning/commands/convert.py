@@ -13,16 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.commands.messages import Parser
+from nsvq_lightning.commands.arguments import Parser
 from nsvq_lightning.commands.progress import progress
-from nsvq_lightning.io.attribute_error import attribute_errors
 from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.describe import attribute_errors
 from nsvq_lightning.io.formats import FORMATS, read_scene, save
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.placing import UP_AXES, cropped, rotated, turn_up
 from nsvq_lightning.io.sog import PALETTE_LIMIT
-from nsvq_lightning.io.spz import DEFAULT_AXES, DEFAULT_VERSION, SPZ_AXES
-from nsvq_lightning.io.spz_frame import SPZ_VERSIONS
+from nsvq_lightning.io.spz import DEFAULT_AXES, DEFAULT_VERSION, SPZ_AXES, SPZ_VERSIONS
 
 if TYPE_CHECKING:
     from nsvq_lightning.data.scene import View

@@ -21,17 +21,15 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 import nsvq_lightning.callbacks as callbacks
 import nsvq_lightning.quantize as quantize
 from nsvq_lightning.callbacks.standard import STANDARD
-from nsvq_lightning.commands.configs import shipped_configs
-from nsvq_lightning.commands.messages import in_plain_words, nearest, unknown_option
+from nsvq_lightning.commands.arguments import SHORTHANDS, in_plain_words, nearest, shipped_configs, unknown_option
 from nsvq_lightning.commands.option_help import class_help, command_help, first_sentence
 from nsvq_lightning.commands.registry import COMMANDS
-from nsvq_lightning.commands.shorthands import SHORTHANDS
+from nsvq_lightning.data.colmap import check_name
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
-from nsvq_lightning.data.model_files import check_name
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.skips import SKIPS, switch, switched
-from nsvq_lightning.training.checkpoints import check_settings, read_checkpoint
 from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.resume import check_settings, read_checkpoint
 from nsvq_lightning.training.run_folder import is_trial, reserve, run_folder
 from nsvq_lightning.training.trainer import SplatTrainer
 

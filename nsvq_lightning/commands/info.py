@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.commands.messages import Parser
+from nsvq_lightning.commands.arguments import Parser
 from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.errors import FormatError
 

@@ -12,10 +12,16 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import TextIO
 
-from nsvq_lightning.commands.configs import check_config, configs_among, limit_aliases, resolve_configs, written_by_run
-from nsvq_lightning.commands.messages import nearest
+from nsvq_lightning.commands.arguments import (
+    check_config,
+    configs_among,
+    expand,
+    limit_aliases,
+    nearest,
+    resolve_configs,
+    written_by_run,
+)
 from nsvq_lightning.commands.registry import COMMANDS, overview
-from nsvq_lightning.commands.shorthands import expand
 from nsvq_lightning.version import __version__
 
 __all__ = ["main"]

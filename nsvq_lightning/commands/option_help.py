@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import docstring_parser
 
-from nsvq_lightning.commands.shorthands import SHORTHANDS
+from nsvq_lightning.commands.arguments import SHORTHANDS
 
 __all__ = ["class_help", "command_help", "first_sentence"]
 

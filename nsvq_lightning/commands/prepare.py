@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nsvq_lightning.commands.messages import Parser
-from nsvq_lightning.commands.positive import positive
+from nsvq_lightning.commands.arguments import Parser, positive
 from nsvq_lightning.commands.progress import Progress
 
 if TYPE_CHECKING:

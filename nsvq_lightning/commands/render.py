@@ -11,11 +11,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nsvq_lightning.commands.comma_lists import names
-from nsvq_lightning.commands.messages import Parser
-from nsvq_lightning.commands.positive import positive
+from nsvq_lightning.commands.arguments import Parser, cameras_of, names, photos_of, positive, scene_file
 from nsvq_lightning.commands.progress import progress
-from nsvq_lightning.commands.scene_argument import cameras_of, photos_of, scene_file
 
 if TYPE_CHECKING:
     import numpy as np

@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import urlsplit
 
-from nsvq_lightning.commands.messages import Parser
-from nsvq_lightning.commands.scene_argument import cameras_of, photos_of, scene_file
+from nsvq_lightning.commands.arguments import Parser, cameras_of, photos_of, scene_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -62,7 +61,7 @@ class Source(NamedTuple):
 
     def current(self) -> Path | None:
         """The file to show now; None if the fit has not written one yet."""
-        from nsvq_lightning.training.live import LIVE_SCENE
+        from nsvq_lightning.training.live_preview import LIVE_SCENE
 
         files = [self.file] if self.run is None else [self.run / LIVE_SCENE, self.file]
         return next((file for file in files if file.is_file()), None)
@@ -215,11 +214,11 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(404, "text/plain; charset=utf-8", b"there is no such page")
 
     def _scene(self, is_question: bool) -> None:
-        from nsvq_lightning.training import live
+        from nsvq_lightning.training import live_preview
 
         if is_question and self.source.run is not None:
             # What was asked of a run that has ended in between is taken back.
-            (live.end if self.source.file.exists() else live.ask)(self.source.run)
+            (live_preview.end if self.source.file.exists() else live_preview.ask)(self.source.run)
         file = self.source.current()
         try:
             if file is None:

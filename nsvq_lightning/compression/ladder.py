@@ -18,7 +18,7 @@ from nsvq_lightning.compression.stored import compress
 from nsvq_lightning.compression.viewpoints import decibels, picture_error, pictures
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import decode, encode
-from nsvq_lightning.io.nsvq.frame import frame, unframe
+from nsvq_lightning.io.nsvq.header import frame, unframe
 from nsvq_lightning.io.nsvq.precision import OPACITY_ERRORS, Precision, Storage
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, Quantizer, codebook_sizes
 from nsvq_lightning.quantize.attributes import attribute_rows

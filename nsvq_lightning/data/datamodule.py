@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,13 +12,105 @@ import torch
 from lightning.pytorch import LightningDataModule
 from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
 from lightning.pytorch.utilities import rank_zero_info
-from torch.utils.data import DataLoader, Dataset, IterableDataset
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, IterableDataset, Sampler
 
-from nsvq_lightning.data.device_photos import DevicePhotos
-from nsvq_lightning.data.sampler import ViewSampler
+from nsvq_lightning.data.images import Picture
 from nsvq_lightning.data.scene import Factor, Scene, SceneError, View, load_scene
+from nsvq_lightning.random import generator
 
-__all__ = ["DEMO", "ColmapDataModule", "DemoDataModule"]
+__all__ = ["DEMO", "ColmapDataModule", "DemoDataModule", "DevicePhotos", "ViewSampler"]
+
+
+class ViewSampler(Sampler[int]):
+    """Endless sequence of views: all in random order without replacement, then all again in a new order.
+
+    Epoch ``e`` of the sequence is a permutation drawn from ``generator(seed, e, "views")``. Draw ``d`` of rank ``r`` of
+    ``R`` ranks takes position ``d·R + r``, so the ranks share one sequence, and a run resumed at draw ``d`` continues
+    exactly where it stopped.
+
+    Args:
+        n_views: Number of views, at least 1.
+        seed: Seed of the run.
+        rank: This process.
+        world_size: Number of processes.
+        start: Draw at which iteration starts.
+
+    Raises:
+        ValueError: A number is out of range.
+    """
+
+    def __init__(self, n_views: int, seed: int = 0, rank: int = 0, world_size: int = 1, start: int = 0) -> None:
+        if n_views < 1:
+            raise ValueError(f"n_views must be at least 1, got {n_views}")
+        if not 0 <= rank < world_size:
+            raise ValueError(f"rank must be in [0, world_size), got rank {rank} of {world_size}")
+        if start < 0:
+            raise ValueError(f"start must be at least 0, got {start}")
+        self.n_views, self.seed, self.rank, self.world_size, self.start = n_views, seed, rank, world_size, start
+        self._epoch = -1
+        self._order = torch.empty(0, dtype=torch.int64)
+
+    def view_at(self, draw: int) -> int:
+        """View of draw ``draw`` on this rank, in ``[0, n_views)``."""
+        epoch, position = divmod(draw * self.world_size + self.rank, self.n_views)
+        return int(self._permutation(epoch)[position])
+
+    def __iter__(self) -> Iterator[int]:
+        draw = self.start
+        while True:
+            yield self.view_at(draw)
+            draw += 1
+
+    def _permutation(self, epoch: int) -> Tensor:
+        if epoch != self._epoch:
+            self._order = torch.randperm(self.n_views, generator=generator(self.seed, epoch, "views"))
+            self._epoch = epoch
+        return self._order
+
+
+_SHARE = 4
+"""Photos take at most one part in so many of a GPU's memory that is free at the first of them: splats grow."""
+
+
+class DevicePhotos:
+    """Moves views to a device and keeps their photos there, the first ones while a budget lasts.
+
+    A photo is 5 MB that would cross the bus at every step. As in :class:`~nsvq_lightning.data.images.ImageStore`, what
+    is kept stays: under a random order that is as good as anything.
+
+    Args:
+        most_bytes: Memory for photos on the device in bytes; on a GPU, a quarter of what is free if that is less.
+    """
+
+    def __init__(self, most_bytes: int) -> None:
+        self._most, self._free = most_bytes, 0
+        self._device = torch.device("cpu")
+        self._kept: dict[int, tuple[Tensor, View]] = {}
+
+    def move(self, view: View, device: torch.device) -> View:
+        """The view with its photo and mask on the device."""
+        if device.type == "cpu":
+            return view.to(device)
+        if device != self._device:
+            self._device, self._kept, self._free = device, {}, min(self._most, _spare(device))
+        host, there = self._kept.get(view.index, (None, None))
+        if there is not None and host is view.image:
+            return replace(view, image=there.image, mask=there.mask)
+        moved = view.to(device)
+        if there is None and (taken := Picture(moved.image, moved.mask).nbytes) <= self._free:
+            self._kept[view.index] = view.image, moved
+            self._free -= taken
+        return moved
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_device": torch.device("cpu"), "_kept": {}}
+
+
+def _spare(device: torch.device) -> int:
+    """Bytes of a device's memory that photos may take."""
+    return torch.cuda.mem_get_info(device)[0] // _SHARE if device.type == "cuda" else 1 << 62
+
 
 DEMO = Path(__file__).parent / "demo"
 """Folder of the demo scene, a COLMAP scene as any other; nothing is ever written there."""
@@ -34,7 +127,7 @@ class ColmapDataModule(LightningDataModule):
 
     Every 8th of the sorted image names is a test view (validated and tested on, never trained on), unless the folder
     says which are, see :func:`~nsvq_lightning.data.scene.load_scene`. The train views come
-    in the endless order of :class:`~nsvq_lightning.data.sampler.ViewSampler`, which starts at the trainer's step: a
+    in the endless order of :class:`~nsvq_lightning.data.datamodule.ViewSampler`, which starts at the trainer's step: a
     resumed run sees the views that the uninterrupted run would have seen. With R processes, each takes its own draws
     of that one sequence, and every R-th of the test views.
 

@@ -12,8 +12,8 @@ import numpy as np
 import PIL.ImageOps
 from cv2.typing import MatLike
 
+from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.images import opened
-from nsvq_lightning.data.model_files import SceneError
 from nsvq_lightning.io.atomic import atomic_path, atomic_write
 
 __all__ = ["PHOTOS", "VIDEOS", "copy_photos", "photos_in", "sharpness", "write_frames"]

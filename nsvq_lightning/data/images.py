@@ -20,7 +20,7 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 from torch import Tensor
 
-from nsvq_lightning.data.model_files import SceneError
+from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.undistort import Pinhole, Undistortion
 from nsvq_lightning.skips import is_on
 

@@ -6,8 +6,7 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from nsvq_lightning.data.colmap import ColmapImage
-from nsvq_lightning.data.model_files import SceneError
+from nsvq_lightning.data.colmap import ColmapImage, SceneError
 
 __all__ = ["find_masks"]
 

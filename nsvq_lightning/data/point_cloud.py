@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nsvq_lightning.data.model_files import SceneError
+from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.ply import read_ply_columns, read_ply_size
 from nsvq_lightning.random import generator

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.data.colmap import import_pycolmap
+from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
 from nsvq_lightning.data.images import image_size
-from nsvq_lightning.data.model_files import SceneError, check_name
 
 __all__ = ["Verdict", "reconstruct"]
 

@@ -16,11 +16,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from nsvq_lightning.compute.devices import upload
-from nsvq_lightning.data.colmap import ColmapImage, ColmapModel
+from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, larger_models
 from nsvq_lightning.data.frames import PHOTOS
 from nsvq_lightning.data.images import ROUNDED, ImageHead, ImageSource, ImageStore, image_head
 from nsvq_lightning.data.masks import find_masks
-from nsvq_lightning.data.model_files import SceneError, larger_models
 from nsvq_lightning.data.point_cloud import random_points
 from nsvq_lightning.data.transforms import read_poses
 from nsvq_lightning.data.undistort import Pinhole, Undistortion, rectify

@@ -14,9 +14,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, import_pycolmap, read_model
+from nsvq_lightning.data.colmap import (
+    LARGEST_SIDE,
+    ColmapImage,
+    ColmapModel,
+    SceneError,
+    check_name,
+    has_model,
+    import_pycolmap,
+    read_model,
+)
 from nsvq_lightning.data.images import image_size
-from nsvq_lightning.data.model_files import LARGEST_SIDE, SceneError, check_name, has_model
 from nsvq_lightning.data.point_cloud import read_points, share_seen
 from nsvq_lightning.rendering.camera import Camera
 

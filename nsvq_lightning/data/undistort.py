@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.data.colmap import import_pycolmap
-from nsvq_lightning.data.model_files import SceneError
+from nsvq_lightning.data.colmap import SceneError, import_pycolmap
 from nsvq_lightning.skips import is_on
 
 __all__ = ["Pinhole", "Undistortion", "rectify"]

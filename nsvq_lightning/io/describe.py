@@ -1,4 +1,4 @@
-"""What a scene file holds, found without decoding its splats."""
+"""What a scene file holds, and how far what is read is from what was written."""
 
 from __future__ import annotations
 
@@ -8,18 +8,52 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.formats import FORMATS
-from nsvq_lightning.io.nsvq.frame import MAGIC, read_header
-from nsvq_lightning.io.ply import plain_ply_bytes, read_ply_size
-from nsvq_lightning.io.ply_header import PLY_MAGIC, attribute_of, splat_degree
-from nsvq_lightning.io.sog import read_sog_header
-from nsvq_lightning.io.sog_archive import META, ZIP_MAGIC
+from nsvq_lightning.io.nsvq.header import MAGIC, read_header
+from nsvq_lightning.io.numbers import opacity_of
+from nsvq_lightning.io.ply import PLY_MAGIC, attribute_of, plain_ply_bytes, read_ply_size, splat_degree
+from nsvq_lightning.io.sog import META, ZIP_MAGIC, read_sog_header
 from nsvq_lightning.io.splat import SPLAT_LAYOUT, count_splats
-from nsvq_lightning.io.spz import DEFAULT_AXES
-from nsvq_lightning.io.spz_frame import SPZ_MAGICS, read_spz_header
+from nsvq_lightning.io.spz import DEFAULT_AXES, SPZ_MAGICS, read_spz_header
+from nsvq_lightning.splats.arrays import SplatArrays
+from nsvq_lightning.splats.conventions import unit
 
-__all__ = ["describe"]
+__all__ = ["attribute_errors", "describe"]
+
+
+def attribute_errors(read: SplatArrays, written: SplatArrays) -> dict[str, float]:
+    """Root mean square errors over the splats, by quantity.
+
+    Args:
+        read: What the file holds, N splats.
+        written: What it was written from, the same splats in the same order; spherical-harmonic coefficients that
+            the file does not hold count as 0.
+
+    Returns:
+        ``position`` in scene units, ``rotation`` in degrees, ``log-scale``, ``opacity`` in [0, 1], and the coefficients
+        ``sh0`` and ``shN``; 0 where there is nothing to compare.
+    """
+    units, others = unit(read.quats), unit(written.quats)
+    nearer = np.minimum(np.linalg.norm(units - others, axis=1), np.linalg.norm(units + others, axis=1))
+    kept = read.shN.shape[1]
+    return {
+        "position": _root_mean_square(read.means - written.means.astype(np.float64)),
+        "rotation": _root_mean_square(np.degrees(4 * np.arcsin(np.minimum(nearer / 2, 1)))),
+        "log-scale": _root_mean_square(read.scales - written.scales.astype(np.float64)),
+        "opacity": _root_mean_square(opacity_of(read.opacities) - opacity_of(written.opacities)),
+        "sh0": _root_mean_square(read.sh0 - written.sh0.astype(np.float64)),
+        "shN": _root_mean_square(
+            np.concatenate([read.shN - written.shN[:, :kept], written.shN[:, kept:]], axis=1, dtype=np.float64)
+        ),
+    }
+
+
+def _root_mean_square(errors: NDArray[np.floating[Any]]) -> float:
+    return float(np.sqrt(np.mean(np.square(errors)))) if errors.size else 0.0
 
 
 def describe(path: str | os.PathLike[str]) -> dict[str, Any]:

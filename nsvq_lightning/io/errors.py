@@ -1,4 +1,9 @@
-"""The error that all file formats share."""
+"""The error that all file formats share, and what the bytes of a file can hold.
+
+A count in a file's head is a claim, and no reader allocates memory on its word alone. Streams and pictures of equal
+numbers shrink to nothing: a few kilobytes would otherwise ask for all memory there is. In scenes, the position alone
+takes 16 bits or more of a splat, and a whole splat 5 bytes or more in every format.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike, fspath
 
-__all__ = ["FormatError", "naming_file"]
+__all__ = ["FEW_ROWS", "FEW_SPLATS", "FormatError", "check_room", "naming_file"]
 
 
 class FormatError(ValueError):
@@ -32,3 +37,22 @@ def naming_file(path: str | PathLike[str]) -> Iterator[None]:
         yield
     except FormatError as error:
         raise FormatError(f"{fspath(path)}: {error.defect}", error.remedy) from None
+
+
+FEW_SPLATS = 1 << 20
+"""Splats that any file may hold, however short, such as one of equal splats; beyond, each takes a byte or more. So many
+are read in less than 1 GB."""
+FEW_ROWS = 1 << 16
+"""The same for the rows of a codebook in level ``compact`` of ``.nsvq``, and the bytes of its stream."""
+
+
+def check_room(what: str, count: int, size: int, few: int = FEW_SPLATS) -> None:
+    """Refuse more splats, texels or rows than a file or stream of ``size`` bytes can hold.
+
+    Raises:
+        FormatError: There are more than ``few``, and more than bytes.
+    """
+    if count > max(few, size):
+        raise FormatError(
+            f"truncated or damaged: {count} {what} cannot be in {size} bytes; above {few}, each takes one or more"
+        )

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.precision import Storage
-from nsvq_lightning.io.ply import read_ply, write_ply
-from nsvq_lightning.io.ply_header import read_ply_header
+from nsvq_lightning.io.ply import read_ply, read_ply_header, write_ply
 from nsvq_lightning.io.sog import in_sog_order, read_sog, write_sog
 from nsvq_lightning.io.splat import read_splat, write_splat
 from nsvq_lightning.io.spz import in_spz_order, read_spz, write_spz

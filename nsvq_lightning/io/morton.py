@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import INT64, UINT64, check_array, outside
-from nsvq_lightning.io.powers import power_above, power_below
+from nsvq_lightning.io.numbers import power_above, power_below
 
 __all__ = ["AXIS_BITS", "Grid", "morton_keys", "nearest_before", "spatial_order", "unmorton"]
 

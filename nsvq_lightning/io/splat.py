@@ -21,10 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import atomic_write
-from nsvq_lightning.io.clamping import Clamped
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
-from nsvq_lightning.io.opacity import logits_of_bytes, opacity_of
+from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, opacity_of
 from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.splats.conventions import unit
 

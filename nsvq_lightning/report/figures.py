@@ -10,7 +10,17 @@ from typing import Any
 
 from nsvq_lightning.io.atomic import atomic_write, write_text
 
-__all__ = ["colours_of", "draw_keys", "markdown_table", "markers_of", "new_figure", "write_csv", "write_figure"]
+__all__ = [
+    "colours_of",
+    "draw_keys",
+    "markdown_table",
+    "markers_of",
+    "new_figure",
+    "panels",
+    "write_csv",
+    "write_figure",
+]
+
 
 MARKERS = "os^Dvph*X<>"
 """Matplotlib markers that are distinguishable in print."""
@@ -79,3 +89,27 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: Co
         for line in lines
     ]
     return "\n".join(f"| {' | '.join(line)} |" for line in [padded[0], rule, *padded[1:]])
+
+
+COLUMNS = 2
+WIDTH = 6.4
+"""Inches of a panel."""
+KEY_LINE = 0.19
+"""Inches of a line of the keys below the panels."""
+
+
+def panels(count: int, height: float, keys: int = 0) -> tuple[Any, list[Any]]:
+    """A figure and its axes.
+
+    Args:
+        count: Number of panels, at least 1.
+        height: Of a panel, inches.
+        keys: Lines of the keys that :func:`~nsvq_lightning.report.figures.draw_keys` will draw below.
+    """
+    across = min(COLUMNS, count)
+    down = -(-count // across)
+    figure = new_figure(WIDTH * across, height * down + KEY_LINE * keys)
+    axes = list(figure.subplots(down, across, squeeze=False).ravel())
+    for axis in axes[count:]:
+        axis.set_axis_off()
+    return figure, axes[:count]

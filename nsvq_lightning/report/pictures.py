@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Sequence
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 from unicodedata import normalize
 
+import cv2
 import torch
+from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from torch import Tensor
 
 from nsvq_lightning.data.images import encode_png
 from nsvq_lightning.io.atomic import atomic_write
 
-__all__ = ["comparison", "file_stem", "write_png"]
+__all__ = ["comparison", "file_stem", "log_pictures", "write_png"]
+
 
 LONGEST = 120
 """Bytes of a file name without suffix; file systems take 143 to 255 with it."""
@@ -78,3 +82,21 @@ def write_png(path: Path, image: Tensor) -> None:
     data = encode_png((image.clamp(0.0, 1.0) * 255).round().to(torch.uint8).cpu().numpy())
     with atomic_write(path) as file:
         file.write(data)
+
+
+def log_pictures(loggers: Sequence[Logger], pictures: Sequence[Path], step: int) -> None:
+    """Show PNG files in TensorBoard and Weights & Biases, as ``test/<file name>``; other loggers get none.
+
+    Args:
+        loggers: Loggers of a trainer.
+        pictures: The files, 8-bit RGB.
+        step: Iteration they belong to.
+    """
+    for logger in loggers:
+        if isinstance(logger, WandbLogger):
+            names = [path.stem for path in pictures]
+            logger.log_image("test/views", [str(path) for path in pictures], step, caption=names)
+        elif isinstance(logger, TensorBoardLogger):
+            for path in pictures:
+                image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+                logger.experiment.add_image(f"test/{path.stem}", image, step, dataformats="HWC")

@@ -32,22 +32,6 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, render, visible
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, sh_degree_of
-from nsvq_lightning.training.branch import (
-    QUANTIZER_SETTINGS,
-    branch_checkpoint,
-    can_branch,
-    changed_schedule,
-    check_continuation,
-    continued_schedule,
-)
-from nsvq_lightning.training.checkpoints import (
-    SCENE,
-    PlainCheckpointIO,
-    check_scene,
-    check_settings,
-    plain,
-    scene_record,
-)
 from nsvq_lightning.training.edit import finite_splats
 from nsvq_lightning.training.optim import (
     LearningRates,
@@ -57,9 +41,23 @@ from nsvq_lightning.training.optim import (
     param_groups,
     position_lr,
 )
+from nsvq_lightning.training.resume import (
+    QUANTIZER_SETTINGS,
+    SCENE,
+    PlainCheckpointIO,
+    branch_checkpoint,
+    can_branch,
+    changed_schedule,
+    check_continuation,
+    check_scene,
+    check_settings,
+    continued_schedule,
+    plain,
+    scene_record,
+)
+from nsvq_lightning.training.scene_access import needed_scene, scene_of
 from nsvq_lightning.training.schedule import Phase, Schedule, log_interval
 from nsvq_lightning.training.state import RunState, Stopwatch
-from nsvq_lightning.training.train_views import needed_scene, scene_of
 from nsvq_lightning.version import __version__
 
 __all__ = ["SplatModule"]

@@ -12,9 +12,9 @@ from lightning.pytorch.profilers import PassThroughProfiler
 from lightning.pytorch.strategies import DDPStrategy
 
 from nsvq_lightning.io.formats import save
-from nsvq_lightning.training.checkpoints import PlainCheckpointIO, read_checkpoint
+from nsvq_lightning.training.distributed import ViewParallelStrategy  # noqa: F401  registers its name
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.strategies import ViewParallelStrategy  # noqa: F401  registers its name
+from nsvq_lightning.training.resume import PlainCheckpointIO, read_checkpoint
 
 __all__ = ["SplatTrainer"]
 
@@ -43,7 +43,7 @@ class _NoProfiler(PassThroughProfiler):
 class SplatTrainer(Trainer):
     """:class:`lightning.pytorch.Trainer`; every public method below is a subcommand of ``nsvq``.
 
-    Checkpoints are read by :class:`~nsvq_lightning.training.checkpoints.PlainCheckpointIO` unless a plugin does it.
+    Checkpoints are read by :class:`~nsvq_lightning.training.resume.PlainCheckpointIO` unless a plugin does it.
 
     If several devices or machines are requested but no strategy, it uses ``view_parallel``: DDP, which Lightning would
     choose, cannot handle a changing number of splats.

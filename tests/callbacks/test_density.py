@@ -29,11 +29,11 @@ from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.splats.splats import RawSplats, Splats
+from nsvq_lightning.training.distributed import ViewParallelStrategy
 from nsvq_lightning.training.edit import append_rows, keep_rows
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.training.schedule import Schedule
-from nsvq_lightning.training.strategies import ViewParallelStrategy
 
 RULES = DensityRules()
 

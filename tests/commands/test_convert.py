@@ -12,7 +12,7 @@ from nsvq_lightning.commands.convert import main
 from nsvq_lightning.commands.registry import COMMANDS
 from nsvq_lightning.io import FORMATS, CompressedScene, read_scene, save
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
-from nsvq_lightning.io.spz_frame import read_spz_header
+from nsvq_lightning.io.spz import read_spz_header
 
 
 def exported(scene: CompressedScene, folder: Path, storage: Storage, *formats: str) -> dict[str, Path]:

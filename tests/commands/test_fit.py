@@ -12,12 +12,12 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from nsvq_lightning.data.synthetic import write_synthetic_scene
 
 from nsvq_lightning.commands import main as cli
-from nsvq_lightning.commands.configs import _without_folder, check_config, find_config, resolve_configs
+from nsvq_lightning.commands.arguments import _without_folder, check_config, find_config, resolve_configs
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.commands.main import main
-from nsvq_lightning.data.synthetic import write_synthetic_scene
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.skips import is_on

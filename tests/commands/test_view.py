@@ -13,8 +13,8 @@ from chromium import chromium, needs_chromium
 from splat_scenes import random_splats
 
 from nsvq_lightning.commands import view
+from nsvq_lightning.commands.arguments import photos_of
 from nsvq_lightning.commands.main import main
-from nsvq_lightning.commands.scene_argument import photos_of
 from nsvq_lightning.commands.view import Source, _Handler, _is_own, _Server
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import read_nsvq, save
@@ -22,7 +22,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.report.viewer import some_cameras, viewer_page
 from nsvq_lightning.splats.arrays import SplatArrays
-from nsvq_lightning.training import live
+from nsvq_lightning.training import live_preview
 
 
 def _get(address: str) -> tuple[int, bytes]:
@@ -52,23 +52,23 @@ def address(run: Path, demo_scene: Path) -> Iterator[str]:
 
 
 def test_a_running_fit_is_asked_until_its_scene_is_there(run: Path, address: str) -> None:
-    assert not live.asked(run)
+    assert not live_preview.asked(run)
     assert _get(f"{address}/scene.nsvq") == (503, b"waiting for the run to show its splats")
-    assert not live.asked(run)
+    assert not live_preview.asked(run)
     assert _get(f"{address}/version")[0] == 503
-    first = live.asked(run)
+    first = live_preview.asked(run)
     assert first
-    save(random_splats(5), run / live.LIVE_SCENE, Storage("paper"))
+    save(random_splats(5), run / live_preview.LIVE_SCENE, Storage("paper"))
     status, version = _get(f"{address}/version")
     assert status == 200
-    assert live.asked(run) > first
-    assert _get(f"{address}/scene.nsvq") == (200, (run / live.LIVE_SCENE).read_bytes())
-    live.end(run)
+    assert live_preview.asked(run) > first
+    assert _get(f"{address}/scene.nsvq") == (200, (run / live_preview.LIVE_SCENE).read_bytes())
+    live_preview.end(run)
     assert _get(f"{address}/version") == (503, b"the run trains no more; its scene is not there yet")
     save(random_splats(6), run / "scene.nsvq")
     status, last = _get(f"{address}/version")
     assert (status, last != version) == (200, True)
-    assert not live.asked(run)
+    assert not live_preview.asked(run)
     assert _get(f"{address}/scene.nsvq") == (200, (run / "scene.nsvq").read_bytes())
     assert _get(f"{address}/")[1].startswith(b"<!doctype html>")
     assert _get(f"{address}/../secret")[0] == 404
@@ -143,7 +143,7 @@ def test_a_client_that_hangs_up_is_no_traceback(run: Path, address: str, capsys:
 
 @needs_chromium
 def test_the_page_shows_each_version(run: Path, address: str, tmp_path: Path) -> None:
-    save(random_splats(40, seed=1), run / live.LIVE_SCENE, Storage("paper"))
+    save(random_splats(40, seed=1), run / live_preview.LIVE_SCENE, Storage("paper"))
     with chromium(tmp_path / "profile") as tab:
         tab.open(address, 320, 240)
         tab.run("nsvqReady")
@@ -152,7 +152,9 @@ def test_the_page_shows_each_version(run: Path, address: str, tmp_path: Path) ->
         camera = tab.run("nsvqViewer.camera()")
         arrays = SplatArrays.from_splats(random_splats(55, seed=2))
         state = {"iteration": 40, "of": 90, "phase": "quantize", "psnr": "21.50"}
-        save(CompressedScene.from_arrays(arrays, config={"live": state}), run / live.LIVE_SCENE, Storage("paper"))
+        save(
+            CompressedScene.from_arrays(arrays, config={"live": state}), run / live_preview.LIVE_SCENE, Storage("paper")
+        )
         wait = """new Promise((resolve, reject) => {
             const seen = () => document.getElementById("facts").textContent.startsWith("55 splats");
             setInterval(() => seen() && nsvqViewer.camera(nsvqViewer.camera()).then(resolve), 50);
@@ -164,7 +166,7 @@ def test_the_page_shows_each_version(run: Path, address: str, tmp_path: Path) ->
         facts = tab.run("document.getElementById('facts').textContent")
         assert facts.endswith(" · iteration 40 of 90 · quantize · test PSNR 21.50 dB")
         save(random_splats(60, seed=2), run / "scene.nsvq")
-        live.end(run)
+        live_preview.end(run)
         tab.run(wait.replace("55", "60"))
         assert tab.run("document.getElementById('facts').textContent").endswith(" MB · the run has ended")
 

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nsvq_lightning.data.colmap import import_pycolmap, read_model
-from nsvq_lightning.data.model_files import SceneError
+from nsvq_lightning.data.colmap import SceneError, import_pycolmap, read_model
 
 SceneFactory = Callable[..., Path]
 

@@ -13,8 +13,7 @@ from lightning.pytorch import LightningModule, Trainer
 from runs import quiet_trainer
 from torch import Tensor, nn
 
-from nsvq_lightning.data.datamodule import DEMO, ColmapDataModule, DemoDataModule
-from nsvq_lightning.data.sampler import ViewSampler
+from nsvq_lightning.data.datamodule import DEMO, ColmapDataModule, DemoDataModule, ViewSampler
 from nsvq_lightning.data.scene import SceneError, View
 
 SceneFactory = Callable[..., Path]

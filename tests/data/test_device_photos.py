@@ -7,8 +7,8 @@ import pickle
 import pytest
 import torch
 
-from nsvq_lightning.data import device_photos
-from nsvq_lightning.data.device_photos import DevicePhotos
+from nsvq_lightning.data import datamodule
+from nsvq_lightning.data.datamodule import DevicePhotos
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.rendering.camera import Camera
 
@@ -44,7 +44,7 @@ def test_a_photo_that_has_been_exchanged_is_moved_anew() -> None:
 
 
 def test_a_gpu_gives_a_part_of_what_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_photos, "_spare", lambda _: BYTES)
+    monkeypatch.setattr(datamodule, "_spare", lambda _: BYTES)
     photos, views = DevicePhotos(10 * BYTES), [view(i) for i in range(2)]
     first = [photos.move(each, ELSEWHERE) for each in views]
     assert photos.move(views[0], ELSEWHERE).image is first[0].image

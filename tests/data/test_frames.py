@@ -8,9 +8,9 @@ import numpy as np
 import PIL.Image
 import pytest
 
+from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.frames import copy_photos, photos_in, sharpness, write_frames
 from nsvq_lightning.data.images import image_size, read_image
-from nsvq_lightning.data.model_files import SceneError
 
 
 def _texture(shift: int = 0) -> np.ndarray[Any, Any]:

@@ -14,8 +14,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.images import ImageSource, ImageStore, Picture, image_size, read_image, read_mask
-from nsvq_lightning.data.model_files import SceneError
 from nsvq_lightning.data.undistort import Pinhole
 from nsvq_lightning.skips import switched
 

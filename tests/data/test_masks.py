@@ -13,8 +13,7 @@ import pytest
 import torch
 from lightning.pytorch import Trainer
 
-from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.data.device_photos import DevicePhotos
+from nsvq_lightning.data.datamodule import ColmapDataModule, DevicePhotos
 from nsvq_lightning.data.edges import edge_strength
 from nsvq_lightning.data.scene import SceneError, load_scene
 from nsvq_lightning.training.module import SplatModule

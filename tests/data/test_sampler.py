@@ -4,7 +4,7 @@ from itertools import islice
 
 import pytest
 
-from nsvq_lightning.data.sampler import ViewSampler
+from nsvq_lightning.data.datamodule import ViewSampler
 
 
 def test_every_epoch_is_a_permutation_and_epochs_differ() -> None:

@@ -12,9 +12,8 @@ import pytest
 import torch
 from lightning.fabric.utilities import move_data_to_device
 
-from nsvq_lightning.data.colmap import import_pycolmap
+from nsvq_lightning.data.colmap import import_pycolmap, larger_models
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.data.model_files import larger_models
 from nsvq_lightning.data.reconstruct import reconstruct
 from nsvq_lightning.data.scene import SceneError, load_scene, split_views
 

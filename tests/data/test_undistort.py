@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from nsvq_lightning.data.colmap import import_pycolmap, read_model
-from nsvq_lightning.data.model_files import SceneError
+from nsvq_lightning.data.colmap import SceneError, import_pycolmap, read_model
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.data.undistort import Pinhole, rectify
 from nsvq_lightning.skips import switched

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from viewer_scenes import plain_scene
 
-from nsvq_lightning.io.attribute_error import attribute_errors
+from nsvq_lightning.io.describe import attribute_errors
 
 
 def test_known_changes_are_found() -> None:

@@ -15,7 +15,7 @@ from viewer_scenes import needs_zstd
 
 from nsvq_lightning.io import FormatError, read_scene
 from nsvq_lightning.io.describe import describe
-from nsvq_lightning.io.limits import FEW_SPLATS, check_room
+from nsvq_lightning.io.errors import FEW_SPLATS, check_room
 from nsvq_lightning.io.zstd import compress
 
 

@@ -11,7 +11,7 @@ from viewer_scenes import assert_same, coded_scene, needs_zstd, plain_scene
 
 from nsvq_lightning.io import FormatError, read_scene, save
 from nsvq_lightning.io.describe import describe
-from nsvq_lightning.io.spz_frame import read_spz_header
+from nsvq_lightning.io.spz import read_spz_header
 
 HEAD = struct.Struct("<4sIIBBBBI12x")
 ENTRY = struct.Struct("<QQ")

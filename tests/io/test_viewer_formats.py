@@ -23,7 +23,7 @@ from nsvq_lightning.compression.viewpoints import decibels, picture_error, pictu
 from nsvq_lightning.io import CompressedScene, FormatError, SplatArrays, load, read_scene, save
 from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.sog import write_sog
-from nsvq_lightning.io.spz_frame import read_spz_header
+from nsvq_lightning.io.spz import read_spz_header
 from nsvq_lightning.rendering.sh import sh_basis
 
 SUFFIXES = (".splat", ".spz", ".sog")

@@ -28,7 +28,7 @@ from viewer_scenes import (
 
 from nsvq_lightning.io import SplatArrays, read_scene, save
 from nsvq_lightning.io.describe import describe
-from nsvq_lightning.io.spz_frame import read_spz_header
+from nsvq_lightning.io.spz import read_spz_header
 
 TOOL = os.environ.get("NSVQ_SPLAT_TRANSFORM") or shutil.which("splat-transform")
 COUNT = 120

@@ -303,13 +303,13 @@ def _build_checkpoint(folder: Path) -> list[Path]:
 
 
 def _read_checkpoint(path: Path) -> object:
-    from nsvq_lightning.training.checkpoints import read_checkpoint
+    from nsvq_lightning.training.resume import read_checkpoint
 
     return read_checkpoint(path)
 
 
 def _build_config(folder: Path) -> list[Path]:
-    from nsvq_lightning.commands.configs import find_config
+    from nsvq_lightning.commands.arguments import find_config
 
     files = []
     for name in ("nsvq_4k", "best", "demo"):
@@ -336,7 +336,7 @@ def _parser() -> Callable[[list[str]], object]:
 
 def _read_config(path: Path) -> object:
     """Parse it as ``nsvq fit`` would; what is wrong ends the command with status 2 and a message."""
-    from nsvq_lightning.commands.configs import check_config
+    from nsvq_lightning.commands.arguments import check_config
 
     check_config(str(path))
     status: object = 0
@@ -383,7 +383,7 @@ def _read_photo(path: Path) -> object:
 
 def targets() -> dict[str, Target]:
     """Kinds of files by name."""
-    from nsvq_lightning.data.model_files import SceneError
+    from nsvq_lightning.data.colmap import SceneError
     from nsvq_lightning.io.errors import FormatError
 
     return {

@@ -15,14 +15,14 @@ from torch import nn
 
 from nsvq_lightning.callbacks import PhaseSchedule, RunCheckpoint
 from nsvq_lightning.quantize import NSVQ, StraightThrough
-from nsvq_lightning.training.branch import (
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.resume import (
     QUANTIZER_SETTINGS,
     branch_optimizer_state,
     can_branch,
     changed_schedule,
     check_continuation,
 )
-from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import run_folder
 from nsvq_lightning.training.schedule import Phase, Schedule
 

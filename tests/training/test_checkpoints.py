@@ -14,14 +14,14 @@ from torch import Tensor, nn
 
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.training.checkpoints import (
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.resume import (
     PlainCheckpointIO,
     check_scene,
     check_settings,
     read_checkpoint,
     scene_record,
 )
-from nsvq_lightning.training.module import SplatModule
 
 SCENE = {"splats.means": torch.arange(300.0).view(100, 3), "state._phase": torch.tensor(0)}
 

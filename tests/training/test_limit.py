@@ -9,10 +9,10 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import Recipe, RunFactory
 
 from nsvq_lightning.callbacks import DensityControl, DensityRules
-from nsvq_lightning.training import footprint
+from nsvq_lightning.training import memory_estimate
 from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.train_views import train_contributions
+from nsvq_lightning.training.scene_access import train_contributions
 
 
 class Counts(Callback):
@@ -61,11 +61,11 @@ def test_the_limit_comes_too_late_for_codebooks(
 def test_the_memory_of_the_run_is_said_before_it(
     run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(footprint, "_resident", lambda: 0)
+    monkeypatch.setattr(memory_estimate, "_resident", lambda: 0)
     with caplog.at_level("INFO"):
         for free, level, words in ((8 << 30, "INFO", ""), (1 << 30, "WARNING", "only 1.1 GB are available")):
             caplog.clear()
-            monkeypatch.setattr(footprint, "available_memory", lambda free=free: free)
+            monkeypatch.setattr(memory_estimate, "available_memory", lambda free=free: free)
             run(recipe(density=limited(100_000)).values(), max_steps=1)
             (said,) = [record for record in caplog.records if "memory: at most about 1.3 GB" in record.getMessage()]
             assert said.levelname == level

@@ -21,10 +21,10 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render, visible
 from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats, Splats
-from nsvq_lightning.training.checkpoints import plain
 from nsvq_lightning.training.host import SplatHost, splat_host
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
+from nsvq_lightning.training.resume import plain
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.training.state import RunState, Stopwatch
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
-from nsvq_lightning.training.replicas import check_replicas, checksum, follow_first
+from nsvq_lightning.training.distributed import check_replicas, checksum, follow_first
 
 ROWS = torch.randn(40, 3, generator=generator(0))
 

@@ -11,8 +11,8 @@ from lightning.pytorch import LightningModule
 from lightning.pytorch.strategies import DDPStrategy, StrategyRegistry
 from torch import Tensor, nn
 
-import nsvq_lightning.training.strategies as strategies
-from nsvq_lightning.training.strategies import ViewParallelStrategy
+import nsvq_lightning.training.distributed as strategies
+from nsvq_lightning.training.distributed import ViewParallelStrategy
 
 LOSS = torch.tensor(1.0)
 

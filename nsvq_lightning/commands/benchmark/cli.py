@@ -12,9 +12,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from nsvq_lightning.commands.arguments import Parser, integers, names
 from nsvq_lightning.commands.benchmark import SIZES, Scope
-from nsvq_lightning.commands.comma_lists import integers, names
-from nsvq_lightning.commands.messages import Parser
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.skips import SKIPS
 

@@ -15,9 +15,8 @@ from llvmlite import binding
 
 from nsvq_lightning.commands.benchmark import Scope
 from nsvq_lightning.commands.benchmark.timing import Measurement
-from nsvq_lightning.commands.panels import panels
 from nsvq_lightning.compute.environment import usable_cores
-from nsvq_lightning.report.figures import colours_of, draw_keys, markdown_table, markers_of, write_figure
+from nsvq_lightning.report.figures import colours_of, draw_keys, markdown_table, markers_of, panels, write_figure
 from nsvq_lightning.version import __version__
 
 __all__ = ["Panel", "as_json", "as_markdown", "describe_machine", "draw_suite", "number"]

@@ -20,9 +20,9 @@ from typing import Any, NamedTuple, cast
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
+from nsvq_lightning.commands.arguments import find_config
 from nsvq_lightning.commands.benchmark import Scope
 from nsvq_lightning.commands.benchmark.timing import finish, milliseconds, sgemm, use_threads
-from nsvq_lightning.commands.configs import find_config
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.training.module import SplatModule

@@ -16,7 +16,7 @@ from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import Splats
-from nsvq_lightning.training.footprint import CACHE_BYTES, available_memory, readable_bytes, run_bytes
+from nsvq_lightning.training.memory_estimate import CACHE_BYTES, available_memory, readable_bytes, run_bytes
 
 __all__ = ["check_budget", "grown"]
 

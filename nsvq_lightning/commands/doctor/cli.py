@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nsvq_lightning.commands.messages import Parser
+from nsvq_lightning.commands.arguments import Parser
 
 if TYPE_CHECKING:
     from nsvq_lightning.commands.doctor.finding import Finding

@@ -18,8 +18,7 @@ from nsvq_lightning.commands.doctor.photo_checks import (
     check_sizes,
     read_photos,
 )
-from nsvq_lightning.data.colmap import ColmapModel
-from nsvq_lightning.data.model_files import larger_models
+from nsvq_lightning.data.colmap import ColmapModel, larger_models
 from nsvq_lightning.data.scene import ONE_PLACE, Scene, load_scene
 from nsvq_lightning.data.transforms import read_poses
 

@@ -16,7 +16,7 @@ from nsvq_lightning.commands.benchmark.report import describe_machine
 from nsvq_lightning.commands.doctor.finding import Finding, good, note, problem
 from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.compute.jit import thread_count
-from nsvq_lightning.training.footprint import available_memory, readable_bytes
+from nsvq_lightning.training.memory_estimate import available_memory, readable_bytes
 
 __all__ = [
     "check_disk",

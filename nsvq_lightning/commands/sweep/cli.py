@@ -11,8 +11,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
 
-from nsvq_lightning.commands.comma_lists import integers, names
-from nsvq_lightning.commands.messages import Parser
+from nsvq_lightning.commands.arguments import Parser, integers, names
 
 if TYPE_CHECKING:
     from nsvq_lightning.commands.sweep.plan import Run

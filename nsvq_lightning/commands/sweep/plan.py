@@ -10,7 +10,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.commands.configs import find_config
+from nsvq_lightning.commands.arguments import find_config
 from nsvq_lightning.commands.sweep.settings import Settings, digest, resolve
 from nsvq_lightning.quantize.attributes import codebook_sizes
 

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.commands.panels import panels
 from nsvq_lightning.commands.sweep.results import Group, RunResult, grouped, series_of
-from nsvq_lightning.report.figures import colours_of, draw_keys, markers_of, write_figure
+from nsvq_lightning.report.figures import colours_of, draw_keys, markers_of, panels, write_figure
 
 __all__ = ["draw_sweep"]
 

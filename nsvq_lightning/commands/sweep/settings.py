@@ -10,10 +10,9 @@ from copy import deepcopy
 from typing import Any
 
 from nsvq_lightning.callbacks import PhaseSchedule
-from nsvq_lightning.commands.configs import resolve_configs
+from nsvq_lightning.commands.arguments import expand, resolve_configs
 from nsvq_lightning.commands.fit import SplatCLI
-from nsvq_lightning.commands.shorthands import expand
-from nsvq_lightning.training.branch import QUANTIZE_RULES
+from nsvq_lightning.training.resume import QUANTIZE_RULES
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.version import __version__
 

@@ -38,8 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.compressed import QUANTIZABLE, CompressedScene, attribute_dims
-from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.io.limits import FEW_ROWS, check_room
+from nsvq_lightning.io.errors import FEW_ROWS, FormatError, check_room
 from nsvq_lightning.io.morton import AXIS_BITS, Grid, morton_keys, nearest_before, unmorton
 from nsvq_lightning.io.nsvq.codebook_order import leaf_paths
 from nsvq_lightning.io.nsvq.entropy import (

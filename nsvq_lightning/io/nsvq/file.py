@@ -9,8 +9,7 @@ from dataclasses import replace
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
-from nsvq_lightning.io.nsvq.frame import frame, read_frame, read_header
-from nsvq_lightning.io.nsvq.header import Header
+from nsvq_lightning.io.nsvq.header import Header, frame, read_frame, read_header
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Precision, Storage, check_level
 
 __all__ = [

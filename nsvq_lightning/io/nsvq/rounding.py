@@ -18,8 +18,7 @@ from nsvq_lightning.io.morton import Grid
 from nsvq_lightning.io.nsvq.codebook_order import sibling_distance, tree_order
 from nsvq_lightning.io.nsvq.header import AttributeEntry
 from nsvq_lightning.io.nsvq.precision import Precision
-from nsvq_lightning.io.opacity import opacity_of
-from nsvq_lightning.io.powers import coarsest_power, nearest_power
+from nsvq_lightning.io.numbers import coarsest_power, nearest_power, opacity_of
 
 __all__ = [
     "Stored",

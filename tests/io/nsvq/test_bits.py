@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.nsvq.bits import code_bits, pack_fields, packed_bytes, unpack_fields
+from nsvq_lightning.io.nsvq.paper import code_bits, pack_fields, packed_bytes, unpack_fields
 
 
 def _big_integer(fields: Sequence[NDArray[np.int64]], widths: Sequence[int]) -> bytes:

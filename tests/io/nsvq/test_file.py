@@ -16,7 +16,7 @@ import pytest
 from nsvq_lightning import io
 from nsvq_lightning.io import CompressedScene, FormatError, read_header, read_nsvq
 from nsvq_lightning.io.nsvq.file import LEVELS
-from nsvq_lightning.io.nsvq.frame import VERSION
+from nsvq_lightning.io.nsvq.header import VERSION
 
 write_nsvq = partial(io.write_nsvq, level="paper")
 

@@ -16,7 +16,7 @@ import pytest
 from compressed_scenes import SIZES, scene
 
 from nsvq_lightning.io import CompressedScene, FormatError, read_nsvq, write_nsvq
-from nsvq_lightning.io.nsvq.frame import read_frame
+from nsvq_lightning.io.nsvq.header import read_frame
 from nsvq_lightning.io.nsvq.precision import LEVELS, Precision
 from nsvq_lightning.splats.arrays import SplatArrays
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.lloyd import best_levels, nearest_level
+from nsvq_lightning.io.scalar_kmeans import best_levels, nearest_level
 
 
 def mean_square(values: NDArray[np.float32], levels: NDArray[np.float32]) -> float:

@@ -8,9 +8,10 @@ from pathlib import Path
 from lightning.pytorch import Trainer
 
 from nsvq_lightning.data.scene import Scene
-from nsvq_lightning.training.train_views import scene_of
+from nsvq_lightning.training.scene_access import scene_of
 
 __all__ = ["CACHE_BYTES", "available_memory", "readable_bytes", "run_bytes", "say_footprint"]
+
 
 log = logging.getLogger(__name__)
 

@@ -10,8 +10,8 @@ from torch import Tensor
 from nsvq_lightning.compression.importance import contributions
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.host import SplatHost
-from nsvq_lightning.training.replicas import sum_over_processes
 
 __all__ = ["needed_scene", "scene_of", "train_cameras", "train_contributions"]
 

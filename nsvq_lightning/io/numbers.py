@@ -1,15 +1,49 @@
-"""Rounding to the values that a format can hold, and a count of the splats out of its range."""
+"""Numbers in few bits: opacities as bytes, values clamped to a range, powers of two."""
 
 from __future__ import annotations
 
 import logging
+import math
 import os
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Clamped"]
+__all__ = [
+    "Clamped",
+    "coarsest_power",
+    "finite_logits",
+    "logits_of_bytes",
+    "nearest_power",
+    "opacity_of",
+    "power_above",
+    "power_below",
+]
+
+
+_OPAQUE = 20.0
+"""Magnitude of the logit that replaces ±inf: its sigmoid is 1 in float32, and training can still move it."""
+
+
+def opacity_of(logits: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Opacities in [0, 1] of logits of any shape."""
+    opacities: NDArray[np.float64] = 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80)))
+    return opacities
+
+
+def finite_logits(logits: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The logits with ±20 in place of ±inf, which 0 and 255 become where opacities are stored as bytes."""
+    return np.where(np.isinf(logits), np.copysign(np.float32(_OPAQUE), logits), logits)
+
+
+def logits_of_bytes(levels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Finite logits of opacities given in 255ths."""
+    shares = np.arange(256) / 255
+    with np.errstate(divide="ignore"):
+        table = np.log(shares) - np.log1p(-shares)
+    return finite_logits(table.astype(np.float32))[levels]
+
 
 logger = logging.getLogger(__name__)
 
@@ -68,3 +102,33 @@ class Clamped:
                 changed,
                 count,
             )
+
+
+_MANTISSA_BITS = 24
+
+
+def power_below(value: float) -> float:
+    """The largest power of two that is at most a positive ``value``; exact, unlike a logarithm."""
+    return math.ldexp(1.0, math.frexp(value)[1] - 1)
+
+
+def power_above(value: float) -> float:
+    """The smallest power of two that is at least a positive ``value``."""
+    below = power_below(value)
+    return below if below == value else 2 * below
+
+
+def nearest_power(value: float) -> float:
+    """The power of two whose ratio to a positive ``value`` is between √½ and √2."""
+    below = power_below(value)
+    return below if value / below <= math.sqrt(2.0) else 2 * below
+
+
+def coarsest_power(values: NDArray[np.float32]) -> float:
+    """The largest power of two of which all ``values`` are integer multiples, 0 if all are 0; they must be finite."""
+    mantissas, exponents = np.frexp(values[values != 0])
+    if not mantissas.size:
+        return 0.0
+    wholes = np.ldexp(mantissas, _MANTISSA_BITS).astype(np.int64)
+    lowest = (wholes & -wholes).astype(np.float64)  # the lowest bit that is set
+    return math.ldexp(1.0, int((np.frexp(lowest)[1] - 1 + exponents).min()) - _MANTISSA_BITS)

@@ -1,0 +1,334 @@
+"""What commands take: lists, numbers, short options, configs, scenes; and what is said of wrong ones."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from difflib import get_close_matches
+from functools import cache
+from itertools import chain
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from nsvq_lightning.top_level import folder_of
+
+if TYPE_CHECKING:
+    from yaml.nodes import Node
+
+    from nsvq_lightning.rendering.camera import Camera
+
+__all__ = [
+    "SHORTHANDS",
+    "Parser",
+    "cameras_of",
+    "check_config",
+    "configs_among",
+    "expand",
+    "find_config",
+    "in_plain_words",
+    "integers",
+    "limit_aliases",
+    "names",
+    "nearest",
+    "photos_of",
+    "positive",
+    "read_config",
+    "resolve_configs",
+    "scene_file",
+    "shipped_configs",
+    "unknown_option",
+    "written_by_run",
+]
+
+
+def names(text: str) -> tuple[str, ...]:
+    """The entries of ``A,B``, each once."""
+    return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+
+
+def integers(text: str) -> tuple[int, ...]:
+    """The numbers of ``1,2``, each once.
+
+    Raises:
+        argparse.ArgumentTypeError: An entry is not a whole number.
+    """
+    try:
+        return tuple(dict.fromkeys(int(part) for part in text.split(",")))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected whole numbers with commas between them, got {text!r}") from None
+
+
+def positive(kind: type[int] | type[float]) -> Callable[[str], int | float]:
+    """A function that reads a number of this kind.
+
+    Raises:
+        argparse.ArgumentTypeError: By the function: it is not above 0, or not finite.
+    """
+
+    def parse(text: str) -> int | float:
+        value = kind(text)
+        if not 0 < value < float("inf"):
+            raise argparse.ArgumentTypeError(f"must be above 0, got {text}")
+        return value
+
+    parse.__name__ = kind.__name__  # argparse says "invalid float value"
+    return parse
+
+
+BUDGET = "--callbacks.budget"
+
+SHORTHANDS: dict[str, str] = {
+    "quality": "Splats, as a multiple of the default for the photos; more look better and take more bytes and time",
+    "splats": "Splats of the scene, instead of --quality",
+    "bytes": "Size of the file, instead of --quality",
+}
+"""Name and meaning of the numbers of :class:`nsvq_lightning.callbacks.SplatBudget`, of which one holds."""
+
+
+def expand(arguments: Sequence[str]) -> list[str]:
+    """The arguments with every shorthand replaced by the options it stands for: its own number, and none of the others.
+
+    Raises:
+        ValueError: Two shorthands are given, of which only one can hold, or one without its number.
+    """
+    expanded: list[str] = []
+    given: str | None = None
+    rest = list(arguments)
+    while rest:
+        argument = rest.pop(0)
+        option, equals, value = argument.partition("=")
+        name = option.removeprefix("--")
+        if not option.startswith("--") or name not in SHORTHANDS:
+            expanded.append(argument)
+            continue
+        if given not in (None, name):
+            raise ValueError(f"--{given} and --{name} both say how large the scene is to be: give one of them")
+        given = name
+        if not (equals or rest):
+            raise ValueError(f"{option} needs a number")
+        value = value if equals else rest.pop(0)
+        expanded += [f"{BUDGET}.{other}={value if other == name else 'null'}" for other in SHORTHANDS]
+    return expanded
+
+
+WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text", "NoneType": "null"}
+"""Types as users call them; others by their name."""
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """``; did you mean …?`` with the one that is most like a word; empty if none is."""
+    found = get_close_matches(word, known, n=1)
+    return f"; did you mean {found[0]}?" if found else ""
+
+
+def unknown_option(message: str, options: Iterable[str]) -> str:
+    """The nearest option to the one that a parser's message says is unknown; empty if the message is another one."""
+    found = re.search(r"unrecognized arguments: --([\w.-]+)|[Oo]ption '([\w.]+)'", message)
+    if found is None:
+        return ""
+    known = [option for option in options if option.startswith("--") and not option.endswith((".help", "+"))]
+    return nearest("--" + (found[1] or found[2]), known)
+
+
+def in_plain_words(message: str, classes: Iterable[str]) -> str:
+    """A message of jsonargparse about a value, in one line that says what is allowed; any other message as it is.
+
+    Args:
+        message: The message, which shows Python's types and each attempt to read the value as one of them.
+        classes: Names of classes that may have been meant.
+    """
+    key = re.match(r'Parser key "([^"]+)":', message)
+    value = re.search(r"(?:Given|Got) value: (.*)\Z", message, re.S) or re.search(r"path string: (.*)", message)
+    if key is None or value is None:
+        return message
+    meant = nearest(value[1].rpartition(".")[2], classes)
+    problem = re.search(r"Problem with given class_path.*?(?=\n +- |\Z)", message, re.S)
+    if problem is not None:
+        return f"{key[1]}: {' '.join(problem[0].split())}{meant}"
+    types = re.search(r"Subtypes: .*", message) or re.search(r"Expected a .*", message)
+    allowed: list[str] = []
+    for literal, kind in re.findall(r"Literal\[(.*?)\]|<class '(?:[\w.]*\.)?(\w+)'>", types[0] if types else ""):
+        allowed += [each.strip("'") for each in literal.split(", ")] if literal else [WORDS.get(kind, kind)]
+    *others, last = dict.fromkeys(allowed or ["the name of a class"])
+    return f"{key[1]}: expected {', '.join(others)}{' or ' * bool(others)}{last}, got {value[1]!r}{meant}"
+
+
+class Parser(argparse.ArgumentParser):
+    """:class:`argparse.ArgumentParser` that names the option that a misspelt one resembles."""
+
+    def error(self, message: str) -> NoReturn:
+        """Write usage and message to stderr and exit with status 2."""
+        super().error(message + unknown_option(message, self._option_string_actions))
+
+
+CONFIG_OPTIONS = ("--config", "-c")
+_MOST_BYTES, _MOST_VALUES = 1 << 17, 100_000
+"""Of a config, and of its values with every alias written out; that of a run has 6 kB and 500 values."""
+
+
+def resolve_configs(arguments: Sequence[str]) -> list[str]:
+    """The arguments, with every ``--config NAME`` that is not a file replaced by the shipped config of that name."""
+    resolved = list(arguments)
+    for place, name in _configs(arguments):
+        resolved[place] = resolved[place].removesuffix(name) + find_config(name)
+    return resolved
+
+
+def configs_among(arguments: Sequence[str]) -> list[str]:
+    """The values of ``--config`` among the arguments."""
+    return [name for _, name in _configs(arguments)]
+
+
+def _configs(arguments: Sequence[str]) -> Iterator[tuple[int, str]]:
+    """Position of each argument that ends with the name of a config, and that name."""
+    expects_config = False
+    for place, argument in enumerate(arguments):
+        option, equals, value = argument.partition("=")
+        if expects_config:
+            yield place, argument
+        elif option in CONFIG_OPTIONS and equals:
+            yield place, value
+        expects_config = not expects_config and argument in CONFIG_OPTIONS
+
+
+def check_config(path: str) -> dict[str, Any]:
+    """Settings of a config, none where the name is not that of a file, which the parser reports.
+
+    Raises:
+        ValueError: It is not text, not YAML, or not a table of settings.
+    """
+    if not Path(path).is_file():
+        return {}
+    settings = read_config(Path(path))
+    if not isinstance(settings, dict):
+        found = "nothing" if settings is None else type(settings).__name__
+        raise ValueError(f"config {path} holds {found}: give settings by name, like 'trainer: {{max_steps: 1000}}'")
+    return settings
+
+
+def read_config(path: Path) -> object:
+    """Content of a YAML file of settings.
+
+    Raises:
+        ValueError: It is not text or not YAML, or too large; what aliases repeat counts as often as they are named.
+    """
+    import yaml
+
+    if path.stat().st_size > _MOST_BYTES:
+        raise ValueError(f"config {path} has {path.stat().st_size} bytes, more than {_MOST_BYTES}: give another file")
+    try:
+        loader = yaml.SafeLoader(path.read_text(encoding="utf-8"))
+        node = loader.get_single_node()
+        values = _values(node, {})
+        settings = None if node is None or values > _MOST_VALUES else loader.construct_document(node)
+    except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error
+    if values > _MOST_VALUES:
+        raise ValueError(f"config {path} has more than {_MOST_VALUES} values by its aliases (*name): correct the file")
+    return settings
+
+
+@cache  # otherwise, each call would wrap the loader once more
+def limit_aliases() -> None:
+    """Let the parser refuse what :func:`read_config` does, in files that a config names and in its texts, too."""
+    import yaml
+    from jsonargparse._loaders_dumpers import get_yaml_default_loader  # all of its ways to read YAML use this class
+
+    loader = get_yaml_default_loader()  # type: ignore[no-untyped-call]
+    compose = loader.get_single_node
+
+    def checked(self: object) -> Node | None:
+        node: Node | None = compose(self)
+        if _values(node, {}) > _MOST_VALUES:
+            raise yaml.YAMLError(f"more than {_MOST_VALUES} values by aliases (*name): correct it")
+        return node
+
+    loader.get_single_node = checked
+
+
+def _values(node: Node | None, known: dict[int, float]) -> float:
+    """Number of values in a node of YAML with all its aliases written out; infinite for one that holds itself."""
+    if node is None:
+        return 0
+    if id(node) not in known:
+        known[id(node)] = math.inf
+        pairs = node.id == "mapping"
+        parts = chain.from_iterable(node.value) if pairs else node.value if node.id == "sequence" else ()
+        known[id(node)] = 1 + sum(_values(part, known) for part in parts)
+    return known[id(node)]
+
+
+def written_by_run(path: str) -> bool:
+    """Whether a file is the ``config.yaml`` that a run leaves; Lightning writes its version on the first line."""
+    return Path(path).is_file() and Path(path).read_text(encoding="utf-8").startswith("# lightning")
+
+
+def find_config(name: str) -> str:
+    """Path of a config: a given file, otherwise one shipped with the package (``nsvq_4k``, ``configs/nsvq_4k.yaml``).
+
+    A name that is neither is returned unchanged, for the parser to report.
+    """
+    if Path(name).exists():
+        return name
+    plain = _without_folder(Path(name))
+    for shipped in (folder_of("configs") / plain, folder_of("configs") / f"{plain}.yaml"):
+        if shipped.is_file():
+            return str(shipped)
+    return name
+
+
+def shipped_configs() -> list[str]:
+    """Names of the configs that come with the package, without their suffix."""
+    return sorted(path.stem for path in folder_of("configs").glob("*.yaml"))
+
+
+def _without_folder(path: PurePath) -> str:
+    return path.as_posix().removeprefix("configs/")
+
+
+def scene_file(path: Path) -> Path:
+    """The scene file that is meant.
+
+    Raises:
+        FileNotFoundError: There is nothing of that name.
+        ValueError: It is a folder without ``scene.nsvq``, or a checkpoint.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"there is no file or folder {path}")
+    if path.is_dir():
+        file = path / "scene.nsvq"
+        if not file.is_file():
+            raise ValueError(f"{path} holds no scene.nsvq: name a scene file, or the folder of a finished run")
+        return file
+    if path.suffix == ".ckpt":
+        raise ValueError(f"{path} is a checkpoint; 'nsvq export --ckpt_path {path}' writes its scene as a file")
+    return path
+
+
+def photos_of(path: Path) -> Path | None:
+    """Folder of the photos that a scene was trained on, as the run that it lies in says; None if nothing says it.
+
+    Raises:
+        ValueError: Beside it is a ``config.yaml`` that is no table of settings.
+    """
+    config = (path if path.is_dir() else path.parent) / "config.yaml"
+    if not config.is_file():
+        return None
+    data = check_config(str(config)).get("data")
+    data = data.get("init_args", data) if isinstance(data, dict) else None
+    root = data.get("root") if isinstance(data, dict) else None
+    return Path(root) if isinstance(root, str) and Path(root).is_dir() else None
+
+
+def cameras_of(path: Path) -> dict[str, Camera]:
+    """Cameras by name that the run has recorded that a scene lies in, for when its photos are gone; none without it.
+
+    Raises:
+        ValueError: Its ``viewer.html`` is damaged.
+    """
+    from nsvq_lightning.report.viewer import page_cameras
+
+    page = (path if path.is_dir() else path.parent) / "viewer.html"
+    return page_cameras(page) if page.is_file() else {}

@@ -1,0 +1,387 @@
+"""Checkpoints that continue a run, or branch from it: read, checked, and never trusted to import anything."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import asdict, is_dataclass, replace
+from hashlib import sha256
+from operator import attrgetter
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+from zipfile import BadZipFile, ZipFile
+
+import torch
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from nsvq_lightning.data.scene import Scene
+from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.splats.splats import ATTRIBUTES, sh_degree_of
+from nsvq_lightning.training.schedule import Phase, Schedule
+
+__all__ = [
+    "QUANTIZER_SETTINGS",
+    "QUANTIZE_RULES",
+    "SCENE",
+    "PlainCheckpointIO",
+    "branch_checkpoint",
+    "branch_optimizer_state",
+    "can_branch",
+    "changed_schedule",
+    "check_continuation",
+    "check_scene",
+    "check_settings",
+    "continued_schedule",
+    "plain",
+    "read_checkpoint",
+    "scene_record",
+]
+
+
+QUANTIZE_RULES = ("quantize_end", "min_finetune", "min_replacement_interval")
+"""Settings of a schedule that have no effect before the quantize phase."""
+
+CODEBOOKS = "codebooks."
+"""Prefix of the codebooks in a module's state."""
+
+SPLATS = "splats."
+"""Prefix of the splats in a module's state."""
+
+QUANTIZER_SETTINGS = "quantizer_settings"
+"""Key under which a checkpoint holds the class and number of codes that each quantizer was made with."""
+
+PHASE = "state._phase"
+"""Key of the last trained iteration's phase in a module's state."""
+
+
+def can_branch(checkpoint: Mapping[str, Any], codebooks: nn.ModuleDict) -> bool:
+    """Whether a checkpoint is from before the quantize phase and has other codebooks, in number or size, than these."""
+    if not _is_unquantized(checkpoint):
+        return False
+    state = checkpoint["state_dict"]
+    stored = {name: value.shape for name, value in state.items() if name.startswith(CODEBOOKS)}
+    return stored != {name: value.shape for name, value in _prefixed(codebooks).items()}
+
+
+def branch_checkpoint(checkpoint: dict[str, Any], codebooks: nn.ModuleDict, optimizer: Optimizer) -> None:
+    """Replace the codebooks of a checkpoint with fresh ones, in place.
+
+    Splats, side tables, their moments in the optimiser, the loops and the callbacks' states stay; so the continued run
+    is, bit for bit, the run that would have had these codebooks from the start.
+
+    Args:
+        checkpoint: Checkpoint of a run that has not quantized yet (:func:`can_branch`).
+        codebooks: Untrained quantizers of the continuing module, by attribute.
+        optimizer: A new optimiser of that module, whose groups are named.
+    """
+    state = checkpoint["state_dict"]
+    kept = {name: value for name, value in state.items() if not name.startswith(CODEBOOKS)}
+    checkpoint["state_dict"] = kept | _prefixed(codebooks)
+    if checkpoint.get("optimizer_states"):
+        (stored,) = checkpoint["optimizer_states"]
+        checkpoint["optimizer_states"] = [branch_optimizer_state(stored, optimizer.state_dict())]
+
+
+def branch_optimizer_state(stored: Mapping[str, Any], fresh: Mapping[str, Any]) -> dict[str, Any]:
+    """State of an optimiser with the groups of ``fresh``: splat attributes as stored, codebooks untrained.
+
+    Args:
+        stored: ``state_dict()`` of the trained optimiser; its groups are named.
+        fresh: ``state_dict()`` of a new optimiser, with the desired groups.
+    """
+    groups = {group["name"]: group for group in stored["param_groups"]}
+    merged: dict[str, Any] = {"state": {}, "param_groups": []}
+    for group in fresh["param_groups"]:
+        if group["name"] not in ATTRIBUTES:
+            merged["param_groups"].append(dict(group))
+            continue
+        old = groups[group["name"]]
+        merged["param_groups"].append({**old, "params": list(group["params"])})
+        # A state dict refers to parameters by index in the list of all; codebooks before them would shift it.
+        for place, old_place in zip(group["params"], old["params"], strict=True):
+            if old_place in stored["state"]:
+                merged["state"][place] = stored["state"][old_place]
+    return merged
+
+
+def continued_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> Schedule:
+    """The schedule with the iterations that the checkpoint's run has saved in the same warm-up phase."""
+    stored = Schedule(**checkpoint["schedule"])
+    same = all(getattr(stored, name) == getattr(schedule, name) for name in ("total", "reference_total", "warmup_end"))
+    return replace(schedule, saved=stored.saved) if same else schedule
+
+
+def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str | None:
+    """What to report on a run that continues from a checkpoint with this schedule; None if nothing changes."""
+    stored = Schedule(**checkpoint["schedule"])
+    if stored.total != schedule.total:
+        return (
+            f"the checkpoint is of a run of {stored.total} iterations, this one has {schedule.total}: phases, density "
+            "control and learning rates follow the new length; pass "
+            f"--trainer.max_steps={stored.total} to continue that run as it was"
+        )
+    own, without_effect = asdict(schedule), ("saved", *(QUANTIZE_RULES if _is_unquantized(checkpoint) else ()))
+    changed = {name: v for name, v in asdict(stored).items() if v != own[name] and name not in without_effect}
+    if not changed:
+        return None
+    return (
+        f"the checkpoint is of a run with {', '.join(f'{name} = {value}' for name, value in changed.items())}, this "
+        f"one continues with {', '.join(f'{name} = {own[name]}' for name in changed)}; pass "
+        f"{' '.join(f'--callbacks.phases.{name}={value}' for name, value in changed.items())} to continue that run as "
+        "it was"
+    )
+
+
+def check_continuation(
+    checkpoint: Mapping[str, Any], own: Mapping[str, Tensor], quantizers: Mapping[str, Mapping[str, Any]]
+) -> None:
+    """Check that training of a module can continue from a checkpoint.
+
+    Args:
+        checkpoint: The checkpoint, with codebooks replaced where allowed (:func:`branch_checkpoint`).
+        own: Its ``state_dict()``; numbers of splats may differ, and those of codes if k-means found fewer rows.
+        quantizers: Class and number of codes of the module's quantizers by attribute, as requested.
+
+    Raises:
+        ValueError: It holds only weights, or is of a module with other settings.
+    """
+    if not checkpoint.get("optimizer_states"):
+        raise ValueError(
+            "the checkpoint holds weights without the state of the optimiser, so training cannot continue from it; "
+            "export its scene and start from that (--model.init_from=scene.ply)"
+        )
+    state = checkpoint["state_dict"]
+    degrees = [sh_degree_of(values[f"{SPLATS}shN"]) for values in (state, own)]
+    if degrees[0] != degrees[1]:
+        raise ValueError(
+            f"the checkpoint is of a run with SH degree {degrees[0]}, this one has {degrees[1]}; pass "
+            f"--model.sh_degree={degrees[0]}"
+        )
+    trained = checkpoint.get(QUANTIZER_SETTINGS)
+    if trained is not None and trained != quantizers and not _is_unquantized(checkpoint):
+        raise ValueError(
+            f"the checkpoint has quantized with {_described(trained)}, and this run would with "
+            f"{_described(quantizers)}; that can change only before the quantize phase: pass "
+            f"{_options(trained)}, or a checkpoint from before it"
+        )
+    # The splats' side tables may differ.
+    stored, wanted = ({name for name in values if not name.startswith(SPLATS)} for values in (state, own))
+    if stored != wanted:
+        raise ValueError(
+            f"the checkpoint is of a run with other codebooks or another quantizer: it has {_some(stored - wanted)} "
+            f"that this run lacks, and lacks {_some(wanted - stored)}; pass the --model.codebooks and "
+            "--model.quantizer that it was trained with"
+        )
+
+
+def _described(settings: Mapping[str, Mapping[str, Any]]) -> str:
+    """The quantizers of a run, for a message."""
+    return f"{_kinds(settings)} ({_sizes(settings)})" if settings else "no codebooks"
+
+
+def _options(settings: Mapping[str, Mapping[str, Any]]) -> str:
+    """The command-line options that select these quantizers."""
+    if not settings:
+        return "--model.codebooks=null"
+    return f"--model.quantizer={_kinds(settings)} --model.codebooks='{{{_sizes(settings)}}}'"
+
+
+def _kinds(settings: Mapping[str, Mapping[str, Any]]) -> str:
+    return ", ".join(sorted({str(one["quantizer"]) for one in settings.values()}))
+
+
+def _sizes(settings: Mapping[str, Mapping[str, Any]]) -> str:
+    return ", ".join(f"{name}: {one['codes']}" for name, one in settings.items())
+
+
+def _is_unquantized(checkpoint: Mapping[str, Any]) -> bool:
+    """Whether a checkpoint is from before the quantize phase."""
+    state = checkpoint["state_dict"]
+    return PHASE in state and Phase(int(state[PHASE])) < Phase.QUANTIZE
+
+
+def _some(names: set[str]) -> str:
+    return ", ".join(sorted(names)[:3]) + ", …" * (len(names) > 3) or "nothing"
+
+
+def _prefixed(codebooks: nn.ModuleDict) -> dict[str, Tensor]:
+    return {f"{CODEBOOKS}{name}": value for name, value in codebooks.state_dict().items()}
+
+
+SCENE = "scene"
+"""Key under which a checkpoint holds which scene it is of."""
+
+NEVER_IMPORTED = ("init_from", "codebooks", "_instantiator")
+"""Settings of a module whose text, whatever it is, is only text; Lightning and :func:`check_settings` know the last."""
+
+WAY_OUT = "pass a checkpoint that nsvq fit has written, …/checkpoints/last.ckpt"
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """Read a checkpoint of this package onto the CPU.
+
+    Raises:
+        FileNotFoundError: No such file.
+        PermissionError: The file is not readable.
+        FormatError: The file is damaged or truncated, holds more than tensors and plain data, or is not a checkpoint of
+            a :class:`nsvq_lightning.SplatModule`.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such checkpoint; {WAY_OUT}")
+    if path.is_dir():
+        raise FormatError(f"{path}: a folder, not a checkpoint", WAY_OUT)
+    if path.stat().st_size == 0:
+        raise FormatError(f"{path}: an empty file, not a checkpoint", WAY_OUT)
+    try:
+        _check_sums(path)
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except (PermissionError, FormatError):
+        raise
+    except UnpicklingError as error:
+        named = re.search(r"GLOBAL (\S+)", str(error))
+        what = f"an object of {named[1]}" if named else "an object that is not plain data"
+        raise FormatError(f"{path}: refused, it holds {what}, and loading that could run code", WAY_OUT) from error
+    except Exception as error:  # damage can make torch's archive and pickle readers raise anything
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise FormatError(f"{path}: damaged, or not a checkpoint ({reason})", WAY_OUT) from error
+    _check_contents(path, checkpoint)
+    return checkpoint  # type: ignore[no-any-return]  # checked
+
+
+def _check_sums(path: Path) -> None:
+    """Verify the checksums of the zip archive that a checkpoint is; torch itself does not."""
+    try:
+        with ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except BadZipFile as error:
+        raise FormatError(f"{path}: truncated, or not a checkpoint", WAY_OUT) from error
+    if damaged is not None:
+        raise FormatError(f"{path}: damaged, its part {damaged} is not what was written", WAY_OUT)
+
+
+def _check_contents(path: Path, checkpoint: Any) -> None:
+    state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
+    if not isinstance(state, dict) or "pytorch-lightning_version" not in checkpoint:
+        raise FormatError(f"{path}: not a checkpoint of Lightning", WAY_OUT)
+    if not {"splats.means", "state._phase"} <= state.keys():
+        first = ", ".join(list(state)[:3]) or "nothing"
+        raise FormatError(f"{path}: a checkpoint of another model, which has {first} but no splats", WAY_OUT)
+
+
+def check_settings(path: Any, settings: Mapping[str, Any], named: Collection[str] = ()) -> None:
+    """Check that making a module from the settings of a checkpoint imports nothing.
+
+    The parser would import whatever they name. What is named by the user, on the command line or in Python, has been
+    imported before.
+
+    Args:
+        path: The checkpoint, for messages.
+        settings: Its hyper-parameters.
+        named: Texts on the command line.
+
+    Raises:
+        FormatError: They name something that has not been imported, or that was not made to be named.
+    """
+    if settings.get("_instantiator") not in (None, "lightning.pytorch.cli.instantiate_module"):
+        raise FormatError(f"{path}: refused, it names the function {settings['_instantiator']}", WAY_OUT)
+    for option, text in _texts("model", {k: v for k, v in settings.items() if k not in NEVER_IMPORTED}):
+        if text not in named and not _is_harmless(text):
+            raise FormatError(
+                f"{path}: refused, its {option} is {text}, and a checkpoint may not import what it names",
+                f"if you trust that code, name it: --{option}={text}, or import it first in Python",
+            )
+
+
+def _texts(option: str, value: Any) -> Iterator[tuple[str, str]]:
+    """All texts among settings, each with the command-line option that sets it."""
+    if isinstance(value, str):
+        yield option, value
+    elif isinstance(value, Mapping | list | tuple):
+        for key, part in value.items() if isinstance(value, Mapping) else enumerate(value):
+            yield from _texts(option if key in ("class_path", "init_args") else f"{option}.{key}", part)
+
+
+def _is_harmless(text: str) -> bool:
+    """Whether a text is a plain word, or the name of something that has been imported from where it was defined."""
+    if re.fullmatch(r"[\w+-]*", text):
+        return not Path(text).is_file()  # the parser would read settings from it
+    root, _, rest = text.partition(".")
+    try:
+        found = attrgetter(rest)(sys.modules[root])
+    except (KeyError, AttributeError):
+        return False
+    # Else torch.os.system would be part of torch.
+    return root not in sys.stdlib_module_names and str(getattr(found, "__module__", "")).partition(".")[0] == root
+
+
+def scene_record(scene: Scene) -> dict[str, Any]:
+    """What a checkpoint remembers of its scene: the folder's name, and a digest of the pose of each view by name.
+
+    Neither the size of the photos nor the place of the folder, masks or the choice of test views change it.
+    """
+    poses = {name: camera.viewmat.flatten().tolist() for name, camera in zip(scene.names, scene.cameras, strict=True)}
+    digests = {
+        name: sha256(repr([round(value, 4) + 0.0 for value in pose]).encode()).hexdigest()[:8]
+        for name, pose in poses.items()
+    }
+    return {"folder": scene.root.resolve().name, "views": digests}
+
+
+def check_scene(checkpoint: Mapping[str, Any], scene: Scene) -> None:
+    """Check that a checkpoint is of a scene: most views that both have are seen from the same place.
+
+    Raises:
+        ValueError: It is of another one.
+    """
+    stored, own = checkpoint[SCENE], scene_record(scene)
+    common = stored["views"].keys() & own["views"].keys()
+    same = sum(stored["views"][name] == own["views"][name] for name in common)
+    if not common or 2 * same < len(common):  # not all: rounding may turn out otherwise
+        raise ValueError(
+            f"the checkpoint is of another scene: it was trained on {stored['folder']} with {len(stored['views'])} "
+            f"views, and {same} of the {len(scene)} views of {scene.root} are among them with the same pose; pass "
+            "--data.root with the folder it was trained on, or --trainer.allow_other_scene=true if that is meant"
+        )
+
+
+class PlainCheckpointIO(TorchCheckpointIO):
+    """Lightning's reading and writing of checkpoints, with :func:`read_checkpoint` for local files."""
+
+    def load_checkpoint(
+        self,
+        path: str | Path,
+        map_location: Callable[..., Any] | None = None,
+        weights_only: bool | None = None,
+    ) -> dict[str, Any]:
+        """Read a checkpoint; remote ones as Lightning does, but also refusing anything that could run code.
+
+        Raises:
+            FormatError: See :func:`read_checkpoint`.
+        """
+        if "://" in str(path):
+            return super().load_checkpoint(path, weights_only=True)
+        return read_checkpoint(path)
+
+
+def plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries that are plain data; dataclasses become dictionaries, everything else is left out.
+
+    An object in a checkpoint would make it unreadable without executing code. LightningCLI records classes as
+    ``class_path`` and ``init_args``, which are plain; a class given from Python must be given again at loading.
+    """
+    converted = {name: asdict(v) if is_dataclass(v) and not isinstance(v, type) else v for name, v in values.items()}
+    return {name: value for name, value in converted.items() if _is_plain(value)}
+
+
+def _is_plain(value: Any) -> bool:
+    if type(value) is dict:
+        return all(isinstance(key, str) and _is_plain(item) for key, item in value.items())
+    if type(value) in (list, tuple):
+        return all(_is_plain(item) for item in value)
+    # Exact types: an enum member or NumPy scalar is also an int or float, but not to the unpickler.
+    return value is None or type(value) in (bool, int, float, str)
