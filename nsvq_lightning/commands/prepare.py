@@ -189,7 +189,7 @@ def _missing(verdict: Verdict, images: Path) -> list[str]:
 
 def _check(scene: Path) -> int:
     """The doctor's checks of the folder, and what to type next."""
-    from nsvq_lightning.commands.doctor.folder import check_folder
+    from nsvq_lightning.commands.doctor import check_folder
 
     sys.stdout.write("\n")
     problems = 0

@@ -1,0 +1,554 @@
+"""``nsvq doctor [FOLDER]``: check whether this machine and a scene folder are fit for training.
+
+Each check imports what it needs: ``--help`` answers at once, and a package that is missing or broken fails only the
+checks that need it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from importlib.metadata import packages_distributions, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import torch
+
+    from nsvq_lightning.commands.benchmark.workloads import Workload
+    from nsvq_lightning.data.colmap import ColmapModel
+    from nsvq_lightning.data.scene import Scene
+    from nsvq_lightning.splats.splats import Splats
+
+__all__ = ["Finding", "check_folder", "main"]
+
+EPILOG = """\
+Each line is good, a note (works, could be better or faster) or a problem (a run would fail).
+
+examples:
+  nsvq doctor
+  nsvq doctor path/to/scene
+  nsvq doctor path/to/scene --json > doctor.json
+"""
+
+PACKAGES = ("lightning", "torchmetrics", "jsonargparse", "scipy", "pycolmap")  # besides those of describe_machine
+EXTRAS = {"gsplat": "gsplat", "lpips": "torchvision", "tensorboard": "tensorboard"}  # the package that each brings
+OPENCV = "opencv-contrib-python-headless"
+WIDE = 256  # bits of a vector register; with fewer, kernels take about twice the time on x86, and ARM64 has none wider
+SMALL_MEMORY, SMALL_DISK = 4 << 30, 2 << 30  # bytes; less may not hold pictures and splats, or checkpoints and report
+
+SPLATS, WIDTH, HEIGHT = 4000, 96, 72  # of the self-test
+LARGEST_ERROR = 1e-3  # relative: rounding stays below 1e-4, but a splat that crosses α = 1/255 costs more
+REPEATS = 3  # of what is timed; for the time of a run, of as many views
+
+FEW_POINTS, FEW_VIEWS = 1000, 20
+FAR, MANY_OUTLIERS = 10.0, 0.02  # an outlier is this many times farther from the median than four fifths of the points
+# Two views may be a wrong match, three confirm each other; and the least share of points that should have three.
+SEEN_BY, SEEN_WELL = 3, 0.5
+# Points that two views must share to count as connected, and the least share of its points with its best partner.
+COMMON, LITTLE_OVERLAP = 15, 0.3
+GAMMA, LOWEST, ENOUGH = 2.2, 4.0, 30  # darker grey says nothing of exposure, nor do fewer points
+MOSTLY = 0.7  # share of excluded pixels from which on masks may be inverted
+UNEVEN = 0.5  # stops between the darkest and the brightest tenth of the photos above which colours visibly disagree
+
+# Iterations, and splats over them, on average, as a multiple of the default for the photos.
+FAST, FAST_SPLATS = 4000, 1.3  # fast.yaml
+PAPER, PAPER_SPLATS = 45_000, 4.0  # the paper's run
+RENDERS_A_STEP = 2.0  # time of a step over that of rendering forward and backward: loss, optimizer, codebooks
+
+
+class Finding(NamedTuple):
+    """One line of the doctor's report.
+
+    Attributes:
+        verdict: ``good``; ``note`` for what costs quality or time; ``problem`` for what keeps a run from working.
+        subject: What was checked, one or two words.
+        text: What was found and, unless it is good, what would help.
+        values: The figures behind it, as JSON values.
+    """
+
+    verdict: Literal["good", "note", "problem"]
+    subject: str
+    text: str
+    values: Mapping[str, Any]
+
+    def __str__(self) -> str:
+        return f"{self.verdict:<8} {self.subject:<12} {self.text}"
+
+
+def judged(subject: str, text: str, *advice: str | Literal[False], **values: Any) -> Finding:
+    """A note with the first advice that is given, ``condition and "advice"``; good if there is none."""
+    said = next(filter(None, advice), None)
+    return Finding("note" if said else "good", subject, f"{text}: {said}" if said else text, values)
+
+
+def problem(subject: str, text: str, **values: Any) -> Finding:
+    """A run would fail or be worthless."""
+    return Finding("problem", subject, text, values)
+
+
+def attempt(subject: str, check: Iterator[Finding]) -> Iterator[Finding]:
+    """The findings of a check; if it raises, that is one more, and the other checks can still be made."""
+    try:
+        yield from check
+    except Exception as error:  # third-party code may fail in any way on this machine or folder
+        text = " ".join(str(error).split())
+        # That of a bad file says what is wrong and where.
+        ours = isinstance(error, ValueError | OSError)
+        yield problem(subject, text if ours else f"the check itself failed: {type(error).__name__}: {text}")
+
+
+def check_machine() -> Iterator[Finding]:
+    """The processor, and the versions of Python and of the packages that results depend on."""
+    from nsvq_lightning.commands.benchmark.report import describe_machine
+    from nsvq_lightning.compute import lanes
+
+    machine = describe_machine()
+    yield judged("machine", f"{machine['system']}, {machine['cpu']}", **machine)
+    bits, simd = machine["simd_bits"], machine["simd"]
+    fused = not {"fma", "neon"}.isdisjoint(simd)
+    text = f"{lanes.WIDTH} floats at a time in {bits}-bit registers ({', '.join(simd) or 'no vector extension'})"
+    narrow = bits < WIDE and "neon" not in simd and "a processor with AVX2 or AVX-512 is about twice as fast"
+    split = not fused and "somewhat slower without fused multiply-add, last digits may differ"
+    yield judged("cpu", text, narrow, split, simd_bits=bits, simd=simd, fma=fused)
+    versions = machine["versions"] | {name: version(name) for name in PACKAGES}
+    yield judged("versions", ", ".join(f"{name} {number}" for name, number in versions.items()), **versions)
+
+
+def check_packages() -> Iterator[Finding]:
+    """OpenCV, once: several packages overwrite each other's files; and what a run uses if it is installed."""
+    import torch
+
+    packages = sorted(set(packages_distributions().get("cv2", ())))
+    try:
+        import cv2
+    except ImportError as error:
+        yield problem("opencv", f"cannot be loaded ({error}): pip install {OPENCV}", packages=packages)
+    else:
+        text = f"{cv2.__version__} ({' and '.join(packages) or 'not from pip'})"
+        advice = f"they overwrite each other's files; uninstall all of them, then pip install {OPENCV}"
+        yield judged("opencv", text, len(packages) > 1 and advice, packages=packages)
+    for extra, package in EXTRAS.items():
+        missing = find_spec(package) is None
+        advice = f"optional, pip install 'nsvq-lightning[{extra}]'"
+        yield judged(extra, f"{package} is {'not ' * missing}installed", missing and advice)
+    if find_spec("torchvision") and not any(Path(torch.hub.get_dir(), "checkpoints").glob("vgg16-*.pth")):
+        yield judged("lpips", "no weights of VGG-16", "the first test downloads them (528 MB)")
+
+
+def check_threads() -> Iterator[Finding]:
+    """Whether the kernels use all cores, and do not wait for each other by spinning."""
+    import numba
+    import torch
+
+    from nsvq_lightning.compute.environment import usable_cores
+    from nsvq_lightning.compute.jit import thread_count
+
+    cores, used = usable_cores(), thread_count()
+    torchs, numbas = torch.get_num_threads(), int(numba.config.NUMBA_NUM_THREADS)
+    told = {"OMP_NUM_THREADS", "NUMBA_NUM_THREADS"} & os.environ.keys()
+    # On a Mac, torch spares the slow cores, which would hold up the others.
+    spared = used < cores and not told and (platform.system(), platform.machine()) == ("Darwin", "arm64")
+    text = f"{used} used of {cores} cores (torch {torchs}, numba {numbas})"
+    advice = f"as many as cores are fastest; unset OMP_NUM_THREADS and NUMBA_NUM_THREADS, or set them to {cores}"
+    bad = used != cores and not spared
+    yield judged("threads", text, bad and advice, cores=cores, torch=torchs, numba=numbas, used=used)
+    policy = os.environ.get("OMP_WAIT_POLICY", "not set")
+    advice = "on a shared machine threads that wait by spinning slow a step down several times; set it to passive"
+    yield judged("waiting", f"OMP_WAIT_POLICY is {policy}", policy.lower() != "passive" and advice, policy=policy)
+    if hasattr(os, "getloadavg") and (load := os.getloadavg()[0]) > cores / 2:
+        yield judged("load", f"{load:.1f} processes ran in the last minute", "times will be longer", load=load)
+
+
+def check_room(folder: Path) -> Iterator[Finding]:
+    """Memory for a run, and disk space for checkpoints, report and exports where runs are written."""
+    from nsvq_lightning.training.footprint import available_memory, readable_bytes
+
+    free, disk = available_memory(), shutil.disk_usage(folder).free
+    text = "not told by this system" if free is None else f"{readable_bytes(free)} available"
+    advice = "a usual run takes 2 to 4 GB; end programs, or try --data.max_width 800 --data.cache_bytes 500000000"
+    yield judged("memory", text, free is not None and free < SMALL_MEMORY and advice, available=free)
+    writable = os.access(folder, os.W_OK)
+    text = f"{readable_bytes(disk)} free in {folder.resolve()}{'' if writable else ', which is read-only'}"
+    advice = "checkpoints of a run take about 1 GB; see --trainer.default_root_dir"
+    yield judged("disk", text, (disk < SMALL_DISK or not writable) and advice, free=disk)
+
+
+def check_gpu() -> Iterator[Finding]:
+    """Whether there is a GPU, and what renders on it."""
+    import torch
+
+    from nsvq_lightning.rendering.rasterize import fast_backends
+
+    if torch.cuda.is_available():
+        name, fast = torch.cuda.get_device_name(), fast_backends(torch.zeros(1, device="cuda"))
+        advice = "this version renders on it in plain torch, slower than on the CPU; use the CPU"
+        yield judged("gpu", f"{name}, back-ends {', '.join(fast)}", not fast and advice, name=name, backends=fast)
+    else:
+        built = torch.version.cuda or torch.version.hip
+        advice = "check nvidia-smi and CUDA_VISIBLE_DEVICES" if built else "for an NVIDIA GPU install a CUDA build"
+        yield judged("gpu", f"torch {torch.__version__} finds none", advice)
+
+
+def check_backends() -> Iterator[Finding]:
+    """Image and gradients of every usable back-end against the float64 oracle, which takes seconds."""
+    import torch
+
+    from nsvq_lightning.commands.benchmark import render, timing, workloads
+    from nsvq_lightning.compute.store import kernel_folder
+    from nsvq_lightning.rendering.rasterize import fast_backends
+    from nsvq_lightning.splats.splats import RawSplats
+
+    def results(workload: Workload, backend: str, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+        traced = render.trace(workload, render.painter(backend), dtype)
+        return {"image": traced.image, **render.gradients_of(traced, workload.image_gradient.to(dtype))}
+
+    crop = workloads.synthetic_workload("A20k").crop(WIDTH, HEIGHT)  # of splats in random order, so any part will do
+    small = replace(crop, splats=RawSplats(*(tensor[:SPLATS].clone() for tensor in crop.splats)))
+    truth = results(small, "reference", torch.float64)
+    for device in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
+        here = small.to(device)
+        for backend in fast_backends(here.splats.means):
+            run = partial(results, here, backend, torch.float32)
+            times = [timing.milliseconds(timing.Case(backend, run), device) for _ in range(REPEATS)]
+            errors = {name: workloads.relative_l2(value.cpu(), truth[name]) for name, value in run().items()}
+            values = {"backend": backend, "errors": errors, "ms": min(times), "first_seconds": times[0] / 1000}
+            # "not <" rather than ">=", so that NaN fails.
+            wrong = [f"{name} {error:.1e}" for name, error in errors.items() if not error < LARGEST_ERROR]
+            if wrong:
+                text = f"{backend}: relative error against the float64 oracle: {', '.join(wrong)}; do not trust a run; "
+                text += f"remove {kernel_folder()}, and if that does not help report it with nsvq doctor --json"
+                yield problem("self-test", text, **values)
+            else:
+                image, *gradients = errors.values()
+                text = f"{backend}: image to {image:.1e}, gradients to {max(gradients):.1e} of the float64 oracle; "
+                text += f"{min(times):.1f} ms for {SPLATS:,} splats at {WIDTH}x{HEIGHT}"
+                yield judged("self-test", text, **values)
+
+
+def check_folder(root: Path) -> Iterator[Finding]:
+    """All findings about a scene folder; an unusable folder is a finding, not an exception."""
+    yield from attempt("model", check_model(root))
+
+
+def check_model(root: Path) -> Iterator[Finding]:
+    """Read the model, then check it, and the scene that it makes."""
+    from nsvq_lightning.data.model_files import larger_models
+    from nsvq_lightning.data.transforms import read_poses
+
+    model = read_poses(root, observations=True)
+    if model.source == "COLMAP" and (larger := larger_models(root)) is not None:
+        yield problem("model", larger)
+    yield from attempt("cameras", check_cameras(model))
+    yield from attempt("points", check_points(model))
+    yield from attempt("overlap", check_overlap(model))
+    yield from attempt("scene", check_scene(root, model))
+
+
+def check_cameras(model: ColmapModel) -> Iterator[Finding]:
+    """Number, models and sizes of the cameras, and what distortion does to the corners."""
+    cameras = [model.cameras[number] for number in {image.camera_id for image in model.images}]
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    names = sorted({camera.model_name for camera in cameras})
+    text = f"{len(cameras)} of {'/'.join(names)}, {_range(sizes)}, for {len(model.images)} registered photos"
+    values = {"cameras": len(cameras), "models": names, "sizes": sizes, "photos": len(model.images)}
+    many = model.source == "COLMAP" and len(cameras) > max(1, len(model.images) // 2) and len(sizes) <= 2
+    advice = "more exact if one lens took them and COLMAP knows it (--ImageReader.single_camera 1)"
+    yield judged("cameras", text, many and advice, **values)
+
+
+def _range(sizes: Sequence[tuple[int, int]]) -> str:
+    return " to ".join(f"{width}x{height}" for width, height in dict.fromkeys((min(sizes), max(sizes))))
+
+
+def check_points(model: ColmapModel) -> Iterator[Finding]:
+    """Number of points, and outliers."""
+    count, finite = len(model.points), model.points[np.isfinite(model.points).all(1)]
+    if not count:
+        text = f"none in {model.source}: random ones take their place, and training has more to do"
+        advice = "name a point cloud (ply_file_path in the file), or run COLMAP"
+        yield judged("points", text, not model.synthetic and advice, points=0)
+    elif not len(finite):
+        yield problem("points", f"none is finite: run {'COLMAP' if model.source == 'COLMAP' else 'the export'} again")
+    else:
+        distances = np.linalg.norm(finite - np.median(finite, axis=0), axis=1)
+        far = float(np.mean(distances > FAR * max(float(np.quantile(distances, 0.8)), 1e-12)))
+        lost = count - len(finite)
+        text = f"{count:,}, {100 * far:.2g} % far outliers{f', {lost} not finite (left out)' if lost else ''}"
+        few = count < FEW_POINTS and "few to start from; take more photos with more overlap, or match more features"
+        spread = far > MANY_OUTLIERS and "they become floaters; filter them with `colmap point_filtering`"
+        yield judged("points", text, few, spread, points=count, not_finite=lost, outliers=far)
+
+
+def check_overlap(model: ColmapModel) -> Iterator[Finding]:
+    """How many views saw a point, whether each view shares points with another, and all are connected."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    pairs, names = model.observations, [image.name for image in model.images]
+    if pairs is None or not len(pairs):
+        yield judged("tracks", f"{model.source} has no observations", "the overlap of views is unknown")
+        return
+    lengths = np.bincount(pairs[:, 0], minlength=len(model.points))
+    share, mean = float(np.mean(lengths >= SEEN_BY)), float(lengths.mean())
+    text = f"{100 * share:.0f} % of the points were seen by {SEEN_BY} views or more, {mean:.1f} on average"
+    advice = "many points are uncertain; take photos closer to each other"
+    yield judged("tracks", text, share < SEEN_WELL and advice, seen_by_three=share, mean=mean)
+    seen = csr_array((np.ones(len(pairs), np.int64), pairs.T), shape=(len(lengths), len(names)))
+    common = (seen.T @ seen).toarray()  # points that two views both saw [V, V]; on the diagonal, those of one view
+    own = np.maximum(common.diagonal(), 1)
+    np.fill_diagonal(common, 0)
+    best = common.max(axis=1) / own
+    groups, group_of = connected_components(common >= COMMON, directed=False)
+    weak = np.flatnonzero(group_of != np.bincount(group_of).argmax() if groups > 1 else best < LITTLE_OVERLAP)
+    named = ", ".join(names[i] for i in weak[:3]) + (f" and {len(weak) - 3} more" if len(weak) > 3 else "")
+    usual, least = float(np.median(best)), float(best.min())
+    text = f"a photo shares {100 * usual:.0f} % of its points with its best partner, at least {100 * least:.0f} %"
+    apart = groups > 1 and f"under {COMMON} with the rest for {named}; take photos between them, or leave them out"
+    little = len(weak) > 0 and f"little for {named}; take photos in between"
+    yield judged("overlap", text, apart, little, median=usual, least=least, groups=int(groups))
+
+
+def check_scene(root: Path, model: ColmapModel) -> Iterator[Finding]:
+    """Load the folder as a run does it, then check its split, its photos, and what a run will take."""
+    from nsvq_lightning.data.scene import ONE_PLACE, load_scene
+
+    scene = load_scene(root)
+    train, test = len(scene.train), len(scene.test)
+    text = f"{train} train and {test} test photos ({scene.split})"
+    advice = "few; what lies between them is guessed, and the test score says little; take more photos"
+    yield judged("split", text, train < FEW_VIEWS and advice, train=train, test=test)
+    if not scene.extent > 0:
+        yield problem("extent", f"all train photos {ONE_PLACE}", extent=scene.extent)
+    yield from attempt("sizes", check_sizes(scene, model))
+    yield from attempt("photos", check_photos(scene, model))
+    yield from attempt("run time", check_budget(scene))
+
+
+def check_sizes(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
+    """Whether files are of the size that the model says, and what becomes of those that lie on their side."""
+    from nsvq_lightning.data.images import image_head
+    from nsvq_lightning.data.scene import OTHER_SHAPE, same_shape
+
+    sources, scaled, others = scene.images.sources, 0, 0
+    for image, source in zip(model.images, sources, strict=True):
+        camera = model.cameras[image.camera_id]
+        others += not same_shape(camera, *source.size)
+        scaled += source.size != (camera.width, camera.height)
+    used = _range([(source.pinhole.width, source.pinhole.height) for source in sources])
+    text = f"trained at {used}; {others or scaled} of {len(sources)} files "
+    if others:
+        yield problem("sizes", f"{text}{OTHER_SHAPE}", scaled=scaled, other_shape=others)
+    else:
+        yield judged("sizes", f"{text}are scaled from what {model.source} says, their cameras with them", scaled=scaled)
+    undistorted = sum(source.undistortion is not None for source in sources)
+    yield judged("distortion", f"{undistorted} of {len(sources)} photos are undistorted when they are decoded")
+    turned = sum(source.orientation != 1 for source in sources)
+    stored = sum(image_head(source.path).lies_on_its_side for source in sources) - turned
+    if turned or stored:
+        text = f"{turned} photos are turned by their EXIF orientation, as cameras are; {stored} are used as stored, "
+        text += "like COLMAP did: they lie on their side in the report, the scene does not"
+        yield judged("orientation", text, turned=turned, stored=stored)
+
+
+def check_photos(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
+    """Decode all photos, in parallel: whether that works, which are not in the model, and what they look like."""
+    import torch
+
+    from nsvq_lightning.data.frames import PHOTOS
+
+    def read(index: int) -> tuple[float, float, float] | str:
+        try:
+            image, mask = scene.images.sources[index].load()
+        except (ValueError, OSError) as error:
+            return str(error)
+        kept = torch.ones(image.shape[:2], dtype=torch.bool) if mask is None else mask
+        return float(image[kept].float().mean()), exposure_of(image, index, scene, model), float(kept.float().mean())
+
+    with ThreadPoolExecutor(max_workers=torch.get_num_threads()) as pool:
+        photos = dict(zip(scene.names, pool.map(read, range(len(scene))), strict=True))
+    broken = [photo for photo in photos.values() if isinstance(photo, str)]
+    if broken:
+        yield problem("photos", f"{len(broken)} of {len(photos)} cannot be used; first: {broken[0]}", errors=broken)
+    else:
+        yield judged("photos", f"all {len(photos)} registered photos can be read")
+    folder = scene.root / (model.images_folder or "images")
+    known = {Path(name).with_suffix("") for name in scene.names}
+    # The folder of a NeRF-synthetic scene also holds maps and further views.
+    found = folder.rglob("*") if folder != scene.root else ()
+    files = [path.relative_to(folder) for path in found if path.suffix.lower() in PHOTOS]
+    extra = sorted(str(path) for path in files if path.with_suffix("") not in known)
+    if extra:
+        text = f"{len(extra)} of {len(files)} files in {folder} are not in the model"
+        yield judged("registered", text, "they are not used; if many, photos lack overlap or sharpness", files=extra)
+    if len(broken) < len(photos):
+        usable = {name: photo for name, photo in photos.items() if not isinstance(photo, str)}
+        yield from attempt("exposure", check_exposure(usable))
+
+
+def exposure_of(image: torch.Tensor, index: int, scene: Scene, model: ColmapModel) -> float:
+    """Median over points of log2(light in a photo / light of the point's colour, its mean over all photos).
+
+    Args:
+        image: The photo ``[H, W, 3]`` uint8 RGB.
+        index: Its place in the scene and in the model.
+        scene: The scene that has its camera.
+        model: The model that has the points and says which it saw.
+
+    Returns:
+        Stops; NaN if it saw too few points that are neither black nor outside the picture.
+    """
+    import torch
+
+    if model.observations is None:
+        return math.nan
+    rows, camera = model.observations[model.observations[:, 1] == index, 0], scene.cameras[index]
+    view = camera.viewmat.double()
+    local = (torch.from_numpy(model.points[rows]) @ view[:3, :3].T + view[:3, 3]) @ camera.K.double().T
+    x, y = (local[:, :2] / local[:, 2:]).floor().T
+    inside = (local[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+    here = image[y[inside].long(), x[inside].long()].double().mean(1)
+    usual = torch.from_numpy(model.colors[rows[inside.numpy()]]).double().mean(1)
+    clear = (here > LOWEST) & (usual > LOWEST)
+    return float(GAMMA * (here[clear] / usual[clear]).log2().median()) if int(clear.sum()) >= ENOUGH else math.nan
+
+
+def check_exposure(photos: Mapping[str, tuple[float, float, float]]) -> Iterator[Finding]:
+    """How much masks exclude, and whether photos were exposed alike: splats have one colour for all of them.
+
+    Args:
+        photos: By name, the mean grey level, 0 to 255, :func:`exposure_of`, and the share of the pixels that count.
+    """
+    names, (grey, stops, counts) = list(photos), np.array(list(photos.values())).T
+    masked = int((counts < 1).sum())
+    if masked:
+        share = 1 - float(counts[counts < 1].mean())
+        text = f"{masked} of {len(names)} photos have pixels that do not count, {100 * share:.0f} % of them"
+        advice = f"most in {names[counts.argmin()]}; masks are white where the photo counts; if not, invert them"
+        yield judged("masks", text, share > MOSTLY and advice, masked=masked, excluded=share)
+    text = "mean grey level {:.0f} to {:.0f}".format(*np.quantile(grey, (0.1, 0.9)))
+    if np.isnan(stops).mean() > 0.5:
+        yield judged("exposure", f"{text}; without observations, exposure and content of a photo cannot be separated")
+        return
+    low, high = map(float, np.nanquantile(stops, (0.1, 0.9)))
+    text += f"; the same points are {low:+.2f} to {high:+.2f} stops from their usual brightness"
+    brightest = names[np.nanargmax(stops)]
+    advice = f"colours disagree, {brightest} is brightest; lock exposure and white balance, or equalize the photos"
+    yield judged("exposure", text, high - low > UNEVEN and advice, stops=[low, high], grey=grey.tolist())
+
+
+def check_budget(scene: Scene) -> Iterator[Finding]:
+    """Memory against what is available; time from renders of the scene grown as two recipes grow it."""
+    from nsvq_lightning.compression.budget import splats_for_photos
+    from nsvq_lightning.data.edges import detailed_pixels
+    from nsvq_lightning.training.footprint import CACHE_BYTES, available_memory, readable_bytes, run_bytes
+
+    default = splats_for_photos(len(scene.train), detailed_pixels(scene))
+    fast, paper = round(FAST_SPLATS * default), round(PAPER_SPLATS * default)
+    photos, needed, free = scene.images.nbytes, run_bytes(scene, paper), available_memory()
+    shown = readable_bytes(min(photos, CACHE_BYTES))
+    text = f"about {readable_bytes(needed)} with {paper:,} splats and {shown} of photos"
+    if photos > CACHE_BYTES:
+        text += f" (all would take {readable_bytes(photos)}; the others are decoded each time)"
+    advice = f"{readable_bytes(free or 0)} are available; lower --data.max_width or --data.cache_bytes"
+    yield judged("run memory", text, free is not None and needed > free and advice, bytes=needed)
+    step, paper_step = (RENDERS_A_STEP * render_seconds(scene, count) for count in (fast, paper))
+    text = f"about {FAST * step / 60:.0f} min for fast.yaml ({FAST:,} steps, {fast:,} splats on average), "
+    text += (
+        f"{PAPER * paper_step / 3600:.1f} h for the paper's run ({PAPER:,}, {paper:,}), with the machine as busy as now"
+    )
+    yield judged("run time", text, step_seconds=step, paper_step_seconds=paper_step)
+
+
+def render_seconds(scene: Scene, count: int) -> float:
+    """Median over views of the shortest time to render ``count`` splats forward and backward."""
+    from nsvq_lightning.commands.benchmark.timing import Case, milliseconds
+    from nsvq_lightning.rendering.rasterize import render
+
+    splats = grown(scene, count)
+
+    def step(view: int) -> None:
+        render(splats, scene.cameras[view]).image.mean().backward()  # type: ignore[no-untyped-call]
+
+    cases = [Case("step", partial(step, view)) for view in scene.some_train(REPEATS)]
+    return float(np.median([min(milliseconds(case) for _ in range(REPEATS)) for case in cases])) / 1000
+
+
+def grown(scene: Scene, count: int) -> Splats:
+    """The scene's points as splats, repeated with small shifts until there are ``count``, and shrunk to match."""
+    import torch
+
+    from nsvq_lightning.random import generator
+    from nsvq_lightning.splats.splats import Splats
+
+    start = Splats.from_points(scene.points, scene.colors)
+    copies, draw = -(-count // len(start)), generator(0, 0, "doctor")
+    rows = torch.arange(len(start)).repeat(copies)[: max(count, len(start))]
+    tensors = {name: value.detach()[rows] for name, value in start.attributes().items()}
+    tensors["means"] = tensors["means"] + tensors["scales"].exp() * torch.randn(len(rows), 3, generator=draw)
+    # More splats cover the surfaces with smaller ones, and trained ones overlap in many layers. With these two numbers,
+    # renders of fox, bonsai and photos of two megapixels take about as long as those of the trained scenes.
+    tensors["scales"] = tensors["scales"] - math.log(copies) / 2 + 0.5
+    tensors["opacities"] = torch.randn(len(rows), generator=draw) - 0.5
+    return Splats.from_tensors(**tensors)
+
+
+def check_all(folder: Path | None) -> Iterator[Finding]:
+    """All findings about this machine and, if given, a scene folder."""
+    yield from attempt("machine", check_machine())
+    yield from attempt("packages", check_packages())
+    yield from attempt("threads", check_threads())
+    yield from attempt("memory", check_room(Path()))
+    yield from attempt("gpu", check_gpu())
+    yield from attempt("self-test", check_backends())
+    if folder is not None:
+        yield from check_folder(folder)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Check this machine and, if given, a scene folder.
+
+    Args:
+        argv: Arguments after ``nsvq doctor``; those of the process if None.
+
+    Returns:
+        0, or 1 if there is a problem: the self-test fails or the folder cannot be used. Wrong arguments end the process
+        with status 2.
+    """
+    parser = argparse.ArgumentParser(
+        prog="nsvq doctor",
+        description="Check whether this machine is fit for training, by a test against a float64 oracle, and whether a "
+        "COLMAP folder is a good scene.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("folder", nargs="?", type=Path, metavar="FOLDER", help="COLMAP folder to check")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of lines")
+    options = parser.parse_args(argv)
+    findings = []
+    for finding in check_all(options.folder):
+        findings.append(finding)
+        if not options.json:
+            sys.stdout.write(f"{finding}\n")
+            sys.stdout.flush()  # each check takes seconds
+    verdicts = [finding.verdict for finding in findings]
+    problems, notes = verdicts.count("problem"), verdicts.count("note")
+    if options.json:
+        document = {"ok": not problems, "findings": [finding._asdict() for finding in findings]}
+        sys.stdout.write(json.dumps(document, indent=2, ensure_ascii=False) + "\n")
+    else:
+        said = f"{problems or 'no'} problem{'s' * (problems != 1)}, {notes or 'no'} note{'s' * (notes != 1)}"
+        sys.stdout.write(f"\n{said}\n")
+    return 1 if problems else 0

@@ -1,0 +1,266 @@
+from __future__ import annotations
+
+import json
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from llvmlite import binding
+
+from nsvq_lightning.commands import doctor
+from nsvq_lightning.commands.benchmark import render as rendering
+from nsvq_lightning.commands.doctor import Finding, attempt, check_folder, main
+from nsvq_lightning.compute import environment, jit
+from nsvq_lightning.data.colmap import import_pycolmap, read_model
+from nsvq_lightning.data.scene import load_scene
+from nsvq_lightning.rendering.rasterize import Render, render
+from nsvq_lightning.training import footprint
+
+GOOD = Finding("good", "run time", "not measured", {})
+
+
+@pytest.fixture
+def scene(demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the demo scene that may be damaged; the slow estimate is tested by itself."""
+    monkeypatch.setattr(doctor, "check_budget", lambda scene: iter([GOOD]))
+    return Path(shutil.copytree(demo_scene, tmp_path / "scene"))
+
+
+def _by_subject(root: Path) -> dict[str, Finding]:
+    return {finding.subject: finding for finding in check_folder(root)}
+
+
+def test_json_has_every_finding_and_the_verdict(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    subjects = {finding["subject"] for finding in document["findings"]}
+    assert document["ok"]
+    assert subjects >= {"machine", "cpu", "versions", "opencv", "gsplat", "lpips", "tensorboard", "threads", "waiting"}
+    assert subjects >= {"memory", "disk", "gpu", "self-test"}
+
+
+def test_a_bad_folder_gives_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path)]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.startswith(f"problem  model        no COLMAP model in {tmp_path}")]
+    assert lines[-1].startswith("1 problem,")
+
+
+def test_help_answers_before_torch_is_imported() -> None:
+    code = "import sys; from nsvq_lightning.commands.main import main\ntry: main(['doctor', '--help'])\n"
+    code += "finally: assert 'torch' not in sys.modules"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+
+
+def test_without_opencv_the_other_checks_are_still_made() -> None:
+    code = "import sys; sys.modules['cv2'] = None\nfrom nsvq_lightning.commands.doctor import main; sys.exit(main([]))"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (run.returncode, "problem  opencv" in run.stdout, "waiting" in run.stdout) == (1, True, True)
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (ZeroDivisionError("of\nsomething"), "the check itself failed: ZeroDivisionError: of something"),
+        (ValueError("a.jpg is cut: copy it again"), "a.jpg is cut: copy it again"),
+    ],
+)
+def test_a_check_that_breaks_is_a_problem_and_keeps_what_it_said_before(error: Exception, said: str) -> None:
+    def check() -> Iterator[Finding]:
+        yield Finding("good", "disk", "enough", {})
+        raise error
+
+    first, second = attempt("disk", check())
+    assert str(first) == "good     disk         enough"
+    assert (second.verdict, second.text) == ("problem", said)
+
+
+def test_threads_and_waiting_are_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    for used, verdict in ((2, "note"), (4, "good"), (8, "note")):
+        monkeypatch.setattr(environment, "usable_cores", lambda: 4)
+        monkeypatch.setattr(jit, "thread_count", lambda used=used: used)
+        assert next(doctor.check_threads()).verdict == verdict
+    for policy, verdict in (("passive", "good"), ("ACTIVE", "note")):
+        monkeypatch.setenv("OMP_WAIT_POLICY", policy)
+        assert list(doctor.check_threads())[1].verdict == verdict
+
+
+def test_the_slow_cores_of_a_mac_are_not_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(environment, "usable_cores", lambda: 8)
+    monkeypatch.setattr(jit, "thread_count", lambda: 4)
+    monkeypatch.setattr(platform, "system", lambda: "Darwin")
+    monkeypatch.setattr(platform, "machine", lambda: "arm64")
+    for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    assert next(doctor.check_threads()).verdict == "good"
+    monkeypatch.setenv("OMP_NUM_THREADS", "4")
+    assert next(doctor.check_threads()).verdict == "note"
+
+
+def test_one_opencv_of_any_name_is_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    packages = ["opencv-python"]
+    monkeypatch.setattr(doctor, "packages_distributions", lambda: {"cv2": packages})
+    finding = next(doctor.check_packages())
+    assert (finding.verdict, finding.values["packages"]) == ("good", ["opencv-python"])
+    packages.append("opencv-contrib-python-headless")
+    finding = next(doctor.check_packages())
+    assert (finding.verdict, "uninstall" in finding.text) == ("note", True)
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    finding = next(doctor.check_packages())
+    assert (finding.verdict, "pip install opencv" in finding.text) == ("problem", True)
+
+
+def test_neon_is_no_reason_to_look_for_another_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(binding, "get_host_cpu_features", dict)  # LLVM says nothing, as on a Mac
+    for processor, found in (("arm64", ("good", True)), ("x86_64", ("note", False))):
+        monkeypatch.setattr(platform, "machine", lambda processor=processor: processor)
+        finding = list(doctor.check_machine())[1]
+        assert (finding.verdict, finding.values["fma"]) == found
+
+
+def test_little_memory_and_disk_are_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(footprint, "available_memory", lambda: 10**9)
+    monkeypatch.setattr(doctor, "SMALL_DISK", 1 << 70)
+    assert [finding.verdict for finding in doctor.check_room(tmp_path)] == ["note", "note"]
+
+
+def test_the_cpu_kernels_pass() -> None:
+    (finding,) = (found for found in doctor.check_backends() if found.values["backend"] == "cpu")
+    assert finding.verdict == "good"
+    assert set(finding.values["errors"]) == {"image", "means", "quats", "scales", "opacities", "sh0", "shN"}
+    assert 0 < max(finding.values["errors"].values()) < 1e-4
+
+
+@pytest.mark.parametrize("factor", [1.01, float("nan")])
+def test_wrong_kernels_fail(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
+    def wrong(splats, camera, *, background, backend):  # type: ignore[no-untyped-def]
+        result = render(splats, camera, background=background, backend=backend)
+        return Render(result.image * factor, *result[1:]) if backend == "cpu" else result
+
+    monkeypatch.setattr(rendering, "render", wrong)
+    (finding,) = (found for found in doctor.check_backends() if found.values["backend"] == "cpu")
+    assert finding.verdict == "problem"
+    assert "image" in finding.text
+    assert "opacities" in finding.text
+
+
+def test_a_sound_scene_has_no_problem(scene: Path) -> None:
+    findings = _by_subject(scene)
+    assert not [finding for finding in findings.values() if finding.verdict == "problem"]
+    assert findings["cameras"].values["sizes"] == [(96, 72)]
+    assert findings["tracks"].values["seen_by_three"] == 1  # the demo scene makes no other points
+    assert findings["split"].values == {"train": 7, "test": 2}
+    assert findings["split"].verdict == "note"  # few photos
+    assert findings["photos"].verdict == findings["exposure"].verdict == "good"
+    assert findings["run time"] is GOOD
+
+
+def test_the_estimate_of_a_run_is_measured(demo_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = load_scene(demo_scene)
+    assert len(doctor.grown(scene, 2000)) == 2000
+    memory, time = doctor.check_budget(scene)
+    assert 1e9 < memory.values["bytes"] < 2e9
+    assert min(time.values["step_seconds"], time.values["paper_step_seconds"]) > 0
+    # With a second for each splat, instead of what a busy machine takes:
+    monkeypatch.setattr(doctor, "render_seconds", lambda scene, count: float(count))
+    _, time = doctor.check_budget(scene)
+    assert 100 < time.values["step_seconds"] < time.values["paper_step_seconds"]
+    monkeypatch.setattr(footprint, "available_memory", lambda: 10**9)
+    assert "max_width" in next(doctor.check_budget(scene)).text
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+@pytest.mark.parametrize(
+    ("damage", "subject", "words"),
+    [
+        (lambda root: shutil.rmtree(root), "model", "does not exist"),
+        (lambda root: shutil.rmtree(root / "sparse"), "model", "no COLMAP model"),
+        (lambda root: _cut(root / "sparse/0/points3D.bin"), "model", "truncated"),
+        (lambda root: shutil.rmtree(root / "images"), "scene", "copy the photos"),
+        (lambda root: (root / "images/view_003.png").unlink(), "scene", "view_003.png"),
+        (lambda root: (root / "images/view_003.png").write_text("no image"), "scene", "view_003.png"),
+        (lambda root: _cut(root / "images/view_003.png"), "photos", "1 of 9 cannot be used"),
+    ],
+)
+def test_damage_is_a_problem_and_no_exception(
+    scene: Path, damage: Callable[[Path], None], subject: str, words: str
+) -> None:
+    damage(scene)
+    finding = _by_subject(scene)[subject]
+    assert finding.verdict == "problem"
+    assert words in finding.text
+
+
+def test_files_outside_the_model_and_of_another_shape_are_named(scene: Path) -> None:
+    picture = cv2.imread(str(scene / "images/view_000.png"))
+    assert cv2.imwrite(str(scene / "images/new.png"), picture)
+    assert cv2.imwrite(str(scene / "images/view_001.png"), picture[:, :50])
+    findings = _by_subject(scene)
+    assert findings["registered"].values["files"] == ["new.png"]
+    assert (findings["sizes"].verdict, findings["sizes"].values["other_shape"]) == ("problem", 1)
+
+
+def test_exposure_is_measured_in_stops_where_points_were_seen(scene: Path) -> None:
+    def stops() -> list[float]:
+        loaded = load_scene(scene)
+        return [doctor.exposure_of(loaded.images[i].image, i, loaded, model) for i in range(len(loaded))]
+
+    model, path = read_model(scene, observations=True), scene / "images/view_004.png"
+    before = stops()
+    assert max(map(abs, before)) < 0.3
+    assert cv2.imwrite(str(path), np.round(cv2.imread(str(path)) * 0.5).astype(np.uint8))
+    after = stops()
+    # half the grey level is 2.2 stops under a gamma of 2.2
+    assert after[4] - before[4] == pytest.approx(-2.2, abs=0.1)
+    assert after[:4] + after[5:] == before[:4] + before[5:]
+    model.points[0] = np.linalg.inv(model.images[3].viewmat)[:3, 3]  # at a camera's centre: the scene leaves it out
+    assert stops() == pytest.approx(after, abs=0.02)
+
+
+def test_photos_that_disagree_and_masks_that_exclude_most_are_noted() -> None:
+    photos = {"a.png": (50.0, -1.0, 0.2), "b.png": (90.0, 0.0, 0.1), "c.png": (200.0, 1.0, 1.0)}
+    masks, exposure = doctor.check_exposure(photos)
+    assert (masks.verdict, masks.values["masked"], "most in b.png" in masks.text) == ("note", 2, True)
+    assert (exposure.verdict, "c.png is brightest" in exposure.text) == ("note", True)
+
+
+def test_a_larger_model_beside_the_first_is_a_problem(scene: Path) -> None:
+    shutil.copytree(scene / "sparse/0", scene / "sparse/1")
+    images = scene / "sparse/0/images.bin"
+    assert "model" not in _by_subject(scene)
+    reconstruction = import_pycolmap().Reconstruction(str(scene / "sparse/1"))
+    reconstruction.deregister_frame(next(iter(reconstruction.frames)))
+    reconstruction.write_binary(str(images.parent))
+    finding = _by_subject(scene)["model"]
+    assert (finding.verdict, finding.text.partition(":")[0]) == ("problem", "sparse/0 has 8 images, sparse/1 has 9")
+
+
+def test_shared_points_are_those_of_both_views(scene: Path) -> None:
+    model = read_model(scene, observations=True)
+    saw = np.random.default_rng(0).random((len(model.points), len(model.images))) < 0.4
+    saw[:, 4] = False  # a view without points
+    _, overlap = doctor.check_overlap(replace(model, observations=np.argwhere(saw)))
+    sets = [set(np.flatnonzero(column)) for column in saw.T]
+    best = [max(len(a & b) / max(len(a), 1) for b in sets if b is not a) for a in sets]
+    assert overlap.values == {"median": np.median(best), "least": 0.0, "groups": 2}
+
+
+def test_a_view_that_shares_nothing_is_named(scene: Path) -> None:
+    model = read_model(scene, observations=True)
+    assert model.observations is not None
+    assert [finding.verdict for finding in doctor.check_overlap(model)] == ["good", "good"]
+    lonely = replace(model, observations=model.observations[model.observations[:, 1] != 2])
+    _, finding = doctor.check_overlap(lonely)
+    assert (finding.verdict, finding.values["groups"]) == ("note", 2)
+    assert "view_002.png" in finding.text
