@@ -44,7 +44,7 @@ examples:
 """
 
 PACKAGES = ("lightning", "torchmetrics", "jsonargparse", "scipy", "pycolmap")  # besides those of describe_machine
-EXTRAS = {"gsplat": "gsplat", "lpips": "torchvision", "tensorboard": "tensorboard"}  # the package that each brings
+EXTRAS = {"lpips": "torchvision", "tensorboard": "tensorboard"}  # the package that each brings
 OPENCV = "opencv-contrib-python-headless"
 WIDE = 256  # bits of a vector register; with fewer, kernels take about twice the time on x86, and ARM64 has none wider
 SMALL_MEMORY, SMALL_DISK = 4 << 30, 2 << 30  # bytes; less may not hold pictures and splats, or checkpoints and report
@@ -174,7 +174,7 @@ def check_threads() -> Iterator[Finding]:
 
 def check_room(folder: Path) -> Iterator[Finding]:
     """Memory for a run, and disk space for checkpoints, report and exports where runs are written."""
-    from nsvq_lightning.training.footprint import available_memory, readable_bytes
+    from nsvq_lightning.training.memory_estimate import available_memory, readable_bytes
 
     free, disk = available_memory(), shutil.disk_usage(folder).free
     text = "not told by this system" if free is None else f"{readable_bytes(free)} available"
@@ -207,7 +207,7 @@ def check_backends() -> Iterator[Finding]:
     import torch
 
     from nsvq_lightning.commands.benchmark import render, timing, workloads
-    from nsvq_lightning.compute.store import kernel_folder
+    from nsvq_lightning.compute.kernel_cache import kernel_folder
     from nsvq_lightning.rendering.rasterize import fast_backends
     from nsvq_lightning.splats.splats import RawSplats
 
@@ -245,7 +245,7 @@ def check_folder(root: Path) -> Iterator[Finding]:
 
 def check_model(root: Path) -> Iterator[Finding]:
     """Read the model, then check it, and the scene that it makes."""
-    from nsvq_lightning.data.model_files import larger_models
+    from nsvq_lightning.data.colmap import larger_models
     from nsvq_lightning.data.transforms import read_poses
 
     model = read_poses(root, observations=True)
@@ -453,7 +453,7 @@ def check_budget(scene: Scene) -> Iterator[Finding]:
     """Memory against what is available; time from renders of the scene grown as two recipes grow it."""
     from nsvq_lightning.compression.budget import splats_for_photos
     from nsvq_lightning.data.edges import detailed_pixels
-    from nsvq_lightning.training.footprint import CACHE_BYTES, available_memory, readable_bytes, run_bytes
+    from nsvq_lightning.training.memory_estimate import CACHE_BYTES, available_memory, readable_bytes, run_bytes
 
     default = splats_for_photos(len(scene.train), detailed_pixels(scene))
     fast, paper = round(FAST_SPLATS * default), round(PAPER_SPLATS * default)

@@ -124,7 +124,9 @@ def splat_host(module: LightningModule) -> SplatHost:
     Raises:
         TypeError: It lacks a member of :class:`SplatHost`, or holds another host, which a callback would never set.
     """
-    inner = [type(each).__name__ for each in module.children() if not missing_members(each, SplatHost)]
+    inner = [
+        type(each).__name__ for each in getattr(module, "_modules", {}).values() if not missing_members(each, SplatHost)
+    ]
     if inner:
         raise TypeError(
             f"{type(module).__name__} cannot host the splat callbacks: it holds a {inner[0]} and passes on to it, but "

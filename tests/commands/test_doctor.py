@@ -42,7 +42,7 @@ def test_json_has_every_finding_and_the_verdict(capsys: pytest.CaptureFixture[st
     document = json.loads(capsys.readouterr().out)
     subjects = {finding["subject"] for finding in document["findings"]}
     assert document["ok"]
-    assert subjects >= {"machine", "cpu", "versions", "opencv", "gsplat", "lpips", "tensorboard", "threads", "waiting"}
+    assert subjects >= {"machine", "cpu", "versions", "opencv", "lpips", "tensorboard", "threads", "waiting"}
     assert subjects >= {"memory", "disk", "gpu", "self-test"}
 
 

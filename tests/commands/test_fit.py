@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from nsvq_lightning.data.synthetic import write_synthetic_scene
+from demo_room import write_synthetic_scene
 
 from nsvq_lightning.commands import main as cli
 from nsvq_lightning.commands.arguments import _without_folder, check_config, find_config, resolve_configs

@@ -139,6 +139,7 @@ def test_errors_are_one_line(scene: Path, arguments: list[str], words: str, caps
 def test_folders_and_checkpoints_without_a_scene_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert _run(tmp_path) == 1
     assert "holds no scene.nsvq" in capsys.readouterr().err
+    (tmp_path / "last.ckpt").touch()
     assert _run(tmp_path / "last.ckpt") == 1
     assert "nsvq export --ckpt_path" in capsys.readouterr().err
 

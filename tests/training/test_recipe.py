@@ -96,14 +96,6 @@ def test_a_resumed_run_is_the_run_not_interrupted(
     assert scene_bytes(resumed) == scene_bytes(finished)
 
 
-def test_late_steps_have_several_views(finished: Trainer, witness: Witness) -> None:
-    # Gradients are zeroed at the first view of a step, so the views of a step count for the next one.
-    assert set(witness.views[:44]) == {1}
-    change = witness.views.index(3)
-    assert 45 <= change <= 47  # between two steps, at a multiple of three views
-    assert set(witness.views[change:]) == {3}
-
-
 def test_rates_fall_at_the_end_and_rise_for_the_selection(finished: Trainer, witness: Witness) -> None:
     rates = [rate["opacities"] / 0.05 for rate in witness.rates]
     assert rates[:24] == pytest.approx([1.0] * 24)
