@@ -37,8 +37,8 @@ class PhaseSchedule(HostedCallback):
         min_reset_interval: Lower limit of the interval of opacity resets in this run.
         min_replacement_interval: Lower limit of the window of code replacement and of the interval of refits.
         min_finetune: Lower limit of the length of the fine-tune phase, up to half of what follows the prune phase.
-        iterations_per_photo: The run has at most so many iterations for each train photo: few photos are soon
-            learned by heart. None is ``trainer.max_steps`` whatever the photos; ``total`` goes before it.
+        iterations_per_photo: Most iterations for each train photo, as few are soon overfitted. None is
+            ``trainer.max_steps`` whatever the photos; ``total`` goes before it.
 
     Raises:
         ValueError: ``iterations_per_photo`` is below 1; or see :class:`~nsvq_lightning.training.schedule.Schedule`.

@@ -144,7 +144,8 @@ def in_plain_words(message: str, classes: Iterable[str]) -> str:
     if key is None or value is None:
         return message
     meant = nearest(value[1].rpartition(".")[2], classes)
-    problem = re.search(r"Problem with given class_path.*?(?=\n +- |\Z)", message, re.S)
+    causes = r"(?:Problem with given class_path|Invalid content in sub-config file).*?(?=\n +- |\Z)"
+    problem = re.search(causes, message, re.S)
     if problem is not None:
         return f"{key[1]}: {' '.join(problem[0].split())}{meant}"
     types = re.search(r"Subtypes: .*", message) or re.search(r"Expected a .*", message)

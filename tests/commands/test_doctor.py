@@ -21,7 +21,7 @@ from nsvq_lightning.compute import environment, jit
 from nsvq_lightning.data.colmap import import_pycolmap, read_model
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.rendering.rasterize import Render, render
-from nsvq_lightning.training import footprint
+from nsvq_lightning.training import memory_estimate
 
 GOOD = Finding("good", "run time", "not measured", {})
 
@@ -127,7 +127,7 @@ def test_neon_is_no_reason_to_look_for_another_processor(monkeypatch: pytest.Mon
 
 
 def test_little_memory_and_disk_are_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(footprint, "available_memory", lambda: 10**9)
+    monkeypatch.setattr(memory_estimate, "available_memory", lambda: 10**9)
     monkeypatch.setattr(doctor, "SMALL_DISK", 1 << 70)
     assert [finding.verdict for finding in doctor.check_room(tmp_path)] == ["note", "note"]
 
@@ -173,7 +173,7 @@ def test_the_estimate_of_a_run_is_measured(demo_scene: Path, monkeypatch: pytest
     monkeypatch.setattr(doctor, "render_seconds", lambda scene, count: float(count))
     _, time = doctor.check_budget(scene)
     assert 100 < time.values["step_seconds"] < time.values["paper_step_seconds"]
-    monkeypatch.setattr(footprint, "available_memory", lambda: 10**9)
+    monkeypatch.setattr(memory_estimate, "available_memory", lambda: 10**9)
     assert "max_width" in next(doctor.check_budget(scene)).text
 
 
