@@ -39,20 +39,20 @@ def naming_file(path: str | PathLike[str]) -> Iterator[None]:
         raise FormatError(f"{fspath(path)}: {error.defect}", error.remedy) from None
 
 
-FEW_SPLATS = 1 << 20
-"""Splats that any file may hold, however short, such as one of equal splats; beyond, each takes a byte or more. So many
-are read in less than 1 GB."""
+FEW_SPLATS = 1 << 18
+"""Splats that any file may hold, however short, such as one of equal splats; beyond, each takes two bytes or more. A
+file below 1 MB is then read in half a gigabyte of memory and a few seconds."""
 FEW_ROWS = 1 << 16
 """The same for the rows of a codebook in level ``compact`` of ``.nsvq``, and the bytes of its stream."""
 
 
-def check_room(what: str, count: int, size: int, few: int = FEW_SPLATS) -> None:
+def check_room(what: str, count: int, size: int, few: int = FEW_SPLATS, each: int = 2) -> None:
     """Refuse more splats, texels or rows than a file or stream of ``size`` bytes can hold.
 
     Raises:
-        FormatError: There are more than ``few``, and more than bytes.
+        FormatError: There are more than ``few``, and not ``each`` bytes for each.
     """
-    if count > max(few, size):
+    if count > max(few, size // each):
         raise FormatError(
-            f"truncated or damaged: {count} {what} cannot be in {size} bytes; above {few}, each takes one or more"
+            f"truncated or damaged: {count} {what} cannot be in {size} bytes; above {few}, each takes {each} or more"
         )

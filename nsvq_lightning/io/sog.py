@@ -160,7 +160,7 @@ class SogArchive:
         """
         from PIL import Image
 
-        data = self._bytes(name, _TEXEL_BYTES * max(FEW_SPLATS, self._size))
+        data = self._bytes(name, _TEXEL_BYTES * max(FEW_SPLATS, self._size // 2))
         try:
             with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
                 if image.width * image.height < count:

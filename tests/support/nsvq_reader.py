@@ -48,7 +48,7 @@ ORDERS = {
     "cells": ["opacities", "scales", "means", *LATER],
     "grid": ["scales", "means", "opacities", *LATER],
 }
-FEW_SPLATS, FEW_ROWS = 2**20, 2**16
+FEW_SPLATS, FEW_ROWS = 2**18, 2**16
 
 
 def natural(value):
@@ -95,7 +95,7 @@ def check(header, streams):
     if compact:
         assert len(streams["means.far"]) % 12 == 0
         assert len(streams["means.far"]) <= 12 * count
-        assert count <= max(FEW_SPLATS, sum(map(len, streams.values())))
+        assert count <= max(FEW_SPLATS, sum(map(len, streams.values())) // 2)
         for name, entry in table.items():
             assert entry["storage"] != "codes" or entry["codes"] <= max(FEW_ROWS, len(streams[f"{name}.codebook"]))
 

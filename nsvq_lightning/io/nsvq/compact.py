@@ -274,7 +274,7 @@ def _checked_tables(header: Header) -> dict[str, AttributeEntry]:
     for entry in header.attributes:
         if entry.storage == "codes":
             name = f"{entry.name}.codebook"
-            check_room(f"rows of {name}", entry.codes, lengths[name], FEW_ROWS)
+            check_room(f"rows of {name}", entry.codes, lengths[name], FEW_ROWS, each=1)
     return entries
 
 

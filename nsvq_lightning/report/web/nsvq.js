@@ -10,7 +10,7 @@
   const PREFIX = 32;
   const TWO32 = 2 ** 32;
   const LARGEST = 2 ** 52; // integers below it add up exactly in a double
-  const FEW_SPLATS = 2 ** 20, FEW_ROWS = 2 ** 16; // what any file may hold; beyond, each splat or row takes a byte or more
+  const FEW_SPLATS = 2 ** 18, FEW_ROWS = 2 ** 16; // what any file may hold; beyond, a splat takes two bytes or more, a row one
   const DIMS = { means: 3, opacities: 1, quats: 4, scales: 3, sh0: 3 };
   const ORDERS = {
     paper: ["means", "opacities", "quats", "scales", "sh0", "shN"],
@@ -174,7 +174,7 @@
     if (at !== body.length) refuse("bytes follow its last stream");
     for (const { name, codes } of coded)
       if (level === "compact" && codes > Math.max(FEW_ROWS, streams[`${name}.codebook`].length)) refuse(`its codebook of ${name} is too large`);
-    if (level === "compact" && splats > Math.max(FEW_SPLATS, body.length)) refuse("it has too many splats for its length");
+    if (level === "compact" && splats > Math.max(FEW_SPLATS, body.length / 2)) refuse("it has too many splats for its length");
     return { level, kind, splats, degree, origin, table, streams };
   }
 

@@ -224,7 +224,7 @@ CHANGES: dict[str, tuple[Any, str]] = {
     "UTF-16": (lambda p: _with_text(p, lambda t: t.decode().encode("utf-16-le")), "not JSON"),
     "no config": (lambda p: _changed(p, lambda h: h.pop("config")), "config"),
     "metrics of words": (lambda p: _changed(p, lambda h: h["metrics"].update(psnr="high")), "metrics"),
-    "many splats": (lambda p: _changed(p, lambda h: h.update(splats=2**20 + 1)), "1048577 splats cannot be in"),
+    "many splats": (lambda p: _changed(p, lambda h: h.update(splats=2**18 + 1)), "262145 splats cannot be in"),
     "many rows": (
         lambda p: _changed(p, lambda h: h["attributes"][3].__setitem__(3, 2**16 + 1)),
         "65537 rows of quats.codebook cannot be in",
