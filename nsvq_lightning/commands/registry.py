@@ -27,7 +27,7 @@ COMMANDS = {
     "compress": Command("make an existing splat file small", "nsvq_lightning.commands.compress"),
     "view": Command("look at a scene in the browser, also while it trains", "nsvq_lightning.commands.view"),
     "render": Command("render pictures or a video along a path of cameras", "nsvq_lightning.commands.render"),
-    "sweep": Command("train many runs and compare them", "nsvq_lightning.commands.sweep.cli"),
+    "sweep": Command("train many runs and compare them", "nsvq_lightning.commands.sweep.run"),
     "doctor": Command("check whether this machine and a scene folder are fit", "nsvq_lightning.commands.doctor"),
     "benchmark": Command("measure run time against error on this machine", "nsvq_lightning.commands.benchmark.cli"),
 }

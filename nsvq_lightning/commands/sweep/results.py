@@ -1,113 +1,34 @@
-"""The results of a sweep: one row for each run, and means over the seeds."""
+"""The results of a sweep: a row for each run, means over the seeds, and the picture of quality over size and time."""
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.report.figures import markdown_table
+import numpy as np
 
-__all__ = ["Group", "RunResult", "as_markdown", "grouped", "series_of"]
+from nsvq_lightning.io.atomic import write_text
+from nsvq_lightning.report.figures import (
+    colours_of,
+    draw_keys,
+    markdown_table,
+    markers_of,
+    panels,
+    write_csv,
+    write_figure,
+)
+from nsvq_lightning.training.schedule import Phase
 
-
-@dataclass(frozen=True)
-class RunResult:
-    """What one run came to; what is not known, as in a failed one, is None.
-
-    Attributes:
-        scene: Name of the scene.
-        config: Name of the configuration.
-        quantizer: Class of the quantizer; empty without codebooks.
-        codebooks: Sizes of the codebooks; empty without.
-        seed: Seed.
-        steps: Iterations that were asked for; a run may end earlier.
-        psnr: Of the decoded file on the test views, dB; None also where it is infinite.
-        ssim: Of the decoded file on the test views.
-        bytes: Size of the file.
-        splats: Their number.
-        bytes_paper: Size that the file has at level ``paper``.
-        psnr_paper: PSNR of the scene before it was stored, which is that of level ``paper``, dB.
-        seconds: Training time from the first iteration on, as if nothing had been shared.
-        trunk_seconds: The part of ``seconds`` that was trained once for all runs with this trunk; 0 without one.
-        psnr_before: PSNR of the plain splats at the end of the prune phase, dB; None without codebooks.
-        version: Version of the package that trained it.
-        folder: Folder of the run.
-        error: Why it has failed; empty otherwise.
-    """
-
-    scene: str
-    config: str
-    quantizer: str
-    codebooks: str
-    seed: int
-    steps: int
-    psnr: float | None = None
-    ssim: float | None = None
-    bytes: int | None = None
-    splats: int | None = None
-    bytes_paper: int | None = None
-    psnr_paper: float | None = None
-    seconds: float | None = None
-    trunk_seconds: float | None = None
-    psnr_before: float | None = None
-    version: str = ""
-    folder: Path = Path()
-    error: str = ""
-
-    def as_csv(self) -> dict[str, Any]:
-        """The row as cells."""
-        return dict(vars(self))
-
-
-@dataclass(frozen=True)
-class Group:
-    """Finished runs that differ in the seed alone."""
-
-    rows: Sequence[RunResult]
-
-    def mean(self, name: str, scale: float = 1.0) -> float | None:
-        """Mean of an attribute over the seeds, times ``scale``; None where no run knows it."""
-        values = self._values(name)
-        return scale * statistics.fmean(values) if values else None
-
-    def spread(self, name: str, scale: float = 1.0) -> float:
-        """Standard deviation of an attribute over the seeds (n - 1), times ``scale``; 0 for a single run."""
-        values = self._values(name)
-        return scale * statistics.stdev(values) if len(values) > 1 else 0.0
-
-    def _values(self, name: str) -> list[float]:
-        return [value for row in self.rows if (value := getattr(row, name)) is not None]
-
-
-def grouped(rows: Sequence[RunResult]) -> list[Group]:
-    """The runs that have not failed, with those that differ in the seed alone together, in the order of the first."""
-    groups: dict[tuple[str, ...], list[RunResult]] = {}
-    for row in rows:
-        if not row.error:
-            groups.setdefault((row.scene, row.config, row.quantizer, row.codebooks), []).append(row)
-    return [Group(members) for members in groups.values()]
-
-
-def series_of(rows: Sequence[RunResult]) -> Callable[[RunResult], str]:
-    """Name of the curve a run belongs to: its quantizer, if that and the sizes tell the runs apart, else more of it."""
-    names: list[Callable[[RunResult], str]] = [
-        lambda row: row.quantizer or "not quantized",
-        lambda row: row.config,
-        lambda row: f"{row.config}, {row.quantizer or 'not quantized'}",
-    ]
-    for name in names:
-        if len({(name(row), row.scene, row.codebooks, row.seed) for row in rows}) == len(rows):
-            return name
-    return names[-1]
-
+__all__ = ["Row", "as_markdown", "draw_sweep", "grouped", "moments", "read", "row_of", "series_of", "write_results"]
 
 NAMES = ("scene", "config", "quantizer", "codebooks")
-"""Columns of the table that say which runs a line is about."""
+"""Columns that say which runs a line of the table is about: they differ in the seed alone."""
 
-NUMBERS = {
+Row = dict[str, Any]
+
+TABLE = {
     "PSNR, dB": ("psnr", 1.0, ".2f"),
     "SSIM": ("ssim", 1.0, ".4f"),
     "MB": ("bytes", 1e-6, ".3f"),
@@ -115,35 +36,164 @@ NUMBERS = {
     "PSNR before, dB": ("psnr_before", 1.0, ".2f"),
     "seconds": ("seconds", 1.0, ",.0f"),
 }
-"""Attribute of a row, its factor and its format by the head of the column."""
-
-LEGEND = (
-    "Mean ± standard deviation over the runs, which differ in the seed. PSNR and SSIM are those of the decoded file on "
-    "the test views; before: of the plain splats at the end of the prune phase. Seconds are those of a whole training, "
-    "though runs may have shared its first part (`trunk_seconds` in the CSV)."
-)
+"""Column, factor and format by the head of a column of the table."""
 
 
-def as_markdown(rows: Sequence[RunResult]) -> str:
+def read(path: Path) -> Any:
+    """A JSON file; None if it is not there."""
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+
+
+def row_of(names: Row, folder: Path, error: str = "") -> Row:
+    """What a run with these names came to that has finished, or failed with an error.
+
+    Returns:
+        Scene, config, quantizer, codebooks, seed, steps; PSNR (dB; None where infinite) and SSIM of the decoded file on
+        the test views, its bytes and splats; its bytes at level ``paper``, and the PSNR of the scene before it was
+        stored, which is that of level ``paper``; the seconds of training as if nothing had been shared, and the part of
+        them that was trained once for all runs with this trunk; the PSNR of the plain splats at the end of the prune
+        phase, None without codebooks; the version of the package that trained it; folder; error. What is not known, as
+        in a failed run, is None.
+    """
+    metrics, record = ({}, {}) if error else (read(folder / "metrics.json"), read(folder / "finished.json"))
+    ends = metrics.get("phases", [{}])
+    shared = [end["seconds"] for end in ends if record.get("trunk") and Phase[end["phase"].upper()] <= Phase.PRUNE]
+    return {
+        **names,
+        "psnr": metrics.get("psnr"),
+        "ssim": metrics.get("ssim"),
+        "bytes": metrics.get("file_bytes"),
+        "splats": metrics.get("num_splats"),
+        "bytes_paper": metrics.get("paper_level", {}).get("file_bytes"),
+        "psnr_paper": ends[-1].get("psnr"),
+        "seconds": metrics.get("train_seconds"),
+        "trunk_seconds": None if error else max(shared, default=0.0),
+        "psnr_before": (metrics.get("before_quantization") or {}).get("psnr"),
+        "version": record.get("version"),
+        "folder": folder,
+        "error": error,
+    }
+
+
+def write_results(output: Path, rows: Sequence[Row]) -> None:
+    """Write ``results.csv``, ``results.md`` and ``results.png``; nothing without rows."""
+    if rows:
+        write_csv(output / "results.csv", rows)
+        write_text(output / "results.md", as_markdown(rows))
+        draw_sweep(output / "results.png", rows)
+
+
+def grouped(rows: Sequence[Row]) -> list[list[Row]]:
+    """The runs that have not failed, with those that differ in the seed alone together, in the order of the first."""
+    groups: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+        if not row["error"]:
+            groups.setdefault(tuple(row[name] for name in NAMES), []).append(row)
+    return list(groups.values())
+
+
+def moments(rows: Sequence[Row], column: str, scale: float = 1.0) -> tuple[float, float]:
+    """Mean and standard deviation (n - 1; 0 for a single run) of a column, times ``scale``; NaN where none knows it."""
+    values = [scale * row[column] for row in rows if row[column] is not None]
+    spread = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+    return float(np.mean(values)) if values else np.nan, spread
+
+
+def series_of(rows: Sequence[Row]) -> list[str]:
+    """Name of each run's curve: its quantizer, and its configuration, too, where more than the sizes differ."""
+    names = [row["quantizer"] or "not quantized" for row in rows]
+    places = {(name, row["scene"], row["codebooks"], row["seed"]) for name, row in zip(names, rows, strict=True)}
+    if len(places) < len(rows):
+        names = [f"{row['config']}, {name}" for name, row in zip(names, rows, strict=True)]
+    return names
+
+
+def as_markdown(rows: Sequence[Row]) -> str:
     """A table of the means over the seeds, with their standard deviation, and a list of what has failed."""
-    cells = []
+    lines = []
     for group in grouped(rows):
-        names = [getattr(group.rows[0], name) or "–" for name in NAMES]
-        cells.append([*names, str(len(group.rows)), *(_plus_minus(group, *number) for number in NUMBERS.values())])
+        line = [*(group[0][name] or "–" for name in NAMES), str(len(group))]
+        for column, scale, form in TABLE.values():
+            mean, spread = moments(group, column, scale)
+            plus_minus = f" ± {spread:{form}}" if len(group) > 1 else ""
+            line.append("–" if np.isnan(mean) else f"{mean:{form}}{plus_minus}")
+        lines.append(line)
     parts = ["# nsvq sweep"]
-    if cells:
-        parts += [markdown_table([*NAMES, "runs", *NUMBERS], cells, words=NAMES), LEGEND]
-    failed = [
-        f"* {row.scene}, {row.config}, {row.codebooks}, seed {row.seed}: {row.error}" for row in rows if row.error
-    ]
+    if lines:
+        parts.append(markdown_table([*NAMES, "runs", *TABLE], lines, words=NAMES))
+        parts.append(
+            "Mean ± standard deviation over the seeds. PSNR and SSIM are those of the decoded file on the test views; "
+            "before: of the plain splats. Seconds include those that runs have shared (`trunk_seconds` in the CSV)."
+        )
+    failed = ["* {scene}, {config}, {codebooks}, seed {seed}: {error}".format(**row) for row in rows if row["error"]]
     if failed:
-        parts.append("\n".join(["Failed:", "", *failed]))
+        parts += ["Failed:", "\n".join(failed)]
     return "\n\n".join(parts) + "\n"
 
 
-def _plus_minus(group: Group, name: str, scale: float, form: str) -> str:
-    mean = group.mean(name, scale)
-    if mean is None:
-        return "–"
-    single = len(group.rows) == 1
-    return format(mean, form) if single else f"{mean:{form}} ± {group.spread(name, scale):{form}}"
+def draw_sweep(path: Path, rows: Sequence[Row]) -> None:
+    """Draw PSNR over file size, and beside it over training time: a row and a marker for each scene.
+
+    The colour tells quantizers or configurations apart. Over the size, a point is the mean over the seeds, its whiskers
+    the standard deviation; lines join the codebook sizes. Runs without codebooks, whose files are many times as large,
+    are dashed lines that say their size. Over the time, a line is the test PSNR of a run while it trains, and the point
+    at its end that of the decoded file.
+
+    Args:
+        path: PNG file, replaced atomically.
+        rows: Runs; those that failed, or whose PSNR is not finite, are left out. Without any, nothing is drawn.
+    """
+    rows = [row for row in rows if row["psnr"] is not None and row["bytes"] is not None]
+    if not rows:
+        return
+    rows = [row | {"series": name} for row, name in zip(rows, series_of(rows), strict=True)]
+    colours = colours_of(list(dict.fromkeys(row["series"] for row in rows)))
+    markers = markers_of(list(dict.fromkeys(row["scene"] for row in rows)))
+    figure, axes = panels(2 * len(markers), 4.6, max(len(colours), len(markers)))
+    for (scene, marker), over_size, over_time in zip(markers.items(), axes[::2], axes[1::2], strict=True):
+        shown = [row for row in rows if row["scene"] == scene]
+        _draw_sizes(over_size, shown, colours, marker)
+        over_size.set_title(scene, fontsize="medium")
+        _draw_times(over_time, shown, colours, marker)
+    draw_keys(figure, colours, markers)
+    write_figure(path, figure)
+
+
+def _draw_sizes(axis: Any, rows: Sequence[Row], colours: dict[str, Any], marker: str) -> None:
+    """Test PSNR over the size of the file, a line for each series."""
+    are_points = not any(row["codebooks"] for row in rows)
+    style = {"linewidth": 1, "elinewidth": 0.8, "capsize": 2, "markersize": 5}
+    labelled = set()
+    for name, colour in colours.items():
+        note = {"textcoords": "offset points", "fontsize": 7, "color": colour}
+        groups = grouped([row for row in rows if row["series"] == name])
+        points = [group for group in groups if group[0]["codebooks"] or are_points]
+        points.sort(key=lambda group: moments(group, "bytes"))
+        x, x_spread = np.reshape([moments(group, "bytes", 1e-6) for group in points], (-1, 2)).T
+        y, y_spread = np.reshape([moments(group, "psnr") for group in points], (-1, 2)).T
+        axis.errorbar(x, y, xerr=x_spread, yerr=y_spread, fmt=f"{marker}-", color=colour, **style)
+        sizes = tuple(group[0]["codebooks"] for group in points)
+        if sizes not in labelled:  # the first curve of these sizes speaks for the others
+            labelled.add(sizes)
+            for size, *place in zip(sizes, x, y, strict=True):
+                axis.annotate(size, place, (4, 5), **note)
+        for group in groups:
+            if group not in points:  # it would be far outside the picture
+                psnr, size = moments(group, "psnr")[0], moments(group, "bytes", 1e-6)[0]
+                axis.axhline(psnr, color=colour, linestyle="--", linewidth=1)
+                axis.annotate(f"{size:.3g} MB", (0, psnr), (3, 3), xycoords=("axes fraction", "data"), **note)
+    axis.grid(alpha=0.3)
+    axis.set(xlabel="size of the file, MB", ylabel="test PSNR of the decoded file, dB")
+
+
+def _draw_times(axis: Any, rows: Sequence[Row], colours: dict[str, Any], marker: str) -> None:
+    """Test PSNR over the minutes of training, a line for each run."""
+    for row in rows:
+        if (path := row["folder"] / "curve.csv").is_file():
+            curve = np.genfromtxt(path, delimiter=",", names=True, encoding="utf-8")
+            axis.plot(curve["seconds"] / 60, curve["psnr"], color=colours[row["series"]], linewidth=1)
+        axis.plot([row["seconds"] / 60], [row["psnr"]], marker, color=colours[row["series"]], markersize=5)
+    # What comes before that is steep and the same for all.
+    axis.set_ylim(bottom=min(row["psnr"] for row in rows) - 2.0)
+    axis.grid(alpha=0.3)
+    axis.set(xlabel="training, minutes", ylabel="test PSNR, dB")
