@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from copy import deepcopy
+from itertools import product
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,22 +17,19 @@ SCENE = ["--data.root=scene", "--trainer.max_steps=60"]
 
 @pytest.fixture
 def scenes(tmp_path: Path) -> tuple[Path, Path]:
-    folders = tmp_path / "fox", tmp_path / "horns"
-    for folder in folders:
-        folder.mkdir()
-    return folders
+    for name in ("fox", "horns"):
+        (tmp_path / name).mkdir()
+    return tmp_path / "fox", tmp_path / "horns"
 
 
-def names(runs: list[Run]) -> list[tuple[str, str, str, str, int]]:
+def names(runs: list[Run]) -> list[tuple[str | int, ...]]:
     return [tuple(list(run.names.values())[:5]) for run in runs]
 
 
 def test_everything_is_combined_with_everything(scenes: tuple[Path, Path]) -> None:
     runs = plan(scenes, codebooks=("1k", "4k"), seeds=(0, 3), options=("--trainer.max_steps=60",))
-    expected = [
-        (scene, "default", "NSVQ", size, seed) for scene in ("fox", "horns") for seed in (0, 3) for size in ("1k", "4k")
-    ]
-    assert names(runs) == expected
+    expected = product(("fox", "horns"), ("default",), ("NSVQ",), (0, 3), ("1k", "4k"))
+    assert names(runs) == [(scene, *names, size, seed) for scene, *names, seed, size in expected]
     last = runs[-1].settings
     assert last["data"]["init_args"]["root"] == str(scenes[1])
     assert (last["model"]["seed"], last["data"]["init_args"]["seed"]) == (3, 3)
@@ -86,15 +83,15 @@ def standard() -> Settings:
     return resolve(SCENE)
 
 
-def changed(settings: Settings, path: str, value: Any) -> Settings:
-    """A copy with another value at ``path``, which must be there: a misspelt one would change nothing."""
-    copy = deepcopy(settings)
+def changed(settings: Settings, case: str) -> Settings:
+    """A copy with ``path=JSON``; the path must be there: a misspelt one would change nothing."""
+    path, _, value = case.partition("=")
     *parents, name = path.split(".")
-    place = copy
+    place = copy = deepcopy(settings)
     for parent in parents:
         place = place[parent]
-    assert place[name] != value
-    place[name] = value
+    assert place[name] != json.loads(value)
+    place[name] = json.loads(value)
     return copy
 
 
@@ -119,82 +116,47 @@ def test_where_the_output_goes_is_no_difference(standard: Settings) -> None:
 def test_a_digest_tells_settings_and_versions_apart(standard: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     first = Run({}, standard).digest
     assert Run({}, json.loads(json.dumps(standard))).digest == first
-    assert Run({}, changed(standard, "model.seed", 1)).digest != first
+    assert Run({}, changed(standard, "model.seed=1")).digest != first
     monkeypatch.setattr(module, "__version__", "0.0.1")
     assert Run({}, standard).digest != first
 
 
-REPLACEMENT = "callbacks.codebook_replacement"
+AFTER = """
+model.codebooks="1k" model.codebooks=null model.quantizer.init_args.kmeans_steps=3 model.quantizer.class_path="my.Mine"
+callbacks.phases.init_args.quantize_end=40000 callbacks.phases.init_args.quantize_end=45000
+callbacks.phases.init_args.min_finetune=2 callbacks.canonical.init_args.mode="full" callbacks.codebook_init=null
+callbacks.codebook_refit.init_args.steps=1 callbacks.codebook_replacement.init_args.late_every=700
+callbacks.codebook_finite=null callbacks.freeze=null callbacks.export=null callbacks.checkpoint.init_args.every=7
+"""
+ELSE = """
+data.init_args.root="other" data.init_args.seed=1 data.init_args.factor=2 model.seed=1 model.sh_degree=2
+model.rates.codebook_factor=0.5 model.init_from="scene.ply" skips.blocks=false trainer.max_steps=61
+trainer.accumulate_grad_batches=2 trainer.precision="64-true" callbacks.phases.init_args.prune_end=19000
+callbacks.density.init_args.max_splats=1000 callbacks.opacity=null callbacks.report.init_args.every=5
+"""
+# Nothing is quantized, the run ends before the prune phase does, the photos are not looked at, ...
+UNCUT = """
+callbacks.phases.init_args.prune_end=43000 callbacks.phases.init_args.total=60000
+callbacks.phases.init_args.iterations_per_photo=100 callbacks.phases=null callbacks.freeze.class_path="my.Freeze"
+trainer.callbacks=[{"class_path":"my.Callback"}] trainer.min_steps=50 trainer.max_epochs=3
+"""
 
 
-@pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        ("model.codebooks", "1k"),
-        ("model.codebooks", None),
-        ("model.quantizer.init_args.kmeans_steps", 3),
-        ("model.quantizer.class_path", "mine.Mine"),
-        ("callbacks.phases.init_args.quantize_end", 40_000),
-        ("callbacks.phases.init_args.quantize_end", 45_000),
-        ("callbacks.phases.init_args.min_finetune", 2),
-        ("callbacks.canonical.init_args.mode", "full"),
-        ("callbacks.codebook_init", None),
-        ("callbacks.codebook_refit.init_args.steps", 1),
-        (f"{REPLACEMENT}.init_args.late_every", 700),
-        ("callbacks.codebook_finite", None),
-        ("callbacks.freeze", None),
-        ("callbacks.export", None),
-        ("callbacks.checkpoint.init_args.every", 7),
-    ],
-)
-def test_a_trunk_does_not_depend_on_what_starts_after_it(standard: Settings, path: str, value: Any) -> None:
-    assert trunk_of(changed(standard, path, value)) == trunk_of(standard) is not None
+@pytest.mark.parametrize("case", AFTER.split())
+def test_a_trunk_does_not_depend_on_what_starts_after_it(standard: Settings, case: str) -> None:
+    assert trunk_of(changed(standard, case)) == trunk_of(standard) is not None
 
 
-@pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        ("data.init_args.root", "other"),
-        ("data.init_args.seed", 1),
-        ("data.init_args.factor", 2),
-        ("model.seed", 1),
-        ("model.sh_degree", 2),
-        ("model.rates.codebook_factor", 0.5),
-        ("model.init_from", "scene.ply"),
-        ("skips.blocks", False),
-        ("trainer.max_steps", 61),
-        ("trainer.accumulate_grad_batches", 2),
-        ("trainer.precision", "64-true"),
-        ("callbacks.phases.init_args.prune_end", 19_000),
-        ("callbacks.density.init_args.max_splats", 1000),
-        ("callbacks.opacity", None),
-        ("callbacks.report.init_args.every", 5),
-    ],
-)
-def test_a_trunk_depends_on_everything_else(standard: Settings, path: str, value: Any) -> None:
-    assert trunk_of(changed(standard, path, value)) != trunk_of(standard)
+@pytest.mark.parametrize("case", ELSE.split())
+def test_a_trunk_depends_on_everything_else(standard: Settings, case: str) -> None:
+    assert trunk_of(changed(standard, case)) != trunk_of(standard)
 
 
-@pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        ("callbacks.phases.init_args.prune_end", 43_000),  # nothing is quantized
-        ("callbacks.phases.init_args.total", 60_000),  # the run ends before the prune phase does
-        ("callbacks.phases.init_args.iterations_per_photo", 100),  # the photos are not looked at
-        ("callbacks.phases", None),
-        ("callbacks.freeze.class_path", "mine.Freeze"),
-        ("trainer.callbacks", [{"class_path": "mine.Callback"}]),
-        ("trainer.min_steps", 50),
-    ],
-)
-def test_a_run_that_may_not_be_cut_has_no_trunk(standard: Settings, path: str, value: Any) -> None:
-    reference = changed(standard, "callbacks.phases.init_args.reference_total", 43_000)
+@pytest.mark.parametrize("case", UNCUT.split())
+def test_a_run_that_may_not_be_cut_has_no_trunk(standard: Settings, case: str) -> None:
+    reference = changed(standard, "callbacks.phases.init_args.reference_total=43000")
     assert trunk_of(reference) is not None
-    assert trunk_of(changed(reference, path, value)) is None
-
-
-def test_plain_splatting_is_nothing_but_a_trunk() -> None:
-    assert trunk_of(resolve([*SCENE, "--config=plain"])) is None
+    assert trunk_of(changed(reference, case)) is None
 
 
 def test_a_trunk_keeps_the_schedule_of_the_whole_run(standard: Settings) -> None:
@@ -202,3 +164,4 @@ def test_a_trunk_keeps_the_schedule_of_the_whole_run(standard: Settings) -> None
     assert trunk is not None
     assert trunk["trainer"]["max_steps"] == 27  # 20 000 of 45 000
     assert trunk["callbacks"]["phases"]["init_args"]["total"] == 60
+    assert trunk_of(resolve([*SCENE, "--config=plain"])) is None  # nothing but a trunk

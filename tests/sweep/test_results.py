@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from nsvq_lightning.commands.sweep.results import Row, as_markdown, draw_sweep, grouped, moments, series_of
@@ -58,7 +59,7 @@ def test_the_picture_shows_every_point(tmp_path: Path) -> None:
     def drawn(rows: list[Row], colour: tuple[int, int, int] = blue) -> int:
         """Pixels in the colour of a curve, the first by default."""
         draw_sweep(tmp_path / "sweep.png", rows)
-        image = cv2.imread(str(tmp_path / "sweep.png"))
+        image = np.asarray(cv2.imread(str(tmp_path / "sweep.png")))
         return int((abs(image.astype(int) - colour).max(-1) < 20).sum())
 
     one = drawn([row(0)])

@@ -27,18 +27,16 @@ from nsvq_lightning.training.run_folder import MARKER, _lock
 
 Calls = list[Sequence[str]]
 
-OPTIONS = (
-    "--data.factor=2",
-    "--trainer.accelerator=cpu",
-    "--model.sh_degree=1",
-    "--callbacks.phases.min_density_interval=4",
-    "--callbacks.phases.min_reset_interval=11",
-    "--callbacks.phases.min_replacement_interval=5",
-    "--callbacks.density.rules.grad_threshold=5e-6",
-    "--callbacks.density.max_splats=1500",
-    "--callbacks.report.every=20",
-    "--callbacks.report.lpips=false",
-)
+Swept = tuple[Path, Calls, list[Row]]
+"""Folder, what was run, and the rows."""
+
+SMALL = """
+--data.factor=2 --trainer.accelerator=cpu --model.sh_degree=1 --callbacks.phases.min_density_interval=4
+--callbacks.phases.min_reset_interval=11 --callbacks.phases.min_replacement_interval=5
+--callbacks.density.rules.grad_threshold=5e-6 --callbacks.density.max_splats=1500 --callbacks.report.every=20
+--callbacks.report.lpips=false
+"""
+OPTIONS = SMALL.split()
 
 
 @contextmanager
@@ -60,13 +58,12 @@ def in_process() -> Iterator[Calls]:
 def configs(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
     """Two sizes (the larger with options that only matter once quantized), none, and a quantizer that cannot work."""
     folder = tmp_path_factory.mktemp("configs")
-    codebooks = {"small": "{scales: 8, sh0: 8}", "large": "{scales: 32, quats: 24, sh0: 16, shN: 16}", "none": "null"}
+    late = "callbacks: {canonical: {mode: full}, phases: {quantize_end: 40000}}"
+    large = "{scales: 32, quats: 24, sh0: 16, shN: 16}"
+    codebooks = {"small": "{scales: 8, sh0: 8}", "large": large, "none": "null", "wrong": "{sh1: 8}"}
     for name, sizes in codebooks.items():
-        (folder / f"{name}.yaml").write_text(f"model: {{codebooks: {sizes}}}\n")
-    with open(folder / "large.yaml", "a") as file:
-        file.write("callbacks: {canonical: {mode: full}, phases: {quantize_end: 40000}}\n")
-    (folder / "wrong.yaml").write_text("model: {codebooks: {sh1: 8}}\n")
-    return tuple(str(folder / f"{name}.yaml") for name in (*codebooks, "wrong"))
+        (folder / f"{name}.yaml").write_text(f"model: {{codebooks: {sizes}}}\n{late * (name == 'large')}\n")
+    return tuple(str(folder / f"{name}.yaml") for name in codebooks)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +72,7 @@ def runs(demo_scene: Path, configs: tuple[str, ...]) -> list[Run]:
 
 
 @pytest.fixture(scope="module")
-def swept(runs: list[Run], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Calls, list[Row]]:
+def swept(runs: list[Run], tmp_path_factory: pytest.TempPathFactory) -> Swept:
     """The sweep once it is through."""
     output = tmp_path_factory.mktemp("sweep")
     with in_process() as calls:
@@ -106,7 +103,7 @@ def held(folder: Path) -> Iterator[None]:
 
 
 def test_a_run_of_a_sweep_is_the_run_alone(
-    swept: tuple[Path, Calls, list[Row]], demo_scene: Path, configs: tuple[str, ...], tmp_path: Path
+    swept: Swept, demo_scene: Path, configs: tuple[str, ...], tmp_path: Path
 ) -> None:
     alone = ["fit", f"--config={configs[1]}", f"--data.root={demo_scene}", "--trainer.max_steps=60", *OPTIONS]
     assert main([*alone, f"--trainer.run_folder={tmp_path / 'alone'}", "--trainer.logger=false"]) == 0
@@ -114,7 +111,7 @@ def test_a_run_of_a_sweep_is_the_run_alone(
 
 
 def test_what_its_command_has_trained_is_collected(
-    swept: tuple[Path, Calls, list[Row]], runs: list[Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    swept: Swept, runs: list[Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     output = tmp_path / "a folder"
     monkeypatch.chdir(tmp_path)
@@ -130,7 +127,7 @@ def test_what_its_command_has_trained_is_collected(
     assert not (row["folder"] / "checkpoints").exists()
 
 
-def test_what_the_runs_share_is_trained_once(swept: tuple[Path, Calls, list[Row]]) -> None:
+def test_what_the_runs_share_is_trained_once_and_a_failure_stops_no_other(swept: Swept) -> None:
     output, calls, rows = swept
     (trunk,) = (output / "trunks").iterdir()
     checkpoint = f"--ckpt_path={trunk / 'checkpoints' / 'last.ckpt'}"
@@ -139,10 +136,6 @@ def test_what_the_runs_share_is_trained_once(swept: tuple[Path, Calls, list[Row]
     for row in rows[:3]:
         assert row["trunk_seconds"] == pytest.approx(seconds, abs=0.02)
         assert row["seconds"] > seconds
-
-
-def test_a_run_that_fails_is_noted_and_stops_no_other(swept: tuple[Path, Calls, list[Row]]) -> None:
-    output, _, rows = swept
     assert [bool(row["error"]) for row in rows] == [False, False, False, True]
     with open(output / "results.csv", newline="") as file:
         table = list(csv.DictReader(file))
@@ -159,9 +152,7 @@ def test_a_run_that_fails_is_noted_and_stops_no_other(swept: tuple[Path, Calls, 
     assert "Failed:" in (output / "results.md").read_text()
 
 
-def test_a_rerun_skips_what_is_finished_even_under_another_name(
-    swept: tuple[Path, Calls, list[Row]], runs: list[Run]
-) -> None:
+def test_a_rerun_skips_what_is_finished_even_under_another_name(swept: Swept, runs: list[Run]) -> None:
     output, _, rows = swept
     renamed = replace(runs[0], names=runs[0].names | {"config": "renamed"})
     with in_process() as calls:
@@ -171,9 +162,7 @@ def test_a_rerun_skips_what_is_finished_even_under_another_name(
     assert not list(output.glob("runs/*none*/checkpoints"))
 
 
-def test_a_run_stopped_after_its_last_step_is_only_measured(
-    swept: tuple[Path, Calls, list[Row]], runs: list[Run], tmp_path: Path
-) -> None:
+def test_a_run_stopped_after_its_last_step_is_only_measured(swept: Swept, runs: list[Run], tmp_path: Path) -> None:
     output = tmp_path / "copy"
     shutil.copytree(swept[0], output)
     folder = folder_of(output, runs[0])
@@ -188,7 +177,7 @@ def test_a_run_stopped_after_its_last_step_is_only_measured(
 
 
 def test_an_interrupted_run_goes_on_from_its_checkpoint(
-    swept: tuple[Path, Calls, list[Row]], runs: list[Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    swept: Swept, runs: list[Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from nsvq_lightning.callbacks import RunCheckpoint
 
