@@ -36,7 +36,7 @@ NOT_ACTIONABLE = (
     "args parameter is intended",  # we pass the arguments after looking up configs
     "dataloader.*no length",
     "LeafSpec",
-    "Checkpoint directory .* exists and is not empty",
+    "(Checkpoint|Experiment logs) directory .* exists and is not empty",  # the marker of who writes there
     "`tensorboardX` has been removed",
     "Couldn't infer the batch indices",  # RenderWriter names pictures after their photos
 )

@@ -181,16 +181,19 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint(
 ) -> None:
     from nsvq_lightning.callbacks import RunCheckpoint
 
+    class Killed(BaseException):
+        """No error that the command turns into a line."""
+
     def save(self: RunCheckpoint, trainer: Any, module: Any) -> None:
         """Stop at the first checkpoint after the trunk, as a killed process would."""
         original(self, trainer, module)
         if trainer.ckpt_path is not None:
-            raise MemoryError
+            raise Killed
 
     original = RunCheckpoint._save
     with in_process(), monkeypatch.context() as patch:
         patch.setattr(RunCheckpoint, "_save", save)
-        with pytest.raises(MemoryError):
+        with pytest.raises(Killed):
             sweep(tmp_path, runs[1:2])
     assert not (tmp_path / "results.csv").exists()
     own = f"--ckpt_path={folder_of(tmp_path, runs[1]) / 'checkpoints' / 'last.ckpt'}"
