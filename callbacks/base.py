@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -96,7 +95,7 @@ class OncePerStep:
     """Remembers the last iteration acted on.
 
     With gradient accumulation ``on_train_batch_start`` and ``on_train_batch_end`` are called several times at one
-    ``global_step``; code that must run once per iteration asks the latch first. Its state belongs in ``state_dict``: a
+    ``global_step``; code that must run once per iteration asks this first. Its state belongs in ``state_dict``: a
     run resumed right after the step must not act again.
     """
 
@@ -132,9 +131,6 @@ class StepCallback(HostedCallback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Do not repeat what was done before the checkpoint."""
         self._once.last = state_dict["last"]
-
-
-log = logging.getLogger(__name__)
 
 
 class FiniteSearch:

@@ -6,7 +6,6 @@ per image.
 
 from __future__ import annotations
 
-import logging
 from typing import Any
 
 import torch
@@ -58,9 +57,6 @@ def color_corrected(image: Tensor, photo: Tensor, mask: Tensor | None = None) ->
             corrected.append(terms @ weights if bool(rows.any()) else colors[:, channel])
         colors = torch.stack(corrected, 1).clamp(0, 1)
     return colors.reshape(image.shape).to(image.dtype)
-
-
-log = logging.getLogger(__name__)
 
 
 def eight_bit(image: Tensor) -> Tensor:
