@@ -1,12 +1,12 @@
 """Lightning callbacks: everything in a run that happens at certain steps.
 
-Each decides from the module's schedule and the trainer's step alone, through
-:class:`nsvq_lightning.training.host.SplatHost`; none depends on another. :func:`standard` makes those of ``nsvq fit``.
+Each decides from the schedule of a :class:`nsvq_lightning.SplatModule` and the trainer's step alone; none depends on
+another. :func:`standard` makes those of ``nsvq fit``.
 """
 
 from .checkpoint import RunCheckpoint
-from .density import DensityControl, DensityRules
-from .growth import BudgetedGrowth, GrowthRules, SplatBudget
+from .density import DensityControl
+from .growth import BudgetedGrowth, SplatBudget
 from .options import ExposureCompensation, FrequencyLimit
 from .outputs import ExportScene, LiveScene, RenderWriter
 from .precompile import CompileAhead
@@ -22,7 +22,7 @@ from .quantization import (
     RateDistortion,
 )
 from .report import MetricReport
-from .schedule import PhaseSchedule, RateDecay, ShDegreeSchedule
+from .schedule import LearningRateDecay, PhaseSchedule, ShDegreeSchedule
 from .standard import STANDARD, standard
 
 __all__ = [
@@ -35,19 +35,17 @@ __all__ = [
     "CompileAhead",
     "ContributionPruning",
     "DensityControl",
-    "DensityRules",
     "ExportScene",
     "ExposureCompensation",
     "FiniteCodes",
     "FreezeCodes",
     "FrequencyLimit",
-    "GrowthRules",
+    "LearningRateDecay",
     "LiveScene",
     "MetricReport",
     "OpacityRegularization",
     "OpacitySelection",
     "PhaseSchedule",
-    "RateDecay",
     "RateDistortion",
     "RenderWriter",
     "RunCheckpoint",

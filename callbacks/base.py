@@ -1,52 +1,128 @@
-"""What callbacks share: the check of the module, the folder of the run, acting once per step, the search for NaN."""
+"""What callbacks share: the check of the module, acting once per step, the folder of the run, the search for NaN."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar, dataclass_transform, get_type_hints
 
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import Callback, Trainer
 
+from nsvq_lightning.data.scene import View
 from nsvq_lightning.training.edit import drop_non_finite
-from nsvq_lightning.training.host import SplatHost, check_optimizer, splat_host
+from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.run_folder import hold, is_trial, let_go, run_folder, take
+from nsvq_lightning.training.schedule import next_iteration
 
-__all__ = [
-    "FiniteSearch",
-    "HostedCallback",
-    "OncePerStep",
-    "StepCallback",
-    "WritingCallback",
-    "keep_finite_splats",
-]
+__all__ = ["SplatCallback", "WritingCallback", "finite_search_is_due", "keep_finite_splats", "settings"]
 
 
-class HostedCallback(Callback):
-    """Base of the callbacks that train: works with any :class:`nsvq_lightning.training.host.SplatHost`.
+T = TypeVar("T")
 
-    The module is checked before anything starts, its optimiser as soon as there is one. A subclass that overrides these
-    hooks calls them here first.
+
+@dataclass_transform(eq_default=False, field_specifiers=(field,))
+def settings(kind: type[T]) -> type[T]:
+    """Make a callback a dataclass whose fields are its settings, with types that the command line can read."""
+    made = dataclass(eq=False)(kind)
+    made.__init__.__annotations__ = get_type_hints(made.__init__)
+    return made
+
+
+BOUNDS: dict[str, Callable[[float], bool]] = {
+    "at least 1": lambda value: value >= 1,
+    "at least 0": lambda value: value >= 0,
+    "above 0": lambda value: value > 0,
+    "between 0 and 1": lambda value: 0 < value < 1,
+    "in [0, 1)": lambda value: 0 <= value < 1,
+    "in (0, 1]": lambda value: 0 < value <= 1,
+}
+"""What a setting may be, by how an error says it."""
+
+
+class SplatCallback(Callback):
+    """Base of the callbacks that train a :class:`nsvq_lightning.SplatModule`.
+
+    A callback decides by the module's ``schedule`` and the trainer's step alone, so that each works without the others.
+    What is to happen once per iteration goes into :meth:`before_step` and :meth:`after_step`; with gradient
+    accumulation Lightning calls the hooks that they come from for every view of the iteration. A subclass that
+    overrides a hook of this class calls it here first.
+
+    The fields of a callback are its settings (:func:`settings`). Those named in :attr:`state` are what it has reached;
+    they have ``init=False``.
     """
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Check the module.
+    state: ClassVar[tuple[str, ...]] = ()
+    """Attributes that checkpoints carry, and that have the values of the class when a fit starts."""
+    _acted: ClassVar[dict[str, int]] = {}
+
+    def check(self, bounds: dict[str, Sequence[str]]) -> None:
+        """Check settings that are not None.
+
+        Args:
+            bounds: Names of settings by one of :data:`BOUNDS`.
 
         Raises:
-            TypeError: It lacks something that :class:`~nsvq_lightning.training.host.SplatHost` names.
+            ValueError: One is out of its bounds, or not finite.
         """
-        splat_host(pl_module)
+        for bound, names in bounds.items():
+            for name in names:
+                value = getattr(self, name)
+                if value is not None and not (math.isfinite(value) and BOUNDS[bound](value)):
+                    raise ValueError(f"{name} must be {bound}, got {value}")
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Check the optimiser.
+    def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
+        """Check the module, and forget an earlier fit; a checkpoint's state is loaded after this.
 
         Raises:
-            ValueError: It lacks the parameter groups of a host, or there are several.
+            TypeError: It is no SplatModule.
         """
-        check_optimizer(trainer, pl_module)
+        if not isinstance(module, SplatModule):
+            raise TypeError(
+                f"{type(self).__name__} needs a nsvq_lightning.SplatModule: derive {type(module).__name__} from it"
+            )
+        if stage == "fit":
+            for name in ("_acted", *self.state):
+                vars(self).pop(name, None)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What :attr:`state` names, and the last iterations acted on."""
+        return {name: getattr(self, name) for name in ("_acted", *self.state)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from there: what was done before the checkpoint is not repeated."""
+        vars(self).update(state_dict)
+
+    def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
+        """Act before an iteration, once, also where the run is resumed in between."""
+
+    def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
+        """Act after a complete iteration, once, also where the run is resumed in between."""
+
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
+        """Call :meth:`before_step`."""
+        iteration = next_iteration(trainer)
+        if self._first_time("before", iteration):
+            self.before_step(trainer, module, iteration)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, batch_idx: int
+    ) -> None:
+        """Call :meth:`after_step`."""
+        iteration = trainer.global_step
+        if iteration and self._first_time("after", iteration):
+            self.after_step(trainer, module, iteration)
+
+    def _first_time(self, hook: str, iteration: int) -> bool:
+        if self._acted.get(hook) == iteration:
+            return False
+        vars(self)["_acted"] = self._acted | {hook: iteration}
+        return True
 
 
-class WritingCallback(HostedCallback):
+class WritingCallback(SplatCallback):
     """Callback that writes files: it takes the folder of the run when the run starts, not when the first file is due.
 
     A subclass that overrides these hooks calls them here first.
@@ -57,17 +133,17 @@ class WritingCallback(HostedCallback):
     folder: str | Path | None = None
     """Where it writes instead of the folder of the run, if set."""
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+    def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Check the module, and for a test take the folder.
 
         Raises:
             FileExistsError: It holds another run.
         """
-        super().setup(trainer, pl_module, stage)
+        super().setup(trainer, module, stage)
         if stage != "fit":
             self._take_folder(trainer, stage)
 
-    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_fit_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Take the folder, now that the trainer knows which checkpoint it continues from.
 
         Raises:
@@ -85,85 +161,29 @@ class WritingCallback(HostedCallback):
         elif trainer.is_global_zero and not is_trial(trainer):
             take(Path(self.folder), trainer.ckpt_path)
 
-    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+    def teardown(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Let go of the folder: nothing is written after this."""
         if stage in self.stages:
             let_go(run_folder(trainer) if self.folder is None else Path(self.folder))
 
 
-class OncePerStep:
-    """Remembers the last iteration acted on.
-
-    With gradient accumulation ``on_train_batch_start`` and ``on_train_batch_end`` are called several times at one
-    ``global_step``; code that must run once per iteration asks this first. Its state belongs in ``state_dict``: a
-    run resumed right after the step must not act again.
-    """
-
-    def __init__(self) -> None:
-        # No iteration: they are 1-based, and `global_step` is 0 before the first step.
-        self.last = -1
-
-    def first_time(self, iteration: int) -> bool:
-        """True at the first call with this iteration."""
-        if iteration == self.last:
-            return False
-        self.last = iteration
-        return True
-
-
-class StepCallback(HostedCallback):
-    """Callback that acts at most once per iteration of a fit, also when the fit is resumed."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._once = OncePerStep()
-
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Forget an earlier fit of the same callback; a checkpoint's state is loaded after this."""
-        super().setup(trainer, pl_module, stage)
-        if stage == "fit":
-            self._once = OncePerStep()
-
-    def state_dict(self) -> dict[str, Any]:
-        """The last iteration acted on."""
-        return {"last": self._once.last}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Do not repeat what was done before the checkpoint."""
-        self._once.last = state_dict["last"]
-
-
-class FiniteSearch:
-    """Decides when to search for NaN and infinite values: at intervals, and after a step without an update.
+def finite_search_is_due(trainer: Trainer, every: int) -> bool:
+    """Whether to search for NaN and infinite values now, at the end of an iteration: at intervals, and if need be.
 
     After a step with a non-finite loss no parameter has a gradient, on any process
     (:class:`nsvq_lightning.SplatModule`, :class:`nsvq_lightning.training.distributed.ViewParallelStrategy`). So all
     processes decide alike without communication.
 
     Args:
-        every: Iterations between two searches.
-        name: Name of the argument, for the error.
-
-    Raises:
-        ValueError: ``every`` is below 1.
+        trainer: The trainer.
+        every: Iterations between two searches; a step without an update always causes one.
     """
-
-    def __init__(self, every: int, name: str = "every") -> None:
-        if every < 1:
-            raise ValueError(f"{name} must be at least 1, got {every}")
-        self.every = every
-
-    def is_due(self, trainer: Trainer) -> bool:
-        """Whether to search now, at the end of an iteration: before callbacks exchange the parameters."""
-        return trainer.global_step % self.every == 0 or not _was_updated(trainer)
-
-
-def _was_updated(trainer: Trainer) -> bool:
     groups = raw_optimizer(trainer).param_groups
-    return any(parameter.grad is not None for group in groups for parameter in group["params"])
+    updated = any(parameter.grad is not None for group in groups for parameter in group["params"])
+    return trainer.global_step % every == 0 or not updated
 
 
-def keep_finite_splats(trainer: Trainer, host: SplatHost) -> None:
+def keep_finite_splats(trainer: Trainer, module: SplatModule) -> None:
     """Drop non-finite splats, with their frozen codes (:func:`nsvq_lightning.training.edit.drop_non_finite`).
 
     The replicas of several processes are equal, so all drop the same splats without communication. Dropping splats
@@ -172,9 +192,9 @@ def keep_finite_splats(trainer: Trainer, host: SplatHost) -> None:
     Raises:
         FloatingPointError: No finite splat is left.
     """
-    kept = drop_non_finite(host.splats, raw_optimizer(trainer), trainer.global_step)
-    if len(host.splats) == len(kept):
+    kept = drop_non_finite(module.splats, raw_optimizer(trainer), trainer.global_step)
+    if len(module.splats) == len(kept):
         return
-    for quantizer in host.quantizers.values():
+    for quantizer in module.quantizers.values():
         if len(quantizer.codes) > 0:
             quantizer.freeze(quantizer.codes[kept])

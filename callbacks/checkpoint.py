@@ -6,27 +6,27 @@ import logging
 import signal
 import threading
 from collections.abc import Iterator
-from dataclasses import is_dataclass
+from dataclasses import field, is_dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
 
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.loops.loop import _Loop
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import atomic_path
 from nsvq_lightning.training.distributed import sum_over_processes
-from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.run_folder import is_trial, run_folder
 from nsvq_lightning.training.schedule import Phase, Schedule
-from nsvq_lightning.training.state import RunState
 
-from .base import StepCallback, WritingCallback
+from .base import WritingCallback, settings
 
 __all__ = ["GracefulStop", "RunCheckpoint", "StepSnapshot"]
 
@@ -140,9 +140,8 @@ class StepSnapshot:
         self._scalars = Phase.WARMUP, 0
         self._counts: list[_Count] = []
 
-    def take(self, trainer: Trainer, module: LightningModule) -> None:
+    def take(self, trainer: Trainer, module: SplatModule) -> None:
         """Remember the state now, at the end of an iteration."""
-        host = as_host(module)
         self.iteration = trainer.global_step
         self._kept = _fingerprint(trainer, module)
         if self._loop is not trainer.fit_loop:
@@ -151,22 +150,21 @@ class StepSnapshot:
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
         states = {callback.state_key: callback.state_dict() for callback in callbacks}
         self._callbacks = {key: state for key, state in states.items() if state}
-        self._scalars = host.phase, host.active_sh_degree
+        self._scalars = module.phase, module.active_sh_degree
         before = {id(count.tensor): count for count in self._counts if count.is_current}
         self._counts = [
-            before.get(id(tensor)) or _Count(tensor, tensor._version, tensor.clone()) for tensor in _counters(host)
+            before.get(id(tensor)) or _Count(tensor, tensor._version, tensor.clone()) for tensor in _counters(module)
         ]
 
     def drop(self) -> None:
         """Forget the state: it can no longer be restored."""
         self._kept = None
 
-    def restore(self, trainer: Trainer, module: LightningModule) -> bool:
+    def restore(self, trainer: Trainer, module: SplatModule) -> bool:
         """Restore the state of module and trainer; returns whether that was possible."""
-        host = as_host(module)
         if self._kept is None or self._kept != _fingerprint(trainer, module):
             return False
-        host.phase, host.active_sh_degree = self._scalars
+        module.phase, module.active_sh_degree = self._scalars
         for count in self._counts:
             count.tensor.copy_(count.copy)
         for place, numbers in zip(self._places, self._progress, strict=True):
@@ -178,9 +176,9 @@ class StepSnapshot:
         checkpoint["callbacks"] = self._callbacks
 
 
-def _fingerprint(trainer: Trainer, module: LightningModule) -> Fingerprint:
+def _fingerprint(trainer: Trainer, module: SplatModule) -> Fingerprint:
     """Identity, address and version of every tensor that an iteration must not change before its update."""
-    changing = {id(tensor) for tensor in _counters(as_host(module))}
+    changing = {id(tensor) for tensor in _counters(module)}
     tensors: list[object] = [value for state in raw_optimizer(trainer).state.values() for value in state.values()]
     # Not module.parameters() and module.buffers(), which take three times as long, and this runs in every step.
     parts: list[nn.Module | None] = [module]
@@ -189,8 +187,7 @@ def _fingerprint(trainer: Trainer, module: LightningModule) -> Fingerprint:
             continue
         parts += part._modules.values()
         tensors += part._parameters.values()
-        if not isinstance(part, RunState):
-            tensors += part._buffers.values()
+        tensors += part._buffers.values()
     return [
         (id(tensor), tensor.data_ptr(), tensor._version)
         for tensor in tensors
@@ -198,8 +195,8 @@ def _fingerprint(trainer: Trainer, module: LightningModule) -> Fingerprint:
     ]
 
 
-def _counters(host: SplatHost) -> Iterator[Tensor]:
-    for quantizer in host.quantizers.values():
+def _counters(module: SplatModule) -> Iterator[Tensor]:
+    for quantizer in module.quantizers.values():
         yield from (quantizer.usage, quantizer.window)
 
 
@@ -211,7 +208,8 @@ def _places(loop: object) -> Iterator[dict[str, Any]]:
             yield from _places(value)
 
 
-class RunCheckpoint(WritingCallback, StepCallback, Checkpoint):
+@settings
+class RunCheckpoint(WritingCallback, Checkpoint):
     """Saves the whole state of the run in ``checkpoints/last.ckpt``: regularly, at ends of phases, and when it stops.
 
     ``fit --ckpt_path …/last.ckpt`` continues exactly where it was saved. Lightning calls checkpoint callbacks after all
@@ -242,20 +240,18 @@ class RunCheckpoint(WritingCallback, StepCallback, Checkpoint):
         [1000, 1500, 2000, 3000, 4000, 4200, 4500]
     """
 
-    def __init__(self, every: int | None = None, keep: bool = False, folder: str | None = None) -> None:
-        super().__init__()
-        if every is not None and every < 0:
-            raise ValueError(f"every must be None or at least 0, got {every}")
-        self.every = every
-        self.keep = keep
-        self.folder = folder
-        self.best_model_path = ""
-        """Path of ``last_path`` under the name by which Lightning looks for ``ckpt_path="best"``."""
-        self._snapshot = StepSnapshot()
-        self._stop = GracefulStop()
-        self._saved = -1
-        self._training = False
-        self._amending = False
+    every: int | None = None
+    keep: bool = False
+    folder: str | None = None
+    best_model_path: str = field(default="", init=False)
+    """Path of ``last_path`` under the name by which Lightning looks for ``ckpt_path="best"``."""
+    _saved: int = field(default=-1, init=False)
+    _training: bool = field(default=False, init=False)
+    _amending: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        self.check({"at least 0": ("every",)})
+        self._snapshot, self._stop = StepSnapshot(), GracefulStop()
 
     @property
     def last_path(self) -> Path | None:
@@ -270,9 +266,9 @@ class RunCheckpoint(WritingCallback, StepCallback, Checkpoint):
         every = max(1, schedule.total // 10) if self.every is None else self.every
         return every > 0 and (iteration % every == 0 or iteration in schedule.ends)
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+    def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Forget an earlier fit; come after all other checkpoint callbacks, whose best one Lightning then finds."""
-        super().setup(trainer, pl_module, stage)
+        super().setup(trainer, module, stage)
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
         # A new list: Lightning is going through the old one.
         trainer.callbacks = [*(each for each in callbacks if each is not self), self]  # type: ignore[attr-defined]
@@ -280,54 +276,54 @@ class RunCheckpoint(WritingCallback, StepCallback, Checkpoint):
             self.best_model_path, self._saved = "", -1
             self._snapshot.drop()
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Start to hold back signals."""
-        super().on_train_start(trainer, pl_module)
+        super().on_train_start(trainer, module)
         if trainer.ckpt_path is not None:
             self.best_model_path, self._saved = str(trainer.ckpt_path), trainer.global_step
         self._training = True
         self._stop.hold(trainer)
 
-    def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
+    def on_before_optimizer_step(self, trainer: Trainer, module: SplatModule, optimizer: Optimizer) -> None:
         """The update begins: from here until the end of the iteration there is no state to save."""
         self._snapshot.drop()
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, batch_idx: int
     ) -> None:
         """Save when it is time; stop here if a signal came."""
         iteration = trainer.global_step
-        if iteration == 0 or not self._once.first_time(iteration):
+        if iteration == 0 or not self._first_time("after", iteration):
             self._snapshot.drop()  # of the next iteration some micro-batches are done
             return
         if trainer.world_size == 1:
-            self._snapshot.take(trainer, pl_module)
+            self._snapshot.take(trainer, module)
         if iteration == trainer.max_steps:
             return  # the end of training belongs to the checkpoint, too: it is saved then, and signals wait
         received = self._stop.received(trainer)
         # One process writes its checkpoint when it has stopped; several can do so together only now.
-        if self.is_due(as_host(pl_module).schedule, iteration) or (received and trainer.world_size > 1):
-            self._save(trainer, pl_module)
+        if self.is_due(module.schedule, iteration) or (received and trainer.world_size > 1):
+            self._save(trainer, module)
         self._stop.deliver(received)
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Save the end of the run."""
         if trainer.global_step > 0:
-            self._save(trainer, pl_module)
+            self._save(trainer, module)
         self._training = False
         self._stop.deliver(self._stop.received(trainer, now=True))
         self._stop.release()
 
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+    def on_exception(self, trainer: Trainer, module: SplatModule, exception: BaseException) -> None:
         """Save the last complete iteration if it still exists; say where to continue from."""
         self._stop.release()
         if not self._training or is_trial(trainer):
             return
         self._training = False
-        if self._snapshot.iteration != self._saved and self._snapshot.restore(trainer, pl_module):
+        if self._snapshot.iteration != self._saved and self._snapshot.restore(trainer, module):
             self._amending = True
             try:
-                self._save(trainer, pl_module)
+                self._save(trainer, module)
             except Exception as error:  # the user must see what stopped the run
                 log.warning("the checkpoint of iteration %d could not be written: %s", self._snapshot.iteration, error)
             finally:
@@ -337,22 +333,21 @@ class RunCheckpoint(WritingCallback, StepCallback, Checkpoint):
         else:
             log.warning("stopped before the first checkpoint")
 
-    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+    def on_save_checkpoint(self, trainer: Trainer, module: SplatModule, checkpoint: dict[str, Any]) -> None:
         """After an incomplete iteration, store counters and callbacks as they were before it."""
         if self._amending:
             self._snapshot.amend(checkpoint)
 
-    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+    def teardown(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Restore the signal handlers in any case."""
-        super().teardown(trainer, pl_module, stage)
+        super().teardown(trainer, module, stage)
         self._stop.release()
 
-    def _save(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def _save(self, trainer: Trainer, module: SplatModule) -> None:
         if is_trial(trainer):
             return
-        host = as_host(pl_module)
         folder = run_folder(trainer) / "checkpoints" if self.folder is None else Path(self.folder)
-        with host.stopwatch.paused(host.device):
+        with module.stopwatch.paused(module.device):
             if self.keep:
                 _write(trainer, folder / f"step-{trainer.global_step}.ckpt")
             _write(trainer, folder / "last.ckpt")

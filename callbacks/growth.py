@@ -5,34 +5,34 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from dataclasses import field, replace
+from typing import ClassVar
 
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nsvq_lightning.compression.budget import splats_for_bytes, splats_for_photos
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.data.edges import detailed_pixels, edge_strength
+from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.distributed import check_replicas
 from nsvq_lightning.training.edit import append_rows, keep_rows
-from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.scene_access import needed_scene
 from nsvq_lightning.training.schedule import Phase
 
-from .base import HostedCallback
+from .base import SplatCallback, settings
 from .density import Densification
 from .quantization import RateDistortion
 
 __all__ = [
     "BudgetedGrowth",
-    "GrowthRules",
     "SplatBudget",
     "add_observed",
     "budget_at",
@@ -45,7 +45,8 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 
-class SplatBudget(HostedCallback):
+@settings
+class SplatBudget(SplatCallback):
     """Decides how many splats the scene is to have, and says why.
 
     :class:`~nsvq_lightning.callbacks.BudgetedGrowth` grows up to it,
@@ -67,33 +68,30 @@ class SplatBudget(HostedCallback):
         [100000]
     """
 
-    def __init__(self, quality: float | None = None, splats: int | None = None, bytes: int | None = None) -> None:
-        numbers = {"quality": quality, "splats": splats, "bytes": bytes}
-        given = {name: value for name, value in numbers.items() if value is not None}
+    quality: float | None = None
+    splats: int | None = None
+    bytes: int | None = None
+
+    def __post_init__(self) -> None:
+        given = [name for name in ("quality", "splats", "bytes") if getattr(self, name) is not None]
         if len(given) > 1:
             raise ValueError(f"a budget is one number, got {' and '.join(given)}; leave all but one out")
-        for name, value in given.items():
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} must be finite and above 0, got {value}")
-        self.quality = quality
-        self.splats = splats
-        self.bytes = bytes
+        self.check({"above 0": given})
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Set the module's budget.
 
         Raises:
             ValueError: The budget in bytes has no room for codebooks; or it is to come from photos, and the trainer has
                 no data module with a scene.
         """
-        super().on_train_start(trainer, pl_module)
-        host = as_host(pl_module)
-        host.splat_budget, reason = self.splats, "as asked"
+        super().on_train_start(trainer, module)
+        module.splat_budget, reason = self.splats, "as asked"
         if self.bytes is not None:
-            codebooks = {name: tuple(quantizer.codebook.shape) for name, quantizer in host.quantizers.items()}
+            codebooks = {name: tuple(quantizer.codebook.shape) for name, quantizer in module.quantizers.items()}
             choices = [c.strength for c in trainer.callbacks if isinstance(c, RateDistortion)]  # type: ignore[attr-defined]
-            host.splat_budget = splats_for_bytes(
-                self.bytes, codebooks, host.splats.sh_degree, host.storage.precision, max(choices, default=0.0)
+            module.splat_budget = splats_for_bytes(
+                self.bytes, codebooks, module.splats.sh_degree, module.storage.precision, max(choices, default=0.0)
             )
             reason = f"for a file of {self.bytes} bytes"
         elif self.quality is not None:
@@ -103,13 +101,13 @@ class SplatBudget(HostedCallback):
                 "give a number of splats (--splats) or bytes (--bytes)",
             )
             detail = detailed_pixels(scene)
-            host.splat_budget = splats_for_photos(len(scene.train), detail, self.quality)
+            module.splat_budget = splats_for_photos(len(scene.train), detail, self.quality)
             reason = (
                 f"quality {self.quality:g} times what {len(scene.train)} photos with {detail:,.0f} detailed pixels "
                 "each support; --quality changes it"
             )
-        if host.splat_budget is not None:
-            log.info("budget: %d splats, %s", host.splat_budget, reason)
+        if module.splat_budget is not None:
+            log.info("budget: %d splats, %s", module.splat_budget, reason)
 
 
 CHILD_OFFSET = 1.35
@@ -120,75 +118,6 @@ CHILD_WIDTH = 0.893
 """Other axes of a child over those of its parent: √(1 - 0.45²), the width of an ellipsoid at 0.45 of its length."""
 CHILD_OPACITY = 0.6
 """Opacity of a child over that of its parent."""
-
-
-@dataclass(frozen=True)
-class GrowthRules:
-    """Settings of budgeted growth (Improved-GS, arXiv 2508.12313, on the absolute gradients of arXiv 2404.10484).
-
-    Iterations are those of the reference run; :class:`~nsvq_lightning.training.schedule.Schedule` scales them.
-
-    Attributes:
-        start: Iteration at which growth may begin.
-        full: Iteration at which the number of splats may reach the budget; between the two it may grow with the root of
-            the time. From here on the gradient itself is a splat's weight.
-        every: Interval of growth.
-        grad_threshold: A splat may be split where its absolute screen-space gradient (in normalised device
-            coordinates), averaged over the views that saw it, reaches this.
-        late_threshold: The same after ``full``.
-        min_opacity: Splats with a lower opacity are pruned at each growth but the last.
-        first_prune: Iteration at which opacities below ``first_opacity`` are pruned once; 0 for never.
-        first_opacity: See ``first_prune``.
-        reset_every: Interval of opacity resets.
-        reset_last: Last opacity reset.
-        reset_opacity: Opacities are reset to at most this.
-        recovery: Iterations after a reset at which those with the lowest opacity are pruned.
-        recoveries: After how many resets, from the first, that is done.
-        recovery_share: Share of the splats that this prunes.
-        patience: After so many times at which there is room, but hardly a splat over the threshold, the warm-up phase
-            ends; 0 for never.
-        min_splats: A pruning that would leave fewer splats is skipped with a warning.
-
-    Raises:
-        ValueError: A setting is out of range.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import BudgetedGrowth, GrowthRules
-        >>> BudgetedGrowth(GrowthRules(every=200)).growth.every  # --callbacks.density.growth.every=200
-        200
-    """
-
-    start: int = 500
-    full: int = 14_500
-    every: int = 100
-    grad_threshold: float = 3e-4
-    late_threshold: float = 2e-4
-    min_opacity: float = 0.005
-    first_prune: int = 300
-    first_opacity: float = 0.02
-    reset_every: int = 3000
-    reset_last: int = 12_000
-    reset_opacity: float = 0.05
-    recovery: int = 300
-    recoveries: int = 2
-    recovery_share: float = 0.2
-    patience: int = 5
-    min_splats: int = 10
-
-    def __post_init__(self) -> None:
-        for name in ("every", "reset_every", "recovery", "min_splats"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("start", "first_prune", "recoveries", "patience", "grad_threshold", "late_threshold"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
-        if self.full <= self.start:
-            raise ValueError(f"growth must be full after its start={self.start}, got full={self.full}")
-        for name in ("min_opacity", "first_opacity", "reset_opacity"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
-        if not 0.0 <= self.recovery_share < 1.0:
-            raise ValueError(f"recovery_share must be in [0, 1), got {self.recovery_share}")
 
 
 def add_observed(
@@ -276,6 +205,7 @@ IDLE = 0.01
 """Growth is idle if it adds at most this share of what it may add, or of what there is."""
 
 
+@settings
 class BudgetedGrowth(Densification):
     """Splits splats where the photos have edges, up to a budget: fewer splats for the same quality.
 
@@ -286,17 +216,37 @@ class BudgetedGrowth(Densification):
     and opacities reset. Growth ends with the warm-up phase, or ends that phase early if hardly any splat needs to be
     split; non-finite splats are dropped in every phase.
 
+    Iterations are those of the reference run; :class:`~nsvq_lightning.training.schedule.Schedule` scales them.
+
     Args:
-        growth: All thresholds, intervals and limits.
         budget: How many splats the scene is to have in the end; None for the module's
             (:class:`nsvq_lightning.callbacks.SplatBudget`).
         overshoot: Growth may reach this many times the budget: more than 1 is for a run that selects the best of them
             afterwards (:class:`nsvq_lightning.callbacks.OpacitySelection`).
+        start: Iteration at which growth may begin.
+        full: Iteration at which the number of splats may reach the budget; between the two it may grow with the root of
+            the time. From here on the gradient itself is a splat's weight.
+        every: Interval of growth.
+        grad_threshold: A splat may be split where its absolute screen-space gradient (in normalised device
+            coordinates), averaged over the views that saw it, reaches this.
+        late_threshold: The same after ``full``.
+        min_opacity: Splats with a lower opacity are pruned at each growth but the last.
+        first_prune: Iteration at which opacities below ``first_opacity`` are pruned once; 0 for never.
+        first_opacity: See ``first_prune``.
+        reset_every: Interval of opacity resets.
+        reset_last: Last opacity reset.
+        reset_opacity: Opacities are reset to at most this.
+        recovery: Iterations after a reset at which those with the lowest opacity are pruned.
+        recoveries: After how many resets, from the first, that is done.
+        recovery_share: Share of the splats that this prunes.
+        patience: After so many times at which there is room, but hardly a splat over the threshold, the warm-up phase
+            ends; 0 for never.
+        min_splats: A pruning that would leave fewer splats is skipped with a warning.
         finite_every: Iterations between two searches for non-finite splats; a step whose loss is not finite always
             causes one.
 
     Raises:
-        ValueError: ``budget`` is below ``growth.min_splats``, ``overshoot`` below 1, or ``finite_every`` below 1.
+        ValueError: A setting is out of range.
 
     Example:
         >>> from nsvq_lightning.callbacks import BudgetedGrowth, standard
@@ -308,49 +258,50 @@ class BudgetedGrowth(Densification):
     tables: ClassVar[tuple[str, ...]] = (GRADIENTS, VIEWS, EDGES)
     limit_name: ClassVar[str] = "the budget"
 
-    def __init__(
-        self,
-        growth: GrowthRules = GrowthRules(),
-        budget: int | None = None,
-        overshoot: float = 2.0,
-        finite_every: int = 100,
-    ) -> None:
-        super().__init__(finite_every)
-        if budget is not None and budget < growth.min_splats:
-            raise ValueError(f"budget must be at least min_splats={growth.min_splats}, got {budget}")
-        if not overshoot >= 1.0:
-            raise ValueError(f"overshoot must be at least 1, got {overshoot}")
-        self.growth = growth
-        self.budget = budget
-        self.overshoot = overshoot
-        self._idle = 0
+    budget: int | None = None
+    overshoot: float = 2.0
+    start: int = 0
+    full: int = 6200
+    every: int = 100
+    grad_threshold: float = 3e-4
+    late_threshold: float = 2e-4
+    min_opacity: float = 0.005
+    first_prune: int = 300
+    first_opacity: float = 0.02
+    reset_every: int = 2600
+    reset_last: int = 5400
+    reset_opacity: float = 0.05
+    recovery: int = 600
+    recoveries: int = 2
+    recovery_share: float = 0.2
+    patience: int = 5
+    min_splats: int = 10
+    finite_every: int = 100
+    state = ("idle",)
+    idle: int = field(default=0, init=False)
+    """How many times in a row hardly a splat had to be split."""
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Forget an earlier fit; reject strategies that would lose the replaced parameters.
+    def __post_init__(self) -> None:
+        self.check(
+            {
+                "at least 1": ("every", "reset_every", "recovery", "min_splats", "overshoot", "finite_every"),
+                "at least 0": ("start", "first_prune", "recoveries", "patience", "grad_threshold", "late_threshold"),
+                "between 0 and 1": ("min_opacity", "first_opacity", "reset_opacity"),
+                "in [0, 1)": ("recovery_share",),
+            }
+        )
+        if self.full <= self.start:
+            raise ValueError(f"growth must be full after its start={self.start}, got full={self.full}")
+        if self.budget is not None and self.budget < self.min_splats:
+            raise ValueError(f"budget must be at least min_splats={self.min_splats}, got {self.budget}")
 
-        Raises:
-            ValueError: The strategy wraps the module in ``DistributedDataParallel``.
-        """
-        super().setup(trainer, pl_module, stage)
-        if stage == "fit":
-            self._idle = 0
-
-    def state_dict(self) -> dict[str, Any]:
-        """The last iteration acted on, and for how long growth has been idle."""
-        return {**super().state_dict(), "idle": self._idle}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from there."""
-        super().load_state_dict(state_dict)
-        self._idle = state_dict["idle"]
-
-    def limit(self, host: SplatHost) -> int:
+    def limit(self, module: SplatModule) -> int:
         """How many splats growth may reach.
 
         Raises:
             ValueError: Neither the callback nor the module has a budget.
         """
-        budget = host.splat_budget if self.budget is None else self.budget
+        budget = module.splat_budget if self.budget is None else self.budget
         if budget is None:
             raise ValueError(
                 "growth needs a budget: list SplatBudget before it (--callbacks.budget=SplatBudget), or set "
@@ -358,14 +309,11 @@ class BudgetedGrowth(Densification):
             )
         return int(self.overshoot * budget)
 
-    def ask(self, host: SplatHost, iteration: int, batch: Any) -> None:
+    def ask(self, module: SplatModule, iteration: int, batch: View) -> bool:
         """Ask for absolute gradients and edge weights during warm-up."""
-        growing = host.schedule.phase_at(iteration) is Phase.WARMUP
-        host.pixel_map = edge_strength(batch.image, batch.mask) if growing else None
-
-    def has_asked(self, host: SplatHost) -> bool:
-        """Whether a map of edges was asked for."""
-        return host.pixel_map is not None
+        growing = module.schedule.phase_at(iteration) is Phase.WARMUP
+        module.pixel_map = edge_strength(batch.image, batch.mask) if growing else None
+        return growing
 
     def add(self, tables: Sequence[Tensor], render: Render, micro_batches: int) -> None:
         """Add a view's absolute gradients and edge weights, and count it."""
@@ -377,54 +325,52 @@ class BudgetedGrowth(Densification):
         gradients, views, edges = tables
         add_observed(gradients, views, edges, render.observed.grad, render.radii, *size)
 
-    def act(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
+    def act(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Split, prune and reset when due."""
-        rules, schedule = self.growth, host.schedule
+        schedule = module.schedule
         if schedule.phase_at(iteration) is not Phase.WARMUP:
             return
-        if rules.first_prune and iteration == schedule.iteration(rules.first_prune):
-            self.prune(trainer, host, host.splats.opacities.sigmoid() < rules.first_opacity, rules.min_splats)
+        if self.first_prune and iteration == schedule.iteration(self.first_prune):
+            self.prune(trainer, module, module.splats.opacities.sigmoid() < self.first_opacity)
         last = schedule.ends[Phase.WARMUP]
-        times = schedule.density_times(rules.start + rules.every, round(last / schedule.scale), rules.every)
+        times = schedule.density_times(self.start + self.every, round(last / schedule.scale), self.every)
         if iteration in times:
-            room, added = self._grow(trainer, host, iteration)
+            room, added = self._grow(trainer, module, iteration)
             pruned = 0
             if iteration != times[-1]:
-                pruned = self.prune(
-                    trainer, host, host.splats.opacities.sigmoid() < rules.min_opacity, rules.min_splats
-                )
+                pruned = self.prune(trainer, module, module.splats.opacities.sigmoid() < self.min_opacity)
             check_replicas(trainer, "growth")
-            log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(host.splats))
-            self._idle = self._idle + 1 if added <= IDLE * min(room, len(host.splats)) else 0
-            if self._idle >= rules.patience > 0:
-                host.schedule = replace(schedule, saved=schedule.saved + last - iteration)
+            log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(module.splats))
+            self.idle = self.idle + 1 if added <= IDLE * min(room, len(module.splats)) else 0
+            if self.idle >= self.patience > 0:
+                module.schedule = replace(schedule, saved=schedule.saved + last - iteration)
                 log.info(
                     "iteration %d: growth ends with %d splats, as hardly any needs to be split; the run will be %d "
                     "iterations shorter",
                     iteration,
-                    len(host.splats),
+                    len(module.splats),
                     last - iteration,
                 )
-        resets = schedule.reset_times(rules.reset_last, rules.reset_every)
+        resets = schedule.reset_times(self.reset_last, self.reset_every)
         if iteration in resets:
-            self.reset_opacities(trainer, host, rules.reset_opacity)
+            self.reset_opacities(trainer, module, self.reset_opacity)
             check_replicas(trainer, "the opacity reset")
-        if iteration in (reset + schedule.interval(rules.recovery) for reset in resets[: rules.recoveries]):
-            self.prune(trainer, host, lowest_share(host.splats.opacities, rules.recovery_share), rules.min_splats)
+        if iteration in (reset + schedule.interval(self.recovery) for reset in resets[: self.recoveries]):
+            self.prune(trainer, module, lowest_share(module.splats.opacities, self.recovery_share))
 
     @torch.no_grad()
-    def _grow(self, trainer: Trainer, host: SplatHost, iteration: int) -> tuple[int, int]:
+    def _grow(self, trainer: Trainer, module: SplatModule, iteration: int) -> tuple[int, int]:
         """Split as many splats as the budget allows; returns how many that was, and were. Resets the statistics."""
-        splats, rules, schedule = host.splats, self.growth, host.schedule
+        splats, schedule = module.splats, module.schedule
         gradients, views, edges = (splats.add_table(name) for name in self.tables)
         statistic = gradients / views.clamp(min=1)
         reference = iteration / schedule.scale
-        late = reference > rules.full
+        late = reference > self.full
         weight = statistic if late else edges
-        threshold = rules.late_threshold if late else rules.grad_threshold
+        threshold = self.late_threshold if late else self.grad_threshold
         candidates = torch.where(statistic >= threshold, weight, torch.zeros_like(weight))
-        room = budget_at((reference - rules.start) / (rules.full - rules.start), self.limit(host)) - len(splats)
-        divided = draw_rows(candidates, room, generator(host.seed, iteration, "grow"))
+        room = budget_at((reference - self.start) / (self.full - self.start), self.limit(module)) - len(splats)
+        divided = draw_rows(candidates, room, generator(module.seed, iteration, "grow"))
         before = len(splats)
         parents = RawSplats(*(tensor.detach()[divided] for tensor in splats.raw()))
         append_rows(splats, raw_optimizer(trainer), split_longest(parents)._asdict())

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import field
 from typing import Any
 
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nsvq_lightning.compression.importance import pixel_sizes
 from nsvq_lightning.data.scene import View
+from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.edit import raise_scales
-from nsvq_lightning.training.host import as_host
+from nsvq_lightning.training.module import LossTerm, SplatModule
 from nsvq_lightning.training.scene_access import needed_scene, train_cameras
 from nsvq_lightning.training.schedule import Phase, next_iteration
 
-from .base import HostedCallback
+from .base import SplatCallback, settings
 
 __all__ = ["ExposureCompensation", "FrequencyLimit"]
 
@@ -26,7 +28,8 @@ __all__ = ["ExposureCompensation", "FrequencyLimit"]
 log = logging.getLogger(__name__)
 
 
-class ExposureCompensation(HostedCallback):
+@settings
+class ExposureCompensation(SplatCallback):
     """Gives each train photo an affine map of colours, which is applied to its rendered picture before the loss.
 
     Cameras that choose exposure and white balance by themselves make photos that contradict each other; splats then
@@ -52,24 +55,25 @@ class ExposureCompensation(HostedCallback):
         0.001
     """
 
-    def __init__(self, rate: float = 0.001, final: float = 0.1) -> None:
-        if not all(math.isfinite(value) and value > 0 for value in (rate, final)):
-            raise ValueError(f"rate and final must be positive and finite, got {rate} and {final}")
-        self.rate, self.final = rate, final
+    rate: float = 0.001
+    final: float = 0.1
+
+    def __post_init__(self) -> None:
+        self.check({"above 0": ("rate", "final")})
         self._changes = torch.zeros(0, 3, 4)
         self._adam: torch.optim.Adam | None = None
         self._row: dict[int, int] = {}
         self._loaded: dict[str, Any] | None = None
+        self._plain: LossTerm | None = None
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Start from no change, or from what a checkpoint has.
 
         Raises:
             ValueError: The trainer has no data module with a scene, or the checkpoint is of another number of photos.
         """
-        super().on_train_start(trainer, pl_module)
+        super().on_train_start(trainer, module)
         scene = needed_scene(trainer, "exposures are those of the train photos", "leave out ExposureCompensation")
-        host = as_host(pl_module)
         self._row = {view: row for row, view in enumerate(scene.train)}
         start = torch.zeros(len(scene.train), 3, 4)
         if self._loaded is not None:
@@ -79,33 +83,34 @@ class ExposureCompensation(HostedCallback):
                     f"the checkpoint has exposures of {len(start)} train photos, {scene.root} has {len(scene.train)}: "
                     "continue with the photos of the run"
                 )
-        self._changes = start.to(host.device).requires_grad_()
+        self._changes = start.to(module.device).requires_grad_()
         self._adam = torch.optim.Adam([self._changes], lr=self.rate)
         if self._loaded is not None:
             self._adam.load_state_dict(self._loaded["adam"])
             self._loaded = None
-        host.appearance = self._appearance
+        self._plain = plain = module.loss_terms["photometric"]
+        module.loss_terms["photometric"] = lambda rendered, view: plain(self._exposed(rendered, view), view)
 
-    def _appearance(self, image: Tensor, view: View) -> Tensor:
-        """The rendered picture ``[H, W, 3]`` with the exposure of a train photo."""
-        change = self._changes[self._row[view.index]] - self._changes.mean(0)
+    def _exposed(self, rendered: Render, view: View) -> Render:
+        """The rendered picture with the exposure of a train photo."""
+        change, image = self._changes[self._row[view.index]] - self._changes.mean(0), rendered.image
         flat = torch.addmm(change[:, 3], image.reshape(-1, 3), (torch.eye(3, device=change.device) + change[:, :3]).T)
-        return flat.reshape(image.shape)
+        return rendered._replace(image=flat.reshape(image.shape))
 
-    def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Any) -> None:
+    def on_before_optimizer_step(self, trainer: Trainer, module: SplatModule, optimizer: Any) -> None:
         """Take a step; a loss that is not finite changes nothing."""
         if self._adam is None:
             return
-        share = next_iteration(trainer) / max(1, as_host(pl_module).schedule.total)
+        share = next_iteration(trainer) / max(1, module.schedule.total)
         self._adam.param_groups[0]["lr"] = self.rate * self.final ** min(1.0, share)
         gradient = torch.zeros_like(self._changes) if self._changes.grad is None else self._changes.grad
         self._changes.grad = sum_over_processes(trainer, gradient.nan_to_num_(0.0, 0.0, 0.0))
         self._adam.step()
         self._adam.zero_grad()
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Say how much the photos differ."""
-        as_host(pl_module).appearance = None
+        self._leave(module)
         gains = 1 + self._changes.detach()[:, :, :3].diagonal(dim1=1, dim2=2).mean(1)
         if len(gains):
             low, high = gains.log2().aminmax()
@@ -115,9 +120,14 @@ class ExposureCompensation(HostedCallback):
                 high - gains.log2().mean(),
             )
 
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+    def on_exception(self, trainer: Trainer, module: SplatModule, exception: BaseException) -> None:
         """Leave the module as it was."""
-        as_host(pl_module).appearance = None
+        self._leave(module)
+
+    def _leave(self, module: SplatModule) -> None:
+        if self._plain is not None:
+            module.loss_terms["photometric"] = self._plain
+            self._plain = None
 
     def state_dict(self) -> dict[str, Any]:
         """Exposures and the state of their Adam."""
@@ -138,7 +148,8 @@ NO_LIMIT = 1e-30
 """Size for splats that no photo sees."""
 
 
-class FrequencyLimit(HostedCallback):
+@settings
+class FrequencyLimit(SplatCallback):
     """Until the quantize phase, keeps scales at or above a share of a pixel in the photo that sees the splat closest.
 
     A splat smaller than the pixels of every photo is a guess, which shows when a camera comes closer: it turns into a
@@ -159,26 +170,23 @@ class FrequencyLimit(HostedCallback):
         0.447
     """
 
-    def __init__(self, pixels: float = math.sqrt(0.2)) -> None:
-        if not 0.0 < pixels < math.inf:
-            raise ValueError(f"pixels must be positive and finite, got {pixels}")
-        self.pixels = pixels
-        self._floor: Tensor | None = None
-        self._edits = 0
+    pixels: float = math.sqrt(0.2)
+    _floor: Tensor | None = field(default=None, init=False)
+    _edits: int = field(default=0, init=False)
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def __post_init__(self) -> None:
+        self.check({"above 0": ("pixels",)})
+
+    def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Look at the splats anew; what is known of them is in a side table."""
-        super().on_train_start(trainer, pl_module)
+        super().on_train_start(trainer, module)
         self._floor = None
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Raise the scales that have become too small."""
-        host, iteration = as_host(pl_module), trainer.global_step
-        if host.schedule.phase_at(iteration + 1) >= Phase.QUANTIZE:
+        if module.schedule.phase_at(iteration + 1) >= Phase.QUANTIZE:
             return
-        splats = host.splats
+        splats = module.splats
         if self._floor is None or splats.edits != self._edits or iteration % EVERY == 0:
             sizes = splats.add_table(PIXEL_SIZES)
             if iteration % EVERY == 0:
@@ -188,6 +196,6 @@ class FrequencyLimit(HostedCallback):
             self._floor, self._edits = (self.pixels * sizes).log()[:, None], splats.edits
         raise_scales(splats, self._floor)
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Forget the limits."""
         self._floor = None

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import BasePredictionWriter
 
+from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import FORMATS, save
 from nsvq_lightning.io.nsvq.file import as_stored
@@ -19,11 +20,11 @@ from nsvq_lightning.report.pictures import file_stem, write_png
 from nsvq_lightning.report.viewer import BACKGROUNDS, some_cameras, write_viewer
 from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.training import live_preview
-from nsvq_lightning.training.host import as_host
+from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_trial, run_folder
 from nsvq_lightning.training.scene_access import scene_of
 
-from .base import WritingCallback
+from .base import WritingCallback, settings
 
 __all__ = ["ExportScene", "LiveScene", "RenderWriter"]
 
@@ -33,10 +34,9 @@ log = logging.getLogger(__name__)
 
 EXPORT_FORMATS = tuple(suffix.removeprefix(".") for suffix in FORMATS)
 """Formats that can be written."""
-DEFAULT_EXPORT = ("nsvq", "ply")
-"""The compressed scene, and its decoded splats for viewers."""
 
 
+@settings
 class ExportScene(WritingCallback):
     """Writes the scene when training ends.
 
@@ -59,32 +59,33 @@ class ExportScene(WritingCallback):
         ValueError: unknown export formats obj; choose from ply, nsvq, sog, spz, splat
     """
 
-    def __init__(self, formats: Sequence[str] = DEFAULT_EXPORT, folder: str | None = None) -> None:
-        unknown = sorted(set(formats) - set(EXPORT_FORMATS))
+    formats: Sequence[str] = ("nsvq", "ply")
+    folder: str | None = None
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.formats) - set(EXPORT_FORMATS))
         if unknown:
             raise ValueError(f"unknown export formats {', '.join(unknown)}; choose from {', '.join(EXPORT_FORMATS)}")
-        self.formats = tuple(formats)
-        self.folder = folder
+        self.formats = tuple(self.formats)
 
-    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Write the files, on the first process."""
         folder = run_folder(trainer) if self.folder is None else Path(self.folder)
         if is_trial(trainer) or not trainer.is_global_zero:
             return
-        host = as_host(pl_module)
-        scene = host.compressed().finite()
+        scene = module.compressed().finite()
         # The files of viewers hold what the compressed one decodes to: found once, however many there are.
-        decoded = as_stored(scene, host.storage) if set(self.formats) - {"nsvq"} else scene
+        decoded = as_stored(scene, module.storage) if set(self.formats) - {"nsvq"} else scene
         folder.mkdir(parents=True, exist_ok=True)
         for suffix in self.formats:
             path = folder / f"scene.{suffix}"
-            size = save(scene, path, host.storage) if suffix == "nsvq" else save(decoded, path)
+            size = save(scene, path, module.storage) if suffix == "nsvq" else save(decoded, path)
             log.info("wrote %s (%d bytes)", path, size)
         photos = getattr(getattr(trainer, "datamodule", None), "scene", None)
         if "nsvq" in self.formats and photos is not None:
             page = folder / "viewer.html"
             title = page.resolve().parent.parent.name
-            background = BACKGROUNDS.get(host.background, BACKGROUNDS["black"])
+            background = BACKGROUNDS.get(module.background, BACKGROUNDS["black"])
             size = write_viewer(page, folder / "scene.nsvq", some_cameras(photos), title, background)
             log.info("wrote %s (%d bytes)", page, size)
 
@@ -107,23 +108,23 @@ class RenderWriter(BasePredictionWriter):
         self.folder = folder
         self._target = Path()
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+    def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Take the folder of the run.
 
         Raises:
             FileExistsError: It holds another run.
         """
-        super().setup(trainer, pl_module, stage)
+        super().setup(trainer, module, stage)
         if stage == "predict" and self.folder is None:
             run_folder(trainer)
 
-    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_predict_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Make the folder in a hook that all processes call: some have fewer views than others."""
         self._target = run_folder(trainer) / "predictions" if self.folder is None else Path(self.folder)
         if not is_trial(trainer):
             self._target.mkdir(parents=True, exist_ok=True)
 
-    def write_on_batch_end(self, trainer: Trainer, pl_module: LightningModule, prediction: Any, *args: Any) -> None:
+    def write_on_batch_end(self, trainer: Trainer, module: SplatModule, prediction: Any, *args: Any) -> None:
         """Write one picture."""
         if is_trial(trainer):
             return
@@ -131,7 +132,7 @@ class RenderWriter(BasePredictionWriter):
         stem = file_stem(prediction["name"], scene.names if scene is not None else ())
         write_png(self._target / f"{stem}.png", prediction["image"])
 
-    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_predict_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Say where the pictures are."""
         if not is_trial(trainer):
             log.info("rendered views are in %s", self._target)
@@ -161,14 +162,14 @@ class LiveScene(WritingCallback):
         self._answered = 0
         self._next = 0.0
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Forget who asked an earlier part of the run."""
-        super().on_train_start(trainer, pl_module)
+        super().on_train_start(trainer, module)
         self._running = not is_trial(trainer)
         self._answered, self._next = live_preview.asked(run_folder(trainer)), 0.0
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, batch_idx: int
     ) -> None:
         """Answer a viewer."""
         due = batch_idx % CHECKED_EVERY == 0 and time.monotonic() >= self._next
@@ -178,24 +179,24 @@ class LiveScene(WritingCallback):
         asked = live_preview.asked(folder)
         if asked == self._answered:
             return
-        host, began = as_host(pl_module), time.monotonic()
-        with host.stopwatch.paused(host.device):
-            splats = type(host.splats).from_tensors(*host.hard_splats(host.phase)).to("cpu")
-            state = {"iteration": trainer.global_step, "of": trainer.max_steps, "phase": host.phase.name.lower()}
-            if host.history:
-                state["psnr"] = f"{host.history[-1]['psnr']:.2f}"
-            config = {"antialiased": getattr(pl_module, "antialiased", False), "live": state}
+        module, began = module, time.monotonic()
+        with module.stopwatch.paused(module.device):
+            splats = type(module.splats).from_tensors(*module.hard_splats(module.phase)).to("cpu")
+            state = {"iteration": trainer.global_step, "of": trainer.max_steps, "phase": module.phase.name.lower()}
+            if module.history:
+                state["psnr"] = f"{module.history[-1]['psnr']:.2f}"
+            config = {"antialiased": module.antialiased, "live": state}
             scene = CompressedScene.from_arrays(SplatArrays.from_splats(splats), config=config)
             save(scene, folder / live_preview.LIVE_SCENE, Storage("paper"))
         self._answered, ended = asked, time.monotonic()
         self._next = ended + (ended - began) / SHARE
 
-    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Leave the finished scene alone."""
         if self._running and trainer.is_global_zero:
             live_preview.end(run_folder(trainer))
         self._running = False
 
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+    def on_exception(self, trainer: Trainer, module: SplatModule, exception: BaseException) -> None:
         """Leave nothing behind that only a running fit has."""
-        self.on_fit_end(trainer, pl_module)
+        self.on_fit_end(trainer, module)

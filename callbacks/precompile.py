@@ -10,12 +10,14 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import Trainer
 
 from nsvq_lightning.compute.compilation import compile_watcher
 from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.training import rehearsal
 from nsvq_lightning.training.module import SplatModule
+
+from .base import SplatCallback
 
 __all__ = ["CompileAhead"]
 
@@ -23,7 +25,7 @@ __all__ = ["CompileAhead"]
 log = logging.getLogger(__name__)
 
 
-class CompileAhead(Callback):
+class CompileAhead(SplatCallback):
     """Compiles the kernels of quantization and of the file in a second process.
 
     The first kernel that the fit compiles starts that process: where all kernels are cached, nothing happens. It goes
@@ -31,8 +33,7 @@ class CompileAhead(Callback):
     leaves its kernels in Numba's cache. If it fails, the fit compiles them itself when it needs them. It ends with the
     fit.
 
-    It does nothing on a single core, on a GPU, without codebooks, or with a module that is not
-    :class:`nsvq_lightning.SplatModule`.
+    It does nothing on a single core, on a GPU, or without codebooks.
 
     Example:
         >>> from nsvq_lightning.callbacks import STANDARD, CompileAhead
@@ -45,12 +46,12 @@ class CompileAhead(Callback):
         self._process: Any = None
         self._settings: bytes | None = None
 
-    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_fit_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Wait for the first compilation."""
-        if not isinstance(pl_module, SplatModule) or not pl_module.quantizers or pl_module.device.type != "cpu":
+        if not module.quantizers or module.device.type != "cpu":
             return
         if trainer.is_global_zero and usable_cores() > 1:
-            self._settings = rehearsal.settings_of(pl_module)
+            self._settings = rehearsal.settings_of(module)
             self._watching.enter_context(compile_watcher(self._start))
 
     def _start(self, _: str) -> None:

@@ -7,12 +7,13 @@ import time
 from contextlib import ExitStack
 from typing import Any
 
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.callbacks.progress.tqdm_progress import Tqdm
 
 from nsvq_lightning.compute.compilation import compile_seconds, compile_watcher
-from nsvq_lightning.training.host import as_host, splat_host
+from nsvq_lightning.data.scene import View
+from nsvq_lightning.training.module import SplatModule
 
 __all__ = ["SplatProgressBar"]
 
@@ -64,10 +65,9 @@ class SplatProgressBar(TQDMProgressBar):
         """Whether no bar is drawn."""
         return super().is_disabled or self._is_plain
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+    def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Find out whether the output shows bars; write only a few lines to a file."""
-        super().setup(trainer, pl_module, stage)
-        splat_host(pl_module)
+        super().setup(trainer, module, stage)
         self._psnr = None
         self._is_plain = not _shows_bars()
         if stage == "fit" and self._is_plain and self._refresh_rate > 0:
@@ -86,14 +86,14 @@ class SplatProgressBar(TQDMProgressBar):
         """Leave the bar unchanged: there is only one epoch, and a resumed run is in the middle of it."""
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, batch_idx: int
     ) -> None:
         """Refresh the bar, or write a line."""
         # A resumed run counts batches from zero; its bar does not.
         done = trainer.global_step
         if not self._should_update(done, int(self.total_train_batches)):
             return
-        text = self._text(trainer, pl_module)
+        text = self._text(trainer, module)
         if self._is_plain:
             sys.stdout.write(f"{self._line(trainer)}: {text}\n")
             sys.stdout.flush()
@@ -103,7 +103,7 @@ class SplatProgressBar(TQDMProgressBar):
         bar.n = done
         bar.set_postfix_str(text)
 
-    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_epoch_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Leave the bar unchanged; the end of the run is the end of its only epoch."""
 
     def on_train_end(self, *args: Any) -> None:
@@ -134,16 +134,15 @@ class SplatProgressBar(TQDMProgressBar):
     def _start_without_compilation(self) -> float:
         return self._started + compile_seconds() - self._compiled_before
 
-    def _text(self, trainer: Trainer, module: LightningModule) -> str:
-        host = as_host(module)
-        parts = [f"{host.phase.name.lower()} {_rounded(len(host.splats))} splats"]
+    def _text(self, trainer: Trainer, module: SplatModule) -> str:
+        parts = [f"{module.phase.name.lower()} {_rounded(len(module.splats))} splats"]
         psnr = trainer.callback_metrics.get("train/psnr")
         if psnr is not None:
             past = float(psnr) if self._psnr is None else self._psnr
             self._psnr = self.smoothing * past + (1.0 - self.smoothing) * float(psnr)
             parts.append(f"{self._psnr:.1f} dB")
-        if host.history:
-            parts.append(f"test {host.history[-1]['psnr']:.2f}")
+        if module.history:
+            parts.append(f"test {module.history[-1]['psnr']:.2f}")
         return " ".join(parts)
 
     def _show_compilation(self, line: str) -> None:

@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 import logging
-import math
-from typing import Any
+from dataclasses import field
 
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Trainer
 from torch import Tensor
-from torch.optim import Optimizer
 
 from nsvq_lightning.compression.importance import least_contributing, most_contributing
+from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import generator
 from nsvq_lightning.training.distributed import check_replicas
 from nsvq_lightning.training.edit import keep_rows
-from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.scene_access import train_contributions
 from nsvq_lightning.training.schedule import Phase, next_iteration
 
-from .base import HostedCallback, StepCallback
+from .base import SplatCallback, settings
 from .growth import draw_rows
 
 __all__ = ["ContributionPruning", "OpacityRegularization", "OpacitySelection", "pressure"]
 
 
-class OpacityRegularization(HostedCallback):
+@settings
+class OpacityRegularization(SplatCallback):
     """Adds λ · Σ opacity to the loss during the prune phase, so that unneeded splats fade and are pruned.
 
     The term is a sum over the splats (paper, section 3.4), so its strength grows with their number. A shorter run has
@@ -47,16 +47,17 @@ class OpacityRegularization(HostedCallback):
         2e-06
     """
 
-    def __init__(self, weight: float = 1e-7) -> None:
-        if not (math.isfinite(weight) and weight >= 0):
-            raise ValueError(f"weight must be finite and at least 0, got {weight}")
-        self.weight = weight
+    weight: float = 1e-7
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def __post_init__(self) -> None:
+        self.check({"at least 0": ("weight",)})
+
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Turn the term on and off."""
-        host = as_host(pl_module)
-        pruning = host.schedule.phase_at(next_iteration(trainer)) is Phase.PRUNE
-        host.opacity_weight = host.schedule.strength(self.weight) if pruning else 0.0
+        module.loss_terms.pop("opacity", None)
+        if module.schedule.phase_at(next_iteration(trainer)) is Phase.PRUNE:
+            weight = module.schedule.strength(self.weight)
+            module.loss_terms["opacity"] = lambda *_: weight * module.splats.opacities.sigmoid().sum()
 
 
 log = logging.getLogger(__name__)
@@ -71,7 +72,8 @@ START_OF_LINE = 0.8
 """Where the line starts, as a share of the opacity of the last splat within the budget."""
 
 
-class OpacitySelection(StepCallback):
+@settings
+class OpacitySelection(SplatCallback):
     """Removes splats in the prune phase until a budget is left: those that do not hold their opacity under pressure.
 
     A term in the loss pushes all opacities down while their learning rate is raised; splats that matter for the photos
@@ -104,143 +106,110 @@ class OpacitySelection(StepCallback):
         [50000]
     """
 
-    def __init__(
-        self,
-        budget: int | None = None,
-        strength: float = 2e-4,
-        pushes: int = 160,
-        gentle: float = 0.125,
-        lead: float = 0.125,
-        rate: float = 4.0,
-        min_opacity: float = 0.001,
-        close: float = 1.05,
-    ) -> None:
-        super().__init__()
-        if budget is not None and budget < 1:
-            raise ValueError(f"budget must be at least 1, got {budget}")
-        if pushes < 1:
-            raise ValueError(f"pushes must be at least 1, got {pushes}")
-        for name, share in (("gentle", gentle), ("lead", lead)):
-            if not 0.0 <= share < 1.0:
-                raise ValueError(f"{name} must be in [0, 1), got {share}")
-        for name, value in (("strength", strength), ("rate", rate), ("close", close)):
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} must be finite and above 0, got {value}")
-        if not 0.0 <= min_opacity < 1.0:
-            raise ValueError(f"min_opacity must be in [0, 1), got {min_opacity}")
-        self.budget = budget
-        self.initial_strength = strength
-        self.pushes = pushes
-        self.gentle = gentle
-        self.lead = lead
-        self.rate = rate
-        self.min_opacity = min_opacity
-        self.close = close
-        self._restart()
+    state = ("current_strength", "line", "done")
 
-    def _restart(self) -> None:
-        self.strength = self.initial_strength
-        self.line: float | None = None
-        self.done = False
+    budget: int | None = None
+    strength: float = 2e-4
+    pushes: int = 160
+    gentle: float = 0.125
+    lead: float = 0.125
+    rate: float = 4.0
+    min_opacity: float = 0.001
+    close: float = 1.05
+    current_strength: float | None = field(default=None, init=False)
+    """λ now; None before the first time."""
+    line: float | None = field(default=None, init=False)
+    """Where the line starts, as an opacity; None before the first time."""
+    done: bool = field(default=False, init=False)
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Forget an earlier fit of the same callback; a checkpoint's state is loaded after this."""
-        super().setup(trainer, pl_module, stage)
-        if stage == "fit":
-            self._restart()
+    def __post_init__(self) -> None:
+        self.check(
+            {
+                "at least 1": ("budget", "pushes"),
+                "in [0, 1)": ("gentle", "lead", "min_opacity"),
+                "above 0": ("strength", "rate", "close"),
+            }
+        )
 
-    def state_dict(self) -> dict[str, Any]:
-        """What the selection has reached."""
-        return {**super().state_dict(), "strength": self.strength, "line": self.line, "done": self.done}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from there."""
-        super().load_state_dict(state_dict)
-        self.strength, self.line, self.done = (state_dict[name] for name in ("strength", "line", "done"))
-
-    def limit(self, host: SplatHost) -> int | None:
+    def limit(self, module: SplatModule) -> int | None:
         """How many splats are to be left; None for all."""
-        return host.splat_budget if self.budget is None else self.budget
+        return module.splat_budget if self.budget is None else self.budget
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Raise the learning rate of the opacities while they compete."""
-        host = as_host(pl_module)
-        if self._is_selecting(host, next_iteration(trainer)):
-            host.scale_rate("opacities", self.rate)
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
+        """While the opacities compete, raise their learning rate, and press on them when due."""
+        module.loss_terms.pop("selection", None)
+        if self._is_selecting(module, next_iteration(trainer)):
+            module.scale_rate("opacities", self.rate)
+            super().on_train_batch_start(trainer, module, batch, batch_idx)
+            since, length = self._place(module, next_iteration(trainer))
+            if since % self._every(length) == 0:
+                module.loss_terms["selection"] = lambda *_: self._pressure(module, gentle=since < self.gentle * length)
 
-    def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
-        """Add the gradient of the pressure when due; the same on every process, after their gradients were averaged."""
-        host, iteration = as_host(pl_module), next_iteration(trainer)
-        if not self._is_selecting(host, iteration):
-            return
-        since, length = self._place(host, iteration)
+    def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
+        """Adjust the strength so that the opacity of the last splat within the budget falls along its line."""
+        budget, (since, length) = self.limit(module), self._place(module, iteration)
+        assert budget is not None
         if since % self._every(length) != 0:
             return
-        # Also in a step that will not update, which processes learn of at different times.
-        self._follow_line(host, since, length)
-        opacities = host.splats.opacities
-        if opacities.grad is not None:
-            opacities.grad += pressure(opacities.detach(), self.strength, gentle=since < self.gentle * length)
+        opacities = module.splats.opacities.detach()
+        last = float(opacities.kthvalue(max(1, len(opacities) - budget + 1)).values.sigmoid())
+        if self.line is None:
+            self.line, self.current_strength = START_OF_LINE * last, self.strength
+        elif since % (2 * self._every(length)) == 0 and self.current_strength is not None:
+            goal = self.line * max(0.0, 1.0 - since / max(1.0, (1.0 - self.lead) * length))
+            if last < NEAR_LINE[0] * goal:
+                self.current_strength *= WEAKER
+            elif last > NEAR_LINE[1] * goal:
+                self.current_strength *= STRONGER
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def _pressure(self, module: SplatModule, *, gentle: bool) -> Tensor:
+        """The pressure as a term of the loss: it has the right gradient, and no value, which would hide the others."""
+        assert self.current_strength is not None
+        opacities = module.splats.opacities
+        term = (pressure(opacities.detach(), self.current_strength, gentle=gentle) * opacities).sum()
+        return term - term.detach()
+
+    def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Prune when due, and end the selection once the budget is reached."""
-        host, iteration = as_host(pl_module), trainer.global_step
-        if iteration == 0 or not self._once.first_time(iteration) or not self._is_selecting(host, iteration):
+        if not self._is_selecting(module, iteration):
             return
-        since, length = self._place(host, iteration)
-        budget = self.limit(host)
+        since, length = self._place(module, iteration)
+        budget = self.limit(module)
         assert budget is not None
-        optimizer, opacities = raw_optimizer(trainer), host.splats.opacities.detach()
+        optimizer, opacities = raw_optimizer(trainer), module.splats.opacities.detach()
         if since >= self.gentle * length and (since + 1) % self._every(length) == 0:
             kept = opacities.sigmoid() >= self.min_opacity
             # Never below the budget: the pressure may have been too strong.
             if int(kept.sum()) >= min(budget, len(kept)):
-                keep_rows(host.splats, optimizer, kept)
-        count = len(host.splats)
+                keep_rows(module.splats, optimizer, kept)
+        count = len(module.splats)
         if count >= self.close * budget and since + 1 < length:
             return
         if count > budget:
-            weight = host.splats.opacities.detach().sigmoid()
+            weight = module.splats.opacities.detach().sigmoid()
             # A few too many are those that have faded. Of many, the most opaque would be those in the foreground.
             few = count < self.close * budget
-            draws = generator(host.seed, iteration, "select")
+            draws = generator(module.seed, iteration, "select")
             kept = most_contributing(weight, budget) if few else draw_rows(weight, budget, draws)
-            keep_rows(host.splats, optimizer, kept)
+            keep_rows(module.splats, optimizer, kept)
         self.done = True
         check_replicas(trainer, "the selection")
-        log.info("iteration %d: the selection is done, %d splats are left", iteration, len(host.splats))
+        log.info("iteration %d: the selection is done, %d splats are left", iteration, len(module.splats))
 
-    def _is_selecting(self, host: SplatHost, iteration: int) -> bool:
-        budget = self.limit(host)
-        if self.done or budget is None or host.schedule.phase_at(iteration) is not Phase.PRUNE:
+    def _is_selecting(self, module: SplatModule, iteration: int) -> bool:
+        budget = self.limit(module)
+        if self.done or budget is None or module.schedule.phase_at(iteration) is not Phase.PRUNE:
             return False
-        return self.line is not None or len(host.splats) >= self.close * budget
+        return self.line is not None or len(module.splats) >= self.close * budget
 
     def _every(self, length: int) -> int:
         """Iterations between two applications of the term, in a phase of ``length`` iterations."""
         return max(1, round(length / self.pushes))
 
-    def _place(self, host: SplatHost, iteration: int) -> tuple[int, int]:
+    def _place(self, module: SplatModule, iteration: int) -> tuple[int, int]:
         """Iterations since the start of the phase, 0 for its first, and its length."""
-        ends = host.schedule.ends
+        ends = module.schedule.ends
         return iteration - ends[Phase.WARMUP] - 1, ends[Phase.PRUNE] - ends[Phase.WARMUP]
-
-    def _follow_line(self, host: SplatHost, since: int, length: int) -> None:
-        """Adjust the strength so that the opacity of the last splat within the budget falls along its line."""
-        budget = self.limit(host)
-        assert budget is not None
-        opacities = host.splats.opacities.detach()
-        last = float(opacities.kthvalue(max(1, len(opacities) - budget + 1)).values.sigmoid())
-        if self.line is None:
-            self.line = START_OF_LINE * last
-        elif since % (2 * self._every(length)) == 0:
-            goal = self.line * max(0.0, 1.0 - since / max(1.0, (1.0 - self.lead) * length))
-            if last < NEAR_LINE[0] * goal:
-                self.strength *= WEAKER
-            elif last > NEAR_LINE[1] * goal:
-                self.strength *= STRONGER
 
 
 @torch.no_grad()
@@ -264,7 +233,8 @@ def pressure(opacities: Tensor, strength: float, *, gentle: bool) -> Tensor:
     return 2 * strength * (above / held).mean() * (1 / held + slope) / count
 
 
-class ContributionPruning(StepCallback):
+@settings
+class ContributionPruning(SplatCallback):
     """Once before the quantize phase, removes the splats that contribute least to the train views.
 
     The contribution of a splat is its blending weight, summed over all pixels
@@ -290,47 +260,40 @@ class ContributionPruning(StepCallback):
         1800
     """
 
-    def __init__(self, share: float = 0.0, at: int = 18_500) -> None:
-        super().__init__()
-        if not 0.0 <= share < 1.0:
-            raise ValueError(f"share must be at least 0 and below 1, got {share}")
-        if at < 1:
-            raise ValueError(f"at must be at least 1, got {at}")
-        self.share = share
-        self.at = at
+    share: float = 0.0
+    at: int = 18_500
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def __post_init__(self) -> None:
+        self.check({"in [0, 1)": ("share",), "at least 1": ("at",)})
+
+    def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Check that the pruning comes before the quantize phase.
 
         Raises:
             ValueError: It does not.
         """
-        super().on_train_start(trainer, pl_module)
-        schedule = as_host(pl_module).schedule
+        super().on_train_start(trainer, module)
+        schedule = module.schedule
         if self.share and schedule.phase_at(schedule.iteration(self.at) + 1) > Phase.PRUNE:
             raise ValueError(
                 f"contribution pruning at={self.at} must leave an iteration before the quantize phase, which starts "
                 f"after {schedule.prune_end}; lower at (--callbacks.contribution.at)"
             )
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Prune after iteration ``at``, now that all callbacks have finished with it."""
-        host = as_host(pl_module)
-        iteration = next_iteration(trainer) - 1
-        if self.share and iteration == host.schedule.iteration(self.at) and self._once.first_time(iteration):
-            self._prune(trainer, host)
-
-    def _prune(self, trainer: Trainer, host: SplatHost) -> None:
-        before = len(host.splats)
-        contribution = train_contributions(trainer, host)
+        if not self.share or iteration - 1 != module.schedule.iteration(self.at):
+            return
+        before = len(module.splats)
+        contribution = train_contributions(trainer, module)
         if not bool(contribution.any()):
             log.warning("iteration %d: no train view sees a splat; none is pruned", trainer.global_step)
             return
-        keep_rows(host.splats, raw_optimizer(trainer), ~least_contributing(contribution, self.share))
+        keep_rows(module.splats, raw_optimizer(trainer), ~least_contributing(contribution, self.share))
         log.info(
             "iteration %d: pruned %d of %d splats, at most %g of the total contribution",
             trainer.global_step,
-            before - len(host.splats),
+            before - len(module.splats),
             before,
             self.share,
         )

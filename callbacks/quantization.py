@@ -5,15 +5,17 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import field
 from typing import Any, Literal, cast, get_args
 
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Trainer
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from nsvq_lightning.compression.covariance_error import form_errors
 from nsvq_lightning.compression.importance import row_weights, scale_floor, sensitivity
+from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import kept
 from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.quantize.attributes import QUANTIZED, check_attributes, codes_of
@@ -32,12 +34,12 @@ from nsvq_lightning.random import derive_seed, generator
 from nsvq_lightning.splats.canonical_covariance import Form, canonical
 from nsvq_lightning.training.distributed import check_replicas, follow_first, from_first_process, sum_over_processes
 from nsvq_lightning.training.edit import change_coordinates, raise_scales, reset_moments, trainable_rows
-from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import codebook_group, raw_optimizer
 from nsvq_lightning.training.scene_access import needed_scene, train_cameras, train_contributions
 from nsvq_lightning.training.schedule import Phase, next_iteration
 
-from .base import FiniteSearch, HostedCallback, OncePerStep, StepCallback, keep_finite_splats
+from .base import SplatCallback, finite_search_is_due, keep_finite_splats, settings
 
 __all__ = [
     "CanonicalCovariance",
@@ -56,7 +58,8 @@ log = logging.getLogger(__name__)
 Mode = Literal["none", "sign", "full", "auto"]
 
 
-class CanonicalCovariance(StepCallback):
+@settings
+class CanonicalCovariance(SplatCallback):
     """After the last iteration before the quantize phase, gives like covariances like scales and rotations.
 
     ``mode`` gives each one of its 48 equivalent pairs of scale and rotation
@@ -86,90 +89,72 @@ class CanonicalCovariance(StepCallback):
         [0.25]
     """
 
-    def __init__(self, mode: Mode = "none", floor: float = 0.0) -> None:
-        super().__init__()
-        if mode not in get_args(Mode):
-            raise ValueError(f"mode must be one of {', '.join(get_args(Mode))}, got {mode!r}")
-        if not 0.0 <= floor < math.inf:
-            raise ValueError(f"floor is a number of pixels and must be at least 0, got {floor}")
-        self.mode = mode
-        self.floor = floor
-        self._log_floor: float | None = None
+    state = ("log_floor",)
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Forget an earlier fit of the same callback."""
-        super().setup(trainer, pl_module, stage)
-        if stage == "fit":
-            self._log_floor = None
+    mode: Mode = "none"
+    floor: float = 0.0
+    log_floor: float | None = field(default=None, init=False)
+    """Logarithm of the floor in use, scene units."""
 
-    def state_dict(self) -> dict[str, Any]:
-        """The last iteration acted on, and the floor in use."""
-        return super().state_dict() | {"log_floor": self._log_floor}
+    def __post_init__(self) -> None:
+        if self.mode not in get_args(Mode):
+            raise ValueError(f"mode must be one of {', '.join(get_args(Mode))}, got {self.mode!r}")
+        self.check({"at least 0": ("floor",)})
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continue with the floor that was in use."""
-        super().load_state_dict(state_dict)
-        self._log_floor = state_dict.get("log_floor")
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Act before the first iteration of a run that starts in the quantize phase."""
-        super().on_train_start(trainer, pl_module)
-        self._act_if_due(trainer, as_host(pl_module))
+        super().on_train_start(trainer, module)
+        if self._first_time("after", trainer.global_step):
+            self._act_if_due(trainer, module, trainer.global_step)
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Act after the last iteration before the quantize phase, so before any callback handles its first one.
 
         After each iteration of the phase, keep scales from falling below the floor: Adam moves parameters with tiny
         gradients as far as all others.
         """
-        host = as_host(pl_module)
-        self._act_if_due(trainer, host)
-        if self._log_floor is not None and host.schedule.phase_at(trainer.global_step) is Phase.QUANTIZE:
-            raise_scales(host.splats, self._log_floor)
+        self._act_if_due(trainer, module, iteration)
+        if self.log_floor is not None and module.schedule.phase_at(iteration) is Phase.QUANTIZE:
+            raise_scales(module.splats, self.log_floor)
 
-    def _act_if_due(self, trainer: Trainer, host: SplatHost) -> None:
-        iteration, first = trainer.global_step, host.schedule.first_of(Phase.QUANTIZE)
-        quantized = {"scales", "quats"} & set(host.quantizers)
-        acts = self.mode != "none" or self.floor > 0
-        if not acts or not quantized or first is None or iteration != first - 1:
+    def _act_if_due(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
+        first, quantized = module.schedule.first_of(Phase.QUANTIZE), {"scales", "quats"} & set(module.quantizers)
+        if not quantized or first is None or iteration != first - 1:
             return
-        if self._once.first_time(iteration):
-            if self.floor and "scales" in quantized:
-                self._raise(trainer, host)
-            form = self._chosen(trainer, host) if self.mode == "auto" else self.mode
-            if form != "none":
-                self._apply(trainer, host, form)
+        if self.floor and "scales" in quantized:
+            self._raise(trainer, module)
+        form = self._chosen(trainer, module) if self.mode == "auto" else self.mode
+        if form != "none":
+            self._apply(trainer, module, form)
 
-    def _chosen(self, trainer: Trainer, host: SplatHost) -> Form:
+    def _chosen(self, trainer: Trainer, module: SplatModule) -> Form:
         """The form with the smallest error over the finite splats; in a tie, the one that changes least."""
-        finite, _ = trainable_rows(host.splats)
-        scales, quats = host.splats.scales.detach()[finite], host.splats.quats.detach()[finite]
-        codes = {name: len(q.codebook) for name, q in host.quantizers.items() if name in ("scales", "quats")}
-        errors = form_errors(scales, quats, codes, derive_seed(host.seed, trainer.global_step, "canonical"))
+        finite, _ = trainable_rows(module.splats)
+        scales, quats = module.splats.scales.detach()[finite], module.splats.quats.detach()[finite]
+        codes = {name: len(q.codebook) for name, q in module.quantizers.items() if name in ("scales", "quats")}
+        errors = form_errors(scales, quats, codes, derive_seed(module.seed, trainer.global_step, "canonical"))
         log.info("covariance error by form: %s", ", ".join(f"{form} {error:.3g}" for form, error in errors.items()))
         form: Form = trainer.strategy.broadcast(min(errors, key=errors.__getitem__))
         return form
 
-    def _raise(self, trainer: Trainer, host: SplatHost) -> None:
-        self._log_floor = scale_floor(host.splats.means.detach(), train_cameras(trainer), self.floor)
-        if self._log_floor is None:
+    def _raise(self, trainer: Trainer, module: SplatModule) -> None:
+        self.log_floor = scale_floor(module.splats.means.detach(), train_cameras(trainer), self.floor)
+        if self.log_floor is None:
             log.warning("iteration %d: no train view sees a splat; no scale is raised", trainer.global_step)
             return
-        share = float((host.splats.scales < self._log_floor).float().mean())
-        raise_scales(host.splats, self._log_floor)
+        share = float((module.splats.scales < self.log_floor).float().mean())
+        raise_scales(module.splats, self.log_floor)
         log.info(
             "iteration %d: raised %.1f %% of all scales to %g pixels, %.3g scene units",
             trainer.global_step,
             100 * share,
             self.floor,
-            math.exp(self._log_floor),
+            math.exp(self.log_floor),
         )
 
     @torch.no_grad()
-    def _apply(self, trainer: Trainer, host: SplatHost, form: Form) -> None:
-        optimizer, splats = raw_optimizer(trainer), host.splats
+    def _apply(self, trainer: Trainer, module: SplatModule, form: Form) -> None:
+        optimizer, splats = raw_optimizer(trainer), module.splats
         new = canonical(splats.scales.detach(), splats.quats.detach(), form)
         change_coordinates(splats, optimizer, "scales", new.scales, new.scale_maps)
         change_coordinates(splats, optimizer, "quats", new.quats, new.quat_maps)
@@ -183,7 +168,8 @@ def perplexity(usage: Tensor) -> float:
     return float(entropy.exp()) if bool(usage.any()) else 0.0
 
 
-class CodebookInit(StepCallback):
+@settings
+class CodebookInit(SplatCallback):
     """At the first iteration of the quantize phase, fit every codebook to the rows of all splats (k-means).
 
     NaN and infinite splats are dropped first, whenever they were last searched for.
@@ -209,43 +195,38 @@ class CodebookInit(StepCallback):
         ValueError: weighted must be among scales, quats, sh0, shN, got means
     """
 
-    def __init__(
-        self,
-        weights: Literal["none", "contribution"] = "none",
-        weighted: Sequence[str] = ("quats", "sh0", "shN"),
-        values_per_splat: float | None = None,
-    ) -> None:
-        super().__init__()
-        if weights not in ("none", "contribution"):
-            raise ValueError(f"weights must be 'none' or 'contribution', got {weights!r}")
-        check_attributes("weighted", weighted)
-        if values_per_splat is not None and not 0 < values_per_splat < math.inf:
-            raise ValueError(f"values_per_splat must be a finite number above 0, got {values_per_splat}")
-        self.weights, self.weighted, self.values_per_splat = weights, weighted, values_per_splat
+    weights: Literal["none", "contribution"] = "none"
+    weighted: Sequence[str] = ("quats", "sh0", "shN")
+    values_per_splat: float | None = None
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def __post_init__(self) -> None:
+        if self.weights not in ("none", "contribution"):
+            raise ValueError(f"weights must be 'none' or 'contribution', got {self.weights!r}")
+        check_attributes("weighted", self.weighted)
+        self.check({"above 0": ("values_per_splat",)})
+
+    def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Fit when the quantize phase starts."""
-        host = as_host(pl_module)
-        iteration = next_iteration(trainer)
-        if iteration != host.schedule.first_of(Phase.QUANTIZE) or not self._once.first_time(iteration):
+        if iteration != module.schedule.first_of(Phase.QUANTIZE):
             return
-        keep_finite_splats(trainer, host)
-        weights = row_weights(train_contributions(trainer, host)) if self.weights == "contribution" else None
-        for name, quantizer in host.quantizers.items():
+        keep_finite_splats(trainer, module)
+        weights = row_weights(train_contributions(trainer, module)) if self.weights == "contribution" else None
+        for name, quantizer in module.quantizers.items():
             if trainer.is_global_zero:
                 if self.values_per_splat is not None and is_limitable(quantizer):
-                    values = self.values_per_splat * len(host.splats)
+                    values = self.values_per_splat * len(module.splats)
                     quantizer.limit(max(1, int(values / quantizer.codebook.shape[1])))
                 weight = weights if name in self.weighted else None
-                quantizer.fit(host.rows(name), weight, generator=generator(host.seed, iteration, "kmeans", name))
+                quantizer.fit(module.rows(name), weight, generator=generator(module.seed, iteration, "kmeans", name))
             if trainer.world_size > 1:  # a fit may leave fewer codes, so counters and all other buffers must follow
                 follow_first(trainer.strategy, cast(nn.Module, quantizer))
-        sizes = ", ".join(f"{name} {q.codebook.shape[0]}" for name, q in host.quantizers.items())
+        sizes = ", ".join(f"{name} {q.codebook.shape[0]}" for name, q in module.quantizers.items())
         if sizes:
-            log.info("iteration %d: codebooks for %d splats: %s", iteration, len(host.splats), sizes)
+            log.info("iteration %d: codebooks for %d splats: %s", iteration, len(module.splats), sizes)
 
 
-class CodebookReplacement(StepCallback):
+@settings
+class CodebookReplacement(SplatCallback):
     """Replaces inactive codes with copies of active ones, at first often, then less often (paper, section 3.2).
 
     All numbers are iterations of the reference run; the paper's are every 100 from 20 100 to 22 000, then every 500 up
@@ -281,80 +262,66 @@ class CodebookReplacement(StepCallback):
         (2050, 2100, 3900)
     """
 
-    def __init__(
-        self,
-        start: int = 20_100,
-        early_end: int = 22_000,
-        early_every: int = 100,
-        end: int = 43_000,
-        late_every: int = 500,
-        jitter: float | None = None,
-        reset_moments: bool = False,
-    ) -> None:
-        super().__init__()
-        if jitter is not None and not 0.0 < jitter <= 1.0:
-            raise ValueError(f"jitter must be None or above 0 and at most 1, got {jitter}")
-        if not 0 < start <= early_end <= end or early_every < 1 or late_every < 1:
-            raise ValueError(
-                "replacement needs 0 < start <= early_end <= end and intervals of at least 1, got "
-                f"start={start}, early_end={early_end}, end={end}, early_every={early_every}, late_every={late_every}"
-            )
-        self.start, self.early_end, self.early_every = start, early_end, early_every
-        self.end, self.late_every = end, late_every
-        self.jitter, self.reset_moments = jitter, reset_moments
+    start: int = 20_100
+    early_end: int = 22_000
+    early_every: int = 100
+    end: int = 43_000
+    late_every: int = 500
+    jitter: float | None = None
+    reset_moments: bool = False
 
-    def is_due(self, host: SplatHost, iteration: int) -> bool:
+    def __post_init__(self) -> None:
+        self.check({"in (0, 1]": ("jitter",), "at least 1": ("start", "early_every", "late_every")})
+        if not self.start <= self.early_end <= self.end:
+            raise ValueError(
+                f"replacement needs start <= early_end <= end, got {self.start}, {self.early_end} and {self.end}"
+            )
+
+    def is_due(self, module: SplatModule, iteration: int) -> bool:
         """Whether codes are replaced after this iteration."""
-        schedule = host.schedule
+        schedule = module.schedule
         if schedule.phase_at(iteration) is not Phase.QUANTIZE:
             return False
         return iteration in schedule.replacement_times(
             self.start, self.early_end, self.early_every, self.end, self.late_every
         )
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Replace the inactive codes of every codebook when it is time."""
-        host = as_host(pl_module)
-        iteration = trainer.global_step
-        if not self.is_due(host, iteration) or not self._once.first_time(iteration):
+        if not self.is_due(module, iteration):
             return
         if self.jitter is not None:
-            keep_finite_splats(trainer, host)
+            keep_finite_splats(trainer, module)
         values: dict[str, float] = {}
-        for name, quantizer in host.quantizers.items():
+        for name, quantizer in module.quantizers.items():
             _sum_usage(trainer, quantizer)
             values[f"codebook/{name}_perplexity"] = perplexity(quantizer.usage)
-            replaced = self._replace(quantizer, host.rows(name), generator(host.seed, iteration, "replace", name))
+            draws = generator(module.seed, iteration, "replace", name)
+            if self.jitter is None:
+                replaced = quantizer.replace_unused(draws)
+            else:
+                replaced = quantizer.replace_unused(draws, rows=module.rows(name), jitter=self.jitter)
             values[f"codebook/{name}_replaced"] = float(len(replaced))
             if self.reset_moments:
                 reset_moments(raw_optimizer(trainer), codebook_group(name), replaced)
             log.debug("iteration %d: replaced %d codes of %s", iteration, len(replaced), name)
         check_replicas(trainer, "the replacement of codes")
-        pl_module.log_dict(dict(values), batch_size=1)
+        module.log_dict(dict(values), batch_size=1)
 
-    def _replace(self, quantizer: Quantizer, rows: Tensor, draws: torch.Generator) -> Tensor:
-        """Replace inactive codes in one codebook by the chosen rule; returns the replaced codes."""
-        if self.jitter is None:
-            return quantizer.replace_unused(draws)
-        return quantizer.replace_unused(draws, rows=rows, jitter=self.jitter)
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Keep a checkpoint's counts on the first process only: they are the sum of all."""
-        super().on_train_start(trainer, pl_module)
+        super().on_train_start(trainer, module)
         if not trainer.is_global_zero:
-            _forget_usage(as_host(pl_module))
+            _forget_usage(module)
 
-    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+    def on_save_checkpoint(self, trainer: Trainer, module: SplatModule, checkpoint: dict[str, Any]) -> None:
         """Sum the counts of all processes in the buffers of the first one, which the checkpoint holds."""
         if trainer.world_size == 1:
             return
-        host = as_host(pl_module)
-        for quantizer in host.quantizers.values():
+        for quantizer in module.quantizers.values():
             _sum_usage(trainer, quantizer)
         if not trainer.is_global_zero:
-            _forget_usage(host)
+            _forget_usage(module)
 
 
 def _sum_usage(trainer: Trainer, quantizer: Quantizer) -> None:
@@ -363,13 +330,14 @@ def _sum_usage(trainer: Trainer, quantizer: Quantizer) -> None:
         counter.copy_(sum_over_processes(trainer, counter))
 
 
-def _forget_usage(host: SplatHost) -> None:
-    for quantizer in host.quantizers.values():
+def _forget_usage(module: SplatModule) -> None:
+    for quantizer in module.quantizers.values():
         quantizer.usage.zero_()
         quantizer.window.zero_()
 
 
-class CodebookRefit(HostedCallback):
+@settings
+class CodebookRefit(SplatCallback):
     """Refits codebooks to the rows of all splats in the quantize phase, as CompGS does (Navaneet et al. 2024).
 
     Only quantizers that support it (:class:`nsvq_lightning.quantize.base.Refittable`, such as ``StraightThrough``) are
@@ -395,41 +363,39 @@ class CodebookRefit(HostedCallback):
         [25000, 30000, 35000, 40000]
     """
 
-    def __init__(self, every: int = 100, steps: int = 10) -> None:
-        if every < 1 or steps < 1:
-            raise ValueError(f"refits need every >= 1 and steps >= 1, got every={every}, steps={steps}")
-        self.every = every
-        self.steps = steps
+    every: int = 100
+    steps: int = 10
 
-    def is_due(self, host: SplatHost, iteration: int) -> bool:
+    def __post_init__(self) -> None:
+        self.check({"at least 1": ("every", "steps")})
+
+    def is_due(self, module: SplatModule, iteration: int) -> bool:
         """Whether codebooks are refitted in this iteration."""
-        schedule = host.schedule
+        schedule = module.schedule
         if schedule.phase_at(iteration) is not Phase.QUANTIZE:
             return False
         return iteration in schedule.refit_times(self.every)
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Drop non-finite splats before a refit to all rows: after the backward pass this would lose the gradients."""
-        host = as_host(pl_module)
-        if self.is_due(host, next_iteration(trainer)) and _refittable(host):
-            keep_finite_splats(trainer, host)
+        if self.is_due(module, iteration) and _refittable(module):
+            keep_finite_splats(trainer, module)
 
-    def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
+    def on_before_optimizer_step(self, trainer: Trainer, module: SplatModule, optimizer: Optimizer) -> None:
         """Refit when due, on the first process."""
-        host = as_host(pl_module)
         iteration = next_iteration(trainer)
-        if not self.is_due(host, iteration):
+        if not self.is_due(module, iteration):
             return
-        for name, quantizer in _refittable(host).items():
+        for name, quantizer in _refittable(module).items():
             if trainer.is_global_zero:
-                quantizer.refit(host.rows(name), self.steps)
+                quantizer.refit(module.rows(name), self.steps)
             quantizer.codebook.data = from_first_process(trainer, quantizer.codebook.data)
             log.debug("iteration %d: refitted the codebook of %s", iteration, name)
 
 
-def _refittable(host: SplatHost) -> dict[str, Refittable]:
+def _refittable(module: SplatModule) -> dict[str, Refittable]:
     """The quantizers that support it, by attribute."""
-    return {name: quantizer for name, quantizer in host.quantizers.items() if is_refittable(quantizer)}
+    return {name: quantizer for name, quantizer in module.quantizers.items() if is_refittable(quantizer)}
 
 
 MEASUREMENTS = 3
@@ -444,7 +410,8 @@ LEAST = 0.05
 """Share of the mean that no splat's sensitivity is below: a test view may see what no train view sees."""
 
 
-class RateDistortion(StepCallback):
+@settings
+class RateDistortion(SplatCallback):
     """In the quantize phase, gives every splat the code with the least error + λ · bits instead of the nearest one.
 
     The error is that of the pictures: a code's squared distance times what it does to the train views
@@ -469,95 +436,75 @@ class RateDistortion(StepCallback):
         [1.0]
     """
 
-    def __init__(self, strength: float = 0.0, attributes: Sequence[str] = tuple(QUANTIZED)) -> None:
-        super().__init__()
-        if not 0.0 <= strength < float("inf"):
-            raise ValueError(f"strength must be a finite number, at least 0, got {strength}")
-        check_attributes("attributes", attributes)
-        self.strength = strength
-        self.attributes = tuple(attributes)
-        self._prices: dict[str, Tensor] = {}
-        self._turn = OncePerStep()
+    state = ("prices",)
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Forget an earlier fit."""
-        super().setup(trainer, pl_module, stage)
-        if stage == "fit":
-            self._prices, self._turn = {}, OncePerStep()
+    strength: float = 0.0
+    attributes: Sequence[str] = tuple(QUANTIZED)
+    prices: dict[str, Tensor] | None = field(default=None, init=False)
+    """What a bit costs each splat ``[N]`` in squared error, by attribute."""
 
-    def state_dict(self) -> dict[str, Any]:
-        """The last iterations acted on, and what a bit costs each splat."""
-        return {**super().state_dict(), "turn": self._turn.last, "prices": self._prices}
+    def __post_init__(self) -> None:
+        self.check({"at least 0": ("strength",)})
+        check_attributes("attributes", self.attributes)
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from there."""
-        super().load_state_dict(state_dict)
-        self._turn.last, self._prices = state_dict["turn"], state_dict["prices"]
-
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Measure, and choose the codes of all splats, when the phase starts and after splats were dropped.
 
         Raises:
             ValueError: The trainer has no data module with a scene.
         """
-        host, iteration = as_host(pl_module), next_iteration(trainer)
-        if not self.strength or host.schedule.phase_at(iteration) is not Phase.QUANTIZE:
+        if not self.strength or module.schedule.phase_at(iteration) is not Phase.QUANTIZE:
             return
-        due = iteration == host.schedule.first_of(Phase.QUANTIZE) or not self._fits(host)
-        if due and self._once.first_time(iteration):
-            self._measure(trainer, host, iteration)
-            self._choose(host, slice(None))
+        if iteration == module.schedule.first_of(Phase.QUANTIZE) or not self._fits(module):
+            self._measure(trainer, module, iteration)
+            self._choose(module, slice(None))
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Choose the codes of the splats whose turn it is; measure again, and choose those of all, when due."""
-        host, iteration = as_host(pl_module), trainer.global_step
-        if not self._prices or host.schedule.phase_at(iteration + 1) is not Phase.QUANTIZE:
-            return
         # Where non-finite splats were just dropped, the next iteration starts with a measurement.
-        if not self._fits(host) or not self._turn.first_time(iteration):
+        if not self.prices or not self._fits(module) or module.schedule.phase_at(iteration + 1) is not Phase.QUANTIZE:
             return
-        start, end = host.schedule.ends[Phase.PRUNE], host.schedule.ends[Phase.QUANTIZE]
+        start, end = module.schedule.ends[Phase.PRUNE], module.schedule.ends[Phase.QUANTIZE]
         every = -(-(end - start) // MEASUREMENTS)
         due = (iteration - start) % every == 0
         if due:
-            self._measure(trainer, host, iteration)
-        self._choose(host, slice(None) if due else slice(iteration % TURNS, None, TURNS))
+            self._measure(trainer, module, iteration)
+        self._choose(module, slice(None) if due else slice(iteration % TURNS, None, TURNS))
 
-    def _fits(self, host: SplatHost) -> bool:
+    def _fits(self, module: SplatModule) -> bool:
         """Whether the prices are those of the splats that there are now."""
-        return all(len(price) == len(host.splats) for price in self._prices.values())
+        return all(len(price) == len(module.splats) for price in (self.prices or {}).values())
 
-    def _measure(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
+    def _measure(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         scene = needed_scene(trainer, "codes are to be chosen by what shows in the train views", "set strength=0")
-        taking_part = [name for name, q in host.quantizers.items() if name in self.attributes and is_holding(q)]
-        splats = host.hard_splats(Phase.QUANTIZE)
+        taking_part = [name for name, q in module.quantizers.items() if name in self.attributes and is_holding(q)]
+        splats = module.hard_splats(Phase.QUANTIZE)
         shown = {name: torch.zeros_like(splats.opacities) for name in taking_part}
-        error = torch.zeros((), dtype=torch.float64, device=host.device)
+        error = torch.zeros((), dtype=torch.float64, device=module.device)
         for index in scene.some_train(VIEWS)[trainer.global_rank :: trainer.world_size]:
-            view = scene.view(index).to(host.device)
-            signs = generator(host.seed, iteration, "signs", index)
-            squares, image = sensitivity(splats, view.camera, host.render_splats, signs)
+            view = scene.view(index).to(module.device)
+            signs = generator(module.seed, iteration, "signs", index)
+            squares, image = sensitivity(splats, view.camera, module.render_splats, signs)
             error += (kept(image, view.mask) - eight_bit(view.image)).square().sum(dtype=torch.float64)
             for name, total in shown.items():
                 total += QUANTIZED[name].rows(getattr(squares, name)).mean(1)
         error = sum_over_processes(trainer, error)
-        a_bit = self.strength * float(error) / (BITS_A_SPLAT * len(host.splats))
-        self._prices = {}
+        a_bit = self.strength * float(error) / (BITS_A_SPLAT * len(module.splats))
+        self.prices = {}
         for name, total in shown.items():
-            self._prices[name] = a_bit / row_weights(sum_over_processes(trainer, total), LEAST)
+            self.prices[name] = a_bit / row_weights(sum_over_processes(trainer, total), LEAST)
 
-    def _choose(self, host: SplatHost, part: slice) -> None:
-        for name, price in self._prices.items():
-            quantizer, rows = host.quantizers[name], host.rows(name)
-            codes = codes_of(host.splats.raw(), name, quantizer).clone()
+    def _choose(self, module: SplatModule, part: slice) -> None:
+        for name, price in (self.prices or {}).items():
+            quantizer, rows = module.quantizers[name], module.rows(name)
+            codes = codes_of(module.splats.raw(), name, quantizer).clone()
             rates = code_rates(codes, len(quantizer.codebook))
             codes[part] = cheapest(rows[part], quantizer.codebook, rates, price[part])
             cast(Holding, quantizer).hold(codes)
 
 
-class FiniteCodes(StepCallback):
+@settings
+class FiniteCodes(SplatCallback):
     """Searches codebooks for NaN and infinite values, from the quantize phase on, and mends such codes with a warning.
 
     As with non-finite splats (:class:`~nsvq_lightning.callbacks.DensityControl`), the run continues. A code cannot be
@@ -580,33 +527,27 @@ class FiniteCodes(StepCallback):
         ValueError: every must be at least 1, got 0
     """
 
-    def __init__(self, every: int = 100) -> None:
-        super().__init__()
-        self._search = FiniteSearch(every)
+    every: int = 100
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def __post_init__(self) -> None:
+        self.check({"at least 1": ("every",)})
+
+    def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Search when due.
 
         Raises:
             FloatingPointError: All codes of an attribute are non-finite, or its quantizer cannot mend them.
         """
-        host, iteration = as_host(pl_module), trainer.global_step
-        if iteration == 0 or host.schedule.phase_at(iteration) < Phase.QUANTIZE:
+        if module.schedule.phase_at(iteration) < Phase.QUANTIZE or not finite_search_is_due(trainer, self.every):
             return
-        if self._once.first_time(iteration) and self._search.is_due(trainer):
-            self._mend(trainer, host, iteration)
-
-    def _mend(self, trainer: Trainer, host: SplatHost, iteration: int) -> None:
-        for name, quantizer in host.quantizers.items():
+        for name, quantizer in module.quantizers.items():
             broken = (~torch.isfinite(quantizer.codebook.detach()).all(1)).nonzero()[:, 0]
             if len(broken) == 0:
                 continue
             found = f"step {iteration}: {len(broken)} of {len(quantizer.codebook)} codes of {name} are non-finite"
             if len(broken) == len(quantizer.codebook) or not is_mendable(quantizer):
                 raise FloatingPointError(f"{found}; lower the learning rates")
-            quantizer.mend(broken, host.rows(name), generator(host.seed, iteration, "mend", name))
+            quantizer.mend(broken, module.rows(name), generator(module.seed, iteration, "mend", name))
             reset_moments(raw_optimizer(trainer), codebook_group(name), broken)
             log.warning("%s (%s); mended", found, _numbers(broken.tolist()))
 
@@ -616,7 +557,8 @@ def _numbers(rows: list[int]) -> str:
     return f"rows {shown}{', …' * (len(rows) > 5)}"
 
 
-class FreezeCodes(StepCallback):
+@settings
+class FreezeCodes(SplatCallback):
     """At the first iteration of fine-tuning, freezes the code of every splat: the one it holds, or else the nearest.
 
     If a quantizer has an attribute ``fitted`` (whether its codebook has been placed), it must be true by then.
@@ -633,48 +575,39 @@ class FreezeCodes(StepCallback):
         4201
     """
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._forget()
+    _edits: int | None = field(default=None, init=False)
+    _codes: dict[str, Tensor] | None = field(default=None, init=False)
+    _warned: bool = field(default=False, init=False)
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+    def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Forget an earlier fit of the same callback."""
-        super().setup(trainer, pl_module, stage)
+        super().setup(trainer, module, stage)
         if stage == "fit":
-            self._forget()
+            self._edits, self._codes, self._warned = None, None, False
 
-    def _forget(self) -> None:
-        self._edits: int | None = None
-        self._codes: dict[str, Tensor] = {}
-        self._warned = False
-
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Freeze when fine-tuning starts, and again where splats have changed.
 
         Raises:
             RuntimeError: A codebook has never been placed.
         """
-        host = as_host(pl_module)
-        iteration, first = next_iteration(trainer), host.schedule.first_of(Phase.FINETUNE)
+        iteration, first = next_iteration(trainer), module.schedule.first_of(Phase.FINETUNE)
         if first is None or iteration < first:
             return
-        if iteration == first and self._once.first_time(iteration):
-            self._freeze(trainer, host, host.quantizers)
-        elif stale := self._stale(host):
+        if iteration == first and self._first_time("before", iteration):
+            self._freeze(trainer, module, module.quantizers)
+        elif stale := self._stale(module):
             self._warn(iteration, stale)
-            self._freeze(trainer, host, stale)
-        self._edits = host.splats.edits
-        self._codes = {name: quantizer.codes for name, quantizer in host.quantizers.items()}
+            self._freeze(trainer, module, stale)
+        self._edits = module.splats.edits
+        self._codes = {name: quantizer.codes for name, quantizer in module.quantizers.items()}
 
-    def _stale(self, host: SplatHost) -> list[str]:
+    def _stale(self, module: SplatModule) -> list[str]:
         """Attributes whose frozen codes belong to other rows; freezing anew would have replaced their tensor."""
-        edited = self._edits not in (None, host.splats.edits)
-        return [
-            name
-            for name, quantizer in host.quantizers.items()
-            if len(quantizer.codes) > 0
-            and (len(quantizer.codes) != len(host.splats) or (edited and quantizer.codes is self._codes[name]))
-        ]
+        edited, count = self._edits not in (None, module.splats.edits), len(module.splats)
+        frozen = {name: q.codes for name, q in module.quantizers.items() if len(q.codes) > 0}
+        before = self._codes or {}
+        return [name for name, codes in frozen.items() if len(codes) != count or (edited and codes is before[name])]
 
     def _warn(self, iteration: int, stale: list[str]) -> None:
         if not self._warned:
@@ -686,12 +619,12 @@ class FreezeCodes(StepCallback):
                 ", ".join(stale),
             )
 
-    def _freeze(self, trainer: Trainer, host: SplatHost, names: Iterable[str]) -> None:
-        keep_finite_splats(trainer, host)
+    def _freeze(self, trainer: Trainer, module: SplatModule, names: Iterable[str]) -> None:
+        keep_finite_splats(trainer, module)
         for name in names:
-            quantizer = host.quantizers[name]
-            held = held_codes(quantizer, len(host.splats))
-            codes = quantizer.encode(host.rows(name)) if held is None else held
+            quantizer = module.quantizers[name]
+            held = held_codes(quantizer, len(module.splats))
+            codes = quantizer.encode(module.rows(name)) if held is None else held
             # Only now: some quantizers place their codebooks when rows are encoded.
             if not getattr(quantizer, "fitted", True):
                 raise RuntimeError(

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from torch import Tensor
 from torchmetrics import Metric
@@ -30,17 +30,17 @@ from nsvq_lightning.report.files import paper_level, summarize, write_curve, wri
 from nsvq_lightning.report.page import RunPage
 from nsvq_lightning.report.pictures import comparison, file_stem, log_pictures, write_png
 from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training.host import SplatHost, as_host
+from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_trial, run_folder
 from nsvq_lightning.training.scene_access import scene_of
 from nsvq_lightning.training.schedule import next_iteration
 
-from .base import WritingCallback
+from .base import WritingCallback, settings
 
 __all__ = ["MetricReport", "notify_monitors"]
 
 
-def notify_monitors(trainer: Trainer, module: LightningModule) -> None:
+def notify_monitors(trainer: Trainer, module: SplatModule) -> None:
     """Let early stopping and checkpoints that monitor ``report/…`` act now.
 
     They wait for the end of an epoch or a validation, depending on their settings and the trainer's, and act in one of
@@ -56,6 +56,7 @@ def notify_monitors(trainer: Trainer, module: LightningModule) -> None:
 log = logging.getLogger(__name__)
 
 
+@settings
 class MetricReport(WritingCallback):
     """Writes the results of a run to its folder.
 
@@ -92,12 +93,12 @@ class MetricReport(WritingCallback):
 
     stages = ("fit", "test")
 
-    def __init__(self, every: int | None = None, lpips: bool = True, pictures: bool = True) -> None:
-        if every is not None and every < 0:
-            raise ValueError(f"every must be None or at least 0, got {every}")
-        self.every = every
-        self.lpips = lpips
-        self.pictures = pictures
+    every: int | None = None
+    lpips: bool = True
+    pictures: bool = True
+
+    def __post_init__(self) -> None:
+        self.check({"at least 0": ("every",)})
         self._scene: CompressedScene | None = None
         self._paper_level: dict[str, Any] = {}
         self._scores: list[ViewScore] = []
@@ -108,82 +109,80 @@ class MetricReport(WritingCallback):
 
     # During training
 
-    def is_due(self, host: SplatHost, iteration: int) -> bool:
+    def is_due(self, module: SplatModule, iteration: int) -> bool:
         """Whether the scene is evaluated after this iteration."""
-        every = max(1, host.schedule.total // 20) if self.every is None else self.every
+        every = max(1, module.schedule.total // 20) if self.every is None else self.every
         # By default between the round numbers: opacities are reset at those, and evaluating right then is misleading.
         offset = every // 2 if self.every is None else 0
-        return iteration > 0 and (iteration in host.schedule.ends or bool(every and iteration % every == offset))
+        return iteration > 0 and (iteration in module.schedule.ends or bool(every and iteration % every == offset))
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Evaluate the last iteration, now that all callbacks have finished with it."""
         iteration = next_iteration(trainer) - 1
-        if self.is_due(as_host(pl_module), iteration):
-            self._evaluate_once(trainer, pl_module, iteration)
+        if self.is_due(module, iteration):
+            self._evaluate_once(trainer, module, iteration)
 
-    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_epoch_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Evaluate the end of the run, before Lightning's own work at the end of its only epoch."""
-        self._evaluate_once(trainer, pl_module, trainer.global_step)
+        self._evaluate_once(trainer, module, trainer.global_step)
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Evaluate the end of the run if no epoch has ended, and draw the curve."""
-        host = as_host(pl_module)
-        self._evaluate_once(trainer, pl_module, trainer.global_step)
+        self._evaluate_once(trainer, module, trainer.global_step)
         folder = run_folder(trainer)
-        if trainer.is_global_zero and host.history and not is_trial(trainer):
-            with host.stopwatch.paused(host.device):
-                write_curve_csv(folder / "curve.csv", host.history)
-                write_curve(folder / "curve.png", host.history, host.schedule)
+        if trainer.is_global_zero and module.history and not is_trial(trainer):
+            with module.stopwatch.paused(module.device):
+                write_curve_csv(folder / "curve.csv", module.history)
+                write_curve(folder / "curve.png", module.history, module.schedule)
 
-    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Catch up for a run that was stopped after its last iteration: when continued, it trains no further."""
         if trainer.global_step and not (run_folder(trainer) / "curve.png").exists():
-            self.on_train_end(trainer, pl_module)
+            self.on_train_end(trainer, module)
 
-    def _evaluate_once(self, trainer: Trainer, module: LightningModule, iteration: int) -> None:
+    def _evaluate_once(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Evaluate an iteration that was not evaluated yet, and notify the callbacks that monitor it."""
-        host = as_host(module)
-        done = host.history[-1]["iteration"] if host.history else 0
+        done = module.history[-1]["iteration"] if module.history else 0
         if iteration <= done or is_trial(trainer):
             return
         datamodule = getattr(trainer, "datamodule", None)
         if datamodule is None or not datamodule.scene.test:
             return
-        with host.stopwatch.paused(host.device), self._timed("evaluations"):
-            self._evaluate(trainer, host, iteration, datamodule.test_dataloader())
+        with module.stopwatch.paused(module.device), self._timed("evaluations"):
+            self._evaluate(trainer, module, iteration, datamodule.test_dataloader())
             notify_monitors(trainer, module)
 
     @torch.no_grad()
-    def _evaluate(self, trainer: Trainer, host: SplatHost, iteration: int, views: Any) -> None:
-        phase = host.schedule.phase_at(iteration)
-        splats = host.hard_splats(phase)
+    def _evaluate(self, trainer: Trainer, module: SplatModule, iteration: int, views: Any) -> None:
+        phase = module.schedule.phase_at(iteration)
+        splats = module.hard_splats(phase)
 
         def render_image(camera: Camera) -> Tensor:
-            return host.render_splats(splats, camera).image
+            return module.render_splats(splats, camera).image
 
         folder = run_folder(trainer)
         show = partial(_preview, folder / "preview.png") if self.pictures and trainer.is_global_zero else None
-        quality = evaluate(render_image, views, host.device, show)
+        quality = evaluate(render_image, views, module.device, show)
         entry: dict[str, Any] = {
             "iteration": iteration,
             "phase": phase.name.lower(),
-            "splats": len(host.splats),
+            "splats": len(module.splats),
             "psnr": quality.psnr,
             "ssim": quality.ssim,
-            "seconds": host.train_seconds,
+            "seconds": module.stopwatch.seconds,
         }
-        host.history.append(entry)
+        module.history.append(entry)
         if trainer.is_global_zero:
-            write_curve_csv(folder / "curve.csv", host.history)
-            self._page(folder, host).write()
+            write_curve_csv(folder / "curve.csv", module.history)
+            self._page(folder, module).write()
         values = {f"report/{name}": float(entry[name]) for name in ("psnr", "ssim", "splats")}
         trainer.callback_metrics.update({name: torch.tensor(value) for name, value in values.items()})
         for logger in trainer.loggers:
             logger.log_metrics(values, iteration)
 
-    def _page(self, folder: Path, host: SplatHost) -> RunPage:
+    def _page(self, folder: Path, module: SplatModule) -> RunPage:
         seconds = {"kernels compiled": compile_seconds(), **self._seconds}
-        return RunPage(folder, host.history, host.schedule, seconds)
+        return RunPage(folder, module.history, module.schedule, seconds)
 
     @contextmanager
     def _timed(self, part: str) -> Iterator[None]:
@@ -194,33 +193,32 @@ class MetricReport(WritingCallback):
 
     # In test
 
-    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_test_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Write the file, read it back, and let the module test the decoded scene; a trial tests the one in memory."""
         self._scene, self._scores = None, []
         if is_trial(trainer):
             return
-        host = as_host(pl_module)
         # All processes call this hook; later ones differ, as some have fewer views than others.
         self._folder = run_folder(trainer)
         path = self._folder / "scene.nsvq"
         with self._timed("file written and read"):
             if trainer.is_global_zero:
-                scene = host.compressed()
-                save(scene, path, host.storage)
+                scene = module.compressed()
+                save(scene, path, module.storage)
                 self._paper_level = paper_level(scene)
             trainer.strategy.barrier("scene.nsvq")
             self._scene = read_nsvq(path)
         # Detached tensors, not the module: a submodule would enter checkpoints.
-        decoded = self._scene.decode().to(host.device).raw()
-        host.evaluation_splats = RawSplats(*(tensor.detach() for tensor in decoded))
+        decoded = self._scene.decode().to(module.device).raw()
+        module.evaluation_splats = RawSplats(*(tensor.detach() for tensor in decoded))
         self._lpips, self._lpips_reason = build_lpips() if self.lpips else (None, "switched off")
         if self._lpips is not None:
-            self._lpips.to(host.device)
+            self._lpips.to(module.device)
 
     def on_test_batch_end(
         self,
         trainer: Trainer,
-        pl_module: LightningModule,
+        module: SplatModule,
         outputs: Any,
         batch: View,
         batch_idx: int,
@@ -250,21 +248,20 @@ class MetricReport(WritingCallback):
             return None
         return float(self._lpips(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]))
 
-    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_test_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Write the figures."""
         if self._scene is None:
             return
-        host = as_host(pl_module)
         scores = _gathered(trainer, self._scores)
         if trainer.is_global_zero and scores:
             folder = self._folder
             lpips = (None, self._lpips_reason) if self._lpips is None else (_mean(scores, "lpips"), None)
-            metrics = summarize(folder / "scene.nsvq", self._scene, scores, lpips, host, self._paper_level)
+            metrics = summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper_level)
             write_metrics(folder / "metrics.json", metrics)
             write_views(folder / "views.csv", scores)
             pictures = [self._picture(trainer, score.name) for score in scores]
             views = [asdict(score) | {"picture": path.name} for score, path in zip(scores, pictures, strict=True)]
-            log.info("report: %s", replace(self._page(folder, host), metrics=metrics, views=views).write())
+            log.info("report: %s", replace(self._page(folder, module), metrics=metrics, views=views).write())
             if self.pictures:
                 log_pictures(trainer.loggers, pictures, trainer.global_step)
         self._scene, self._lpips = None, None

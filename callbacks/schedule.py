@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
+from dataclasses import field, fields
 
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Trainer
 
-from nsvq_lightning.training.host import as_host
+from nsvq_lightning.data.scene import View
+from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.scene_access import needed_scene
 from nsvq_lightning.training.schedule import Phase, Schedule, next_iteration
 
-from .base import HostedCallback
+from .base import SplatCallback, settings
 
-__all__ = ["PhaseSchedule", "RateDecay", "ShDegreeSchedule"]
+__all__ = ["LearningRateDecay", "PhaseSchedule", "ShDegreeSchedule"]
 
 
 log = logging.getLogger(__name__)
 
 
-class PhaseSchedule(HostedCallback):
-    """Gives the module its schedule, and its buffer the phase of each iteration.
+@settings
+class PhaseSchedule(SplatCallback):
+    """Gives the module its schedule, and the phase of each iteration.
 
     The ends of the phases are iterations of a reference run, the paper's of 45 000 iterations by default; a run of any
     other length is that run, scaled (:mod:`nsvq_lightning.training.schedule` says how).
@@ -51,55 +53,40 @@ class PhaseSchedule(HostedCallback):
         (1500, 2000, 3000, 4500)
     """
 
-    def __init__(
-        self,
-        total: int | None = None,
-        reference_total: int | None = 45_000,
-        warmup_end: int = 15_000,
-        prune_end: int = 20_000,
-        quantize_end: int = 43_000,
-        position_decay: int = Schedule.position_decay,
-        min_density_interval: int = Schedule.min_density_interval,
-        min_reset_interval: int = Schedule.min_reset_interval,
-        min_replacement_interval: int = Schedule.min_replacement_interval,
-        min_finetune: int = Schedule.min_finetune,
-        iterations_per_photo: int | None = None,
-    ) -> None:
-        if iterations_per_photo is not None and iterations_per_photo < 1:
-            raise ValueError(f"iterations_per_photo must be at least 1, got {iterations_per_photo}")
-        self.total = total
-        self.iterations_per_photo = iterations_per_photo
-        self.reference_total = reference_total
-        self._steps = -1
-        self.rules = {
-            "warmup_end": warmup_end,
-            "prune_end": prune_end,
-            "quantize_end": quantize_end,
-            "position_decay": position_decay,
-            "min_density_interval": min_density_interval,
-            "min_reset_interval": min_reset_interval,
-            "min_replacement_interval": min_replacement_interval,
-            "min_finetune": min_finetune,
-        }
-        if total is not None or reference_total is not None:
+    total: int | None = None
+    reference_total: int | None = 45_000
+    warmup_end: int = Schedule.warmup_end
+    prune_end: int = Schedule.prune_end
+    quantize_end: int = Schedule.quantize_end
+    position_decay: int = Schedule.position_decay
+    min_density_interval: int = Schedule.min_density_interval
+    min_reset_interval: int = Schedule.min_reset_interval
+    min_replacement_interval: int = Schedule.min_replacement_interval
+    min_finetune: int = Schedule.min_finetune
+    iterations_per_photo: int | None = None
+    _steps: int = field(default=-1, init=False)
+
+    def __post_init__(self) -> None:
+        self.check({"at least 1": ("iterations_per_photo",)})
+        if self.total is not None or self.reference_total is not None:
             # Report wrong settings at once, not after the scene is loaded.
-            self.schedule(total or reference_total or 1)
+            self.schedule(self.total or self.reference_total or 1)
 
     def schedule(self, total: int) -> Schedule:
         """The schedule of a run of ``total`` iterations."""
-        return Schedule(total=total, reference_total=self.reference_total or total, **self.rules)
+        own = {each.name: getattr(self, each.name) for each in fields(Schedule) if hasattr(self, each.name)}
+        return Schedule(**own | {"total": total, "reference_total": self.reference_total or total})
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+    def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Set the module's schedule.
 
         Raises:
             ValueError: ``trainer.max_steps`` is not set and neither is ``total``; or the limit for each photo needs a
                 data module with a scene.
         """
-        super().setup(trainer, pl_module, stage)
+        super().setup(trainer, module, stage)
         if stage != "fit":
             return
-        host = as_host(pl_module)
         if self.iterations_per_photo is not None and self.total is None:
             _limit_steps(trainer, self.iterations_per_photo)
         self._steps = trainer.max_steps
@@ -109,47 +96,45 @@ class PhaseSchedule(HostedCallback):
                 f"the run has no length: trainer.max_steps is {trainer.max_steps}; set trainer.max_steps (45000 in the "
                 "paper) or PhaseSchedule.total"
             )
-        host.schedule = self.schedule(total)
+        module.schedule = self.schedule(total)
         if 0 < trainer.max_steps < total:
             log.warning(
                 "trainer.max_steps=%d ends this run in its %s phase, the schedule has %d: the scene will not "
                 "be fine-tuned to its codebooks; leave PhaseSchedule.total unset to scale the phases",
                 trainer.max_steps,
-                host.schedule.phase_at(trainer.max_steps).name.lower(),
+                module.schedule.phase_at(trainer.max_steps).name.lower(),
                 total,
             )
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Check that a resumed run continues in the phase it was in.
 
         Raises:
             ValueError: In this schedule, the last trained iteration is in another phase.
         """
-        super().on_train_start(trainer, pl_module)
-        host = as_host(pl_module)
+        super().on_train_start(trainer, module)
         step = trainer.global_step
-        expected = host.schedule.phase_at(step) if step else Phase.WARMUP
+        expected = module.schedule.phase_at(step) if step else Phase.WARMUP
         # A checkpoint may have been written just after the next iteration began.
-        if host.phase is expected or (step and host.phase is host.schedule.phase_at(step + 1)):
+        if module.phase is expected or (step and module.phase is module.schedule.phase_at(step + 1)):
             return
         if step == 0:
             raise ValueError(
-                f"this module was already trained into its {host.phase.name.lower()} phase; make a new one, or pass "
+                f"this module was already trained into its {module.phase.name.lower()} phase; make a new one, or pass "
                 "ckpt_path to continue"
             )
         raise ValueError(
-            f"the checkpoint is at iteration {step} in its {host.phase.name.lower()} phase, but in a run of "
-            f"{host.schedule.total} iterations that is in the {expected.name.lower()} phase; pass "
+            f"the checkpoint is at iteration {step} in its {module.phase.name.lower()} phase, but in a run of "
+            f"{module.schedule.total} iterations that is in the {expected.name.lower()} phase; pass "
             "the trainer.max_steps it was started with, or that number as PhaseSchedule.total "
             "(--callbacks.phases.total) and a larger trainer.max_steps to continue its last phase"
         )
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Write the phase of the iteration that starts; end the run earlier by what its warm-up has saved."""
-        host = as_host(pl_module)
         if self._steps > 0:
-            trainer.fit_loop.epoch_loop.max_steps = self._steps - host.schedule.saved
-        host.phase = host.schedule.phase_at(next_iteration(trainer))
+            trainer.fit_loop.epoch_loop.max_steps = self._steps - module.schedule.saved
+        module.phase = module.schedule.phase_at(next_iteration(trainer))
 
 
 def _limit_steps(trainer: Trainer, per_photo: int) -> None:
@@ -163,7 +148,8 @@ def _limit_steps(trainer: Trainer, per_photo: int) -> None:
         log.info("iterations: %d, %d for each of %d photos", limit, per_photo, len(scene.train))
 
 
-class ShDegreeSchedule(HostedCallback):
+@settings
+class ShDegreeSchedule(SplatCallback):
     """Starts with SH degree 0 and adds a degree every ``every`` iterations, up to that of the splats.
 
     Args:
@@ -180,20 +166,20 @@ class ShDegreeSchedule(HostedCallback):
         [0, 1, 2, 3, 3]
     """
 
-    def __init__(self, every: int = 1000) -> None:
-        if every < 1:
-            raise ValueError(f"every must be at least 1 iteration, got {every}")
-        self.every = every
+    every: int = 1000
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def __post_init__(self) -> None:
+        self.check({"at least 1": ("every",)})
+
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Set the degree of the iteration that starts."""
-        host = as_host(pl_module)
-        degree = host.schedule.sh_degree_at(next_iteration(trainer), self.every, host.splats.sh_degree)
+        degree = module.schedule.sh_degree_at(next_iteration(trainer), self.every, module.splats.sh_degree)
         # A run that starts from a trained scene keeps its degree.
-        host.active_sh_degree = max(degree, host.active_sh_degree)
+        module.active_sh_degree = max(degree, module.active_sh_degree)
 
 
-class RateDecay(HostedCallback):
+@settings
+class LearningRateDecay(SplatCallback):
     """Lets all learning rates but that of the positions, which have their own, fall in the last iterations of a run.
 
     They fall from their value to ``final`` times it, linearly in the logarithm.
@@ -206,30 +192,28 @@ class RateDecay(HostedCallback):
         ValueError: ``final`` is not in (0, 1], or ``start`` is negative.
 
     Example:
-        >>> from nsvq_lightning.callbacks import RateDecay, standard
-        >>> callbacks = standard(rate_decay=RateDecay(final=0.1))  # --callbacks.rate_decay.final=0.1
-        >>> [callback.final for callback in callbacks if isinstance(callback, RateDecay)]
+        >>> from nsvq_lightning.callbacks import LearningRateDecay, standard
+        >>> callbacks = standard(rate_decay=LearningRateDecay(final=0.1))  # --callbacks.rate_decay.final=0.1
+        >>> [callback.final for callback in callbacks if isinstance(callback, LearningRateDecay)]
         [0.1]
     """
 
-    def __init__(self, final: float = 1.0, start: int | None = None) -> None:
-        if not 0.0 < final <= 1.0:
-            raise ValueError(f"final must be above 0 and at most 1, got {final}")
-        if start is not None and start < 0:
-            raise ValueError(f"start must be at least 0, got {start}")
-        self.final = final
-        self.start = start
+    final: float = 1.0
+    start: int | None = None
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def __post_init__(self) -> None:
+        self.check({"in (0, 1]": ("final",), "at least 0": ("start",)})
+
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Scale the rates of this iteration."""
         if self.final == 1.0:
             return
-        host, iteration = as_host(pl_module), next_iteration(trainer)
-        ends = host.schedule.ends
-        start = ends[Phase.QUANTIZE] if self.start is None else self.start * host.schedule.scale
+        iteration = next_iteration(trainer)
+        ends = module.schedule.ends
+        start = ends[Phase.QUANTIZE] if self.start is None else self.start * module.schedule.scale
         end = ends[Phase.FINETUNE]
         progress = min(max((iteration - start) / max(end - start, 1), 0.0), 1.0)
         if progress > 0.0:
             for group in raw_optimizer(trainer).param_groups:
                 if group["name"] != "means":
-                    host.scale_rate(group["name"], self.final**progress)
+                    module.scale_rate(group["name"], self.final**progress)

@@ -22,14 +22,14 @@ from .quantization import (
     RateDistortion,
 )
 from .report import MetricReport
-from .schedule import PhaseSchedule, RateDecay, ShDegreeSchedule
+from .schedule import LearningRateDecay, PhaseSchedule, ShDegreeSchedule
 
 __all__ = ["STANDARD", "standard"]
 
 STANDARD: dict[str, type[Callback]] = {
     "phases": PhaseSchedule,
     "sh_degree": ShDegreeSchedule,
-    "rate_decay": RateDecay,
+    "rate_decay": LearningRateDecay,
     "budget": SplatBudget,
     "density": DensityControl,
     "selection": OpacitySelection,

@@ -18,7 +18,6 @@ _HOME = {
     "Camera": "nsvq_lightning.rendering.camera",
     "ColmapDataModule": "nsvq_lightning.data.datamodule",
     "Render": "nsvq_lightning.rendering.rasterize",
-    "SplatHost": "nsvq_lightning.training.host",
     "SplatModule": "nsvq_lightning.training.module",
     "Splats": "nsvq_lightning.splats.splats",
     "load": "nsvq_lightning.io.formats",
@@ -32,10 +31,9 @@ if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
     from nsvq_lightning.rendering.rasterize import Render, render
     from nsvq_lightning.splats.splats import Splats
-    from nsvq_lightning.training.host import SplatHost
     from nsvq_lightning.training.module import SplatModule
 
-__all__ = ["Camera", "ColmapDataModule", "Render", "SplatHost", "SplatModule", "Splats", "load", "render", "save"]
+__all__ = ["Camera", "ColmapDataModule", "Render", "SplatModule", "Splats", "load", "render", "save"]
 
 find_callbacks()
 

@@ -10,9 +10,11 @@ import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from pkgutil import resolve_name
 from types import NoneType
 from typing import Any, NoReturn
 
+from jsonargparse import _typehints as typehints
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
@@ -90,6 +92,21 @@ class QuietParser(LightningArgumentParser):
             message += unknown_option(message, options)
         sys.stderr.write(f"error: {message}\nAll options: {program} --help\n")
         self.exit(2)
+
+
+def _drop_settings_of_another_class(_: Any, before: Any, value: Any) -> None:
+    """Keep no settings where an option names another class that is no subclass of the one before.
+
+    jsonargparse keeps those of the same name: the paper's threshold would become one of BudgetedGrowth.
+    """
+    if before and "init_args" in before and before["class_path"] != value["class_path"]:
+        old, new = (resolve_name(each["class_path"]) for each in (before, value))
+        if not (isinstance(old, type) and isinstance(new, type) and issubclass(new, old)):
+            for name in list(before.init_args.keys()):
+                before.init_args.pop(name)
+
+
+typehints.discard_init_args_on_class_path_change = _drop_settings_of_another_class
 
 
 class RunStart(SaveConfigCallback):

@@ -19,7 +19,7 @@ from nsvq_lightning.io.nsvq.file import read_header
 from nsvq_lightning.io.nsvq.paper import paper_header
 from nsvq_lightning.report.evaluation import ViewScore
 from nsvq_lightning.report.figures import new_figure, write_csv, write_figure
-from nsvq_lightning.training.host import SplatHost
+from nsvq_lightning.training.resume import ResumedModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 
 __all__ = ["paper_level", "summarize", "write_curve", "write_curve_csv", "write_metrics", "write_views"]
@@ -32,7 +32,7 @@ def summarize(
     scene: CompressedScene,
     scores: Sequence[ViewScore],
     lpips: tuple[float | None, str | None],
-    host: SplatHost,
+    module: ResumedModule,
     paper: Mapping[str, Any],
 ) -> dict[str, Any]:
     """The content of ``metrics.json``; sizes in bytes, PSNR in dB, times in seconds.
@@ -42,11 +42,11 @@ def summarize(
         scene: The decoded scene.
         scores: Score of each test view.
         lpips: Mean LPIPS and None, or None and the reason.
-        host: The module, for its history and schedule.
+        module: The module, for its history and schedule.
         paper: :func:`paper_level` of the scene that was stored.
     """
     file_bytes, header = path.stat().st_size, read_header(path)
-    ends = _phase_ends(host.history)
+    ends = _phase_ends(module.history)
     pruned = next((end for end in ends if end["phase"] == Phase.PRUNE.name.lower()), None)
     return {
         "psnr": _mean([score.psnr for score in scores]),
@@ -63,7 +63,7 @@ def summarize(
         "streams": {"header": header.size, **{stream.name: stream.length for stream in header.streams}},
         "codes": {name: _codes_in_use(codes, len(scene.codebooks[name])) for name, codes in scene.codes.items()},
         "paper_level": dict(paper),
-        "train_seconds": host.train_seconds,
+        "train_seconds": module.stopwatch.seconds,
         "before_quantization": pruned if scene.codebooks else None,
         "phases": ends,
     }

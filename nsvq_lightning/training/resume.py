@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -10,24 +12,29 @@ from hashlib import sha256
 from operator import attrgetter
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any
+from typing import Any, Self
 from zipfile import BadZipFile, ZipFile
 
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
+from lightning.pytorch.utilities.model_helpers import _restricted_classmethod
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.splats.splats import ATTRIBUTES, sh_degree_of
+from nsvq_lightning.training.scene_access import scene_of
+from nsvq_lightning.training.scene_module import SceneModule
 from nsvq_lightning.training.schedule import Phase, Schedule
+from nsvq_lightning.training.stopwatch import Stopwatch
 
 __all__ = [
     "QUANTIZER_SETTINGS",
     "QUANTIZE_RULES",
     "SCENE",
     "PlainCheckpointIO",
+    "ResumedModule",
     "branch_checkpoint",
     "branch_optimizer_state",
     "can_branch",
@@ -41,6 +48,7 @@ __all__ = [
     "scene_record",
 ]
 
+log = logging.getLogger(__name__)
 
 QUANTIZE_RULES = ("quantize_end", "min_finetune", "min_replacement_interval")
 """Settings of a schedule that have no effect before the quantize phase."""
@@ -54,8 +62,8 @@ SPLATS = "splats."
 QUANTIZER_SETTINGS = "quantizer_settings"
 """Key under which a checkpoint holds the class and number of codes that each quantizer was made with."""
 
-PHASE = "state._phase"
-"""Key of the last trained iteration's phase in a module's state."""
+RUN = "_extra_state"
+"""Key of :meth:`ResumedModule.get_extra_state` in a module's state."""
 
 
 def can_branch(checkpoint: Mapping[str, Any], codebooks: nn.ModuleDict) -> bool:
@@ -201,7 +209,7 @@ def _sizes(settings: Mapping[str, Mapping[str, Any]]) -> str:
 def _is_unquantized(checkpoint: Mapping[str, Any]) -> bool:
     """Whether a checkpoint is from before the quantize phase."""
     state = checkpoint["state_dict"]
-    return PHASE in state and Phase(int(state[PHASE])) < Phase.QUANTIZE
+    return RUN in state and Phase(int(state[RUN][0])) < Phase.QUANTIZE
 
 
 def _some(names: set[str]) -> str:
@@ -268,7 +276,7 @@ def _check_contents(path: Path, checkpoint: Any) -> None:
     state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
     if not isinstance(state, dict) or "pytorch-lightning_version" not in checkpoint:
         raise FormatError(f"{path}: not a checkpoint of Lightning", WAY_OUT)
-    if not {"splats.means", "state._phase"} <= state.keys():
+    if not {"splats.means", RUN} <= state.keys():
         first = ", ".join(list(state)[:3]) or "nothing"
         raise FormatError(f"{path}: a checkpoint of another model, which has {first} but no splats", WAY_OUT)
 
@@ -385,3 +393,84 @@ def _is_plain(value: Any) -> bool:
         return all(_is_plain(item) for item in value)
     # Exact types: an enum member or NumPy scalar is also an int or float, but not to the unpickler.
     return value is None or type(value) in (bool, int, float, str)
+
+
+class ResumedModule(SceneModule):
+    """A module whose checkpoints continue its run, or branch from it."""
+
+    quantizer_settings: dict[str, dict[str, Any]]
+    """Class and number of codes of each quantizer by attribute, as requested; k-means may give fewer codes."""
+    configure_optimizers: Callable[[], Optimizer]
+    stopwatch: Stopwatch
+    history: list[dict[str, Any]]
+    """Evaluations so far, one plain dictionary each."""
+
+    @_restricted_classmethod
+    def load_from_checkpoint(cls, checkpoint_path: Any, *args: Any, **settings: Any) -> Self:
+        """Lightning's, which would also import what the checkpoint names; here only the user names what to import.
+
+        Args:
+            checkpoint_path: File or address.
+            *args: Lightning's arguments.
+            **settings: Those by name, and arguments of this class that replace the checkpoint's.
+
+        Raises:
+            FormatError: The checkpoint is damaged, or its settings name something that has not been imported.
+        """
+        checkpoint = PlainCheckpointIO().load_checkpoint(os.fspath(checkpoint_path))
+        stored = checkpoint.get(cls.CHECKPOINT_HYPER_PARAMS_KEY, {})
+        check_settings(checkpoint_path, {k: v for k, v in stored.items() if k not in settings})
+        return super().load_from_checkpoint(checkpoint_path, *args, **settings)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # Lightning writes it before and after each of some thirty hooks of a step; nn.Module would look for a
+        # parameter.
+        if name == "_current_fx_name":
+            object.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
+
+    def get_extra_state(self) -> Tensor:
+        """Phase, SH degree, extent and seconds of training ``[4]``, float64."""
+        values = self.phase, self.active_sh_degree, self.extent, self.stopwatch.seconds
+        return torch.tensor(values, dtype=torch.float64)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Go on from these."""
+        phase, degree, self.extent, self.stopwatch.seconds = state.tolist()
+        self.phase, self.active_sh_degree = Phase(int(phase)), int(degree)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add history, schedule, quantizers and scene; plain data only, so that ``weights_only=True`` can read it."""
+        checkpoint["history"] = self.history
+        checkpoint[QUANTIZER_SETTINGS] = self.quantizer_settings
+        checkpoint["schedule"] = asdict(self.schedule)
+        scene = scene_of(self._trainer)
+        if scene is not None:
+            checkpoint[SCENE] = scene_record(scene)
+        if (stored := checkpoint.get(self.CHECKPOINT_HYPER_PARAMS_KEY)) is not None:
+            # Without the photos nobody knows what "auto" was.
+            checkpoint[self.CHECKPOINT_HYPER_PARAMS_KEY] = plain(stored) | {"background": self.background}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Restore history and schedule; a fit keeps its own schedule, and may continue with other codebooks.
+
+        Raises:
+            ValueError: A fit cannot continue from the checkpoint, or it is of another scene than the trainer's, which
+                ``allow_other_scene`` of :class:`nsvq_lightning.training.trainer.SplatTrainer` lets pass.
+        """
+        scene = scene_of(self._trainer)
+        if scene is not None and SCENE in checkpoint and not getattr(self._trainer, "allow_other_scene", False):
+            check_scene(checkpoint, scene)
+        self.history = list(checkpoint.get("history", []))
+        if self._trainer is None or self._trainer.state.fn != "fit":
+            if "schedule" in checkpoint:
+                self.schedule = Schedule(**checkpoint["schedule"])
+            return
+        if "schedule" in checkpoint:
+            self.schedule = continued_schedule(checkpoint, self.schedule)
+            if (change := changed_schedule(checkpoint, self.schedule)) is not None:
+                log.warning(change)
+        if can_branch(checkpoint, self.codebooks):
+            branch_checkpoint(checkpoint, self.codebooks, self.configure_optimizers())
+        check_continuation(checkpoint, self.state_dict(), self.quantizer_settings)

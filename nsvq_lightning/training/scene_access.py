@@ -11,12 +11,12 @@ from nsvq_lightning.compression.importance import contributions
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.training.distributed import sum_over_processes
-from nsvq_lightning.training.host import SplatHost
+from nsvq_lightning.training.scene_module import SceneModule
 
 __all__ = ["needed_scene", "scene_of", "train_cameras", "train_contributions"]
 
 
-def scene_of(trainer: Trainer) -> Scene | None:
+def scene_of(trainer: Trainer | None) -> Scene | None:
     """The scene of the trainer's data module; None if it has none."""
     scene: Scene | None = getattr(getattr(trainer, "datamodule", None), "scene", None)
     return scene
@@ -54,11 +54,11 @@ def train_cameras(trainer: Trainer, *, share: bool = False) -> Iterator[Camera]:
     return (scene.cameras[index] for index in indices)
 
 
-def train_contributions(trainer: Trainer, host: SplatHost) -> Tensor:
+def train_contributions(trainer: Trainer, module: SceneModule) -> Tensor:
     """Blending weight ``[N]`` of each splat in all train views (:mod:`nsvq_lightning.compression.importance`).
 
     Raises:
         ValueError: The trainer has no data module with a scene.
     """
     cameras = train_cameras(trainer, share=True)
-    return sum_over_processes(trainer, contributions(host.splats, cameras, host.render_splats))
+    return sum_over_processes(trainer, contributions(module.splats, cameras, module.render_splats))

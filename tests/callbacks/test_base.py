@@ -36,7 +36,7 @@ class StandIn(Trainer):
 
 def host() -> SplatModule:
     module = SplatModule(sh_degree=0, codebooks={"scales": 4}, splats=Splats(0))
-    module.state.extent = 1.0
+    module.extent = 1.0
     return module
 
 

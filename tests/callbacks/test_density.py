@@ -233,7 +233,7 @@ def test_a_view_of_splats_that_changed_since_is_left_out_with_one_warning(
 
 def test_clone_split_and_prune_at_the_scheduled_iteration() -> None:
     splats = make_splats([SMALL, LARGE, SMALL, SMALL], [0.5, 0.5, 0.004, 0.5])
-    stage = Stage(splats, DensityControl(DensityRules(min_splats=1)))
+    stage = Stage(splats, DensityControl(min_splats=1))
     stage.end_batch(599, view([3e-4, 3e-4, 0.0, 1e-4], [True] * 4))
     assert stage.count == 4
     stage.end_batch(600, view([3e-4, 3e-4, 0.0, 1e-4], [True] * 4))
@@ -247,7 +247,7 @@ def test_clone_split_and_prune_at_the_scheduled_iteration() -> None:
 
 
 def test_gradient_accumulation_neither_repeats_an_edit_nor_weakens_the_statistic() -> None:
-    stage = Stage(make_splats([SMALL] * 2, [0.5] * 2), DensityControl(DensityRules(min_splats=1)), micro=2)
+    stage = Stage(make_splats([SMALL] * 2, [0.5] * 2), DensityControl(min_splats=1), micro=2)
     # Each micro-batch sees half of the gradient, as Lightning divides the loss.
     stage.end_batch(600, view([1.1e-4, 0.0], [True, True]))
     assert stage.count == 3
@@ -264,7 +264,7 @@ def test_huge_splats_go_only_after_iteration_3000() -> None:
 
 
 def test_opacities_are_reset_with_their_moments() -> None:
-    stage = Stage(make_splats([SMALL] * 3, [0.9, 0.5, 0.008]), DensityControl(DensityRules(min_splats=1)))
+    stage = Stage(make_splats([SMALL] * 3, [0.9, 0.5, 0.008]), DensityControl(min_splats=1))
     optimizer = stage.trainer.optimizers[0]
     stage.host.splats.opacities.sum().backward()
     optimizer.step()
@@ -283,7 +283,7 @@ def test_a_white_background_is_reset_once_more() -> None:
 
 
 def test_the_prune_phase_prunes_and_never_grows() -> None:
-    stage = Stage(make_splats([SMALL] * 3, [0.5, 0.004, 0.5]), DensityControl(DensityRules(min_splats=1)))
+    stage = Stage(make_splats([SMALL] * 3, [0.5, 0.004, 0.5]), DensityControl(min_splats=1))
     stage.end_batch(15_500, view([1.0] * 3, [True] * 3))
     assert stage.count == 3
     stage.end_batch(16_000, view([1.0] * 3, [True] * 3))
@@ -299,7 +299,7 @@ def test_pruning_everything_is_skipped_with_a_warning(caplog: pytest.LogCaptureF
 
 
 def test_growth_stops_at_the_cap() -> None:
-    control = DensityControl(DensityRules(min_splats=1), max_splats=5)
+    control = DensityControl(min_splats=1, max_splats=5)
     stage = Stage(make_splats([SMALL, SMALL, LARGE, LARGE], [0.5] * 4), control)
     stage.end_batch(600, view([3e-4, 4e-4, 5e-4, 9e-4], [True] * 4))
     assert stage.count == 5
@@ -309,7 +309,7 @@ def test_growth_stops_at_the_cap() -> None:
 
 def test_growth_into_many_children_stops_at_the_cap() -> None:
     for cap, count in ((6, 5), (7, 7)):  # a clone adds 1, a split into 3 adds 2
-        control = DensityControl(DensityRules(min_splats=1, children=3), max_splats=cap)
+        control = DensityControl(min_splats=1, children=3, max_splats=cap)
         stage = Stage(make_splats([SMALL, LARGE, LARGE, SMALL], [0.5] * 4), control)
         stage.end_batch(600, view([3e-4, 4e-4, 5e-4, 9e-4], [True] * 4))
         assert stage.count == count
@@ -338,10 +338,10 @@ def test_frozen_codes_go_with_the_splats_that_are_dropped_in_fine_tuning() -> No
 
 
 def test_resuming_right_after_an_edit_does_not_repeat_it() -> None:
-    control = DensityControl(DensityRules(min_splats=1))
+    control = DensityControl(min_splats=1)
     stage = Stage(make_splats([SMALL] * 2, [0.5] * 2), control)
     stage.end_batch(600, view([3e-4, 0.0], [True, True]))
-    fresh = DensityControl(DensityRules(min_splats=1))
+    fresh = DensityControl(min_splats=1)
     fresh.load_state_dict(control.state_dict())
     stage.control = fresh
     stage.end_batch(600, view([3e-4, 0.0, 3e-4], [True] * 3))

@@ -18,7 +18,7 @@ from nsvq_lightning.callbacks import progress
 from nsvq_lightning.callbacks.progress import SplatProgressBar
 from nsvq_lightning.compute import compilation
 from nsvq_lightning.compute.compilation import compile_seconds, compile_watcher
-from nsvq_lightning.training.state import RunState, Stopwatch
+from nsvq_lightning.training.stopwatch import RunState, Stopwatch
 
 
 def compiled() -> Callable[[float], float]:
@@ -51,8 +51,8 @@ def test_the_clock_counts_compilation_and_tells_those_who_watch() -> None:
 
 def test_training_time_leaves_compilation_out(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0, 0.0]
-    monkeypatch.setattr("nsvq_lightning.training.state.time.perf_counter", lambda: now[0])
-    monkeypatch.setattr("nsvq_lightning.training.state.compile_seconds", lambda: now[1])
+    monkeypatch.setattr("nsvq_lightning.training.stopwatch.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("nsvq_lightning.training.stopwatch.compile_seconds", lambda: now[1])
     watch = Stopwatch(state := RunState())
     watch.start()
     now[:] = [100.0, 93.0]

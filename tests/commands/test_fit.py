@@ -359,7 +359,7 @@ def test_callbacks_can_be_configured_exchanged_removed_and_added(
     with pytest.raises(SystemExit) as stop:
         main(
             [
-                *("fit", f"--data.root={demo_scene}", "--callbacks.density.rules.min_splats=7"),
+                *("fit", f"--data.root={demo_scene}", "--callbacks.density.min_splats=7"),
                 *("--callbacks.density.max_splats=99", "--callbacks.opacity=null"),
                 *("--trainer.callbacks+=LearningRateMonitor", "--print_config"),
             ]

@@ -82,7 +82,7 @@ def test_one_callback_says_what_it_takes(capsys: pytest.CaptureFixture[str]) -> 
     assert end.value.code == 0
     out = capsys.readouterr().out
     assert out.startswith("callbacks.density:\n  Clones, splits and prunes splats")
-    assert "--callbacks.density.rules.grad_threshold=0.0002\n" in out
+    assert "--callbacks.density.grad_threshold=0.0002\n" in out
 
 
 def test_the_first_sentence_is_plain_text() -> None:

@@ -38,7 +38,7 @@ def assert_same(first: Any, second: Any, where: str = "") -> None:
     if isinstance(first, dict):
         assert first.keys() == second.keys(), where
         for key in first:
-            if key not in ("seconds", "state._train_seconds"):
+            if key not in ("seconds", "_extra_state"):
                 assert_same(first[key], second[key], f"{where}/{key}")
     elif isinstance(first, list | tuple):
         assert len(first) == len(second), where

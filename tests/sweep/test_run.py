@@ -33,7 +33,7 @@ Swept = tuple[Path, Calls, list[Row]]
 SMALL = """
 --data.factor=2 --trainer.accelerator=cpu --model.sh_degree=1 --callbacks.phases.min_density_interval=4
 --callbacks.phases.min_reset_interval=11 --callbacks.phases.min_replacement_interval=5
---callbacks.density.rules.grad_threshold=5e-6 --callbacks.density.max_splats=1500 --callbacks.report.every=20
+--callbacks.density.grad_threshold=5e-6 --callbacks.density.max_splats=1500 --callbacks.report.every=20
 --callbacks.report.lpips=false
 """
 OPTIONS = SMALL.split()

@@ -28,7 +28,7 @@ def recipe() -> Recipe:
             "phases": PhaseSchedule(
                 min_density_interval=4, min_reset_interval=11, min_replacement_interval=5, min_finetune=1
             ),
-            "density": DensityControl(DensityRules(grad_threshold=5e-6)),
+            "density": DensityControl(grad_threshold=5e-6),
             "report": MetricReport(every=20),
             **dict.fromkeys(("predictions", "checkpoint", "kernels", "progress")),
             **replaced,

@@ -23,7 +23,7 @@ from nsvq_lightning.training.resume import (
     scene_record,
 )
 
-SCENE = {"splats.means": torch.arange(300.0).view(100, 3), "state._phase": torch.tensor(0)}
+SCENE = {"splats.means": torch.arange(300.0).view(100, 3), "_extra_state": torch.zeros(4)}
 
 
 def write(path: Path, state: dict[str, Tensor] = SCENE, **more: Any) -> bytes:

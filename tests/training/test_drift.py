@@ -75,7 +75,7 @@ def test_a_run_on_bad_points_never_has_a_number_that_is_none(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     watch = Watch()
-    callbacks = recipe(density=DensityControl(DensityRules(grad_threshold=5e-6), max_splats=1000))
+    callbacks = recipe(density=DensityControl(grad_threshold=5e-6, max_splats=1000))
     callbacks = {name: callback for name, callback in callbacks.items() if name not in ("report", "export")}
     with caplog.at_level(logging.WARNING, logger="nsvq_lightning"):
         _, module = run(

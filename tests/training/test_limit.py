@@ -26,7 +26,7 @@ class Counts(Callback):
 
 
 def limited(most: int | None) -> DensityControl:
-    return DensityControl(DensityRules(grad_threshold=5e-6), max_splats=most)
+    return DensityControl(grad_threshold=5e-6, max_splats=most)
 
 
 @pytest.mark.parametrize("most", [100, 400])

@@ -26,7 +26,7 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.resume import plain
 from nsvq_lightning.training.schedule import Phase
-from nsvq_lightning.training.state import RunState, Stopwatch
+from nsvq_lightning.training.stopwatch import RunState, Stopwatch
 
 CODES = {"scales": 6, "quats": 5, "sh0": 4, "shN": 3}
 
@@ -190,7 +190,7 @@ def test_a_loaded_state_refreshes_the_mirrors() -> None:
 
 def test_a_paused_stopwatch_stands_still(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr("nsvq_lightning.training.state.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("nsvq_lightning.training.stopwatch.time.perf_counter", lambda: now[0])
     state = RunState()
     watch = Stopwatch(state)
     watch.lap()

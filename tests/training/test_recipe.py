@@ -16,7 +16,7 @@ from nsvq_lightning.callbacks import (
     GrowthRules,
     OpacitySelection,
     PhaseSchedule,
-    RateDecay,
+    LearningRateDecay,
     RunCheckpoint,
     SplatBudget,
 )
@@ -41,7 +41,7 @@ def options(**replaced: Callback) -> dict[str, Callback]:
         "budget": SplatBudget(splats=BUDGET),
         "density": BudgetedGrowth(growth),
         "selection": OpacitySelection(strength=1e-2),
-        "rate_decay": RateDecay(final=0.1),
+        "rate_decay": LearningRateDecay(final=0.1),
         **replaced,
     }
 
@@ -107,7 +107,7 @@ def test_rates_fall_at_the_end_and_rise_for_the_selection(finished: Trainer, wit
 
 
 def test_neutral_options_are_the_run_without_them(run: RunFactory, recipe: Recipe) -> None:
-    neutral = {"budget": SplatBudget(), "selection": OpacitySelection(), "rate_decay": RateDecay()}
+    neutral = {"budget": SplatBudget(), "selection": OpacitySelection(), "rate_decay": LearningRateDecay()}
     without = recipe(**dict.fromkeys(neutral)).values()
     present = recipe(**neutral).values()
     assert scene_bytes(run(present)[0]) == scene_bytes(run(without)[0])
@@ -158,7 +158,7 @@ def test_few_photos_shorten_the_run(run: RunFactory, recipe: Recipe, caplog: pyt
         (lambda: SplatBudget(quality=1.0, splats=5), "a budget is one number, got quality and splats"),
         (lambda: SplatBudget(bytes=0), "bytes must be finite and above 0, got 0"),
         (lambda: PhaseSchedule(iterations_per_photo=0), "iterations_per_photo must be at least 1, got 0"),
-        (lambda: RateDecay(final=0.0), "final must be above 0 and at most 1, got 0.0"),
+        (lambda: LearningRateDecay(final=0.0), "final must be above 0 and at most 1, got 0.0"),
     ],
 )
 def test_settings_out_of_range_are_refused(make: Any, message: str) -> None:

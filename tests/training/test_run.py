@@ -199,7 +199,7 @@ def test_a_resumed_run_is_the_run_not_interrupted(
     assert scene_bytes(resumed) == scene_bytes(whole.trainer)
     assert measured(module) == measured(whole.module)
     stored = read(path)  # no code in a checkpoint
-    assert 0.0 < float(stored["state_dict"]["state._train_seconds"]) < module.train_seconds
+    assert 0.0 < float(stored["state_dict"]["_extra_state"]) < module.stopwatch.seconds
 
 
 def test_a_checkpoint_is_complete_without_its_trainer(whole: Whole) -> None:
@@ -358,7 +358,7 @@ def test_a_loss_that_is_known_only_after_the_backward_pass_changes_no_bit(
     assert len(said_late) == 2
     assert said_late == said_at_once
     for name, tensor in at_once.state_dict().items():
-        assert name == "state._train_seconds" or torch.equal(late.state_dict()[name], tensor), name
+        assert name == "_extra_state" or torch.equal(late.state_dict()[name], tensor), name
 
 
 @pytest.mark.parametrize("with_density", [True, False])

@@ -1,0 +1,158 @@
+"""The part of the Lightning module that knows what a file would hold: it renders, measures and stores that."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from typing import Any, cast
+
+import torch
+from lightning.pytorch import LightningModule
+from torch import Tensor, nn
+from torchmetrics import MetricCollection
+
+from nsvq_lightning.compression.stored import compress
+from nsvq_lightning.data.scene import View
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.quality.loss import kept
+from nsvq_lightning.quality.metrics import eight_bit
+from nsvq_lightning.quantize.attributes import attribute_rows, decoded
+from nsvq_lightning.quantize.base import Quantizer
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.rasterize import Render, render
+from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, sh_degree_of
+from nsvq_lightning.training.optim import LearningRates
+from nsvq_lightning.training.schedule import Phase, Schedule
+from nsvq_lightning.version import __version__
+
+__all__ = ["SceneModule"]
+
+log = logging.getLogger(__name__)
+
+
+class SceneModule(LightningModule):
+    """Splats, their codebooks and the settings that they are rendered and stored with; evaluates them.
+
+    :class:`nsvq_lightning.SplatModule` adds the training.
+    """
+
+    splats: Splats
+    """The splats; rows are edited only through :mod:`nsvq_lightning.training.edit`."""
+    codebooks: nn.ModuleDict
+    """Quantizer by attribute; empty for a run without quantization."""
+    schedule: Schedule
+    """Phases and milestones of the run."""
+    phase: Phase
+    """Phase of the current iteration."""
+    active_sh_degree: int
+    """SH degree that is rendered; higher coefficients are ignored."""
+    extent: float
+    """1.1 × the largest distance of a train camera from the mean of all, scene units; 0 while unknown."""
+    rates: LearningRates
+    storage: Storage
+    background: str
+    dssim_weight: float
+    antialiased: bool
+    backend: str
+    seed: int
+    evaluation_splats: SplatTensors | None
+    """What validation, test and prediction render instead of the module's own splats."""
+    view_metrics: MetricCollection
+
+    @property
+    def quantizers(self) -> Mapping[str, Quantizer]:
+        """Quantizer by attribute."""
+        return cast("Mapping[str, Quantizer]", dict(self.codebooks.items()))
+
+    def rows(self, attribute: str) -> Tensor:
+        """Rows ``[N, D]`` of a quantized attribute, detached."""
+        return attribute_rows(self.splats.raw(), attribute)
+
+    @torch.no_grad()
+    def hard_splats(self, phase: Phase) -> RawSplats:
+        """The splats as a file written in ``phase`` would hold them, detached: hard codes from ``QUANTIZE`` on."""
+        raw = RawSplats(*(tensor.detach() for tensor in self.splats.raw()))
+        return decoded(raw, self.quantizers) if phase >= Phase.QUANTIZE else raw
+
+    def render_splats(self, splats: SplatTensors, camera: Camera, **options: Any) -> Render:
+        """Render any splats at the active SH degree, over the module's background (``random``: black).
+
+        Args:
+            splats: Raw attributes.
+            camera: Where to look from.
+            **options: Arguments of :func:`nsvq_lightning.render` that replace the module's.
+        """
+        white = torch.ones(3, device=self.device) if self.background == "white" else None
+        own = {
+            "sh_degree": min(self.active_sh_degree, sh_degree_of(splats.shN)),
+            "background": white,
+            "antialiased": self.antialiased,
+            "backend": self.backend,
+        }
+        return render(splats, camera, **(own | options))
+
+    def compressed(self) -> CompressedScene:
+        """The scene as it is stored: frozen or nearest codes, codebooks, positions, opacities and the settings.
+
+        Before the quantize phase there are no codebooks yet, and everything is stored as it is.
+
+        Raises:
+            ValueError: There are no splats.
+        """
+        if len(self.splats) == 0:
+            raise ValueError("there are no splats to store or to measure: pass the checkpoint of a run (--ckpt_path)")
+        quantizers = self.quantizers if self.phase >= Phase.QUANTIZE else {}
+        if self.quantizers and not quantizers:
+            log.warning("the %s phase has no codebooks yet: the scene is stored unquantized", self.phase.name.lower())
+        scene = compress(self.splats.raw(), quantizers)  # PostHoc fits its codebooks only now
+        # Nothing that differs between two runs with the same seed.
+        settings = {
+            "version": __version__,
+            "codebooks": {name: int(q.codebook.shape[0]) for name, q in quantizers.items()},
+            "quantizers": {name: type(q).__name__ for name, q in quantizers.items()},
+            "phase_ends": list(self.schedule.ends),
+            "rates": asdict(self.rates),
+            "background": self.background,
+            **({"antialiased": True} if self.antialiased else {}),
+            "dssim_weight": self.dssim_weight,
+            "extent": self.extent,
+            "seed": self.seed,
+        }
+        return replace(scene, config=settings)
+
+    def _start_evaluation(self) -> None:
+        if len(self.splats) == 0:
+            raise ValueError("there are no splats to render: pass the checkpoint of a run (--ckpt_path)")
+        if self.evaluation_splats is None:
+            self.evaluation_splats = self.hard_splats(self.phase)
+
+    def _end_evaluation(self) -> None:
+        self.evaluation_splats = None
+
+    on_validation_start = on_test_start = on_predict_start = _start_evaluation
+    on_validation_end = on_test_end = on_predict_end = _end_evaluation
+
+    def _evaluated_image(self, camera: Camera) -> Tensor:
+        if self.evaluation_splats is None:
+            raise RuntimeError("evaluation steps run only inside Trainer.validate, test or predict")
+        return eight_bit(self.render_splats(self.evaluation_splats, camera).image)
+
+    def _evaluate(self, view: View, prefix: str) -> dict[str, Any]:
+        image = kept(self._evaluated_image(view.camera), view.mask)
+        scores = self.view_metrics(image, view.image, view.mask)
+        self.log_dict({f"{prefix}/{name}": metric for name, metric in self.view_metrics.items()}, batch_size=1)
+        return {"image": image, **scores}
+
+    def validation_step(self, batch: View, batch_idx: int) -> dict[str, Any]:
+        """Score one view: ``image [H, W, 3]`` (8-bit values in [0, 1]), ``psnr``, ``ssim``."""
+        return self._evaluate(batch, "val")
+
+    def test_step(self, batch: View, batch_idx: int) -> dict[str, Any]:
+        """Score one view: ``image [H, W, 3]`` (8-bit values in [0, 1]), ``psnr``, ``ssim``."""
+        return self._evaluate(batch, "test")
+
+    def predict_step(self, batch: View, batch_idx: int) -> dict[str, Any]:
+        """Render one view: ``name`` and ``image [H, W, 3]`` (8-bit values in [0, 1])."""
+        return {"name": batch.name, "image": self._evaluated_image(batch.camera)}
