@@ -23,9 +23,10 @@ from .quantization import (
 )
 from .report import MetricReport
 from .schedule import LearningRateDecay, PhaseSchedule, ShDegreeSchedule
-from .standard import STANDARD, standard
+from .standard import OPTIONAL, STANDARD, standard
 
 __all__ = [
+    "OPTIONAL",
     "STANDARD",
     "BudgetedGrowth",
     "CanonicalCovariance",

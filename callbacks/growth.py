@@ -50,8 +50,8 @@ class SplatBudget(SplatCallback):
     """Decides how many splats the scene is to have, and says why.
 
     :class:`~nsvq_lightning.callbacks.BudgetedGrowth` grows up to it,
-    :class:`~nsvq_lightning.callbacks.OpacitySelection` removes what is above it. Give one of the three numbers, or none
-    for as many splats as density control makes.
+    :class:`~nsvq_lightning.callbacks.OpacitySelection` removes what is above it. Without a number of splats or bytes it
+    comes from the photos.
 
     Args:
         quality: Times the default for the photos (:func:`nsvq_lightning.compression.budget.splats_for_photos`).
@@ -59,7 +59,7 @@ class SplatBudget(SplatCallback):
         bytes: Size of the file at level ``compact``.
 
     Raises:
-        ValueError: More than one number is given, or one is not above 0.
+        ValueError: Splats and bytes are both given, or a number is not above 0.
 
     Example:
         >>> from nsvq_lightning.callbacks import SplatBudget, standard
@@ -68,15 +68,14 @@ class SplatBudget(SplatCallback):
         [100000]
     """
 
-    quality: float | None = None
+    quality: float = 1.0
     splats: int | None = None
     bytes: int | None = None
 
     def __post_init__(self) -> None:
-        given = [name for name in ("quality", "splats", "bytes") if getattr(self, name) is not None]
-        if len(given) > 1:
-            raise ValueError(f"a budget is one number, got {' and '.join(given)}; leave all but one out")
-        self.check({"above 0": given})
+        self.check({"above 0": ("quality", "splats", "bytes")})
+        if self.splats is not None and self.bytes is not None:
+            raise ValueError("splats and bytes both say how large the scene is to be: give one of them")
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Set the module's budget.
@@ -94,7 +93,7 @@ class SplatBudget(SplatCallback):
                 self.bytes, codebooks, module.splats.sh_degree, module.storage.precision, max(choices, default=0.0)
             )
             reason = f"for a file of {self.bytes} bytes"
-        elif self.quality is not None:
+        elif self.splats is None:
             scene = needed_scene(
                 trainer,
                 "a budget from the photos needs them",
@@ -106,8 +105,7 @@ class SplatBudget(SplatCallback):
                 f"quality {self.quality:g} times what {len(scene.train)} photos with {detail:,.0f} detailed pixels "
                 "each support; --quality changes it"
             )
-        if module.splat_budget is not None:
-            log.info("budget: %d splats, %s", module.splat_budget, reason)
+        log.info("budget: %d splats, %s", module.splat_budget, reason)
 
 
 CHILD_OFFSET = 1.35

@@ -260,7 +260,7 @@ class ContributionPruning(SplatCallback):
         1800
     """
 
-    share: float = 0.0
+    share: float = 0.001
     at: int = 18_500
 
     def __post_init__(self) -> None:
@@ -282,7 +282,7 @@ class ContributionPruning(SplatCallback):
 
     def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Prune after iteration ``at``, now that all callbacks have finished with it."""
-        if not self.share or iteration - 1 != module.schedule.iteration(self.at):
+        if iteration - 1 != module.schedule.iteration(self.at):
             return
         before = len(module.splats)
         contribution = train_contributions(trainer, module)

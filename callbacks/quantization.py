@@ -91,7 +91,7 @@ class CanonicalCovariance(SplatCallback):
 
     state = ("log_floor",)
 
-    mode: Mode = "none"
+    mode: Mode = "auto"
     floor: float = 0.0
     log_floor: float | None = field(default=None, init=False)
     """Logarithm of the floor in use, scene units."""
@@ -195,7 +195,7 @@ class CodebookInit(SplatCallback):
         ValueError: weighted must be among scales, quats, sh0, shN, got means
     """
 
-    weights: Literal["none", "contribution"] = "none"
+    weights: Literal["none", "contribution"] = "contribution"
     weighted: Sequence[str] = ("quats", "sh0", "shN")
     values_per_splat: float | None = None
 
@@ -229,8 +229,7 @@ class CodebookInit(SplatCallback):
 class CodebookReplacement(SplatCallback):
     """Replaces inactive codes with copies of active ones, at first often, then less often (paper, section 3.2).
 
-    All numbers are iterations of the reference run; the paper's are every 100 from 20 100 to 22 000, then every 500 up
-    to 43 000. The quantizer decides which codes are inactive.
+    All numbers are iterations of the reference run. The quantizer decides which codes are inactive.
 
     By the paper's rule the last replacement comes right before the codes freeze, so its new codes are never trained; a
     smaller ``end`` leaves them time. Untrained copies equal their originals, which keep all the rows. Few codes are
@@ -262,13 +261,13 @@ class CodebookReplacement(SplatCallback):
         (2050, 2100, 3900)
     """
 
-    start: int = 20_100
-    early_end: int = 22_000
-    early_every: int = 100
-    end: int = 43_000
-    late_every: int = 500
-    jitter: float | None = None
-    reset_moments: bool = False
+    start: int = 10_700
+    early_end: int = 11_500
+    early_every: int = 200
+    end: int = 12_000
+    late_every: int = 200
+    jitter: float | None = 0.5
+    reset_moments: bool = True
 
     def __post_init__(self) -> None:
         self.check({"in (0, 1]": ("jitter",), "at least 1": ("start", "early_every", "late_every")})
@@ -423,7 +422,7 @@ class RateDistortion(SplatCallback):
     Only quantizers that can hold codes (:class:`nsvq_lightning.quantize.base.Holding`) take part.
 
     Args:
-        strength: Per cent of squared error worth one per cent of the file; 0 is off.
+        strength: Per cent of squared error worth one per cent of the file.
         attributes: Those whose codes are chosen so; the others have their nearest codes.
 
     Raises:
@@ -438,13 +437,13 @@ class RateDistortion(SplatCallback):
 
     state = ("prices",)
 
-    strength: float = 0.0
+    strength: float = 2.0
     attributes: Sequence[str] = tuple(QUANTIZED)
     prices: dict[str, Tensor] | None = field(default=None, init=False)
     """What a bit costs each splat ``[N]`` in squared error, by attribute."""
 
     def __post_init__(self) -> None:
-        self.check({"at least 0": ("strength",)})
+        self.check({"above 0": ("strength",)})
         check_attributes("attributes", self.attributes)
 
     def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
@@ -453,7 +452,7 @@ class RateDistortion(SplatCallback):
         Raises:
             ValueError: The trainer has no data module with a scene.
         """
-        if not self.strength or module.schedule.phase_at(iteration) is not Phase.QUANTIZE:
+        if module.schedule.phase_at(iteration) is not Phase.QUANTIZE:
             return
         if iteration == module.schedule.first_of(Phase.QUANTIZE) or not self._fits(module):
             self._measure(trainer, module, iteration)
@@ -476,7 +475,9 @@ class RateDistortion(SplatCallback):
         return all(len(price) == len(module.splats) for price in (self.prices or {}).values())
 
     def _measure(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
-        scene = needed_scene(trainer, "codes are to be chosen by what shows in the train views", "set strength=0")
+        scene = needed_scene(
+            trainer, "codes are to be chosen by what shows in the train views", "leave RateDistortion out"
+        )
         taking_part = [name for name, q in module.quantizers.items() if name in self.attributes and is_holding(q)]
         splats = module.hard_splats(Phase.QUANTIZE)
         shown = {name: torch.zeros_like(splats.opacities) for name in taking_part}

@@ -25,8 +25,9 @@ log = logging.getLogger(__name__)
 class PhaseSchedule(SplatCallback):
     """Gives the module its schedule, and the phase of each iteration.
 
-    The ends of the phases are iterations of a reference run, the paper's of 45 000 iterations by default; a run of any
-    other length is that run, scaled (:mod:`nsvq_lightning.training.schedule` says how).
+    The ends of the phases are iterations of a reference run; a run of any other length is that run, scaled
+    (:mod:`nsvq_lightning.training.schedule` says how). The defaults are those of the recipe (docs/recipe.md), for a run
+    of 15 000 iterations; ``configs/paper.yaml`` has the paper's.
 
     Args:
         total: Iterations of the run; None takes ``trainer.max_steps``.
@@ -47,19 +48,19 @@ class PhaseSchedule(SplatCallback):
 
     Example:
         >>> from nsvq_lightning.callbacks import PhaseSchedule
-        >>> PhaseSchedule().schedule(4500).ends  # --trainer.max_steps=4500
-        (1500, 2000, 4200, 4500)
-        >>> PhaseSchedule(quantize_end=30_000).schedule(4500).ends  # --callbacks.phases.quantize_end=30000
-        (1500, 2000, 3000, 4500)
+        >>> PhaseSchedule().schedule(3000).ends  # --trainer.max_steps=3000
+        (1600, 2120, 2520, 3000)
+        >>> PhaseSchedule(warmup_end=10_000).schedule(3000).ends  # --callbacks.phases.warmup_end=10000
+        (2000, 2120, 2520, 3000)
     """
 
     total: int | None = None
-    reference_total: int | None = 45_000
-    warmup_end: int = Schedule.warmup_end
-    prune_end: int = Schedule.prune_end
-    quantize_end: int = Schedule.quantize_end
-    position_decay: int = Schedule.position_decay
-    min_density_interval: int = Schedule.min_density_interval
+    reference_total: int | None = 15_000
+    warmup_end: int = 8000
+    prune_end: int = 10_600
+    quantize_end: int = 12_600
+    position_decay: int = 10_600
+    min_density_interval: int = 100
     min_reset_interval: int = Schedule.min_reset_interval
     min_replacement_interval: int = Schedule.min_replacement_interval
     min_finetune: int = Schedule.min_finetune
@@ -153,7 +154,7 @@ class ShDegreeSchedule(SplatCallback):
     """Starts with SH degree 0 and adds a degree every ``every`` iterations, up to that of the splats.
 
     Args:
-        every: Iterations of the reference run between two degrees (the paper's 1000).
+        every: Iterations of the reference run between two degrees (1000 in the paper).
 
     Raises:
         ValueError: ``every`` is below 1.
@@ -166,7 +167,7 @@ class ShDegreeSchedule(SplatCallback):
         [0, 1, 2, 3, 3]
     """
 
-    every: int = 1000
+    every: int = 500
 
     def __post_init__(self) -> None:
         self.check({"at least 1": ("every",)})
@@ -198,8 +199,8 @@ class LearningRateDecay(SplatCallback):
         [0.1]
     """
 
-    final: float = 1.0
-    start: int | None = None
+    final: float = 0.1
+    start: int | None = 10_600
 
     def __post_init__(self) -> None:
         self.check({"in (0, 1]": ("final",), "at least 0": ("start",)})

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint, ProgressBar, RichProgressBar, TQDMProgressBar
 
+from nsvq_lightning.top_level import folder_of
+
 from .checkpoint import RunCheckpoint
-from .density import DensityControl
-from .growth import SplatBudget
+from .growth import BudgetedGrowth, SplatBudget
 from .outputs import ExportScene, LiveScene, RenderWriter
 from .precompile import CompileAhead
 from .progress import SplatProgressBar
@@ -24,14 +27,14 @@ from .quantization import (
 from .report import MetricReport
 from .schedule import LearningRateDecay, PhaseSchedule, ShDegreeSchedule
 
-__all__ = ["STANDARD", "standard"]
+__all__ = ["OPTIONAL", "STANDARD", "standard"]
 
 STANDARD: dict[str, type[Callback]] = {
     "phases": PhaseSchedule,
     "sh_degree": ShDegreeSchedule,
     "rate_decay": LearningRateDecay,
     "budget": SplatBudget,
-    "density": DensityControl,
+    "density": BudgetedGrowth,
     "selection": OpacitySelection,
     "opacity": OpacityRegularization,
     "contribution": ContributionPruning,
@@ -54,6 +57,9 @@ STANDARD: dict[str, type[Callback]] = {
 after the same iteration; the canonical form, whose floor raises scales, before the replacement of codes, which may copy
 them; contribution pruning before the report, whose figures are then those of the remaining splats.
 """
+
+OPTIONAL = frozenset({"opacity", "contribution", "codebook_refit", "rate_distortion"})
+"""Those that a run has only if a config or the user asks for them."""
 
 
 class _IfWanted(Callback):
@@ -91,21 +97,22 @@ def _is_plain(callback: Callback, kind: type[Callback]) -> bool:
     return all(vars(callback)[name] == value for name, value in vars(ModelCheckpoint()).items())
 
 
-def standard(**replaced: Callback | None) -> list[Callback]:
-    """The callbacks of ``nsvq fit``, with their defaults.
+def standard(config: str | None = None, /, **replaced: Callback | None) -> list[Callback]:
+    """The callbacks of ``nsvq fit``, with their defaults or with the settings of a config.
 
     Progress bar and checkpoints take the place of the trainer's own, unless its flags (``enable_progress_bar``,
     ``enable_checkpointing``, ``barebones``) leave them out. Those that you name are in the list as they are.
 
     Args:
+        config: Name of a config that comes with the package, such as ``small`` or ``paper``.
         replaced: Callbacks that replace those of the same name in :data:`STANDARD`; None leaves one out.
 
     Raises:
         ValueError: There is no callback of that name.
 
     Example:
-        >>> from nsvq_lightning.callbacks import STANDARD, DensityControl, standard
-        >>> len(standard()) == len(STANDARD)
+        >>> from nsvq_lightning.callbacks import OPTIONAL, STANDARD, DensityControl, standard
+        >>> len(standard()) == len(STANDARD) - len(OPTIONAL)
         True
         >>> few = standard(density=DensityControl(max_splats=200_000), report=None, progress=None)
         >>> [type(callback).__name__ for callback in few[:2]]
@@ -114,9 +121,32 @@ def standard(**replaced: Callback | None) -> list[Callback]:
     unknown = sorted(set(replaced) - set(STANDARD))
     if unknown:
         raise ValueError(f"there is no standard callback {', '.join(unknown)}; there are {', '.join(STANDARD)}")
-    made = (replaced[name] if name in replaced else _made(kind) for name, kind in STANDARD.items())
-    return [callback for callback in made if callback is not None]
+    settings = {} if config is None else _callbacks_of(config)
+    made = []
+    for name, kind in STANDARD.items():
+        if name in replaced:
+            callback = replaced[name]
+        elif name in settings:
+            callback = settings[name]
+        else:
+            callback = None if name in OPTIONAL else kind()
+        if callback is not None:
+            takes_place = name not in replaced and isinstance(callback, Checkpoint | ProgressBar)
+            made.append(_IfWanted(callback) if takes_place else callback)
+    return made
 
 
-def _made(kind: type[Callback]) -> Callback:
-    return _IfWanted(kind()) if issubclass(kind, Checkpoint | ProgressBar) else kind()
+def _callbacks_of(config: str) -> dict[str, Callback | None]:
+    """What a config says of callbacks: null, the name of a class, or settings of the standard one."""
+    import yaml
+
+    text = (folder_of("configs") / f"{config}.yaml").read_text(encoding="utf-8")
+    made: dict[str, Callback | None] = {}
+    for name, value in yaml.safe_load(text).get("callbacks", {}).items():
+        if value is None:
+            made[name] = None
+        elif isinstance(value, str):
+            made[name] = getattr(import_module(__package__), value)()
+        else:
+            made[name] = STANDARD[name](**value)
+    return made

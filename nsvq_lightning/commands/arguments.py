@@ -109,7 +109,8 @@ def expand(arguments: Sequence[str]) -> list[str]:
         if not (equals or rest):
             raise ValueError(f"{option} needs a number")
         value = value if equals else rest.pop(0)
-        expanded += [f"{BUDGET}.{other}={value if other == name else 'null'}" for other in SHORTHANDS]
+        others = [other for other in ("splats", "bytes") if other != name]
+        expanded += [f"{BUDGET}.{name}={value}", *(f"{BUDGET}.{other}=null" for other in others)]
     return expanded
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import re
@@ -22,8 +23,15 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 import nsvq_lightning.callbacks as callbacks
 import nsvq_lightning.quantize as quantize
-from nsvq_lightning.callbacks.standard import STANDARD
-from nsvq_lightning.commands.arguments import SHORTHANDS, in_plain_words, nearest, shipped_configs, unknown_option
+from nsvq_lightning.callbacks.standard import OPTIONAL, STANDARD
+from nsvq_lightning.commands.arguments import (
+    SHORTHANDS,
+    find_config,
+    in_plain_words,
+    nearest,
+    shipped_configs,
+    unknown_option,
+)
 from nsvq_lightning.commands.option_help import class_help, command_help, first_sentence
 from nsvq_lightning.commands.registry import COMMANDS
 from nsvq_lightning.data.colmap import check_name
@@ -38,7 +46,6 @@ from nsvq_lightning.training.trainer import SplatTrainer
 __all__ = ["SplatCLI", "default_loggers"]
 
 TRAINER_DEFAULTS: dict[str, Any] = {
-    "max_steps": 45_000,  # the paper's run; phases and everything that depends on them follow
     "max_epochs": -1,  # the sampler is endless: steps end the run
     "limit_val_batches": 0,  # MetricReport evaluates, outside the training time
     "num_sanity_val_steps": 0,
@@ -54,10 +61,11 @@ CLASSES = (*callbacks.__all__, *quantize.__all__, "ColmapDataModule", "DemoDataM
 NAMED_CHECKPOINTS = frozenset({"hpc", "registry"})
 """Words that Lightning accepts instead of a checkpoint's path; ``last`` and ``best`` refer to its own callback."""
 
-PARSER_TEXTS: dict[str, Any] = {
+PARSER_SETTINGS: dict[str, Any] = {
     "prog": "nsvq",
     **{name: {"description": command.summary} for name, command in COMMANDS.items() if command.module is None},
 }
+PARSER_SETTINGS["fit"]["default_config_files"] = [find_config("fast")]
 
 
 class QuietParser(LightningArgumentParser):
@@ -95,14 +103,16 @@ class QuietParser(LightningArgumentParser):
 
 
 def _drop_settings_of_another_class(_: Any, before: Any, value: Any) -> None:
-    """Keep no settings where an option names another class that is no subclass of the one before.
+    """Where an option names another class, keep only what was set for the one before that it is derived from.
 
-    jsonargparse keeps those of the same name: the paper's threshold would become one of BudgetedGrowth.
+    jsonargparse keeps all settings of the same name: the paper's threshold would become one of BudgetedGrowth.
     """
     if before and "init_args" in before and before["class_path"] != value["class_path"]:
         old, new = (resolve_name(each["class_path"]) for each in (before, value))
-        if not (isinstance(old, type) and isinstance(new, type) and issubclass(new, old)):
-            for name in list(before.init_args.keys()):
+        derived = isinstance(old, type) and isinstance(new, type) and issubclass(new, old)
+        defaults = inspect.signature(old).parameters
+        for name, setting in list(before.init_args.items(branches=True, nested=False)):
+            if not derived or setting in (None, defaults[name].default):
                 before.init_args.pop(name)
 
 
@@ -157,7 +167,7 @@ class SplatCLI(LightningCLI):
                 save_config_callback=RunStart,
                 seed_everything_default=False,  # every draw has its own generator
                 parser_class=QuietParser,
-                parser_kwargs=PARSER_TEXTS,
+                parser_kwargs=PARSER_SETTINGS,
                 subclass_mode_data=True,
                 auto_configure_optimizers=False,  # the module builds its groups
                 args=args,
@@ -174,9 +184,10 @@ class SplatCLI(LightningCLI):
             parser.add_argument(f"--skips.{skip.name}", type=bool, default=True, help=skip.summary)
         for name, kind in STANDARD.items():
             key = f"callbacks.{name}"
-            path = f"{kind.__module__}.{kind.__qualname__}"
+            default = None if name in OPTIONAL else {"class_path": f"{kind.__module__}.{kind.__qualname__}"}
+            # Settings alone mean the standard class; another one need not be derived from it.
             parser.add_argument(
-                f"--{key}", type=Callback | None, default={"class_path": path}, help=first_sentence(kind.__doc__)
+                f"--{key}", type=kind | Callback | None, default=default, help=first_sentence(kind.__doc__)
             )
             parser.callback_keys.append(key)
 

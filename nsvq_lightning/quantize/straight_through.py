@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -46,6 +46,11 @@ class TrainedStraightThrough(CodebookQuantizer):
     fifty iterations, and training may end at any iteration.
     """
 
+    def __init__(
+        self, num_codes: int, dim: int, *, kmeans_steps: int = 10, start: Literal["sample", "spread"] = "spread"
+    ) -> None:
+        super().__init__(num_codes, dim, kmeans_steps=kmeans_steps, start=start)
+
     def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator, rows: Tensor | None) -> Tensor:
         """The codes of the rows ``rows [V]`` of ``x [N, D]``; the gradient goes to both."""
         result: Tensor = _CopiedGradient.apply(x, self.codebook, codes, rows)  # type: ignore[no-untyped-call]
@@ -79,7 +84,7 @@ class PostHoc(CodebookQuantizer):
     all with equal weight. Once codes are frozen, codebook and codes are those of that moment, as with every other
     quantizer.
 
-    ``configs/post_hoc_4k.yaml`` has no fine-tune phase, because that would train the codebooks after all.
+    Leave the fine-tune phase out (``phases.quantize_end`` at the end of the run): it would train the codebooks after all.
 
     Args:
         num_codes: Codes K, at least 1.

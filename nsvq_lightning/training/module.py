@@ -16,7 +16,7 @@ from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quality.metrics import eight_bit, image_metrics, psnr
 from nsvq_lightning.quantize.attributes import build_quantizers, decoded, noisy_rows
-from nsvq_lightning.quantize.nsvq import NSVQ
+from nsvq_lightning.quantize.straight_through import TrainedStraightThrough
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, visible
@@ -73,8 +73,8 @@ class SplatModule(ResumedModule):
     def __init__(
         self,
         sh_degree: int = 3,
-        quantizer: Callable[[int, int], nn.Module] = NSVQ,
-        codebooks: str | dict[str, int] | None = "16k",
+        quantizer: Callable[[int, int], nn.Module] = TrainedStraightThrough,
+        codebooks: str | dict[str, int] | None = "4k",
         background: Literal["auto", "black", "white", "random"] = "auto",
         dssim_weight: float = 0.2,
         rates: optim.LearningRates = optim.LearningRates(),  # noqa: B008  frozen
@@ -203,6 +203,7 @@ class SplatModule(ResumedModule):
     def on_train_start(self) -> None:
         """Set the learning rates of this run, not those of a checkpoint; start measuring the training time."""
         views = self.trainer.world_size * self.trainer.accumulate_grad_batches
+        optim.check_groups(self.trainer.optimizers, self.quantizers)
         optim.apply_rates(self.trainer.optimizers[0], self.rates, self.extent, views)
         self._step_rates = self.rates.of_step(views)
         self.stopwatch.start()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -17,6 +17,7 @@ __all__ = [
     "LearningRates",
     "apply_rates",
     "build_adam",
+    "check_groups",
     "codebook_group",
     "find_group",
     "group_lr",
@@ -40,7 +41,7 @@ CODEBOOK_PREFIX = "codebook_"
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Learning rates of 3D Gaussian splatting, which the paper also uses.
+    """Learning rates of the recipe (docs/recipe.md); ``configs/paper.yaml`` has those of 3D Gaussian splatting.
 
     Attributes:
         means: Position at the start, times the extent of the scene.
@@ -58,13 +59,13 @@ class LearningRates:
         ValueError: A rate is negative or not finite, or a rate of the position is 0.
     """
 
-    means: float = 1.6e-4
-    means_final: float = 1.6e-6
-    scales: float = 5e-3
-    quats: float = 1e-3
-    opacities: float = 0.05
+    means: float = 3.2e-4
+    means_final: float = 4e-6
+    scales: float = 0.01
+    quats: float = 2e-3
+    opacities: float = 0.025
     sh0: float = 2.5e-3
-    shN: float = 1.25e-4
+    shN: float = 5e-4
     codebook_factor: float = 1.0
     scale_with_views: bool = False
 
@@ -176,6 +177,26 @@ def find_group(optimizer: torch.optim.Optimizer, name: str) -> dict[str, Any]:
             return group
     names = ", ".join(str(group.get("name")) for group in optimizer.param_groups)
     raise ValueError(f"the optimiser has no parameter group {name!r}, only: {names}")
+
+
+def check_groups(optimizers: Sequence[torch.optim.Optimizer], quantized: Iterable[str]) -> None:
+    """Check that a module's optimiser has the groups that callbacks edit by name.
+
+    Args:
+        optimizers: Those of the trainer.
+        quantized: Attributes with a codebook.
+
+    Raises:
+        ValueError: A group is missing or has several parameters, or there is not exactly one optimiser.
+    """
+    sizes = {group.get("name"): len(group["params"]) for each in optimizers for group in each.param_groups}
+    missing = [name for name in (*ATTRIBUTES, *map(codebook_group, quantized)) if sizes.get(name) != 1]
+    if missing or len(optimizers) != 1:
+        raise ValueError(
+            "splats need one optimiser with a group of one parameter for each attribute and codebook, named after it; "
+            f"there are {len(optimizers)} optimisers, without groups for: {', '.join(missing) or 'none'}. Build the "
+            "groups with nsvq_lightning.training.optim.param_groups"
+        )
 
 
 def raw_optimizer(trainer: Trainer) -> torch.optim.Optimizer:

@@ -11,7 +11,7 @@ from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from runs import Recipe, RunFactory, quiet_trainer
 
-from nsvq_lightning.callbacks import STANDARD, DensityControl, DensityRules, MetricReport, PhaseSchedule, standard
+from nsvq_lightning.callbacks import STANDARD, DensityControl, MetricReport, PhaseSchedule, standard
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.training.module import SplatModule
 

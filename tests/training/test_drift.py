@@ -13,7 +13,7 @@ from demo_room import write_synthetic_scene
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from nsvq_lightning.callbacks import DensityControl, DensityRules
+from nsvq_lightning.callbacks import DensityControl
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.splats import Splats

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 from lightning.pytorch import Callback, LightningModule, Trainer
+from nsvq_lightning.training.host import as_host
 from runs import Recipe, RunFactory
 
-from nsvq_lightning.callbacks import DensityControl, DensityRules
+from nsvq_lightning.callbacks import DensityControl
 from nsvq_lightning.training import memory_estimate
-from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.scene_access import train_contributions
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from lightning.pytorch import Trainer
+from nsvq_lightning.training.host import SplatHost, splat_host
 from runs import fit
 from torch import Tensor, nn
 
@@ -21,7 +22,6 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render, visible
 from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats, Splats
-from nsvq_lightning.training.host import SplatHost, splat_host
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.resume import plain

@@ -14,9 +14,9 @@ from runs import Recipe, RunFactory
 from nsvq_lightning.callbacks import (
     BudgetedGrowth,
     GrowthRules,
+    LearningRateDecay,
     OpacitySelection,
     PhaseSchedule,
-    LearningRateDecay,
     RunCheckpoint,
     SplatBudget,
 )
