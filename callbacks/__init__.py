@@ -11,7 +11,7 @@ from .options import ExposureCompensation, FrequencyLimit
 from .outputs import ExportScene, LiveScene, RenderWriter
 from .precompile import CompileAhead
 from .progress import SplatProgressBar
-from .pruning import ContributionPruning, OpacityRegularization, OpacitySelection
+from .pruning import OpacityRegularization, OpacitySelection
 from .quantization import (
     CanonicalCovariance,
     CodebookInit,
@@ -34,7 +34,6 @@ __all__ = [
     "CodebookRefit",
     "CodebookReplacement",
     "CompileAhead",
-    "ContributionPruning",
     "DensityControl",
     "ExportScene",
     "ExposureCompensation",

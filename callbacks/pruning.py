@@ -1,4 +1,4 @@
-"""What removes splats in the prune phase: the penalty on opacities, their selection, the least contributions."""
+"""What removes splats in the prune phase: the penalty on opacities, and their selection."""
 
 from __future__ import annotations
 
@@ -9,20 +9,19 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
 
-from nsvq_lightning.compression.importance import least_contributing, most_contributing
+from nsvq_lightning.compression.importance import most_contributing
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import generator
 from nsvq_lightning.training.distributed import check_replicas
 from nsvq_lightning.training.edit import keep_rows
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import raw_optimizer
-from nsvq_lightning.training.scene_access import train_contributions
 from nsvq_lightning.training.schedule import Phase, next_iteration
 
 from .base import SplatCallback, settings
 from .growth import draw_rows
 
-__all__ = ["ContributionPruning", "OpacityRegularization", "OpacitySelection", "pressure"]
+__all__ = ["OpacityRegularization", "OpacitySelection", "pressure"]
 
 
 @settings
@@ -231,69 +230,3 @@ def pressure(opacities: Tensor, strength: float, *, gentle: bool) -> Tensor:
     # d/do of (o + 20)/h is 1/h + (o + 20)/h² · σ(1 - σ), the second term only where h is not clamped.
     slope = torch.where(transparency > 0.05, above / held.square() * opacities.sigmoid() * transparency, 0.0)
     return 2 * strength * (above / held).mean() * (1 / held + slope) / count
-
-
-@settings
-class ContributionPruning(SplatCallback):
-    """Once before the quantize phase, removes the splats that contribute least to the train views.
-
-    The contribution of a splat is its blending weight, summed over all pixels
-    (:func:`nsvq_lightning.compression.importance.contributions`): unlike opacity, this also finds splats that are small
-    or hidden behind others. The paper prunes by opacity alone.
-
-    Of 187 k splats at iteration 18 000, before any further training: share 0.001 removed 11 % and cost 0.03 dB of test
-    PSNR; 0.003, 18 % and 0.11 dB; 0.01, 30 % and 0.38 dB.
-
-    Args:
-        share: The least contributing splats go that together have at most this share of the total contribution.
-            0 removes nothing, as in the paper.
-        at: Iteration of the reference run; leave some before the quantize phase to close the gaps.
-
-    Raises:
-        ValueError: ``share`` is not in [0, 1), or ``at`` is below 1.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import ContributionPruning
-        >>> from nsvq_lightning.training.schedule import Schedule
-        >>> pruning = ContributionPruning(share=0.002, at=18_000)  # --callbacks.contribution.share=0.002
-        >>> Schedule(total=4500).iteration(pruning.at)
-        1800
-    """
-
-    share: float = 0.001
-    at: int = 18_500
-
-    def __post_init__(self) -> None:
-        self.check({"in [0, 1)": ("share",), "at least 1": ("at",)})
-
-    def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
-        """Check that the pruning comes before the quantize phase.
-
-        Raises:
-            ValueError: It does not.
-        """
-        super().on_train_start(trainer, module)
-        schedule = module.schedule
-        if self.share and schedule.phase_at(schedule.iteration(self.at) + 1) > Phase.PRUNE:
-            raise ValueError(
-                f"contribution pruning at={self.at} must leave an iteration before the quantize phase, which starts "
-                f"after {schedule.prune_end}; lower at (--callbacks.contribution.at)"
-            )
-
-    def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
-        """Prune after iteration ``at``, now that all callbacks have finished with it."""
-        if iteration - 1 != module.schedule.iteration(self.at):
-            return
-        before = len(module.splats)
-        contribution = train_contributions(trainer, module)
-        if not bool(contribution.any()):
-            log.warning("iteration %d: no train view sees a splat; none is pruned", trainer.global_step)
-            return
-        keep_rows(module.splats, raw_optimizer(trainer), ~least_contributing(contribution, self.share))
-        log.info(
-            "iteration %d: pruned %d of %d splats, at most %g of the total contribution",
-            trainer.global_step,
-            before - len(module.splats),
-            before,
-            self.share,
-        )

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import field
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, cast
 
 import torch
 from lightning.pytorch import Trainer
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from nsvq_lightning.compression.covariance_error import form_errors
-from nsvq_lightning.compression.importance import row_weights, scale_floor, sensitivity
+from nsvq_lightning.compression.importance import row_weights, sensitivity
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import kept
 from nsvq_lightning.quality.metrics import eight_bit
-from nsvq_lightning.quantize.attributes import QUANTIZED, check_attributes, codes_of
+from nsvq_lightning.quantize.attributes import QUANTIZED, codes_of
 from nsvq_lightning.quantize.base import (
     Holding,
     Quantizer,
@@ -30,13 +28,13 @@ from nsvq_lightning.quantize.base import (
     is_refittable,
 )
 from nsvq_lightning.quantize.nearest import cheapest, code_rates
-from nsvq_lightning.random import derive_seed, generator
-from nsvq_lightning.splats.canonical_covariance import Form, canonical
+from nsvq_lightning.random import generator
+from nsvq_lightning.splats.canonical_covariance import canonical
 from nsvq_lightning.training.distributed import check_replicas, follow_first, from_first_process, sum_over_processes
-from nsvq_lightning.training.edit import change_coordinates, raise_scales, reset_moments, trainable_rows
+from nsvq_lightning.training.edit import change_coordinates, reset_moments
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import codebook_group, raw_optimizer
-from nsvq_lightning.training.scene_access import needed_scene, train_cameras, train_contributions
+from nsvq_lightning.training.scene_access import needed_scene, train_contributions
 from nsvq_lightning.training.schedule import Phase, next_iteration
 
 from .base import SplatCallback, finite_search_is_due, keep_finite_splats, settings
@@ -55,110 +53,43 @@ __all__ = [
 
 log = logging.getLogger(__name__)
 
-Mode = Literal["none", "sign", "full", "auto"]
-
 
 @settings
 class CanonicalCovariance(SplatCallback):
     """After the last iteration before the quantize phase, gives like covariances like scales and rotations.
 
-    ``mode`` gives each one of its 48 equivalent pairs of scale and rotation
+    Of the 48 equivalent pairs of scale and rotation that a covariance has, each splat takes one
     (:mod:`nsvq_lightning.splats.canonical_covariance`), so that k-means groups them; renderings do not change. The form
     is not enforced afterwards: rows move continuously and keep their codes, while a row that jumped to another
     equivalent pair would lose its code.
 
-    ``floor`` raises scales too small to be visible to one value, then and throughout the quantize phase, so that no
-    codes are spent on distinguishing them (:func:`nsvq_lightning.compression.importance.scale_floor`).
-
-    With 4k codes on 187 k splats, right after k-means for scales and rotations, test PSNR was 30.47 dB with ``none``,
-    30.61 dB with ``sign`` and 31.17 dB with ``full``, against 31.64 dB unquantized; ``auto`` chose the last.
-
-    Args:
-        mode: ``none`` leaves everything as it is, as in the paper; ``sign`` gives quaternions length 1 and w ≥ 0;
-            ``full`` also sorts the axes and takes the smallest rotation; ``auto`` takes the form with the smallest
-            covariance error after k-means on a sample of the scene's splats.
-        floor: Smallest scale, in pixels of the train views where those see splats close; 0 is none, as in the paper.
-
-    Raises:
-        ValueError: An unknown mode, or a negative floor.
+    With 4k codes on 187 k splats, right after k-means for scales and rotations, test PSNR was 30.47 dB without and
+    31.17 dB with it, against 31.64 dB unquantized.
 
     Example:
         >>> from nsvq_lightning.callbacks import CanonicalCovariance, standard
-        >>> canonical = CanonicalCovariance(mode="auto", floor=0.25)  # --callbacks.canonical.mode=auto
-        >>> [callback.floor for callback in standard(canonical=canonical) if isinstance(callback, CanonicalCovariance)]
-        [0.25]
+        >>> callbacks = standard(canonical=None)  # --callbacks.canonical=null
+        >>> any(isinstance(callback, CanonicalCovariance) for callback in callbacks)
+        False
     """
-
-    state = ("log_floor",)
-
-    mode: Mode = "auto"
-    floor: float = 0.0
-    log_floor: float | None = field(default=None, init=False)
-    """Logarithm of the floor in use, scene units."""
-
-    def __post_init__(self) -> None:
-        if self.mode not in get_args(Mode):
-            raise ValueError(f"mode must be one of {', '.join(get_args(Mode))}, got {self.mode!r}")
-        self.check({"at least 0": ("floor",)})
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Act before the first iteration of a run that starts in the quantize phase."""
         super().on_train_start(trainer, module)
         if self._first_time("after", trainer.global_step):
-            self._act_if_due(trainer, module, trainer.global_step)
+            self.after_step(trainer, module, trainer.global_step)
 
+    @torch.no_grad()
     def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
-        """Act after the last iteration before the quantize phase, so before any callback handles its first one.
-
-        After each iteration of the phase, keep scales from falling below the floor: Adam moves parameters with tiny
-        gradients as far as all others.
-        """
-        self._act_if_due(trainer, module, iteration)
-        if self.log_floor is not None and module.schedule.phase_at(iteration) is Phase.QUANTIZE:
-            raise_scales(module.splats, self.log_floor)
-
-    def _act_if_due(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
+        """Act after the last iteration before the quantize phase, so before any callback handles its first one."""
         first, quantized = module.schedule.first_of(Phase.QUANTIZE), {"scales", "quats"} & set(module.quantizers)
         if not quantized or first is None or iteration != first - 1:
             return
-        if self.floor and "scales" in quantized:
-            self._raise(trainer, module)
-        form = self._chosen(trainer, module) if self.mode == "auto" else self.mode
-        if form != "none":
-            self._apply(trainer, module, form)
-
-    def _chosen(self, trainer: Trainer, module: SplatModule) -> Form:
-        """The form with the smallest error over the finite splats; in a tie, the one that changes least."""
-        finite, _ = trainable_rows(module.splats)
-        scales, quats = module.splats.scales.detach()[finite], module.splats.quats.detach()[finite]
-        codes = {name: len(q.codebook) for name, q in module.quantizers.items() if name in ("scales", "quats")}
-        errors = form_errors(scales, quats, codes, derive_seed(module.seed, trainer.global_step, "canonical"))
-        log.info("covariance error by form: %s", ", ".join(f"{form} {error:.3g}" for form, error in errors.items()))
-        form: Form = trainer.strategy.broadcast(min(errors, key=errors.__getitem__))
-        return form
-
-    def _raise(self, trainer: Trainer, module: SplatModule) -> None:
-        self.log_floor = scale_floor(module.splats.means.detach(), train_cameras(trainer), self.floor)
-        if self.log_floor is None:
-            log.warning("iteration %d: no train view sees a splat; no scale is raised", trainer.global_step)
-            return
-        share = float((module.splats.scales < self.log_floor).float().mean())
-        raise_scales(module.splats, self.log_floor)
-        log.info(
-            "iteration %d: raised %.1f %% of all scales to %g pixels, %.3g scene units",
-            trainer.global_step,
-            100 * share,
-            self.floor,
-            math.exp(self.log_floor),
-        )
-
-    @torch.no_grad()
-    def _apply(self, trainer: Trainer, module: SplatModule, form: Form) -> None:
         optimizer, splats = raw_optimizer(trainer), module.splats
-        new = canonical(splats.scales.detach(), splats.quats.detach(), form)
+        new = canonical(splats.scales.detach(), splats.quats.detach(), "full")
         change_coordinates(splats, optimizer, "scales", new.scales, new.scale_maps)
         change_coordinates(splats, optimizer, "quats", new.quats, new.quat_maps)
-        log.info("iteration %d: canonical covariances, form %s", trainer.global_step, form)
+        log.info("iteration %d: canonical covariances", iteration)
 
 
 def perplexity(usage: Tensor) -> float:
@@ -176,33 +107,29 @@ class CodebookInit(SplatCallback):
 
     Args:
         weights: Weight of a splat in k-means: ``none`` weights all equally, as in the paper; ``contribution`` weights
-            each by its blending weight in the train views, so that codes go to visible splats.
-        weighted: The weighted attributes. Scales are left out: small splats contribute little, but a small splat with
-            the code of larger ones is visible. Weighting all four, right after k-means with 4k codes on 187 k splats,
-            changed test PSNR by -0.37 dB for scales, +0.07 for rotations, +0.04 for colours and +0.15 for SH.
+            each by its blending weight in the train views, so that codes go to visible splats. Scales stay
+            unweighted: small splats contribute little, but a small splat with the code of larger ones is visible.
+            Right after k-means with 4k codes on 187 k splats, weighting changed test PSNR by -0.37 dB for scales, +0.07
+            for rotations, +0.04 for colours and +0.15 for SH.
         values_per_splat: Largest K·D of a codebook for each splat; None has no limit. A value takes 4 to 5 bits in the
             file, so 1024 codes of 45 values for 36 000 splats take as much as they save.
 
     Raises:
-        ValueError: Unknown weights or an unknown attribute, or ``values_per_splat`` is not above 0.
+        ValueError: Unknown weights, or ``values_per_splat`` is not above 0.
 
     Example:
-        >>> from nsvq_lightning.callbacks import CodebookInit
-        >>> CodebookInit(weights="contribution").weighted  # --callbacks.codebook_init.weights=contribution
-        ('quats', 'sh0', 'shN')
-        >>> CodebookInit(weights="contribution", weighted=["means"])
-        Traceback (most recent call last):
-        ValueError: weighted must be among scales, quats, sh0, shN, got means
+        >>> from nsvq_lightning.callbacks import CodebookInit, standard
+        >>> callbacks = standard(codebook_init=CodebookInit(weights="none"))  # --callbacks.codebook_init.weights=none
+        >>> [callback.weights for callback in callbacks if isinstance(callback, CodebookInit)]
+        ['none']
     """
 
     weights: Literal["none", "contribution"] = "contribution"
-    weighted: Sequence[str] = ("quats", "sh0", "shN")
     values_per_splat: float | None = None
 
     def __post_init__(self) -> None:
         if self.weights not in ("none", "contribution"):
             raise ValueError(f"weights must be 'none' or 'contribution', got {self.weights!r}")
-        check_attributes("weighted", self.weighted)
         self.check({"above 0": ("values_per_splat",)})
 
     def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
@@ -216,7 +143,7 @@ class CodebookInit(SplatCallback):
                 if self.values_per_splat is not None and is_limitable(quantizer):
                     values = self.values_per_splat * len(module.splats)
                     quantizer.limit(max(1, int(values / quantizer.codebook.shape[1])))
-                weight = weights if name in self.weighted else None
+                weight = None if name == "scales" else weights
                 quantizer.fit(module.rows(name), weight, generator=generator(module.seed, iteration, "kmeans", name))
             if trainer.world_size > 1:  # a fit may leave fewer codes, so counters and all other buffers must follow
                 follow_first(trainer.strategy, cast(nn.Module, quantizer))
@@ -423,10 +350,9 @@ class RateDistortion(SplatCallback):
 
     Args:
         strength: Per cent of squared error worth one per cent of the file.
-        attributes: Those whose codes are chosen so; the others have their nearest codes.
 
     Raises:
-        ValueError: ``strength`` is negative or not finite, or an attribute is unknown.
+        ValueError: ``strength`` is not above 0 or not finite.
 
     Example:
         >>> from nsvq_lightning.callbacks import RateDistortion, standard
@@ -438,13 +364,11 @@ class RateDistortion(SplatCallback):
     state = ("prices",)
 
     strength: float = 2.0
-    attributes: Sequence[str] = tuple(QUANTIZED)
     prices: dict[str, Tensor] | None = field(default=None, init=False)
     """What a bit costs each splat ``[N]`` in squared error, by attribute."""
 
     def __post_init__(self) -> None:
         self.check({"above 0": ("strength",)})
-        check_attributes("attributes", self.attributes)
 
     def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Measure, and choose the codes of all splats, when the phase starts and after splats were dropped.
@@ -478,7 +402,7 @@ class RateDistortion(SplatCallback):
         scene = needed_scene(
             trainer, "codes are to be chosen by what shows in the train views", "leave RateDistortion out"
         )
-        taking_part = [name for name, q in module.quantizers.items() if name in self.attributes and is_holding(q)]
+        taking_part = [name for name, q in module.quantizers.items() if is_holding(q)]
         splats = module.hard_splats(Phase.QUANTIZE)
         shown = {name: torch.zeros_like(splats.opacities) for name in taking_part}
         error = torch.zeros((), dtype=torch.float64, device=module.device)

@@ -14,7 +14,7 @@ from .growth import BudgetedGrowth, SplatBudget
 from .outputs import ExportScene, LiveScene, RenderWriter
 from .precompile import CompileAhead
 from .progress import SplatProgressBar
-from .pruning import ContributionPruning, OpacityRegularization, OpacitySelection
+from .pruning import OpacityRegularization, OpacitySelection
 from .quantization import (
     CanonicalCovariance,
     CodebookInit,
@@ -37,7 +37,6 @@ STANDARD: dict[str, type[Callback]] = {
     "density": BudgetedGrowth,
     "selection": OpacitySelection,
     "opacity": OpacityRegularization,
-    "contribution": ContributionPruning,
     "canonical": CanonicalCovariance,
     "codebook_init": CodebookInit,
     "codebook_refit": CodebookRefit,
@@ -53,12 +52,10 @@ STANDARD: dict[str, type[Callback]] = {
     "kernels": CompileAhead,
     "progress": SplatProgressBar,
 }
-"""Callback by name. The order matters in three places: density control comes before the canonical form, which may act
-after the same iteration; the canonical form, whose floor raises scales, before the replacement of codes, which may copy
-them; contribution pruning before the report, whose figures are then those of the remaining splats.
+"""Callback by name. Density control comes before the canonical form, which may act after the same iteration.
 """
 
-OPTIONAL = frozenset({"opacity", "contribution", "codebook_refit", "rate_distortion"})
+OPTIONAL = frozenset({"opacity", "codebook_refit", "rate_distortion"})
 """Those that a run has only if a config or the user asks for them."""
 
 

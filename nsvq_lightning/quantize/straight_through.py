@@ -84,7 +84,7 @@ class PostHoc(CodebookQuantizer):
     all with equal weight. Once codes are frozen, codebook and codes are those of that moment, as with every other
     quantizer.
 
-    Leave the fine-tune phase out (``phases.quantize_end`` at the end of the run): it would train the codebooks after all.
+    Leave the fine-tune phase out (``phases.quantize_end`` at the end of the run): it would train the codebooks.
 
     Args:
         num_codes: Codes K, at least 1.
