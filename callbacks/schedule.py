@@ -151,7 +151,7 @@ def _limit_steps(trainer: Trainer, per_photo: int) -> None:
 
 @settings
 class ShDegreeSchedule(SplatCallback):
-    """Starts with SH degree 0 and adds a degree every ``every`` iterations, up to that of the splats.
+    """Starts with SH degree 0 and adds one at intervals, up to the degree of the splats.
 
     Args:
         every: Iterations of the reference run between two degrees (1000 in the paper).

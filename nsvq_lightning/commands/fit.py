@@ -55,6 +55,9 @@ TRAINER_DEFAULTS: dict[str, Any] = {
     "default_root_dir": "runs",
 }
 
+TRAINER_OPTIONS = ("run_folder", "allow_other_scene", "max_steps", "accelerator", "devices", "logger", "callbacks")
+"""Options of the trainer that the help explains."""
+
 CLASSES = (*callbacks.__all__, *quantize.__all__, "ColmapDataModule", "DemoDataModule")
 """Names that options take as they are: short class names resolve to what is imported."""
 
@@ -76,8 +79,7 @@ class QuietParser(LightningArgumentParser):
         subcommand = self.prog.rpartition(" ")[2]
         if subcommand not in COMMANDS:
             return super().format_help(*args)
-        data = {} if subcommand == "export" else {"data": ColmapDataModule}
-        return command_help(self, subcommand, data | {f"callbacks.{key}": kind for key, kind in STANDARD.items()})
+        return command_help(self, subcommand, None if subcommand == "export" else ColmapDataModule, TRAINER_OPTIONS)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Write the message to stderr and exit with status 2."""

@@ -11,11 +11,12 @@ import re
 import shutil
 import textwrap
 from argparse import SUPPRESS, ArgumentParser
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any, NamedTuple
 
 import docstring_parser
+from jsonargparse import Namespace
 
 from nsvq_lightning.commands.arguments import SHORTHANDS
 
@@ -33,33 +34,39 @@ class Option(NamedTuple):
     text: str
 
 
-def command_help(parser: ArgumentParser, command: str, classes: Mapping[str, type]) -> str:
+def command_help(parser: ArgumentParser, command: str, data: type | None, own_trainer: Collection[str]) -> str:
     """Help text of a command.
 
     Args:
         parser: Its parser, with options named ``group.name``.
         command: Its name.
-        classes: Classes, by prefix, whose constructor arguments are also options.
+        data: Class whose constructor arguments are also options, ``data.…``, if it reads photos.
+        own_trainer: Options of the trainer that are explained; the others are Lightning's, and are listed.
     """
-    groups: dict[str, list[Option]] = {"run": [], "model": [], "skips": [], "trainer": []}
+    groups: dict[str, list[Option]] = {"run": [], "callbacks": [], "model": [], "skips": [], "trainer": []}
+    defaults = parser.get_defaults()  # type: ignore[attr-defined]  # jsonargparse's, with those of the default config
     for action in parser._actions:
         name = (action.option_strings or [""])[-1].lstrip("-").removesuffix("+")
         group = name.partition(".")[0] if "." in name else "run"
         if name and group in groups and name not in groups and not name.endswith((".help", "model.splats")):
-            default = inspect.Parameter.empty if action.default == SUPPRESS else action.default
+            default = inspect.Parameter.empty if action.default == SUPPRESS else defaults.get(action.dest)
             groups[group].append(Option(name, default, first_sentence(action.help)))
     budget = [Option(name, inspect.Parameter.empty, text) for name, text in SHORTHANDS.items()]
+    explained = [option for option in groups["trainer"] if option.name.removeprefix("trainer.") in own_trainer]
+    others = " ".join(f"--{each.name}{_default(each.default)}" for each in groups["trainer"] if each not in explained)
     return "\n".join(
         [
             f"usage: nsvq {command} [--config NAME] [--OPTION=VALUE ...]\n\n{parser.description}\n",
             _section("run", groups["run"]),
             *([_section("budget", budget)] if command == "fit" else []),
-            *(class_help(prefix, kind) for prefix, kind in classes.items()),
+            *([class_help("data", data)] if data is not None else []),
+            _section("callbacks", groups["callbacks"], "Their options: --callbacks.density.help; null leaves one out."),
             _section("model", groups["model"]),
             _section("skips", groups["skips"]),
-            _section("trainer", groups["trainer"]),
-            "--model.quantizer.help=CLASS lists the options of a quantizer; another class for a callback is\n"
-            "--callbacks.density=my_package.Class, and null leaves one out.\n",
+            _section("trainer", explained),
+            *_wrapped(f"Lightning's own: {others}", "  "),
+            "\n--model.quantizer.help=CLASS lists the options of a quantizer; another class for a callback is\n"
+            "--callbacks.density=my_package.Class.\n",
         ]
     )
 
@@ -122,6 +129,8 @@ def _default(value: Any) -> str:
         return f"={'null' if value is None else str(value).lower()}"
     if isinstance(value, type):
         return f"={value.__name__}"
+    if isinstance(value, Namespace) and "class_path" in value:
+        return f"={value.class_path.rpartition('.')[2]}"
     if isinstance(value, tuple | list):
         return f"=[{','.join(map(str, value))}]"
     return f"={value}" if isinstance(value, int | float | str) else ""
