@@ -103,12 +103,20 @@ class Densification(SplatCallback, ABC):
                 ones matter.
         """
         super().on_train_start(trainer, module)
-        limit = self.limit(module)
+        limit, count = self.limit(module), len(module.splats)
         if limit is None:
             return
         if module.device.type == "cpu" and trainer.is_global_zero:
             say_footprint(trainer, limit)
-        self._keep_at_most(trainer, module, limit)
+        if count > limit and module.phase > Phase.PRUNE:
+            log.warning(
+                "%s=%d comes too late for %d splats with codebooks; all are kept", self.limit_name, limit, count
+            )
+        elif count > limit:
+            kept = most_contributing(train_contributions(trainer, module), limit)
+            keep_rows(module.splats, raw_optimizer(trainer), kept)
+            check_replicas(trainer, "the limit of splats")
+            log.info("kept %d of %d splats, those that contribute most to the train views", limit, count)
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Ask for what the statistics need while they are needed."""
@@ -128,21 +136,6 @@ class Densification(SplatCallback, ABC):
         if finite_search_is_due(trainer, self.finite_every):
             keep_finite_splats(trainer, module)
         self.act(trainer, module, iteration)
-
-    def _keep_at_most(self, trainer: Trainer, module: SplatModule, limit: int) -> None:
-        """Remove splats if there are more than ``limit``: those that contribute least to the train views."""
-        count = len(module.splats)
-        if count <= limit:
-            return
-        if module.phase > Phase.PRUNE:
-            log.warning(
-                "%s=%d comes too late for %d splats with codebooks; all are kept", self.limit_name, limit, count
-            )
-            return
-        kept = most_contributing(train_contributions(trainer, module), limit)
-        keep_rows(module.splats, raw_optimizer(trainer), kept)
-        check_replicas(trainer, "the limit of splats")
-        log.info("kept %d of %d splats, those that contribute most to the train views", limit, count)
 
     @torch.no_grad()
     def prune(self, trainer: Trainer, module: SplatModule, mask: Tensor) -> int:

@@ -69,7 +69,8 @@ class SplatProgressBar(TQDMProgressBar):
         """Find out whether the output shows bars; write only a few lines to a file."""
         super().setup(trainer, module, stage)
         self._psnr = None
-        self._is_plain = not _shows_bars()
+        # A terminal or a notebook can draw a line again.
+        self._is_plain = not (sys.stdout.isatty() or "ipykernel" in sys.modules)
         if stage == "fit" and self._is_plain and self._refresh_rate > 0:
             self._refresh_rate = max(self._refresh_rate, trainer.max_steps // LINES)
 
@@ -95,8 +96,12 @@ class SplatProgressBar(TQDMProgressBar):
             return
         text = self._text(trainer, module)
         if self._is_plain:
-            sys.stdout.write(f"{self._line(trainer)}: {text}\n")
-            sys.stdout.flush()
+            total = trainer.max_steps
+            seconds = time.time() - self._start_without_compilation()
+            left = seconds * (total - done) / max(1.0, done - self.train_progress_bar.initial)
+            elapsed, remaining = Tqdm.format_interval(seconds), Tqdm.format_interval(left)
+            progress = f"iteration {done} of {total} ({100 * done // total} %), {elapsed} elapsed, {remaining} left"
+            print(f"{progress}: {text}", flush=True)
             return
         bar = self.train_progress_bar
         bar.start_t = self._start_without_compilation()
@@ -123,14 +128,6 @@ class SplatProgressBar(TQDMProgressBar):
         bar.set_description_str("", refresh=False)
         return bar
 
-    def _line(self, trainer: Trainer) -> str:
-        step, total = trainer.global_step, trainer.max_steps
-        seconds = time.time() - self._start_without_compilation()
-        done = self.train_progress_bar.initial
-        left = seconds * (total - step) / max(1.0, step - done)
-        elapsed, remaining = Tqdm.format_interval(seconds), Tqdm.format_interval(left)
-        return f"iteration {step} of {total} ({100 * step // total} %), {elapsed} elapsed, {remaining} left"
-
     def _start_without_compilation(self) -> float:
         return self._started + compile_seconds() - self._compiled_before
 
@@ -149,11 +146,6 @@ class SplatProgressBar(TQDMProgressBar):
         bar = self._train_progress_bar
         if bar is not None and not bar.disable:
             bar.set_postfix_str(line)  # the next refresh removes it
-
-
-def _shows_bars() -> bool:
-    """Whether the output is a terminal or a notebook, where a line can be drawn again."""
-    return sys.stdout.isatty() or "ipykernel" in sys.modules
 
 
 def _rounded(count: int) -> str:

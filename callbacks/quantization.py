@@ -474,12 +474,8 @@ class FiniteCodes(SplatCallback):
                 raise FloatingPointError(f"{found}; lower the learning rates")
             quantizer.mend(broken, module.rows(name), generator(module.seed, iteration, "mend", name))
             reset_moments(raw_optimizer(trainer), codebook_group(name), broken)
-            log.warning("%s (%s); mended", found, _numbers(broken.tolist()))
-
-
-def _numbers(rows: list[int]) -> str:
-    shown = ", ".join(map(str, rows[:5]))
-    return f"rows {shown}{', …' * (len(rows) > 5)}"
+            rows = ", ".join(map(str, broken[:5].tolist())) + ", …" * (len(broken) > 5)
+            log.warning("%s (rows %s); mended", found, rows)
 
 
 @settings
@@ -522,7 +518,15 @@ class FreezeCodes(SplatCallback):
         if iteration == first and self._first_time("before", iteration):
             self._freeze(trainer, module, module.quantizers)
         elif stale := self._stale(module):
-            self._warn(iteration, stale)
+            if not self._warned:
+                self._warned = True
+                log.warning(
+                    "iteration %d: another callback has removed or added splats after codes were frozen; the nearest "
+                    "codes of %s are searched again after every such edit. Let that callback act before the fine-tune "
+                    "phase",
+                    iteration,
+                    ", ".join(stale),
+                )
             self._freeze(trainer, module, stale)
         self._edits = module.splats.edits
         self._codes = {name: quantizer.codes for name, quantizer in module.quantizers.items()}
@@ -533,16 +537,6 @@ class FreezeCodes(SplatCallback):
         frozen = {name: q.codes for name, q in module.quantizers.items() if len(q.codes) > 0}
         before = self._codes or {}
         return [name for name, codes in frozen.items() if len(codes) != count or (edited and codes is before[name])]
-
-    def _warn(self, iteration: int, stale: list[str]) -> None:
-        if not self._warned:
-            self._warned = True
-            log.warning(
-                "iteration %d: another callback has removed or added splats after codes were frozen; the nearest codes "
-                "of %s are searched again after every such edit. Let that callback act before the fine-tune phase",
-                iteration,
-                ", ".join(stale),
-            )
 
     def _freeze(self, trainer: Trainer, module: SplatModule, names: Iterable[str]) -> None:
         keep_finite_splats(trainer, module)

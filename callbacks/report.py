@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -228,7 +229,9 @@ class MetricReport(WritingCallback):
         if self._scene is None:
             return
         image, photo = outputs["image"], eight_bit(batch.image)
-        lpips = self._lpips_of(image, photo)
+        lpips = None
+        if self._lpips is not None:
+            lpips = float(self._lpips(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]))
         corrected = kept(eight_bit(color_corrected(image, photo, batch.mask)), batch.mask)
         corrected_scores = float(psnr(corrected, photo, batch.mask)), float(ssim(corrected, photo, batch.mask))
         scores = float(outputs["psnr"]), float(outputs["ssim"])
@@ -243,11 +246,6 @@ class MetricReport(WritingCallback):
         scene = scene_of(trainer)
         return self._folder / "renders" / f"{file_stem(view, scene.names if scene is not None else ())}.png"
 
-    def _lpips_of(self, image: Tensor, photo: Tensor) -> float | None:
-        if self._lpips is None:
-            return None
-        return float(self._lpips(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]))
-
     def on_test_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Write the figures."""
         if self._scene is None:
@@ -255,7 +253,9 @@ class MetricReport(WritingCallback):
         scores = _gathered(trainer, self._scores)
         if trainer.is_global_zero and scores:
             folder = self._folder
-            lpips = (None, self._lpips_reason) if self._lpips is None else (_mean(scores, "lpips"), None)
+            lpips = (None, self._lpips_reason)
+            if self._lpips is not None:
+                lpips = fmean(score.lpips for score in scores if score.lpips is not None), None
             metrics = summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper_level)
             write_metrics(folder / "metrics.json", metrics)
             write_views(folder / "views.csv", scores)
@@ -270,11 +270,6 @@ class MetricReport(WritingCallback):
 def _preview(path: Path, image: Tensor, photo: Tensor) -> None:
     """Write the photo beside the render."""
     write_png(path, torch.cat([eight_bit(photo), image], dim=1))
-
-
-def _mean(scores: list[ViewScore], name: str) -> float:
-    values = [getattr(score, name) for score in scores]
-    return float(sum(values) / len(values))
 
 
 def _gathered(trainer: Trainer, scores: list[ViewScore]) -> list[ViewScore]:

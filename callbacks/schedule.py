@@ -89,7 +89,12 @@ class PhaseSchedule(SplatCallback):
         if stage != "fit":
             return
         if self.iterations_per_photo is not None and self.total is None:
-            _limit_steps(trainer, self.iterations_per_photo)
+            need = "a number of iterations for each photo needs the photos"
+            photos = len(needed_scene(trainer, need, "leave iterations_per_photo unset").train)
+            limit = self.iterations_per_photo * photos
+            if not 0 < trainer.max_steps <= limit:
+                trainer.fit_loop.epoch_loop.max_steps = limit
+                log.info("iterations: %d, %d for each of %d photos", limit, self.iterations_per_photo, photos)
         self._steps = trainer.max_steps
         total = self.total if self.total is not None else trainer.max_steps
         if total < 1:
@@ -136,17 +141,6 @@ class PhaseSchedule(SplatCallback):
         if self._steps > 0:
             trainer.fit_loop.epoch_loop.max_steps = self._steps - module.schedule.saved
         module.phase = module.schedule.phase_at(next_iteration(trainer))
-
-
-def _limit_steps(trainer: Trainer, per_photo: int) -> None:
-    """End the run after ``per_photo`` iterations for each train photo, if it would be longer."""
-    scene = needed_scene(
-        trainer, "a number of iterations for each photo needs the photos", "leave iterations_per_photo unset"
-    )
-    limit = per_photo * len(scene.train)
-    if not 0 < trainer.max_steps <= limit:
-        trainer.fit_loop.epoch_loop.max_steps = limit
-        log.info("iterations: %d, %d for each of %d photos", limit, per_photo, len(scene.train))
 
 
 @settings
