@@ -253,7 +253,7 @@ class MetricReport(WritingCallback):
         scores = _gathered(trainer, self._scores)
         if trainer.is_global_zero and scores:
             folder = self._folder
-            lpips = (None, self._lpips_reason)
+            lpips: tuple[float | None, str | None] = (None, self._lpips_reason)
             if self._lpips is not None:
                 lpips = fmean(score.lpips for score in scores if score.lpips is not None), None
             metrics = summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper_level)
