@@ -83,22 +83,8 @@ def test_what_a_reader_has_to_hold_stays_small() -> None:
 
 
 def test_the_measures_count_what_they_say() -> None:
-    source = "\n".join(
-        [
-            '"""About."""',
-            "",
-            "from a import b",
-            "",
-            "X = 1",
-            '"""Text."""',
-            "",
-            "def f() -> None:",
-            "    # nothing",
-            "    _g()",
-            "",
-        ]
-        + ["def _g() -> None:", '    """Text."""', ""]
-    )
+    lines = ['"""About."""', "", "from a import b", "", "X = 1", '"""Text."""', "", "def f() -> None:", "    # nothing"]
+    source = "\n".join([*lines, "    _g()", "", "def _g() -> None:", '    """Text."""', ""])
     assert code_lines(source) == 5
     assert lines_before_the_first_definition(source) == 7
     assert private_functions_used_once(source) == 1
