@@ -143,12 +143,9 @@ class Densification(SplatCallback, ABC):
         count = int(mask.sum())
         if len(module.splats) - count < self.min_splats:
             log.warning(
-                "iteration %d: pruning %d of %d splats would leave fewer than min_splats=%d; skipped. Opacities or "
-                "scales have collapsed: lower the learning rates, or check the camera poses",
-                trainer.global_step,
-                count,
-                len(module.splats),
-                self.min_splats,
+                f"iteration {trainer.global_step}: pruning {count} of {len(module.splats)} splats would leave fewer "
+                f"than min_splats={self.min_splats}; skipped. Opacities or scales have collapsed: lower the learning "
+                "rates, or check the camera poses"
             )
             return 0
         keep_rows(module.splats, raw_optimizer(trainer), ~mask)
@@ -172,13 +169,9 @@ class Densification(SplatCallback, ABC):
         if not self._warned:
             self._warned = True
             log.warning(
-                "iteration %d: another callback has removed or added splats (%d were rendered, now %d) before density "
-                "control took the statistics of the view; such views are left out from now on. List that callback "
-                "after %s to count all views",
-                trainer.global_step,
-                len(render.radii),
-                len(splats),
-                type(self).__name__,
+                f"iteration {trainer.global_step}: another callback has removed or added splats ({len(render.radii)} "
+                f"were rendered, now {len(splats)}) before density control took the statistics of the view; such views "
+                f"are left out from now on. List that callback after {type(self).__name__} to count all views"
             )
         return None
 

@@ -343,11 +343,8 @@ class BudgetedGrowth(Densification):
             if self.idle >= self.patience > 0:
                 module.schedule = replace(schedule, saved=schedule.saved + last - iteration)
                 log.info(
-                    "iteration %d: growth ends with %d splats, as hardly any needs to be split; the run will be %d "
-                    "iterations shorter",
-                    iteration,
-                    len(module.splats),
-                    last - iteration,
+                    f"iteration {iteration}: growth ends with {len(module.splats)} splats, as hardly any needs to be "
+                    f"split; the run will be {last - iteration} iterations shorter"
                 )
         resets = schedule.reset_times(self.reset_last, self.reset_every)
         if iteration in resets:

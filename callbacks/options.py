@@ -115,9 +115,8 @@ class ExposureCompensation(SplatCallback):
         if len(gains):
             low, high = gains.log2().aminmax()
             log.info(
-                "exposures of the train photos: %+.2f to %+.2f stops",
-                low - gains.log2().mean(),
-                high - gains.log2().mean(),
+                f"exposures of the train photos: {low - gains.log2().mean():+.2f} to {high - gains.log2().mean():+.2f} "
+                "stops"
             )
 
     def on_exception(self, trainer: Trainer, module: SplatModule, exception: BaseException) -> None:

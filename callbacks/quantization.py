@@ -521,11 +521,9 @@ class FreezeCodes(SplatCallback):
             if not self._warned:
                 self._warned = True
                 log.warning(
-                    "iteration %d: another callback has removed or added splats after codes were frozen; the nearest "
-                    "codes of %s are searched again after every such edit. Let that callback act before the fine-tune "
-                    "phase",
-                    iteration,
-                    ", ".join(stale),
+                    f"iteration {iteration}: another callback has removed or added splats after codes were frozen; the "
+                    f"nearest codes of {', '.join(stale)} are searched again after every such edit. Let that callback "
+                    "act before the fine-tune phase"
                 )
             self._freeze(trainer, module, stale)
         self._edits = module.splats.edits

@@ -105,11 +105,9 @@ class PhaseSchedule(SplatCallback):
         module.schedule = self.schedule(total)
         if 0 < trainer.max_steps < total:
             log.warning(
-                "trainer.max_steps=%d ends this run in its %s phase, the schedule has %d: the scene will not "
-                "be fine-tuned to its codebooks; leave PhaseSchedule.total unset to scale the phases",
-                trainer.max_steps,
-                module.schedule.phase_at(trainer.max_steps).name.lower(),
-                total,
+                f"trainer.max_steps={trainer.max_steps} ends this run in its "
+                f"{module.schedule.phase_at(trainer.max_steps).name.lower()} phase, the schedule has {total}: the "
+                "scene will not be fine-tuned to its codebooks; leave PhaseSchedule.total unset to scale the phases"
             )
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:

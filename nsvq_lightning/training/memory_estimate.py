@@ -49,10 +49,8 @@ def say_footprint(trainer: Trainer, splats: int) -> None:
         log.info(said)
     else:
         log.warning(
-            "%s, but only %s are available: ask for fewer (--quality, --splats), or lower --data.max_width or "
-            "--data.cache_bytes",
-            said,
-            readable_bytes(free + own),
+            f"{said}, but only {readable_bytes(free + own)} are available: ask for fewer (--quality, --splats), or "
+            "lower --data.max_width or --data.cache_bytes"
         )
 
 
