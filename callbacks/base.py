@@ -1,12 +1,9 @@
 """What callbacks share: the check of the module, acting once per step, the folder of the run, the search for NaN."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, dataclass_transform, get_type_hints
+from typing import Any, ClassVar
 
 from lightning.pytorch import Callback, Trainer
 
@@ -17,18 +14,7 @@ from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.run_folder import hold, is_trial, let_go, run_folder, take
 from nsvq_lightning.training.schedule import next_iteration
 
-__all__ = ["SplatCallback", "WritingCallback", "finite_search_is_due", "keep_finite_splats", "settings"]
-
-
-T = TypeVar("T")
-
-
-@dataclass_transform(eq_default=False, field_specifiers=(field,))
-def settings(kind: type[T]) -> type[T]:
-    """Make a callback a dataclass whose fields are its settings, with types that the command line can read."""
-    made = dataclass(eq=False)(kind)
-    made.__init__.__annotations__ = get_type_hints(made.__init__)
-    return made
+__all__ = ["SplatCallback", "WritingCallback", "finite_search_is_due", "keep_finite_splats"]
 
 
 BOUNDS: dict[str, Callable[[float], bool]] = {
@@ -50,8 +36,8 @@ class SplatCallback(Callback):
     accumulation Lightning calls the hooks that they come from for every view of the iteration. A subclass that
     overrides a hook of this class calls it here first.
 
-    The fields of a callback are its settings (:func:`settings`). Those named in :attr:`state` are what it has reached;
-    they have ``init=False``.
+    A callback is a dataclass whose fields are its settings; those named in :attr:`state` are what it has reached and have
+    ``init=False``.
     """
 
     state: ClassVar[tuple[str, ...]] = ()

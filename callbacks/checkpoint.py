@@ -1,12 +1,10 @@
 """Checkpoints of a run: after a complete iteration, when a signal asks for a stop, and after an exception."""
 
-from __future__ import annotations
-
 import logging
 import signal
 import threading
 from collections.abc import Iterator
-from dataclasses import field, is_dataclass
+from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
@@ -26,7 +24,7 @@ from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.run_folder import is_trial, run_folder
 from nsvq_lightning.training.schedule import Phase, Schedule
 
-from .base import WritingCallback, settings
+from .base import WritingCallback
 
 __all__ = ["GracefulStop", "RunCheckpoint", "StepSnapshot"]
 
@@ -208,7 +206,7 @@ def _places(loop: object) -> Iterator[dict[str, Any]]:
             yield from _places(value)
 
 
-@settings
+@dataclass(eq=False)
 class RunCheckpoint(WritingCallback, Checkpoint):
     """Saves the whole state of the run in ``checkpoints/last.ckpt``: regularly, at ends of phases, and when it stops.
 

@@ -1,11 +1,10 @@
 """Adaptive density control of the warm-up and prune phases (Kerbl et al. 2023, section 5), and the base of its kind."""
 
-from __future__ import annotations
-
 import logging
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -28,7 +27,7 @@ from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.scene_access import train_contributions
 from nsvq_lightning.training.schedule import Phase, next_iteration
 
-from .base import SplatCallback, finite_search_is_due, keep_finite_splats, settings
+from .base import SplatCallback, finite_search_is_due, keep_finite_splats
 
 __all__ = ["Densification", "DensityControl", "add_view", "limit_growth", "split"]
 
@@ -195,7 +194,7 @@ GRADIENTS, VIEWS = "gradient_sum", "view_count"
 """Side tables of the splats: sum of the screen-space gradient norms, and number of views that saw the splat."""
 
 
-@settings
+@dataclass(eq=False)
 class DensityControl(Densification):
     """Clones, splits and prunes splats (Kerbl et al. 2023, section 5), and drops those that become NaN or infinite.
 

@@ -1,11 +1,9 @@
 """Density control with a budget: how many splats there are to be, and splits where the photos have edges."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import torch
@@ -27,7 +25,7 @@ from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.scene_access import needed_scene
 from nsvq_lightning.training.schedule import Phase
 
-from .base import SplatCallback, settings
+from .base import SplatCallback
 from .density import Densification
 from .quantization import RateDistortion
 
@@ -45,7 +43,7 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 
-@settings
+@dataclass(eq=False)
 class SplatBudget(SplatCallback):
     """Decides how many splats the scene is to have, and says why.
 
@@ -203,7 +201,7 @@ IDLE = 0.01
 """Growth is idle if it adds at most this share of what it may add, or of what there is."""
 
 
-@settings
+@dataclass(eq=False)
 class BudgetedGrowth(Densification):
     """Splits splats where the photos have edges, up to a budget: fewer splats for the same quality.
 

@@ -1,10 +1,8 @@
 """Options beyond the recipe: exposures of photos, and the 3D limit of anti-aliasing."""
 
-from __future__ import annotations
-
 import logging
 import math
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -20,7 +18,7 @@ from nsvq_lightning.training.module import LossTerm, SplatModule
 from nsvq_lightning.training.scene_access import needed_scene, train_cameras
 from nsvq_lightning.training.schedule import Phase, next_iteration
 
-from .base import SplatCallback, settings
+from .base import SplatCallback
 
 __all__ = ["ExposureCompensation", "FrequencyLimit"]
 
@@ -28,7 +26,7 @@ __all__ = ["ExposureCompensation", "FrequencyLimit"]
 log = logging.getLogger(__name__)
 
 
-@settings
+@dataclass(eq=False)
 class ExposureCompensation(SplatCallback):
     """Gives each train photo an affine map of colours, which is applied to its rendered picture before the loss.
 
@@ -147,7 +145,7 @@ NO_LIMIT = 1e-30
 """Size for splats that no photo sees."""
 
 
-@settings
+@dataclass(eq=False)
 class FrequencyLimit(SplatCallback):
     """Until the quantize phase, keeps scales at or above a share of a pixel in the photo that sees the splat closest.
 

@@ -1,10 +1,9 @@
 """What a run writes besides its report: scene files, predicted pictures, and the scene to look at while it trains."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_trial, run_folder
 from nsvq_lightning.training.scene_access import scene_of
 
-from .base import WritingCallback, settings
+from .base import WritingCallback
 
 __all__ = ["ExportScene", "LiveScene", "RenderWriter"]
 
@@ -36,7 +35,7 @@ EXPORT_FORMATS = tuple(suffix.removeprefix(".") for suffix in FORMATS)
 """Formats that can be written."""
 
 
-@settings
+@dataclass(eq=False)
 class ExportScene(WritingCallback):
     """Writes the scene when training ends.
 

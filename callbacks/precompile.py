@@ -1,7 +1,5 @@
 """Compile the kernels of the later phases while the first ones compile and train."""
 
-from __future__ import annotations
-
 import logging
 import os
 import subprocess

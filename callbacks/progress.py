@@ -1,7 +1,5 @@
 """The progress of a whole run: a bar on a terminal, plain lines in a file."""
 
-from __future__ import annotations
-
 import sys
 import time
 from contextlib import ExitStack

@@ -1,9 +1,7 @@
 """What removes splats in the prune phase: the penalty on opacities, and their selection."""
 
-from __future__ import annotations
-
 import logging
-from dataclasses import field
+from dataclasses import dataclass, field
 
 import torch
 from lightning.pytorch import Trainer
@@ -18,13 +16,13 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.schedule import Phase, next_iteration
 
-from .base import SplatCallback, settings
+from .base import SplatCallback
 from .growth import draw_rows
 
 __all__ = ["OpacityRegularization", "OpacitySelection", "pressure"]
 
 
-@settings
+@dataclass(eq=False)
 class OpacityRegularization(SplatCallback):
     """Adds λ · Σ opacity to the loss during the prune phase, so that unneeded splats fade and are pruned.
 
@@ -71,7 +69,7 @@ START_OF_LINE = 0.8
 """Where the line starts, as a share of the opacity of the last splat within the budget."""
 
 
-@settings
+@dataclass(eq=False)
 class OpacitySelection(SplatCallback):
     """Removes splats in the prune phase until a budget is left: those that do not hold their opacity under pressure.
 

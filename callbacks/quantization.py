@@ -1,10 +1,8 @@
 """What the quantize and fine-tune phases do to codebooks and codes: place, refit, replace, mend, freeze."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Any, Literal, cast
 
 import torch
@@ -37,7 +35,7 @@ from nsvq_lightning.training.optim import codebook_group, raw_optimizer
 from nsvq_lightning.training.scene_access import needed_scene, train_contributions
 from nsvq_lightning.training.schedule import Phase, next_iteration
 
-from .base import SplatCallback, finite_search_is_due, keep_finite_splats, settings
+from .base import SplatCallback, finite_search_is_due, keep_finite_splats
 
 __all__ = [
     "CanonicalCovariance",
@@ -54,7 +52,7 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 
-@settings
+@dataclass(eq=False)
 class CanonicalCovariance(SplatCallback):
     """After the last iteration before the quantize phase, gives like covariances like scales and rotations.
 
@@ -99,7 +97,7 @@ def perplexity(usage: Tensor) -> float:
     return float(entropy.exp()) if bool(usage.any()) else 0.0
 
 
-@settings
+@dataclass(eq=False)
 class CodebookInit(SplatCallback):
     """At the first iteration of the quantize phase, fit every codebook to the rows of all splats (k-means).
 
@@ -152,7 +150,7 @@ class CodebookInit(SplatCallback):
             log.info("iteration %d: codebooks for %d splats: %s", iteration, len(module.splats), sizes)
 
 
-@settings
+@dataclass(eq=False)
 class CodebookReplacement(SplatCallback):
     """Replaces inactive codes with copies of active ones, at first often, then less often (paper, section 3.2).
 
@@ -262,7 +260,7 @@ def _forget_usage(module: SplatModule) -> None:
         quantizer.window.zero_()
 
 
-@settings
+@dataclass(eq=False)
 class CodebookRefit(SplatCallback):
     """Refits codebooks to the rows of all splats in the quantize phase, as CompGS does (Navaneet et al. 2024).
 
@@ -336,7 +334,7 @@ LEAST = 0.05
 """Share of the mean that no splat's sensitivity is below: a test view may see what no train view sees."""
 
 
-@settings
+@dataclass(eq=False)
 class RateDistortion(SplatCallback):
     """In the quantize phase, gives every splat the code with the least error + λ · bits instead of the nearest one.
 
@@ -428,7 +426,7 @@ class RateDistortion(SplatCallback):
             cast(Holding, quantizer).hold(codes)
 
 
-@settings
+@dataclass(eq=False)
 class FiniteCodes(SplatCallback):
     """Searches codebooks for NaN and infinite values, from the quantize phase on, and mends such codes with a warning.
 
@@ -478,7 +476,7 @@ class FiniteCodes(SplatCallback):
             log.warning("%s (rows %s); mended", found, rows)
 
 
-@settings
+@dataclass(eq=False)
 class FreezeCodes(SplatCallback):
     """At the first iteration of fine-tuning, freezes the code of every splat: the one it holds, or else the nearest.
 

@@ -1,12 +1,10 @@
 """Measure the run: curves while it trains, and the quality of the decoded file at the end."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -36,7 +34,7 @@ from nsvq_lightning.training.run_folder import is_trial, run_folder
 from nsvq_lightning.training.scene_access import scene_of
 from nsvq_lightning.training.schedule import next_iteration
 
-from .base import WritingCallback, settings
+from .base import WritingCallback
 
 __all__ = ["MetricReport", "notify_monitors"]
 
@@ -57,7 +55,7 @@ def notify_monitors(trainer: Trainer, module: SplatModule) -> None:
 log = logging.getLogger(__name__)
 
 
-@settings
+@dataclass(eq=False)
 class MetricReport(WritingCallback):
     """Writes the results of a run to its folder.
 

@@ -1,9 +1,7 @@
 """What follows the iteration alone: the phase, the degree of the spherical harmonics, falling learning rates."""
 
-from __future__ import annotations
-
 import logging
-from dataclasses import field, fields
+from dataclasses import dataclass, field, fields
 
 from lightning.pytorch import Trainer
 
@@ -13,7 +11,7 @@ from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.scene_access import needed_scene
 from nsvq_lightning.training.schedule import Phase, Schedule, next_iteration
 
-from .base import SplatCallback, settings
+from .base import SplatCallback
 
 __all__ = ["LearningRateDecay", "PhaseSchedule", "ShDegreeSchedule"]
 
@@ -21,7 +19,7 @@ __all__ = ["LearningRateDecay", "PhaseSchedule", "ShDegreeSchedule"]
 log = logging.getLogger(__name__)
 
 
-@settings
+@dataclass(eq=False)
 class PhaseSchedule(SplatCallback):
     """Gives the module its schedule, and the phase of each iteration.
 
@@ -141,7 +139,7 @@ class PhaseSchedule(SplatCallback):
         module.phase = module.schedule.phase_at(next_iteration(trainer))
 
 
-@settings
+@dataclass(eq=False)
 class ShDegreeSchedule(SplatCallback):
     """Starts with SH degree 0 and adds one at intervals, up to the degree of the splats.
 
@@ -171,7 +169,7 @@ class ShDegreeSchedule(SplatCallback):
         module.active_sh_degree = max(degree, module.active_sh_degree)
 
 
-@settings
+@dataclass(eq=False)
 class LearningRateDecay(SplatCallback):
     """Lets all learning rates but that of the positions, which have their own, fall in the last iterations of a run.
 

@@ -1,7 +1,5 @@
 """The callbacks of ``nsvq fit``, one of each, in order."""
 
-from __future__ import annotations
-
 from importlib import import_module
 
 from lightning.pytorch import Callback, LightningModule, Trainer

@@ -1,7 +1,5 @@
 """Training on several devices: one view each, equal replicas, and what they exchange."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager

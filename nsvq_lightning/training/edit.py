@@ -5,8 +5,6 @@ new ``nn.Parameter`` objects are bound in the module, in their parameter group (
 the optimiser. The step count of Adam belongs to the parameter, not to a row, and is kept.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping
 

@@ -1,7 +1,5 @@
 """How a viewer asks a running fit for its splats: by two files in the folder of the run."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from nsvq_lightning.io.atomic import write_text

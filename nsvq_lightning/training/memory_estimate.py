@@ -1,7 +1,5 @@
 """The memory that a run takes, before it takes it."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 

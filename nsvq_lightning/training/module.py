@@ -1,7 +1,5 @@
 """The Lightning module: one step of training; what happens at certain steps is left to callbacks."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable, Mapping

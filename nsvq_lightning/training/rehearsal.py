@@ -4,8 +4,6 @@
 :func:`settings_of` wrote them, and leaves nothing behind but compiled kernels on the disk.
 """
 
-from __future__ import annotations
-
 import os
 import pickle
 import sys

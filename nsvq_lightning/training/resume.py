@@ -1,7 +1,5 @@
 """Checkpoints that continue a run, or branch from it: read, checked, and never trusted to import anything."""
 
-from __future__ import annotations
-
 import logging
 import os
 import re

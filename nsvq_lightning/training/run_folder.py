@@ -1,7 +1,5 @@
 """Where a run writes its files: a folder of its own, whatever the logger, which never overwrites another run."""
 
-from __future__ import annotations
-
 import atexit
 import errno
 import logging

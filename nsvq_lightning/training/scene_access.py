@@ -1,7 +1,5 @@
 """What callbacks need from the train views, on all processes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from lightning.pytorch import Trainer

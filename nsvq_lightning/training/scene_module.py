@@ -1,7 +1,5 @@
 """The part of the Lightning module that knows what a file would hold: it renders, measures and stores that."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from dataclasses import asdict, replace

@@ -1,7 +1,5 @@
 """What a run starts from: its first splats, the colour behind them, and what the user should know of the device."""
 
-from __future__ import annotations
-
 import logging
 import os
 

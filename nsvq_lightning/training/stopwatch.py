@@ -1,7 +1,5 @@
 """The time that a run spends training, without evaluations, pauses and the compilation of kernels."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

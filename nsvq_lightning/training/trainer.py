@@ -1,7 +1,5 @@
 """Lightning's trainer with the subcommand ``export``."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 from typing import Any
