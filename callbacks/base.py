@@ -36,8 +36,8 @@ class SplatCallback(Callback):
     accumulation Lightning calls the hooks that they come from for every view of the iteration. A subclass that
     overrides a hook of this class calls it here first.
 
-    A callback is a dataclass whose fields are its settings; those named in :attr:`state` are what it has reached and have
-    ``init=False``.
+    A callback is a dataclass whose fields are its settings; those that :attr:`state` names are what it has reached, and
+    have ``init=False``.
     """
 
     state: ClassVar[tuple[str, ...]] = ()
