@@ -12,7 +12,7 @@ from torch.optim import Optimizer
 
 from nsvq_lightning.compression.importance import row_weights, sensitivity
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.quality.loss import kept
+from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.quantize.attributes import QUANTIZED, codes_of
 from nsvq_lightning.quantize.base import (
@@ -408,7 +408,7 @@ class RateDistortion(SplatCallback):
             view = scene.view(index).to(module.device)
             signs = generator(module.seed, iteration, "signs", index)
             squares, image = sensitivity(splats, view.camera, module.render_splats, signs)
-            error += (kept(image, view.mask) - eight_bit(view.image)).square().sum(dtype=torch.float64)
+            error += (apply_mask(image, view.mask) - eight_bit(view.image)).square().sum(dtype=torch.float64)
             for name, total in shown.items():
                 total += QUANTIZED[name].rows(getattr(squares, name)).mean(1)
         error = sum_over_processes(trainer, error)

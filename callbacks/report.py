@@ -21,7 +21,7 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.file import read_nsvq
-from nsvq_lightning.quality.loss import kept, ssim
+from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_bit, psnr
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.report.evaluation import ViewScore, evaluate
@@ -230,7 +230,7 @@ class MetricReport(WritingCallback):
         lpips = None
         if self._lpips is not None:
             lpips = float(self._lpips(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]))
-        corrected = kept(eight_bit(color_corrected(image, photo, batch.mask)), batch.mask)
+        corrected = apply_mask(eight_bit(color_corrected(image, photo, batch.mask)), batch.mask)
         corrected_scores = float(psnr(corrected, photo, batch.mask)), float(ssim(corrected, photo, batch.mask))
         scores = float(outputs["psnr"]), float(outputs["ssim"])
         self._scores.append(ViewScore(batch.name, *scores, lpips, *corrected_scores))

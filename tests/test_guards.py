@@ -10,8 +10,8 @@ import pytest
 from guards import GuardError, guarded
 from numba import njit, typeof
 
-from nsvq_lightning.compute.lanes import put
 from nsvq_lightning.compute.memory import Workspace, recycled
+from nsvq_lightning.compute.simd import put
 
 
 @njit

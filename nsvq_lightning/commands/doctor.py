@@ -113,13 +113,13 @@ def attempt(subject: str, check: Iterator[Finding]) -> Iterator[Finding]:
 def check_machine() -> Iterator[Finding]:
     """The processor, and the versions of Python and of the packages that results depend on."""
     from nsvq_lightning.commands.benchmark.report import describe_machine
-    from nsvq_lightning.compute import lanes
+    from nsvq_lightning.compute.simd import WIDTH
 
     machine = describe_machine()
     yield judged("machine", f"{machine['system']}, {machine['cpu']}", **machine)
     bits, simd = machine["simd_bits"], machine["simd"]
     fused = not {"fma", "neon"}.isdisjoint(simd)
-    text = f"{lanes.WIDTH} floats at a time in {bits}-bit registers ({', '.join(simd) or 'no vector extension'})"
+    text = f"{WIDTH} floats at a time in {bits}-bit registers ({', '.join(simd) or 'no vector extension'})"
     narrow = bits < WIDE and "neon" not in simd and "a processor with AVX2 or AVX-512 is about twice as fast"
     split = not fused and "somewhat slower without fused multiply-add, last digits may differ"
     yield judged("cpu", text, narrow, split, simd_bits=bits, simd=simd, fma=fused)

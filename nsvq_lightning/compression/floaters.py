@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.quality.loss import kept
+from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
@@ -100,7 +100,7 @@ def removal_effects(
     slope, curvature, error = torch.zeros_like(scale), torch.zeros_like(scale), 0.0
     for view in views:
         with torch.enable_grad():
-            image = kept(render(raw, view.camera).image, view.mask)
+            image = apply_mask(render(raw, view.camera).image, view.mask)
         photo = eight_bit(view.image).to(image)
         difference = image.detach() - photo
         difference.masked_fill_((photo >= SATURATED) & (difference > 0), 0)

@@ -15,7 +15,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-__all__ = ["COMPILE", "LateNumber", "kernels_for", "triton_obstacle", "upload"]
+__all__ = ["COMPILE", "AsyncScalar", "kernels_for", "to_device", "triton_obstacle"]
 
 
 def kernels_for(like: Tensor) -> Literal["cpu", "cuda"] | None:
@@ -65,7 +65,7 @@ def _has_triton() -> bool:
     return importlib.util.find_spec("triton") is not None
 
 
-def upload(tensor: Tensor, device: torch.device | str) -> Tensor:
+def to_device(tensor: Tensor, device: torch.device | str) -> Tensor:
     """The tensor on a device, or itself if it is there already; the copy to a GPU runs beside what is queued there."""
     device = torch.device(device)
     if device.type == "cuda" and tensor.device.type == "cpu":
@@ -73,7 +73,7 @@ def upload(tensor: Tensor, device: torch.device | str) -> Tensor:
     return tensor.to(device, non_blocking=True)
 
 
-class LateNumber:
+class AsyncScalar:
     """A number from a device, which can be read without waiting for what has been queued since.
 
     ``tensor.item()`` waits until a GPU has done all its work, and the GPU then waits for the next launch. Here the copy

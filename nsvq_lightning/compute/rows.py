@@ -12,8 +12,8 @@ from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
-from nsvq_lightning.compute.lanes import get, put
 from nsvq_lightning.compute.memory import INT64, Array, flat, flat_checked, outside, recycled
+from nsvq_lightning.compute.simd import get, put
 
 __all__ = ["clear", "clear_between", "count_outside", "gather_rows", "put_rows", "spread_rows", "take_rows"]
 

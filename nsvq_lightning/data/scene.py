@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from nsvq_lightning.compute.devices import upload
+from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, larger_models
 from nsvq_lightning.data.frames import PHOTOS
 from nsvq_lightning.data.images import ROUNDED, ImageHead, ImageSource, ImageStore, image_head
@@ -69,10 +69,10 @@ class View:
 
         The camera stays: kernels take its numbers from the host.
         """
-        image = upload(self.image, device)
+        image = to_device(self.image, device)
         if image is self.image:
             return self
-        return replace(self, image=image, mask=None if self.mask is None else upload(self.mask, device))
+        return replace(self, image=image, mask=None if self.mask is None else to_device(self.mask, device))
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,10 +15,10 @@ from torch.autograd.function import once_differentiable
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.quality.ssim import check_pair, in_range, plain_ssim
 
-__all__ = ["kept", "mean_of_kept", "photometric_loss", "ssim"]
+__all__ = ["apply_mask", "mean_of_kept", "photometric_loss", "ssim"]
 
 
-def kept(image: Tensor, mask: Tensor | None) -> Tensor:
+def apply_mask(image: Tensor, mask: Tensor | None) -> Tensor:
     """An image ``[H, W, 3]`` that is 0 where its mask ``[H, W]`` is; itself without a mask."""
     return image if mask is None else image * mask[..., None]
 
@@ -44,7 +44,7 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """
     check_pair(image, target, mask)
     if mask is not None:
-        return 1 - mean_of_kept(1 - ssim(kept(image, mask), kept(target, mask)), mask)
+        return 1 - mean_of_kept(1 - ssim(apply_mask(image, mask), apply_mask(target, mask)), mask)
     kernels = None if torch.is_grad_enabled() and image.requires_grad else _kernels(image, target)
     if kernels == "cpu":
         from nsvq_lightning.quality.ssim_cpu import l1_dssim
@@ -73,7 +73,7 @@ def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2, m
     """
     check_pair(image, target, mask)
     if mask is not None:
-        return mean_of_kept(photometric_loss(kept(image, mask), kept(target, mask), dssim_weight), mask)
+        return mean_of_kept(photometric_loss(apply_mask(image, mask), apply_mask(target, mask), dssim_weight), mask)
     kernels = _kernels(image, target)
     if kernels is not None:
         function = _CpuLoss if kernels == "cpu" else _CudaLoss

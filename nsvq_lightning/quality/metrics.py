@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric, MetricCollection
 
-from nsvq_lightning.quality.loss import kept, mean_of_kept, ssim
+from nsvq_lightning.quality.loss import apply_mask, mean_of_kept, ssim
 from nsvq_lightning.quality.ssim import check_pair
 
 __all__ = ["PSNR", "SSIM", "build_lpips", "color_corrected", "eight_bit", "image_metrics", "psnr"]
@@ -77,7 +77,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
         mask: Which pixels count ``[H, W]`` bool; None if all do.
     """
     # The norm sums in float64 without making a float64 copy of the images.
-    error = torch.linalg.vector_norm(kept(image - target, mask), dtype=torch.float64)
+    error = torch.linalg.vector_norm(apply_mask(image - target, mask), dtype=torch.float64)
     return -10.0 * torch.log10(mean_of_kept(error.square() / image.numel(), mask))
 
 

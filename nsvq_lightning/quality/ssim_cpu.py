@@ -16,7 +16,8 @@ from numba import prange
 from torch import Tensor
 
 from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
-from nsvq_lightning.compute.lanes import (
+from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat_checked, recycled
+from nsvq_lightning.compute.simd import (
     WIDTH,
     broadcast,
     fma,
@@ -29,7 +30,6 @@ from nsvq_lightning.compute.lanes import (
     store,
     vfabs,
 )
-from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat_checked, recycled
 from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
 
 __all__ = ["l1_dssim"]

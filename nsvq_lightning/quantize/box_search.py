@@ -21,7 +21,18 @@ from numba import prange
 from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
-from nsvq_lightning.compute.lanes import (
+from nsvq_lightning.compute.memory import (
+    FLOAT32,
+    FLOAT64,
+    INT32,
+    INT64,
+    aligned_empty,
+    check_array,
+    check_table,
+    outside,
+)
+from nsvq_lightning.compute.rows import count_outside
+from nsvq_lightning.compute.simd import (
     broadcast,
     fma,
     get,
@@ -35,17 +46,6 @@ from nsvq_lightning.compute.lanes import (
     vmax,
     vmin,
 )
-from nsvq_lightning.compute.memory import (
-    FLOAT32,
-    FLOAT64,
-    INT32,
-    INT64,
-    aligned_empty,
-    check_array,
-    check_table,
-    outside,
-)
-from nsvq_lightning.compute.rows import count_outside
 
 __all__ = [
     "MAX_DIM",

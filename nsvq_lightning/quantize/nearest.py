@@ -22,7 +22,7 @@ from torch import Tensor
 
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import kernel, thread_count
-from nsvq_lightning.compute.lanes import (
+from nsvq_lightning.compute.simd import (
     broadcast,
     fma,
     get,

@@ -18,7 +18,8 @@ from numba import prange
 from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
-from nsvq_lightning.compute.lanes import (
+from nsvq_lightning.compute.memory import FLOAT32, aligned_empty, check_array, check_table
+from nsvq_lightning.compute.simd import (
     broadcast,
     fma,
     fnma,
@@ -31,7 +32,6 @@ from nsvq_lightning.compute.lanes import (
     store,
     vmin,
 )
-from nsvq_lightning.compute.memory import FLOAT32, aligned_empty, check_array, check_table
 
 __all__ = ["LIST", "CentredCodes", "centre_codes", "score_search", "true_distance"]
 

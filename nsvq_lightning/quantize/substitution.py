@@ -24,9 +24,9 @@ from numba import prange
 from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
-from nsvq_lightning.compute.lanes import broadcast, fma, get, lane_sum, load, log2, put, select, store, vsqrt
 from nsvq_lightning.compute.memory import FLOAT32, INT64, check_array, check_table, outside, recycled
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside
+from nsvq_lightning.compute.simd import broadcast, fma, get, lane_sum, load, log2, put, select, store, vsqrt
 
 __all__ = [
     "COS",

@@ -22,7 +22,8 @@ from torch import Tensor
 
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
-from nsvq_lightning.compute.lanes import (
+from nsvq_lightning.compute.memory import INT64, check_array
+from nsvq_lightning.compute.simd import (
     broadcast,
     fma,
     get,
@@ -35,7 +36,6 @@ from nsvq_lightning.compute.lanes import (
     put,
     store,
 )
-from nsvq_lightning.compute.memory import INT64, check_array
 from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, BoxMemory, box_search, build_boxes, empty_memory
 from nsvq_lightning.quantize.nearest import check_rows, nearest
 from nsvq_lightning.quantize.scores import LIST, centre_codes, score_search, true_distance

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.quality.loss import kept
+from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import image_metrics
 from nsvq_lightning.rendering.camera import Camera
 
@@ -62,7 +62,7 @@ def evaluate(
     scores: list[ViewScore] = []
     for view in views:
         on_device = view.to(device)
-        image = kept(render_image(on_device.camera), on_device.mask)
+        image = apply_mask(render_image(on_device.camera), on_device.mask)
         if show is not None and not scores:
             show(image, on_device.image)
         values = metrics(image, on_device.image, on_device.mask)

@@ -12,7 +12,7 @@ from lightning.pytorch.strategies import DDPStrategy, Strategy, StrategyRegistry
 from torch import Tensor, nn
 from torch.distributed import all_reduce, broadcast
 
-from nsvq_lightning.compute.devices import upload
+from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.training.optim import raw_optimizer
 
 __all__ = [
@@ -134,7 +134,7 @@ class ViewParallelStrategy(DDPStrategy):
         assert self.lightning_module is not None
         parameters = [parameter for parameter in self.lightning_module.parameters() if parameter.requires_grad]
         votes = torch.tensor([float(parameter.grad is not None) for parameter in parameters])
-        tally = torch.cat([self._failed.clamp(max=1).view(1), upload(votes, self.root_device)])
+        tally = torch.cat([self._failed.clamp(max=1).view(1), to_device(votes, self.root_device)])
         self._failed = None
         all_reduce(tally)
         failed, *wanted = tally.tolist()  # waits for the backward pass: what is reduced next depends on it

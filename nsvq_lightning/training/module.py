@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from nsvq_lightning.compute.devices import LateNumber, upload
+from nsvq_lightning.compute.devices import AsyncScalar, to_device
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.quality.loss import photometric_loss
@@ -122,7 +122,7 @@ class SplatModule(ResumedModule):
         self._step_rates = self.rates
         self._rate_factors: dict[str, float] = {}
         self._updates = True
-        self._late_loss: tuple[str, LateNumber] | None = None
+        self._late_loss: tuple[str, AsyncScalar] | None = None
         self._micro_batch = 0
 
     def scale_rate(self, group: str, factor: float) -> None:
@@ -142,7 +142,7 @@ class SplatModule(ResumedModule):
         """
         splats = self._phase_splats(camera)
         if self.training and self.background == "random":
-            background = upload(torch.rand(3, generator=self._generator("background")), self.device)
+            background = to_device(torch.rand(3, generator=self._generator("background")), self.device)
             return self.render_splats(splats, camera, observe=observe, background=background)
         return self.render_splats(splats, camera, observe=observe)
 
@@ -243,14 +243,14 @@ class SplatModule(ResumedModule):
             quality = psnr(eight_bit(rendered.image.detach()), eight_bit(batch.image), batch.mask).float()
             values = {"train/loss": loss.detach(), "train/psnr": quality, "train/splats": float(len(self.splats))}
             self.log_dict(values, batch_size=1)  # type: ignore[arg-type]  # a number among tensors
-        late_loss = LateNumber(loss)
+        late_loss = AsyncScalar(loss)
         if not late_loss.is_here:
             self._late_loss = batch.name, late_loss
         elif not self._has_finite_loss(batch.name, late_loss):
             return {"loss": loss} if self.trainer.world_size > 1 else None
         return {"loss": loss, "render": rendered, "edits": edits, "late_loss": late_loss}
 
-    def _has_finite_loss(self, view: str, loss: LateNumber) -> bool:
+    def _has_finite_loss(self, view: str, loss: AsyncScalar) -> bool:
         """Whether the loss of a view is finite; otherwise say so, and let the step update nothing."""
         if math.isfinite(loss.read()):
             return True

@@ -14,7 +14,7 @@ from nsvq_lightning.compression.stored import compress
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.precision import Storage
-from nsvq_lightning.quality.loss import kept
+from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.quantize.attributes import attribute_rows, decoded
 from nsvq_lightning.quantize.base import Quantizer
@@ -138,7 +138,7 @@ class SceneModule(LightningModule):
         return eight_bit(self.render_splats(self.evaluation_splats, camera).image)
 
     def _evaluate(self, view: View, prefix: str) -> dict[str, Any]:
-        image = kept(self._evaluated_image(view.camera), view.mask)
+        image = apply_mask(self._evaluated_image(view.camera), view.mask)
         scores = self.view_metrics(image, view.image, view.mask)
         self.log_dict({f"{prefix}/{name}": metric for name, metric in self.view_metrics.items()}, batch_size=1)
         return {"image": image, **scores}

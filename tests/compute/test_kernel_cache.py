@@ -12,13 +12,13 @@ import numba
 import numpy as np
 import pytest
 
-from nsvq_lightning.compute import lanes
+from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.kernel_cache import VERSIONS, digest, kernel_folder
 
 
 def test_meaning_of_operators_counts_for_all_that_names_their_module(monkeypatch: pytest.MonkeyPatch) -> None:
     def kernel(a: Any, b: Any) -> Any:
-        return lanes.load(a, 0) * lanes.load(b, 0)
+        return simd.load(a, 0) * simd.load(b, 0)
 
     before = digest(kernel)
     assert digest(kernel) == before

@@ -29,7 +29,7 @@ from nsvq_lightning.callbacks import (
     PhaseSchedule,
     RunCheckpoint,
 )
-from nsvq_lightning.compute.devices import LateNumber
+from nsvq_lightning.compute.devices import AsyncScalar
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.images import read_image
 from nsvq_lightning.io.formats import load
@@ -353,7 +353,7 @@ def test_a_loss_that_is_known_only_after_the_backward_pass_changes_no_bit(
         return module, [message for message in caplog.messages if "no update" in message]
 
     at_once, said_at_once = outcome()
-    monkeypatch.setattr(LateNumber, "is_here", property(lambda _: False))  # as on a GPU
+    monkeypatch.setattr(AsyncScalar, "is_here", property(lambda _: False))  # as on a GPU
     late, said_late = outcome()
     assert len(said_late) == 2
     assert said_late == said_at_once

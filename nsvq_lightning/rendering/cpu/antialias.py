@@ -14,7 +14,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
-from nsvq_lightning.compute.lanes import (
+from nsvq_lightning.compute.memory import Array, flat, flat_checked, outside
+from nsvq_lightning.compute.simd import (
     broadcast,
     gather_rows3,
     gather_rows4,
@@ -26,7 +27,6 @@ from nsvq_lightning.compute.lanes import (
     vmax,
     vsqrt,
 )
-from nsvq_lightning.compute.memory import Array, flat, flat_checked, outside
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu.projection import BLUR, BLUR_SQUARED, HUGE_FOOTPRINT, affine, axes_of, image_axes

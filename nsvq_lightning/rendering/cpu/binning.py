@@ -6,7 +6,7 @@ import numpy as np
 from numba import prange
 
 from nsvq_lightning.compute.jit import inline, kernel
-from nsvq_lightning.compute.lanes import get, prefetch, put
+from nsvq_lightning.compute.simd import get, prefetch, put
 from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES
 
 DIGIT_BITS = 11

@@ -15,7 +15,7 @@ import numpy as np
 from numba import prange
 
 from nsvq_lightning.compute.jit import F, inline, kernel
-from nsvq_lightning.compute.lanes import (
+from nsvq_lightning.compute.simd import (
     any_lane,
     broadcast,
     column_bits,

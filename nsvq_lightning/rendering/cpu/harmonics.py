@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from nsvq_lightning.compute.jit import F, inline
-from nsvq_lightning.compute.lanes import (
+from nsvq_lightning.compute.rows import clear
+from nsvq_lightning.compute.simd import (
     broadcast,
     fma,
     fnma,
@@ -21,7 +22,6 @@ from nsvq_lightning.compute.lanes import (
     vmax,
     vsqrt,
 )
-from nsvq_lightning.compute.rows import clear
 from nsvq_lightning.rendering import sh
 from nsvq_lightning.rendering.cpu.records import POSITION, RECORD, RED, dot3
 

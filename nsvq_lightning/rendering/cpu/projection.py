@@ -9,7 +9,7 @@ import numpy as np
 from numba import prange
 
 from nsvq_lightning.compute.jit import F, inline, kernel
-from nsvq_lightning.compute.lanes import (
+from nsvq_lightning.compute.simd import (
     broadcast,
     exp2_clamped,
     fma,

@@ -6,7 +6,8 @@ import numpy as np
 from numba import prange
 
 from nsvq_lightning.compute.jit import F, inline, kernel
-from nsvq_lightning.compute.lanes import (
+from nsvq_lightning.compute.rows import clear
+from nsvq_lightning.compute.simd import (
     broadcast,
     exp2_clamped,
     fma,
@@ -24,7 +25,6 @@ from nsvq_lightning.compute.lanes import (
     scatter_rows4,
     select,
 )
-from nsvq_lightning.compute.rows import clear
 from nsvq_lightning.rendering.cpu.harmonics import AHEAD, coefficients_of, color_backward, prefetch_sh
 from nsvq_lightning.rendering.cpu.projection import BLUR, affine, axes_of, image_axes
 from nsvq_lightning.rendering.cpu.records import (

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 
 from nsvq_lightning.compute.jit import F, inline
-from nsvq_lightning.compute.lanes import broadcast, fma, get
+from nsvq_lightning.compute.simd import broadcast, fma, get
 
 RECORD = 16
 """Floats in a record and in a slot."""

@@ -7,8 +7,8 @@ from numba import prange
 from torch import Tensor
 
 from nsvq_lightning.compute.jit import F, kernel, thread_count
-from nsvq_lightning.compute.lanes import get, put
 from nsvq_lightning.compute.memory import INT32, flat_checked
+from nsvq_lightning.compute.simd import get, put
 
 __all__ = ["add_observed", "add_view"]
 

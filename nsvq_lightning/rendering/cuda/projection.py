@@ -13,7 +13,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nsvq_lightning.compute.devices import COMPILE, upload
+from nsvq_lightning.compute.devices import COMPILE, to_device
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.camera import Camera
@@ -389,7 +389,7 @@ class Lens(NamedTuple):
         """Pack a camera; for one that has been packed for the device before, nothing is copied."""
         version, lens = _lenses.get(camera, {}).get(device, (-1, None))
         if lens is None or version != camera.viewmat._version:
-            view = upload(torch.tensor(camera.packed_view, dtype=torch.float32), device)
+            view = to_device(torch.tensor(camera.packed_view, dtype=torch.float32), device)
             lens = cls(view, *camera.intrinsics, camera.width, camera.height)
             _lenses.setdefault(camera, {})[device] = camera.viewmat._version, lens
         return lens

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 import pytest
 
-from nsvq_lightning.compute import lanes
+from nsvq_lightning.compute import simd
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -26,14 +26,14 @@ def values() -> Array:
 
 def test_operators(values: Array) -> None:
     def kernel(a: Array, out: Array) -> None:
-        x, y = lanes.load(a, 0), lanes.load(a, 16)
-        lanes.store(out, 0, x + y)
-        lanes.store(out, 16, x - y)
-        lanes.store(out, 32, x * y)
-        lanes.store(out, 48, x / y)
-        lanes.store(out, 64, -x)
-        lanes.store(out, 80, lanes.fma(x, y, lanes.broadcast(a[40])))
-        lanes.store(out, 96, lanes.fnma(x, y, lanes.broadcast(a[40])))
+        x, y = simd.load(a, 0), simd.load(a, 16)
+        simd.store(out, 0, x + y)
+        simd.store(out, 16, x - y)
+        simd.store(out, 32, x * y)
+        simd.store(out, 48, x / y)
+        simd.store(out, 64, -x)
+        simd.store(out, 80, simd.fma(x, y, simd.broadcast(a[40])))
+        simd.store(out, 96, simd.fnma(x, y, simd.broadcast(a[40])))
 
     x, y, z = values[:16], values[16:32], np.float64(values[40])
     out = run(kernel, values, outputs=7)
@@ -45,8 +45,8 @@ def test_operators(values: Array) -> None:
 
 def test_minimum_and_maximum_take_the_second_argument_for_nan(values: Array) -> None:
     def kernel(a: Array, out: Array) -> None:
-        lanes.store(out, 0, lanes.vmin(lanes.load(a, 0), lanes.load(a, 16)))
-        lanes.store(out, 16, lanes.vmax(lanes.load(a, 0), lanes.load(a, 16)))
+        simd.store(out, 0, simd.vmin(simd.load(a, 0), simd.load(a, 16)))
+        simd.store(out, 16, simd.vmax(simd.load(a, 0), simd.load(a, 16)))
 
     values[3] = np.nan
     out = run(kernel, values, outputs=2)
@@ -55,9 +55,9 @@ def test_minimum_and_maximum_take_the_second_argument_for_nan(values: Array) -> 
 
 def test_exponential_and_logarithm() -> None:
     def kernel(a: Array, out: Array) -> None:
-        lanes.store(out, 0, lanes.exp2(lanes.load(a, 0)))
-        lanes.store(out, 16, lanes.log2(lanes.load(a, 16)))
-        lanes.store(out, 32, lanes.exp2_clamped(lanes.load(a, 32)))
+        simd.store(out, 0, simd.exp2(simd.load(a, 0)))
+        simd.store(out, 16, simd.log2(simd.load(a, 16)))
+        simd.store(out, 32, simd.exp2_clamped(simd.load(a, 32)))
 
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -74,13 +74,11 @@ def test_exponential_and_logarithm() -> None:
 
 def test_masks() -> None:
     def kernel(a: Array, out: Array) -> None:
-        low = lanes.load(a, 0) < lanes.load(a, 16)
-        lanes.store(
-            out, 0, lanes.select(low & ~(lanes.load(a, 0) >= lanes.load(a, 16)), lanes.load(a, 0), lanes.load(a, 16))
-        )
-        out[16] = lanes.mask_bits(low)
-        out[17] = lanes.lowest_bit(lanes.mask_bits(low))
-        out[18] = lanes.any_lane(lanes.load(a, 0) > lanes.load(a, 0))
+        low = simd.load(a, 0) < simd.load(a, 16)
+        simd.store(out, 0, simd.select(low & ~(simd.load(a, 0) >= simd.load(a, 16)), simd.load(a, 0), simd.load(a, 16)))
+        out[16] = simd.mask_bits(low)
+        out[17] = simd.lowest_bit(simd.mask_bits(low))
+        out[18] = simd.any_lane(simd.load(a, 0) > simd.load(a, 0))
 
     rng = np.random.default_rng(1)
     a = rng.normal(size=32).astype(np.float32)
@@ -94,12 +92,12 @@ def test_masks() -> None:
 
 @pytest.mark.parametrize("columns", [3, 4])
 def test_rows_come_apart(values: Array, columns: int) -> None:
-    loader = getattr(lanes, f"load_rows{columns}")
+    loader = getattr(simd, f"load_rows{columns}")
 
     def kernel(a: Array, out: Array) -> None:
         rows = loader(a, 1)
-        lanes.store(out, 0, rows[0])
-        lanes.store(out, 16, rows[2])
+        simd.store(out, 0, rows[0])
+        simd.store(out, 16, rows[2])
 
     out = run(kernel, values, outputs=2)
     matrix = values[1 : 1 + 16 * columns].reshape(16, columns)
@@ -108,13 +106,13 @@ def test_rows_come_apart(values: Array, columns: int) -> None:
 
 def test_gather_and_scatter(values: Array) -> None:
     def kernel(a: Array, indices: Array, out: Array) -> None:
-        columns = lanes.gather_columns(a, indices, 0, 16, 1)
-        lanes.store(out, 0, columns[0])
-        lanes.store(out, 16, columns[15])
-        lanes.store(out, 32, lanes.transpose(columns)[3])
-        triple = lanes.gather_rows3(a, indices, 0)
-        lanes.store(out, 48, triple[2])
-        lanes.scatter_rows3(out[64:], indices, 0, triple)
+        columns = simd.gather_columns(a, indices, 0, 16, 1)
+        simd.store(out, 0, columns[0])
+        simd.store(out, 16, columns[15])
+        simd.store(out, 32, simd.transpose(columns)[3])
+        triple = simd.gather_rows3(a, indices, 0)
+        simd.store(out, 48, triple[2])
+        simd.scatter_rows3(out[64:], indices, 0, triple)
 
     indices = np.random.default_rng(2).permutation(16).astype(np.int32)
     out = run(kernel, values, indices, outputs=7)
@@ -126,9 +124,9 @@ def test_gather_and_scatter(values: Array) -> None:
 
 def test_sums(values: Array) -> None:
     def kernel(a: Array, out: Array) -> None:
-        sums = lanes.lane_sums((lanes.load(a, 0), lanes.load(a, 16), lanes.load(a, 32)))
-        lanes.store(out, 0, sums)
-        out[16] = lanes.lane_sum(lanes.load(a, 48))
+        sums = simd.lane_sums((simd.load(a, 0), simd.load(a, 16), simd.load(a, 32)))
+        simd.store(out, 0, sums)
+        out[16] = simd.lane_sum(simd.load(a, 48))
 
     out = run(kernel, values, outputs=2)
     np.testing.assert_allclose(out[0][:3], values[:48].reshape(3, 16).sum(1), rtol=1e-6)
@@ -138,13 +136,13 @@ def test_sums(values: Array) -> None:
 
 def test_image_blocks() -> None:
     def kernel(image: Array, plane: Array, out: Array) -> None:
-        red, green, blue = lanes.load_rgb_block(image, 3 * (2 * 9 + 1), 27)
-        lanes.store(out, 0, red)
-        lanes.store(out, 16, green)
-        lanes.store(out, 32, blue)
-        lanes.store(out, 48, lanes.load_block(plane, 2 * 9 + 1, 9))
-        lanes.store_rgb_block(image, 3 * (1 * 9 + 4), 27, red, green, blue)
-        lanes.store_block(plane, 1 * 9 + 4, 9, lanes.load(out, 48))
+        red, green, blue = simd.load_rgb_block(image, 3 * (2 * 9 + 1), 27)
+        simd.store(out, 0, red)
+        simd.store(out, 16, green)
+        simd.store(out, 32, blue)
+        simd.store(out, 48, simd.load_block(plane, 2 * 9 + 1, 9))
+        simd.store_rgb_block(image, 3 * (1 * 9 + 4), 27, red, green, blue)
+        simd.store_block(plane, 1 * 9 + 4, 9, simd.load(out, 48))
 
     rng = np.random.default_rng(3)
     image, plane = rng.normal(size=(8, 9, 3)).astype(np.float32), rng.normal(size=(8, 9)).astype(np.float32)
@@ -162,7 +160,7 @@ def test_image_blocks() -> None:
 def test_column_bits() -> None:
     def kernel(masks: Array, found: Array) -> None:
         for bit in range(16):
-            found[bit] = lanes.column_bits(masks, 1, bit)
+            found[bit] = simd.column_bits(masks, 1, bit)
 
     masks = np.random.default_rng(4).integers(0, 1 << 16, 65).astype(np.uint16)
     found = np.zeros(16, np.int64)
