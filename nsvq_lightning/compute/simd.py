@@ -2,8 +2,9 @@
 
 Whether Numba vectorizes a plain loop is up to LLVM; the kernels of this package vectorize explicitly instead.
 ``Lanes`` and ``Mask`` are Numba types that hold one LLVM ``<16 x float>`` and ``<16 x i1>``. LLVM turns them into one
-AVX-512, two AVX2 or four NEON/SSE registers, so one source serves every CPU. Operators work between two vectors;
-scalars enter through :func:`broadcast`. All functions here are intrinsics: they only exist inside ``@njit`` code.
+AVX-512, two AVX2 or four NEON/SSE registers, so one source serves every CPU. In operators, and in functions of vectors,
+a scalar stands for a vector that holds it in every lane. All functions here are intrinsics: they only exist inside
+``@njit`` code.
 
 Conventions: a memory argument is a pair (one-dimensional contiguous array, element offset); nothing is
 bounds-checked. Floating-point code may be contracted (a·b + c with one rounding) but never reassociated, so NaN and
@@ -54,6 +55,16 @@ def _operator(symbol: Callable[..., Any], result: types.Type, arguments: tuple[t
     name = f"_{symbol.__name__}_{'_'.join(argument.name for argument in arguments)}"
     infer_global(symbol)(type(name, (ConcreteTemplate,), {"cases": [signature(result, *arguments)]}))
     lower_builtin(symbol, *arguments)(lambda context, builder, sig, values: emit(builder, *values))
+
+
+def _binary(symbol: Callable[..., Any], result: types.Type, emit: Callable[..., Any]) -> None:
+    """Define the operator ``symbol`` between two vectors, and between a vector and a scalar."""
+
+    def spread(builder: Any, *values: Any) -> Any:
+        return emit(builder, *(_broadcast(builder, _VF, x) if x.type == _f32 else x for x in values))
+
+    for arguments in ((Lanes, Lanes), (Lanes, types.float32), (types.float32, Lanes)):
+        _operator(symbol, result, arguments, spread)
 
 
 def _function(result: Any, arity: int) -> Callable[[Any], Any]:
@@ -135,16 +146,25 @@ def _write(builder: Any, address: Any, value: Any) -> None:
 # ---- operators
 # --------------------------------------------------------------------------------------------------------
 
-_operator(operator.add, Lanes, (Lanes, Lanes), lambda b, x, y: b.fadd(x, y, flags=_CONTRACT))
-_operator(operator.sub, Lanes, (Lanes, Lanes), lambda b, x, y: b.fsub(x, y, flags=_CONTRACT))
-_operator(operator.mul, Lanes, (Lanes, Lanes), lambda b, x, y: b.fmul(x, y, flags=_CONTRACT))
-_operator(operator.truediv, Lanes, (Lanes, Lanes), lambda b, x, y: b.fdiv(x, y))
-_operator(operator.neg, Lanes, (Lanes,), lambda b, x: b.fneg(x))
+
+def _flagged(name: str) -> Callable[..., Any]:
+    return lambda builder, x, y: getattr(builder, name)(x, y, flags=_CONTRACT)
+
+
+def _compared(symbol: str) -> Callable[..., Any]:
+    return lambda builder, x, y: builder.fcmp_ordered(symbol, x, y)
+
+
+_binary(operator.add, Lanes, _flagged("fadd"))
+_binary(operator.sub, Lanes, _flagged("fsub"))
+_binary(operator.mul, Lanes, _flagged("fmul"))
+_binary(operator.truediv, Lanes, lambda builder, x, y: builder.fdiv(x, y))
+_operator(operator.neg, Lanes, (Lanes,), lambda builder, x: builder.fneg(x))
 for _symbol, _comparison in ((operator.ge, ">="), (operator.le, "<="), (operator.lt, "<"), (operator.gt, ">")):
-    _operator(_symbol, Mask, (Lanes, Lanes), lambda b, x, y, c=_comparison: b.fcmp_ordered(c, x, y))
-_operator(operator.and_, Mask, (Mask, Mask), lambda b, x, y: b.and_(x, y))
-_operator(operator.or_, Mask, (Mask, Mask), lambda b, x, y: b.or_(x, y))
-_operator(operator.invert, Mask, (Mask,), lambda b, x: b.not_(x))
+    _binary(_symbol, Mask, _compared(_comparison))
+_operator(operator.and_, Mask, (Mask, Mask), lambda builder, x, y: builder.and_(x, y))
+_operator(operator.or_, Mask, (Mask, Mask), lambda builder, x, y: builder.or_(x, y))
+_operator(operator.invert, Mask, (Mask,), lambda builder, x: builder.not_(x))
 
 # ---- memory
 # -----------------------------------------------------------------------------------------------------------
@@ -157,6 +177,12 @@ def broadcast(context, builder, sig, values):
 
 
 @_function(Lanes, 2)
+def load_one(context, builder, sig, values):
+    """``load_one(array, offset)``: one float in every lane."""
+    return _broadcast(builder, _VF, builder.load(_address(context, builder, sig.args[0], *values)))
+
+
+@_function(Lanes, 2)
 def load(context, builder, sig, values):
     """``load(array, offset)``: 16 consecutive floats."""
     return _read(builder, _address(context, builder, sig.args[0], *values))
@@ -165,7 +191,8 @@ def load(context, builder, sig, values):
 @_function(types.void, 3)
 def store(context, builder, sig, values):
     """``store(array, offset, lanes)``: 16 consecutive floats."""
-    _write(builder, _address(context, builder, sig.args[0], *values[:2]), values[2])
+    (value,) = _spread(context, builder, sig.args[2:], values[2:])
+    _write(builder, _address(context, builder, sig.args[0], *values[:2]), value)
     return context.get_dummy_value()
 
 
@@ -202,28 +229,39 @@ def fetch_add(context, builder, sig, values):
 # -------------------------------------------------------------------------------------------------------
 
 
+def _spread(context: Any, builder: Any, kinds: Sequence[Any], values: Sequence[Any]) -> list[Any]:
+    """The arguments, with vectors in place of scalars."""
+    return [
+        value if kind in (Lanes, Mask) else _broadcast(builder, _VF, context.cast(builder, value, kind, types.float32))
+        for kind, value in zip(kinds, values, strict=True)
+    ]
+
+
 @_function(Lanes, 3)
 def fma(context, builder, sig, values):
     """``x * y + z``, with one rounding where the processor supports it."""
-    return _fused(builder, *values)
+    return _fused(builder, *_spread(context, builder, sig.args, values))
 
 
 @_function(Lanes, 3)
 def fnma(context, builder, sig, values):
     """``z - x * y``, with one rounding where the processor supports it."""
-    return _fused(builder, builder.fneg(values[0]), values[1], values[2])
+    x, y, z = _spread(context, builder, sig.args, values)
+    return _fused(builder, builder.fneg(x), y, z)
 
 
 @_function(Lanes, 2)
 def vmin(context, builder, sig, values):
     """The smaller of two; the second one where the first is NaN."""
-    return builder.select(builder.fcmp_ordered("<", *values), *values)
+    x, y = _spread(context, builder, sig.args, values)
+    return builder.select(builder.fcmp_ordered("<", x, y), x, y)
 
 
 @_function(Lanes, 2)
 def vmax(context, builder, sig, values):
     """The larger of two; the second one where the first is NaN."""
-    return builder.select(builder.fcmp_ordered(">", *values), *values)
+    x, y = _spread(context, builder, sig.args, values)
+    return builder.select(builder.fcmp_ordered(">", x, y), x, y)
 
 
 def _unary(name: str, doc: str) -> Any:
@@ -243,7 +281,7 @@ vfabs = _unary("fabs", "Absolute value.")
 @_function(Lanes, 3)
 def select(context, builder, sig, values):
     """``select(mask, x, y)``: x where the mask is set, else y."""
-    return builder.select(*values)
+    return builder.select(*_spread(context, builder, sig.args, values))
 
 
 @_function(Lanes, 1)
@@ -387,6 +425,14 @@ def _transposed(builder: Any, rows: Sequence[Any]) -> list[Any]:
 
 
 _SIXTEEN = types.UniTuple(Lanes, WIDTH)
+
+
+@_function(_SIXTEEN, 2)
+def load_vectors(context, builder, sig, values):
+    """``load_vectors(array, offset)``: 256 consecutive floats as sixteen vectors."""
+    first = _address(context, builder, sig.args[0], *values)
+    vectors = [_read(builder, builder.gep(first, [_i64(WIDTH * part)])) for part in range(WIDTH)]
+    return context.make_tuple(builder, sig.return_type, vectors)
 
 
 @_function(_SIXTEEN, 1)

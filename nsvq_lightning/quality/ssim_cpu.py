@@ -15,21 +15,9 @@ import torch
 from numba import prange
 from torch import Tensor
 
+from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat_checked, recycled
-from nsvq_lightning.compute.simd import (
-    WIDTH,
-    broadcast,
-    fma,
-    fnma,
-    get,
-    lane_sum,
-    load,
-    put,
-    select,
-    store,
-    vfabs,
-)
 from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
 
 __all__ = ["l1_dssim"]
@@ -54,9 +42,8 @@ def row_of(y, planes, pitch):
 @inline
 def clear_row(ring, o, count):
     """Zero ``count`` floats."""
-    zero = broadcast(F(0))
     for x in range(0, count, 16):
-        store(ring, o + x, zero)
+        simd.store(ring, o + x, 0)
 
 
 @inline
@@ -66,26 +53,25 @@ def take_row(image, target, white, images, y, height, length, pitch):
     if y < 0 or y >= height:
         clear_row(images, o, IMAGES * pitch)
     else:
-        zero, one = broadcast(F(0)), broadcast(F(1))
         for x_ in range(0, length, 16):
             # The last vector of a row overlaps the one before it instead of running past the end.
             x = min(x_, length - 16)
-            p = load(image, y * length + x)
+            p = simd.load(image, y * length + x)
             # Not vmin and vmax: NaN must stay NaN.
-            store(images, o + x, select(p < zero, zero, select(p > one, one, p)))
+            simd.store(images, o + x, simd.select(p < 0, 0, simd.select(p > 1, 1, p)))
         for x in range(length):
-            put(images, o + pitch + x, F(get(target, y * length + x)) / white)
+            simd.put(images, o + pitch + x, F(simd.get(target, y * length + x)) / white)
 
 
 @inline
 def blur_along(row, o):
     """Eleven taps along a padded row of interleaved RGB (neighbouring pixels are 3 floats apart)."""
-    total = broadcast(G0) * load(row, o)
-    total = fma(broadcast(G1), load(row, o - 3) + load(row, o + 3), total)
-    total = fma(broadcast(G2), load(row, o - 6) + load(row, o + 6), total)
-    total = fma(broadcast(G3), load(row, o - 9) + load(row, o + 9), total)
-    total = fma(broadcast(G4), load(row, o - 12) + load(row, o + 12), total)
-    return fma(broadcast(G5), load(row, o - 15) + load(row, o + 15), total)
+    total = G0 * simd.load(row, o)
+    total = simd.fma(G1, simd.load(row, o - 3) + simd.load(row, o + 3), total)
+    total = simd.fma(G2, simd.load(row, o - 6) + simd.load(row, o + 6), total)
+    total = simd.fma(G3, simd.load(row, o - 9) + simd.load(row, o + 9), total)
+    total = simd.fma(G4, simd.load(row, o - 12) + simd.load(row, o + 12), total)
+    return simd.fma(G5, simd.load(row, o - 15) + simd.load(row, o + 15), total)
 
 
 @inline
@@ -93,13 +79,13 @@ def add_pair(images, y, distance, x, pitch, weight, sums):
     """Add the moments (p, q, p² + q², p·q) of the rows ``distance`` above and below row y, which share a tap."""
     above = row_of(y - distance, IMAGES, pitch) + x
     below = row_of(y + distance, IMAGES, pitch) + x
-    p, q = load(images, above), load(images, above + pitch)
-    r, s = load(images, below), load(images, below + pitch)
+    p, q = simd.load(images, above), simd.load(images, above + pitch)
+    r, s = simd.load(images, below), simd.load(images, below + pitch)
     return (
-        fma(weight, p + r, sums[0]),
-        fma(weight, q + s, sums[1]),
-        fma(weight, fma(p, p, r * r) + fma(q, q, s * s), sums[2]),
-        fma(weight, fma(p, q, r * s), sums[3]),
+        simd.fma(weight, p + r, sums[0]),
+        simd.fma(weight, q + s, sums[1]),
+        simd.fma(weight, simd.fma(p, p, r * r) + simd.fma(q, q, s * s), sums[2]),
+        simd.fma(weight, simd.fma(p, q, r * s), sums[3]),
     )
 
 
@@ -109,87 +95,84 @@ def moments_of_row(images, y, length, pitch, moments):
     for x_ in range(0, length, 16):
         x = min(x_, length - 16)
         o = row_of(y, IMAGES, pitch) + x
-        p, q, tap = load(images, o), load(images, o + pitch), broadcast(G0)
-        sums = (tap * p, tap * q, tap * fma(p, p, q * q), tap * (p * q))
-        sums = add_pair(images, y, 1, x, pitch, broadcast(G1), sums)
-        sums = add_pair(images, y, 2, x, pitch, broadcast(G2), sums)
-        sums = add_pair(images, y, 3, x, pitch, broadcast(G3), sums)
-        sums = add_pair(images, y, 4, x, pitch, broadcast(G4), sums)
-        sums = add_pair(images, y, 5, x, pitch, broadcast(G5), sums)
-        store(moments, PAD + x, sums[0])
-        store(moments, pitch + PAD + x, sums[1])
-        store(moments, 2 * pitch + PAD + x, sums[2])
-        store(moments, 3 * pitch + PAD + x, sums[3])
+        p, q = simd.load(images, o), simd.load(images, o + pitch)
+        sums = (G0 * p, G0 * q, G0 * simd.fma(p, p, q * q), G0 * (p * q))
+        sums = add_pair(images, y, 1, x, pitch, G1, sums)
+        sums = add_pair(images, y, 2, x, pitch, G2, sums)
+        sums = add_pair(images, y, 3, x, pitch, G3, sums)
+        sums = add_pair(images, y, 4, x, pitch, G4, sums)
+        sums = add_pair(images, y, 5, x, pitch, G5, sums)
+        simd.store(moments, PAD + x, sums[0])
+        simd.store(moments, pitch + PAD + x, sums[1])
+        simd.store(moments, 2 * pitch + PAD + x, sums[2])
+        simd.store(moments, 3 * pitch + PAD + x, sums[3])
 
 
 @inline
 def similarity_of_row(moments, derivatives, length, pitch, lanes):
     """Sum of SSIM over a row; its derivatives with respect to blurred p, p² and pq go into three padded rows."""
-    one, two, c1, c2 = broadcast(F(1)), broadcast(F(2)), broadcast(C1), broadcast(C2)
-    total = broadcast(F(0))
-    lane = load(lanes, 0)
+    total = simd.broadcast(0)
+    lane = simd.load(lanes, 0)
     for x_ in range(0, length, 16):
         x = min(x_, length - 16)
         o = PAD + x
         m1, m2 = blur_along(moments, o), blur_along(moments, pitch + o)
         m12 = m1 * m2
-        squares = fma(m1, m1, m2 * m2)
+        squares = simd.fma(m1, m1, m2 * m2)
         variances = blur_along(moments, 2 * pitch + o) - squares
         covariance = blur_along(moments, 3 * pitch + o) - m12
-        a, d = fma(two, m12, c1), fma(two, covariance, c2)
-        e, f = squares + c1, variances + c2
-        ef = one / (e * f)
+        a, d = simd.fma(2, m12, C1), simd.fma(2, covariance, C2)
+        e, f = squares + C1, variances + C2
+        ef = 1 / (e * f)
         e, f = f * ef, e * ef
         similarity = a * d * ef
-        by_product = two * a * ef
+        by_product = 2 * a * ef
         by_square = -(similarity * f)
-        by_mean = two * (m2 * d * ef - m1 * similarity * e - m1 * by_square) - m2 * by_product
-        store(derivatives, o, by_mean)
-        store(derivatives, pitch + o, by_square)
-        store(derivatives, 2 * pitch + o, by_product)
-        total = total + select(lane >= broadcast(F(x_ - x)), similarity, broadcast(F(0)))
-    return lane_sum(total)
+        by_mean = 2 * (m2 * d * ef - m1 * similarity * e - m1 * by_square) - m2 * by_product
+        simd.store(derivatives, o, by_mean)
+        simd.store(derivatives, pitch + o, by_square)
+        simd.store(derivatives, 2 * pitch + o, by_product)
+        total = total + simd.select(lane >= F(x_ - x), similarity, 0)
+    return simd.lane_sum(total)
 
 
 @inline
 def pair_sum(ring, y, distance, o, pitch):
     """Sum of the rows ``distance`` above and below row y."""
     above, below = row_of(y - distance, DERIVATIVES, pitch), row_of(y + distance, DERIVATIVES, pitch)
-    return load(ring, above + o) + load(ring, below + o)
+    return simd.load(ring, above + o) + simd.load(ring, below + o)
 
 
 @inline
 def blur_across(ring, y, plane, x, pitch):
     """Eleven taps down the ring buffer, centred on row y, of one derivative plane."""
     o = plane * pitch + x
-    total = broadcast(G0) * load(ring, row_of(y, DERIVATIVES, pitch) + o)
-    total = fma(broadcast(G1), pair_sum(ring, y, 1, o, pitch), total)
-    total = fma(broadcast(G2), pair_sum(ring, y, 2, o, pitch), total)
-    total = fma(broadcast(G3), pair_sum(ring, y, 3, o, pitch), total)
-    total = fma(broadcast(G4), pair_sum(ring, y, 4, o, pitch), total)
-    return fma(broadcast(G5), pair_sum(ring, y, 5, o, pitch), total)
+    total = G0 * simd.load(ring, row_of(y, DERIVATIVES, pitch) + o)
+    total = simd.fma(G1, pair_sum(ring, y, 1, o, pitch), total)
+    total = simd.fma(G2, pair_sum(ring, y, 2, o, pitch), total)
+    total = simd.fma(G3, pair_sum(ring, y, 3, o, pitch), total)
+    total = simd.fma(G4, pair_sum(ring, y, 4, o, pitch), total)
+    return simd.fma(G5, pair_sum(ring, y, 5, o, pitch), total)
 
 
 @inline
 def gradient_of_row(image, gradient, images, ring, y, length, pitch, l1_step, ssim_step, lanes):
     """Gradient of the loss at row y, 0 where the image was clamped; returns the row's sum of absolute differences."""
-    zero, one, two = broadcast(F(0)), broadcast(F(1)), broadcast(F(2))
-    step, scale = broadcast(l1_step), broadcast(ssim_step)
-    total = zero
-    lane = load(lanes, 0)
+    total = simd.broadcast(0)
+    lane = simd.load(lanes, 0)
     for x_ in range(0, length, 16):
         x = min(x_, length - 16)
         o = row_of(y, IMAGES, pitch) + x
-        p, q = load(images, o), load(images, o + pitch)
+        p, q = simd.load(images, o), simd.load(images, o + pitch)
         g = blur_across(ring, y, 0, PAD + x, pitch)
-        g = fma(two * p, blur_across(ring, y, 1, PAD + x, pitch), g)
-        g = fma(q, blur_across(ring, y, 2, PAD + x, pitch), g)
-        sign = select(p > q, step, select(p < q, -step, zero))
-        raw = load(image, y * length + x)
-        inside = (raw >= zero) & (raw <= one)
-        store(gradient, y * length + x, select(inside, fnma(scale, g, sign), zero))
-        total = total + select(lane >= broadcast(F(x_ - x)), vfabs(p - q), zero)
-    return lane_sum(total)
+        g = simd.fma(2 * p, blur_across(ring, y, 1, PAD + x, pitch), g)
+        g = simd.fma(q, blur_across(ring, y, 2, PAD + x, pitch), g)
+        sign = simd.select(p > q, l1_step, simd.select(p < q, -l1_step, 0))
+        raw = simd.load(image, y * length + x)
+        inside = (raw >= 0) & (raw <= 1)
+        simd.store(gradient, y * length + x, simd.select(inside, simd.fnma(ssim_step, g, sign), 0))
+        total = total + simd.select(lane >= F(x_ - x), simd.vfabs(p - q), 0)
+    return simd.lane_sum(total)
 
 
 @inline
@@ -213,7 +196,7 @@ def sweep(
             for plane in range(DERIVATIVES):
                 for x_ in range(0, length, 16):
                     x = plane * pitch + PAD + min(x_, length - 16)
-                    store(ring, slot + x, blur_along(derivatives, x))
+                    simd.store(ring, slot + x, blur_along(derivatives, x))
         done = y - SSIM_RADIUS
         if done >= first:
             sums[2 * done + 1] = gradient_of_row(
@@ -250,7 +233,7 @@ def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float) -> tuple[float,
     check_pair(image, target)
     height, width = image.shape[:2]
     length = 3 * width
-    if length < WIDTH:
+    if length < simd.WIDTH:
         raise ValueError(f"a row of the image must fill a vector, so its width must be at least 6, got {width}")
     kind = UINT8 if target.dtype == torch.uint8 else FLOAT32
     pixels = flat_checked("image", image, tuple(image.shape)), flat_checked("target", target, tuple(target.shape), kind)

@@ -13,26 +13,15 @@ from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
 from nsvq_lightning.compute.memory import Array, flat, flat_checked, outside
-from nsvq_lightning.compute.simd import (
-    broadcast,
-    gather_rows3,
-    gather_rows4,
-    load,
-    scatter_rows3,
-    scatter_rows4,
-    select,
-    store,
-    vmax,
-    vsqrt,
-)
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.projection import BLUR, BLUR_SQUARED, HUGE_FOOTPRINT, affine, axes_of, image_axes
 from nsvq_lightning.rendering.cpu.projection_backward import axes_backward
 from nsvq_lightning.rendering.cpu.rasterizer import pack_camera
-from nsvq_lightning.rendering.cpu.records import cross, dot3, vector_range
 
 __all__ = ["light_kept_cpu"]
 
@@ -42,25 +31,23 @@ LEAST = F(constants.FAINTEST**2)
 @inline
 def light(u, v):
     """Square of the factor, area² = det Σ, sum of the variances, what the blur adds to det Σ, and u × v."""
-    one = broadcast(F(1))
-    n = cross(u, v)
-    area = dot3(n[0], n[1], n[2], n[0], n[1], n[2])
-    size = dot3(u[0], u[1], u[2], u[0], u[1], u[2]) + dot3(v[0], v[1], v[2], v[0], v[1], v[2])
-    added = broadcast(BLUR) * size + broadcast(BLUR_SQUARED)
-    squared = select(size < broadcast(HUGE_FOOTPRINT), area / (area + added), one)
-    return vmax(squared, broadcast(LEAST)), area, size, added, n
+    n = rec.cross(u, v)
+    area, size = rec.dot3(n, n), rec.dot3(u, u) + rec.dot3(v, v)
+    added = BLUR * size + BLUR_SQUARED
+    squared = simd.select(size < HUGE_FOOTPRINT, area / (area + added), 1)
+    return simd.vmax(squared, LEAST), area, size, added, n
 
 
 @kernel
 def keep_light(threads, camera, means, quats, scales, ids, count, factors):
     """Factors ``[count]`` of the splats ``ids``; both arrays have room for a last, incomplete vector."""
     for thread in prange(threads):
-        first, last = vector_range(count, thread, threads)
+        first, last = rec.vector_range(count, thread, threads)
         for start in range(first, last, 16):
-            _, _, _, t0, t1 = affine(camera, gather_rows3(means, ids, start))
-            _, _, _, m = axes_of(gather_rows4(quats, ids, start), gather_rows3(scales, ids, start))
+            _, _, _, t0, t1 = affine(camera, simd.gather_rows3(means, ids, start))
+            _, _, _, m = axes_of(simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start))
             squared, _, _, _, _ = light(image_axes(t0, m), image_axes(t1, m))
-            store(factors, start, vsqrt(squared))
+            simd.store(factors, start, simd.vsqrt(squared))
 
 
 @kernel
@@ -70,32 +57,31 @@ def keep_light_backward(threads, camera, means, quats, scales, ids, count, gradi
     With A = det Σ, S the sum of the variances and D = A + b·S + b², the factor is ρ = √(A/D), and
     dρ = ½·ρ·((b·S + b²)/(A·D)·dA − b/D·dS), where dA = 2·((v × n)·du + (n × u)·dv) with n = u × v.
     """
-    zero = broadcast(F(0))
     for thread in prange(threads):
-        first, last = vector_range(count, thread, threads)
+        first, last = rec.vector_range(count, thread, threads)
         for start in range(first, last, 16):
-            view = affine(camera, gather_rows3(means, ids, start))
-            axes = axes_of(gather_rows4(quats, ids, start), gather_rows3(scales, ids, start))
+            view = affine(camera, simd.gather_rows3(means, ids, start))
+            axes = axes_of(simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start))
             _, _, _, t0, t1 = view
             _, _, _, m = axes
             u, v = image_axes(t0, m), image_axes(t1, m)
             squared, area, size, added, n = light(u, v)
             # At the floor, and where the blur does not count, the factor is constant.
-            free = (size < broadcast(HUGE_FOOTPRINT)) & (squared > broadcast(LEAST))
+            free = (size < HUGE_FOOTPRINT) & (squared > LEAST)
             # A huge splat's v × n would overflow, and 0 · ∞ is not 0.
-            u = select(free, u[0], zero), select(free, u[1], zero), select(free, u[2], zero)
-            v = select(free, v[0], zero), select(free, v[1], zero), select(free, v[2], zero)
+            u = simd.select(free, u[0], 0), simd.select(free, u[1], 0), simd.select(free, u[2], 0)
+            v = simd.select(free, v[0], 0), simd.select(free, v[1], 0), simd.select(free, v[2], 0)
             whole = area + added
-            g = select(free, load(gradient, start) * vsqrt(squared) / whole, zero)
-            by_area = select(free, g * added / area, zero)
-            by_size = g * broadcast(BLUR)
-            vn, nu = cross(v, n), cross(n, u)
+            g = simd.select(free, simd.load(gradient, start) * simd.vsqrt(squared) / whole, 0)
+            by_area = simd.select(free, g * added / area, 0)
+            by_size = g * BLUR
+            vn, nu = rec.cross(v, n), rec.cross(n, u)
             gu = by_area * vn[0] - by_size * u[0], by_area * vn[1] - by_size * u[1], by_area * vn[2] - by_size * u[2]
             gv = by_area * nu[0] - by_size * v[0], by_area * nu[1] - by_size * v[1], by_area * nu[2] - by_size * v[2]
-            g_mean, g_quat = axes_backward(camera, view, axes, gu, gv, zero, zero, zero)
-            scatter_rows3(g_means, ids, start, g_mean)
-            scatter_rows4(g_quats, ids, start, g_quat)
-            scatter_rows3(
+            g_mean, g_quat = axes_backward(camera, view, axes, gu, gv, 0, 0, 0)
+            simd.scatter_rows3(g_means, ids, start, g_mean)
+            simd.scatter_rows4(g_quats, ids, start, g_quat)
+            simd.scatter_rows3(
                 g_scales,
                 ids,
                 start,

@@ -8,63 +8,11 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
+from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, kernel
-from nsvq_lightning.compute.simd import (
-    broadcast,
-    exp2_clamped,
-    fma,
-    fnma,
-    get,
-    load,
-    load_rows3,
-    load_rows4,
-    log2,
-    lowest_bit,
-    mask_bits,
-    put,
-    select,
-    store,
-    transpose,
-    vceil,
-    vfabs,
-    vfloor,
-    vmax,
-    vmin,
-    vsqrt,
-)
 from nsvq_lightning.rendering import constants
+from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import color_range
-from nsvq_lightning.rendering.cpu.records import (
-    CX,
-    CY,
-    DEPTH,
-    EXTENT,
-    FACTOR_SCALE,
-    FX,
-    FY,
-    GROUP_SHIFT,
-    HEIGHT,
-    HIGH_X,
-    HIGH_Y,
-    LOG2_ALPHA_MIN,
-    LOG2_E,
-    LOW_X,
-    LOW_Y,
-    ORIGIN,
-    RADIUS,
-    RECORD,
-    ROTATION,
-    SLOT,
-    TILE_SHIFT,
-    TRANSLATION,
-    WIDTH,
-    X,
-    Y,
-    cross,
-    dot3,
-    rotate,
-    vector_range,
-)
 from nsvq_lightning.splats import conventions
 
 NEAR = F(constants.NEAR)
@@ -78,123 +26,100 @@ LN2 = F(np.log(2.0))
 
 
 @inline
-def view_depth(camera, means):
+def view_depth(camera, mean):
     """View-space z of 16 means."""
-    return rotate(camera, 2, means[0], means[1], means[2]) + broadcast(get(camera, TRANSLATION + 2))
+    return rec.rotate(camera, 2, mean) + simd.load_one(camera, rec.TRANSLATION + 2)
 
 
 @inline
 def axes_of(quat, log_scales):
-    """Unit quaternion and its inverse norm, axis lengths, and the matrix M = R·diag(lengths), row by row."""
-    one, two = broadcast(F(1)), broadcast(F(2))
+    """Unit quaternion and its inverse norm, axis lengths, and the rows of the matrix M = R·diag(lengths)."""
     w, x, y, z = quat
-    largest = vmax(vmax(vfabs(w), vfabs(x)), vmax(vfabs(y), vfabs(z)))
-    shrink = select(largest > broadcast(HUGE_QUATERNION), broadcast(SHRINK), one)
+    largest = simd.vmax(simd.vmax(simd.vfabs(w), simd.vfabs(x)), simd.vmax(simd.vfabs(y), simd.vfabs(z)))
+    shrink = simd.select(largest > HUGE_QUATERNION, SHRINK, 1)
     w, x, y, z = w * shrink, x * shrink, y * shrink, z * shrink
-    squared = fma(w, w, fma(x, x, fma(y, y, z * z)))
-    inverse = one / vsqrt(vmax(squared, broadcast(MIN_SQUARED_NORM)))
+    squared = simd.fma(w, w, simd.fma(x, x, simd.fma(y, y, z * z)))
+    inverse = 1 / simd.vsqrt(simd.vmax(squared, MIN_SQUARED_NORM))
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
-    s0 = exp2_clamped(log_scales[0] * broadcast(LOG2_E))
-    s1 = exp2_clamped(log_scales[1] * broadcast(LOG2_E))
-    s2 = exp2_clamped(log_scales[2] * broadcast(LOG2_E))
-    m = (
-        fnma(two, fma(y, y, z * z), one) * s0,
-        two * (x * y - w * z) * s1,
-        two * (x * z + w * y) * s2,
-        two * (x * y + w * z) * s0,
-        fnma(two, fma(x, x, z * z), one) * s1,
-        two * (y * z - w * x) * s2,
-        two * (x * z - w * y) * s0,
-        two * (y * z + w * x) * s1,
-        fnma(two, fma(x, x, y * y), one) * s2,
-    )
-    return (w, x, y, z), inverse * shrink, (s0, s1, s2), m
+    s0 = simd.exp2_clamped(log_scales[0] * rec.LOG2_E)
+    s1 = simd.exp2_clamped(log_scales[1] * rec.LOG2_E)
+    s2 = simd.exp2_clamped(log_scales[2] * rec.LOG2_E)
+    xx, yy, zz = simd.fma(y, y, z * z), simd.fma(x, x, z * z), simd.fma(x, x, y * y)
+    m0 = simd.fnma(2, xx, 1) * s0, 2 * (x * y - w * z) * s1, 2 * (x * z + w * y) * s2
+    m1 = 2 * (x * y + w * z) * s0, simd.fnma(2, yy, 1) * s1, 2 * (y * z - w * x) * s2
+    m2 = 2 * (x * z - w * y) * s0, 2 * (y * z + w * x) * s1, simd.fnma(2, zz, 1) * s2
+    return (w, x, y, z), inverse * shrink, (s0, s1, s2), (m0, m1, m2)
 
 
 @inline
-def affine(camera, means):
+def affine_row(camera, k, scale, slope):
+    """Row k of T = J·W, the local affine map: ``scale`` is focal/z, W the rotation."""
+    near, far = rec.load3(camera, rec.ROTATION + 3 * k, 1), rec.load3(camera, rec.ROTATION + 6, 1)
+    return rec.fma3(scale, near, rec.scale3(-(scale * slope), far))
+
+
+@inline
+def affine(camera, mean):
     """View-space point, 1/z, slopes limited to the frustum, and T = J·W, the two rows of the local affine map."""
-    x = rotate(camera, 0, means[0], means[1], means[2]) + broadcast(get(camera, TRANSLATION))
-    y = rotate(camera, 1, means[0], means[1], means[2]) + broadcast(get(camera, TRANSLATION + 1))
-    z = view_depth(camera, means)
-    inverse = broadcast(F(1)) / z
-    slope_x = vmin(broadcast(get(camera, HIGH_X)), vmax(broadcast(get(camera, LOW_X)), x * inverse))
-    slope_y = vmin(broadcast(get(camera, HIGH_Y)), vmax(broadcast(get(camera, LOW_Y)), y * inverse))
-    fx, fy = broadcast(get(camera, FX)) * inverse, broadcast(get(camera, FY)) * inverse
-    jx, jy = -(fx * slope_x), -(fy * slope_y)
-    o = ROTATION
-    t0 = (
-        fma(fx, broadcast(get(camera, o)), jx * broadcast(get(camera, o + 6))),
-        fma(fx, broadcast(get(camera, o + 1)), jx * broadcast(get(camera, o + 7))),
-        fma(fx, broadcast(get(camera, o + 2)), jx * broadcast(get(camera, o + 8))),
-    )
-    t1 = (
-        fma(fy, broadcast(get(camera, o + 3)), jy * broadcast(get(camera, o + 6))),
-        fma(fy, broadcast(get(camera, o + 4)), jy * broadcast(get(camera, o + 7))),
-        fma(fy, broadcast(get(camera, o + 5)), jy * broadcast(get(camera, o + 8))),
-    )
+    x = rec.rotate(camera, 0, mean) + simd.load_one(camera, rec.TRANSLATION)
+    y = rec.rotate(camera, 1, mean) + simd.load_one(camera, rec.TRANSLATION + 1)
+    z = view_depth(camera, mean)
+    inverse = 1 / z
+    slope_x = simd.vmin(simd.load_one(camera, rec.HIGH_X), simd.vmax(simd.load_one(camera, rec.LOW_X), x * inverse))
+    slope_y = simd.vmin(simd.load_one(camera, rec.HIGH_Y), simd.vmax(simd.load_one(camera, rec.LOW_Y), y * inverse))
+    t0 = affine_row(camera, 0, simd.load_one(camera, rec.FX) * inverse, slope_x)
+    t1 = affine_row(camera, 1, simd.load_one(camera, rec.FY) * inverse, slope_y)
     return (x, y, z), inverse, (slope_x, slope_y), t0, t1
 
 
 @inline
 def image_axes(t, m):
     """One row of U = T·M: the splat's axes along one image axis."""
+    m0, m1, m2 = m
     return (
-        dot3(t[0], t[1], t[2], m[0], m[3], m[6]),
-        dot3(t[0], t[1], t[2], m[1], m[4], m[7]),
-        dot3(t[0], t[1], t[2], m[2], m[5], m[8]),
+        rec.dot3(t, (m0[0], m1[0], m2[0])),
+        rec.dot3(t, (m0[1], m1[1], m2[1])),
+        rec.dot3(t, (m0[2], m1[2], m2[2])),
     )
 
 
 @inline
 def footprint(camera, means, quats, scales, logits):
     """All of a record except the colour, the tile rectangle, and which of 16 splats can change the image."""
-    zero, one, half = broadcast(F(0)), broadcast(F(1)), broadcast(F(0.5))
     (x, y, z), inverse, _, t0, t1 = affine(camera, means)
     _, _, _, m = axes_of(quats, scales)
     u, v = image_axes(t0, m), image_axes(t1, m)
-    xx = dot3(u[0], u[1], u[2], u[0], u[1], u[2])
-    yy = dot3(v[0], v[1], v[2], v[0], v[1], v[2])
-    xy = dot3(u[0], u[1], u[2], v[0], v[1], v[2])
+    xx, yy, xy = rec.dot3(u, u), rec.dot3(v, v), rec.dot3(u, v)
     # |u|²|v|² - (u·v)² = |u × v|² (Lagrange): no cancellation for large splats.
-    n0, n1, n2 = cross(u, v)
     size = xx + yy
-    unit = select(size > broadcast(HUGE_FOOTPRINT), one / size, one)
-    n0, n1, n2 = n0 * unit, n1 * unit, n2 * unit
-    determinant = dot3(n0, n1, n2, n0, n1, n2) + fma(broadcast(BLUR), size, broadcast(BLUR_SQUARED)) * unit * unit
-    xx, yy = xx + broadcast(BLUR), yy + broadcast(BLUR)
+    unit = simd.select(size > HUGE_FOOTPRINT, 1 / size, 1)
+    n = rec.scale3(unit, rec.cross(u, v))
+    determinant = rec.dot3(n, n) + simd.fma(BLUR, size, BLUR_SQUARED) * unit * unit
+    xx, yy = xx + BLUR, yy + BLUR
 
-    px = fma(broadcast(get(camera, FX)), x * inverse, broadcast(get(camera, CX)))
-    py = fma(broadcast(get(camera, FY)), y * inverse, broadcast(get(camera, CY)))
-    log2_opacity = -log2(one + exp2_clamped(-(logits * broadcast(LOG2_E))))
+    px = simd.fma(simd.load_one(camera, rec.FX), x * inverse, simd.load_one(camera, rec.CX))
+    py = simd.fma(simd.load_one(camera, rec.FY), y * inverse, simd.load_one(camera, rec.CY))
+    log2_opacity = -simd.log2(1 + simd.exp2_clamped(-(logits * rec.LOG2_E)))
     # α reaches 1/255 where u² + v² ≤ log2(255 o): a box of half sizes √(2 ln(255 o)·Σ_ii).
-    reach = (log2_opacity - broadcast(LOG2_ALPHA_MIN)) * broadcast(F(2) * LN2)
-    half_x, half_y = vsqrt(vmax(reach, zero) * xx), vsqrt(vmax(reach, zero) * yy)
-    left, right = vmax(vceil(px - half_x - half), zero), vfloor(px + half_x - half)
-    top, bottom = vmax(vceil(py - half_y - half), zero), vfloor(py + half_y - half)
-    right = vmin(right, broadcast(get(camera, WIDTH)) - one)
-    bottom = vmin(bottom, broadcast(get(camera, HEIGHT)) - one)
+    reach = (log2_opacity - rec.LOG2_ALPHA_MIN) * (F(2) * LN2)
+    half_x, half_y = simd.vsqrt(simd.vmax(reach, 0) * xx), simd.vsqrt(simd.vmax(reach, 0) * yy)
+    left, right = simd.vmax(simd.vceil(px - half_x - 0.5), 0), simd.vfloor(px + half_x - 0.5)
+    top, bottom = simd.vmax(simd.vceil(py - half_y - 0.5), 0), simd.vfloor(py + half_y - 0.5)
+    right = simd.vmin(right, simd.load_one(camera, rec.WIDTH) - 1)
+    bottom = simd.vmin(bottom, simd.load_one(camera, rec.HEIGHT) - 1)
 
-    finite = broadcast(FINITE)
-    seen = (z > broadcast(NEAR)) & (reach > zero) & (left <= right) & (top <= bottom)
-    seen = (
-        seen
-        & (size < broadcast(LARGEST_FOOTPRINT))
-        & (determinant < finite)
-        & (vfabs(px) < finite)
-        & (vfabs(py) < finite)
-        & (logits >= -finite)
-    )
+    seen = (z > NEAR) & (reach > 0) & (left <= right) & (top <= bottom)
+    seen = seen & (size < LARGEST_FOOTPRINT) & (determinant < FINITE)
+    seen = seen & (simd.vfabs(px) < FINITE) & (simd.vfabs(py) < FINITE) & (logits >= -FINITE)
     # exp2_clamped makes a broken scale finite; the raw one still shows that it is broken.
-    seen = seen & (scales[0] + scales[1] + scales[2] < finite)
+    seen = seen & (scales[0] + scales[1] + scales[2] < FINITE)
 
-    factor = broadcast(FACTOR_SCALE)
     slope_y = xy / yy
-    a = factor * vsqrt(yy * unit / determinant * unit)
-    record = (px, py, a, -(a * slope_y), factor / vsqrt(yy), log2_opacity, z, xy / xx, slope_y)
-    tile = broadcast(F(1.0 / (1 << TILE_SHIFT)))
-    tiles = (vfloor(left * tile), vfloor(top * tile), vfloor(right * tile), vfloor(bottom * tile))
-    return seen, record, tiles, vceil(vmax(half_x, half_y))
+    a = rec.FACTOR_SCALE * simd.vsqrt(yy * unit / determinant * unit)
+    record = (px, py, a, -(a * slope_y), rec.FACTOR_SCALE / simd.vsqrt(yy), log2_opacity, z, xy / xx, slope_y)
+    tile = F(1.0 / rec.TILE)
+    tiles = (simd.vfloor(left * tile), simd.vfloor(top * tile), simd.vfloor(right * tile), simd.vfloor(bottom * tile))
+    return seen, record, tiles, simd.vceil(simd.vmax(half_x, half_y))
 
 
 @inline
@@ -202,9 +127,9 @@ def load_means(means, start, count, scratch):
     """16 means; the last, incomplete vector is read from a padded copy."""
     if count < 16:
         for k in range(3 * count):
-            put(scratch, k, get(means, 3 * start + k))
-        return load_rows3(scratch, 0)
-    return load_rows3(means, 3 * start)
+            simd.put(scratch, k, simd.get(means, 3 * start + k))
+        return simd.load_rows3(scratch, 0)
+    return simd.load_rows3(means, 3 * start)
 
 
 @inline
@@ -212,54 +137,57 @@ def load_shapes(quats, scales, logits, start, count, scratch):
     """16 quaternions, log scales and opacity logits, an incomplete vector as in :func:`load_means`."""
     if count < 16:
         for k in range(4 * count):
-            put(scratch, k, get(quats, 4 * start + k))
-        quat = load_rows4(scratch, 0)
+            simd.put(scratch, k, simd.get(quats, 4 * start + k))
+        quat = simd.load_rows4(scratch, 0)
         for k in range(3 * count):
-            put(scratch, k, get(scales, 3 * start + k))
-        scale = load_rows3(scratch, 0)
+            simd.put(scratch, k, simd.get(scales, 3 * start + k))
+        scale = simd.load_rows3(scratch, 0)
         for k in range(count):
-            put(scratch, k, get(logits, start + k))
-        return quat, scale, load(scratch, 0)
-    return load_rows4(quats, 4 * start), load_rows3(scales, 3 * start), load(logits, start)
+            simd.put(scratch, k, simd.get(logits, start + k))
+        return quat, scale, simd.load(scratch, 0)
+    return simd.load_rows4(quats, 4 * start), simd.load_rows3(scales, 3 * start), simd.load(logits, start)
 
 
 @inline
 def project_range(camera, means, quats, scales, logits, first, last, records, integers, ids, scratch):
     """Write the records of a range's visible splats; returns how many there are and how many slots they need."""
-    zero = broadcast(F(0))
+    zero = simd.broadcast(0)
     visible = 0
     slots = 0
     for start in range(first, last, 16):
         count = min(16, last - start)
         mean = load_means(means, start, count, scratch)
         lanes = (1 << count) - 1
-        if mask_bits(view_depth(camera, mean) > broadcast(NEAR)) & lanes == 0:
+        if simd.mask_bits(view_depth(camera, mean) > NEAR) & lanes == 0:
             continue
         quat, scale, logit = load_shapes(quats, scales, logits, start, count, scratch)
         seen, record, tiles, radius = footprint(camera, mean, quat, scale, logit)
-        bits = mask_bits(seen) & lanes
+        bits = simd.mask_bits(seen) & lanes
         if bits == 0:
             continue
         x, y, a, b, c, opacity, depth, slope_x, slope_y = record
-        rows = transpose((x, y, a, b, c, opacity, zero, zero, zero, depth, slope_x, slope_y, zero, zero, zero, zero))
+        rows = simd.transpose(
+            (x, y, a, b, c, opacity, zero, zero, zero, depth, slope_x, slope_y, zero, zero, zero, zero)
+        )
         for lane in range(16):
-            store(scratch, 128 + 16 * lane, rows[lane])
+            simd.store(scratch, 128 + 16 * lane, rows[lane])
         for k in range(4):
-            store(scratch, 16 * k, tiles[k])
-        store(scratch, 64, radius)
+            simd.store(scratch, 16 * k, tiles[k])
+        simd.store(scratch, 64, radius)
         while bits != 0:
-            lane = lowest_bit(bits)
+            lane = simd.lowest_bit(bits)
             bits &= bits - 1
             row = start + lane
-            store(records, RECORD * row, load(scratch, 128 + 16 * lane))
-            x0, y0 = np.int64(get(scratch, lane)), np.int64(get(scratch, 16 + lane))
-            x1, y1 = np.int64(get(scratch, 32 + lane)), np.int64(get(scratch, 48 + lane))
-            put(integers, RECORD * row + SLOT, slots)
-            put(integers, RECORD * row + ORIGIN, x0 | (y0 << 16))
-            put(integers, RECORD * row + EXTENT, (x1 - x0 + 1) | ((y1 - y0 + 1) << 16))
-            put(integers, RECORD * row + RADIUS, np.int64(min(get(scratch, 64 + lane), F(1e9))))
-            slots += ((x1 >> GROUP_SHIFT) - (x0 >> GROUP_SHIFT) + 1) * ((y1 >> GROUP_SHIFT) - (y0 >> GROUP_SHIFT) + 1)
-            put(ids, first + visible, row)
+            simd.store(records, rec.RECORD * row, simd.load(scratch, 128 + 16 * lane))
+            x0, y0 = np.int64(simd.get(scratch, lane)), np.int64(simd.get(scratch, 16 + lane))
+            x1, y1 = np.int64(simd.get(scratch, 32 + lane)), np.int64(simd.get(scratch, 48 + lane))
+            simd.put(integers, rec.RECORD * row + rec.SLOT, slots)
+            simd.put(integers, rec.RECORD * row + rec.ORIGIN, x0 | (y0 << 16))
+            simd.put(integers, rec.RECORD * row + rec.EXTENT, (x1 - x0 + 1) | ((y1 - y0 + 1) << 16))
+            simd.put(integers, rec.RECORD * row + rec.RADIUS, np.int64(min(simd.get(scratch, 64 + lane), F(1e9))))
+            columns = (x1 >> rec.GROUP_SHIFT) - (x0 >> rec.GROUP_SHIFT) + 1
+            slots += columns * ((y1 >> rec.GROUP_SHIFT) - (y0 >> rec.GROUP_SHIFT) + 1)
+            simd.put(ids, first + visible, row)
             visible += 1
     return visible, slots
 
@@ -268,7 +196,7 @@ def project_range(camera, means, quats, scales, logits, first, last, records, in
 def project_splats(threads, camera, means, quats, scales, logits, records, integers, found, counts, slots, scratch):
     """Write the records of all visible splats; ``found`` gets a run of rows for each thread's range."""
     for thread in prange(threads):
-        first, last = vector_range(logits.shape[0], thread, threads)
+        first, last = rec.vector_range(logits.shape[0], thread, threads)
         counts[thread], slots[thread] = project_range(
             camera, means, quats, scales, logits, first, last, records, integers, found, scratch[thread]
         )
@@ -278,19 +206,19 @@ def project_splats(threads, camera, means, quats, scales, logits, records, integ
 def find_visible(threads, camera, means, quats, scales, logits, found, runs, scratch):
     """Find the rows of the visible splats; thread t writes them to ``found`` from ``runs[t, 0]`` to ``runs[t, 1]``."""
     for thread in prange(threads):
-        first, last = vector_range(logits.shape[0], thread, threads)
+        first, last = rec.vector_range(logits.shape[0], thread, threads)
         at = first
         for start in range(first, last, 16):
             count = min(16, last - start)
             mean = load_means(means, start, count, scratch[thread])
-            bits = mask_bits(view_depth(camera, mean) > broadcast(NEAR)) & ((1 << count) - 1)
+            bits = simd.mask_bits(view_depth(camera, mean) > NEAR) & ((1 << count) - 1)
             if bits == 0:
                 continue
             quat, scale, logit = load_shapes(quats, scales, logits, start, count, scratch[thread])
             seen, _, _, _ = footprint(camera, mean, quat, scale, logit)
-            bits &= mask_bits(seen)
+            bits &= simd.mask_bits(seen)
             while bits != 0:
-                put(found, at, start + lowest_bit(bits))
+                simd.put(found, at, start + simd.lowest_bit(bits))
                 bits &= bits - 1
                 at += 1
         runs[thread, 0], runs[thread, 1] = first, at
@@ -327,23 +255,25 @@ def finish_records(
     """
     total = counts.sum()
     for thread in prange(threads):
-        first, _ = vector_range(records.shape[0] // RECORD, thread, threads)
+        first, _ = rec.vector_range(records.shape[0] // rec.RECORD, thread, threads)
         start, slot = counts[:thread].sum(), slots[:thread].sum()
         for k in range(counts[thread]):
-            row = np.int64(get(found, first + k))
-            put(ids, start + k, row)
-            put(integers, RECORD * row + SLOT, np.int64(get(integers, RECORD * row + SLOT)) + slot)
+            row = np.int64(simd.get(found, first + k))
+            simd.put(ids, start + k, row)
+            simd.put(
+                integers, rec.RECORD * row + rec.SLOT, np.int64(simd.get(integers, rec.RECORD * row + rec.SLOT)) + slot
+            )
             # Depths are positive, so their bits sort as integers.
-            put(keys, start + k, get(integers, RECORD * row + DEPTH))
-            put(order, start + k, start + k)
-            extent = np.int64(get(integers, RECORD * row + EXTENT))
-            put(boxes, start + k, np.int64(get(integers, RECORD * row + ORIGIN)) | (extent << 32))
-            put(means2d, 2 * row, get(records, RECORD * row + X))
-            put(means2d, 2 * row + 1, get(records, RECORD * row + Y))
-            put(radii, row, get(integers, RECORD * row + RADIUS))
+            simd.put(keys, start + k, simd.get(integers, rec.RECORD * row + rec.DEPTH))
+            simd.put(order, start + k, start + k)
+            extent = np.int64(simd.get(integers, rec.RECORD * row + rec.EXTENT))
+            simd.put(boxes, start + k, np.int64(simd.get(integers, rec.RECORD * row + rec.ORIGIN)) | (extent << 32))
+            simd.put(means2d, 2 * row, simd.get(records, rec.RECORD * row + rec.X))
+            simd.put(means2d, 2 * row + 1, simd.get(records, rec.RECORD * row + rec.Y))
+            simd.put(radii, row, simd.get(integers, rec.RECORD * row + rec.RADIUS))
         if start + counts[thread] == total and counts[thread] > 0:
             for k in range(16):
-                put(ids, total + k, get(ids, total - 1))
+                simd.put(ids, total + k, simd.get(ids, total - 1))
     for thread in prange(threads):
-        first, last = vector_range(total, thread, threads)
+        first, last = rec.vector_range(total, thread, threads)
         color_range(camera, means, sh0, shN, stride, degree, evaluated, ids, first, last, records, scratch[thread])

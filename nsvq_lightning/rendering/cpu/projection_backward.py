@@ -5,54 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
+from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, kernel
 from nsvq_lightning.compute.rows import clear
-from nsvq_lightning.compute.simd import (
-    broadcast,
-    exp2_clamped,
-    fma,
-    fnma,
-    gather_columns,
-    gather_rows1,
-    gather_rows3,
-    gather_rows4,
-    get,
-    load,
-    prefetch,
-    put,
-    scatter_rows1,
-    scatter_rows3,
-    scatter_rows4,
-    select,
-)
+from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import AHEAD, coefficients_of, color_backward, prefetch_sh
 from nsvq_lightning.rendering.cpu.projection import BLUR, affine, axes_of, image_axes
-from nsvq_lightning.rendering.cpu.records import (
-    BLUE,
-    FX,
-    FY,
-    GREEN,
-    LOG2_E,
-    RECORD,
-    RED,
-    SLOT,
-    SUM_BLUE,
-    SUM_DEPTH,
-    SUM_GREEN,
-    SUM_H,
-    SUM_RED,
-    SUM_UU,
-    SUM_UV,
-    SUM_VV,
-    A,
-    B,
-    C,
-    cross,
-    dot3,
-    rotate,
-    rotate_back,
-    vector_range,
-)
 
 COVARIANCE_SCALE = F(2 * np.log(2.0) ** 2)
 """Converts moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)²."""
@@ -60,20 +18,16 @@ COVARIANCE_SCALE = F(2 * np.log(2.0) ** 2)
 
 @inline
 def quaternion_gradient(q, inverse, r):
-    """dL/dq of an unnormalised quaternion from dL/dR (row by row)."""
-    two = broadcast(F(2))
+    """dL/dq of an unnormalised quaternion from the rows of dL/dR."""
     w, x, y, z = q
-    gw = two * (x * (r[7] - r[5]) + y * (r[2] - r[6]) + z * (r[3] - r[1]))
-    gx = two * (y * (r[1] + r[3]) + z * (r[2] + r[6]) + w * (r[7] - r[5]) - two * x * (r[4] + r[8]))
-    gy = two * (x * (r[1] + r[3]) + z * (r[5] + r[7]) + w * (r[2] - r[6]) - two * y * (r[0] + r[8]))
-    gz = two * (x * (r[2] + r[6]) + y * (r[5] + r[7]) + w * (r[3] - r[1]) - two * z * (r[0] + r[4]))
-    radial = fma(gw, w, dot3(gx, gy, gz, x, y, z))
-    return (
-        fnma(radial, w, gw) * inverse,
-        fnma(radial, x, gx) * inverse,
-        fnma(radial, y, gy) * inverse,
-        fnma(radial, z, gz) * inverse,
-    )
+    r0, r1, r2 = r
+    gw = 2 * (x * (r2[1] - r1[2]) + y * (r0[2] - r2[0]) + z * (r1[0] - r0[1]))
+    gx = 2 * (y * (r0[1] + r1[0]) + z * (r0[2] + r2[0]) + w * (r2[1] - r1[2]) - 2 * x * (r1[1] + r2[2]))
+    gy = 2 * (x * (r0[1] + r1[0]) + z * (r1[2] + r2[1]) + w * (r0[2] - r2[0]) - 2 * y * (r0[0] + r2[2]))
+    gz = 2 * (x * (r0[2] + r2[0]) + y * (r1[2] + r2[1]) + w * (r1[0] - r0[1]) - 2 * z * (r0[0] + r1[1]))
+    radial = simd.fma(gw, w, rec.dot3((gx, gy, gz), (x, y, z)))
+    rest = rec.scale3(inverse, rec.fma3(-radial, (x, y, z), (gx, gy, gz)))
+    return simd.fnma(radial, w, gw) * inverse, rest[0], rest[1], rest[2]
 
 
 @inline
@@ -96,48 +50,28 @@ def axes_backward(camera, view, axes, gu, gv, g2x, g2y, g_depth):
     """
     (x, y, _), inverse, (slope_x, slope_y), t0, t1 = view
     q, q_inverse, lengths, m = axes
-    gm = (
-        fma(t0[0], gu[0], t1[0] * gv[0]), fma(t0[0], gu[1], t1[0] * gv[1]), fma(t0[0], gu[2], t1[0] * gv[2]),
-        fma(t0[1], gu[0], t1[1] * gv[0]), fma(t0[1], gu[1], t1[1] * gv[1]), fma(t0[1], gu[2], t1[1] * gv[2]),
-        fma(t0[2], gu[0], t1[2] * gv[0]), fma(t0[2], gu[1], t1[2] * gv[1]), fma(t0[2], gu[2], t1[2] * gv[2]),
-    )  # fmt: skip
-    g_rotation = (
-        gm[0] * lengths[0], gm[1] * lengths[1], gm[2] * lengths[2],
-        gm[3] * lengths[0], gm[4] * lengths[1], gm[5] * lengths[2],
-        gm[6] * lengths[0], gm[7] * lengths[1], gm[8] * lengths[2],
-    )  # fmt: skip
+    gm0 = rec.fma3(t0[0], gu, rec.scale3(t1[0], gv))
+    gm1 = rec.fma3(t0[1], gu, rec.scale3(t1[1], gv))
+    gm2 = rec.fma3(t0[2], gu, rec.scale3(t1[2], gv))
+    g_rotation = rec.times3(gm0, lengths), rec.times3(gm1, lengths), rec.times3(gm2, lengths)
     g_quat = quaternion_gradient(q, q_inverse, g_rotation)
 
-    g0 = (
-        dot3(gu[0], gu[1], gu[2], m[0], m[1], m[2]),
-        dot3(gu[0], gu[1], gu[2], m[3], m[4], m[5]),
-        dot3(gu[0], gu[1], gu[2], m[6], m[7], m[8]),
-    )
-    g1 = (
-        dot3(gv[0], gv[1], gv[2], m[0], m[1], m[2]),
-        dot3(gv[0], gv[1], gv[2], m[3], m[4], m[5]),
-        dot3(gv[0], gv[1], gv[2], m[6], m[7], m[8]),
-    )
+    g0 = rec.dot3(gu, m[0]), rec.dot3(gu, m[1]), rec.dot3(gu, m[2])
+    g1 = rec.dot3(gv, m[0]), rec.dot3(gv, m[1]), rec.dot3(gv, m[2])
     # J = [[fx/z, 0, -fx·sx/z], [0, fy/z, -fy·sy/z]]; sx = x/z except where it is clamped.
-    j00, j02 = rotate(camera, 0, g0[0], g0[1], g0[2]), rotate(camera, 2, g0[0], g0[1], g0[2])
-    j11, j12 = rotate(camera, 1, g1[0], g1[1], g1[2]), rotate(camera, 2, g1[0], g1[1], g1[2])
-    fx, fy = broadcast(get(camera, FX)) * inverse, broadcast(get(camera, FY)) * inverse
+    j00, j02 = rec.rotate(camera, 0, g0), rec.rotate(camera, 2, g0)
+    j11, j12 = rec.rotate(camera, 1, g1), rec.rotate(camera, 2, g1)
+    fx, fy = simd.load_one(camera, rec.FX) * inverse, simd.load_one(camera, rec.FY) * inverse
     fx_z, fy_z = fx * inverse, fy * inverse
-    one, zero = broadcast(F(1)), broadcast(F(0))
     tx, ty = x * inverse, y * inverse
-    free_x = select((slope_x >= tx) & (slope_x <= tx), one, zero)
-    free_y = select((slope_y >= ty) & (slope_y <= ty), one, zero)
-    vx = fnma(free_x * fx_z, j02, fx * g2x)
-    vy = fnma(free_y * fy_z, j12, fy * g2y)
-    vz = (one + free_x) * fx_z * slope_x * j02 + (one + free_y) * fy_z * slope_y * j12
+    free_x = simd.select((slope_x >= tx) & (slope_x <= tx), 1, 0)
+    free_y = simd.select((slope_y >= ty) & (slope_y <= ty), 1, 0)
+    vx = simd.fnma(free_x * fx_z, j02, fx * g2x)
+    vy = simd.fnma(free_y * fy_z, j12, fy * g2y)
+    vz = (1 + free_x) * fx_z * slope_x * j02 + (1 + free_y) * fy_z * slope_y * j12
     vz = vz - fx_z * (x * g2x + j00) - fy_z * (y * g2y + j11)
-    vz = vz + g_depth
-    g_mean = (
-        rotate_back(camera, 0, vx, vy, vz),
-        rotate_back(camera, 1, vx, vy, vz),
-        rotate_back(camera, 2, vx, vy, vz),
-    )
-    return g_mean, g_quat
+    v = vx, vy, vz + g_depth
+    return (rec.rotate_back(camera, 0, v), rec.rotate_back(camera, 1, v), rec.rotate_back(camera, 2, v)), g_quat
 
 
 @inline
@@ -146,7 +80,6 @@ def geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y):
 
     ``total`` are the 16 sums of a slot, ``g2x``, ``g2y`` the gradient of the projected centre.
     """
-    two = broadcast(F(2))
     view, axes = affine(camera, mean), axes_of(quat, scale)
     _, _, _, t0, t1 = view
     _, _, _, m = axes
@@ -154,21 +87,16 @@ def geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y):
 
     # dL/dΣ = ½ Fᵀ S F with S = Σ h uuᵀ, so dL/dU = Fᵀ S (F U). The rows of F U are a·u + b·v and c·v; by Lagrange's
     # identity the first is a·(v × (u × v) + blur·u)/|v|², which stays accurate for needles.
-    a, b, c = record[A], record[B], record[C]
-    k = two * broadcast(COVARIANCE_SCALE)
-    uu, uv, vv = k * total[SUM_UU], k * total[SUM_UV], k * total[SUM_VV]
-    per_yy = broadcast(F(1)) / (dot3(v[0], v[1], v[2], v[0], v[1], v[2]) + broadcast(BLUR))
-    n = cross(u, v)
-    n = cross(v, (n[0] * per_yy, n[1] * per_yy, n[2] * per_yy))
-    blur = broadcast(BLUR) * per_yy
-    r = a * fma(blur, u[0], n[0]), a * fma(blur, u[1], n[1]), a * fma(blur, u[2], n[2])
-    s = c * v[0], c * v[1], c * v[2]
-    e = fma(uu, r[0], uv * s[0]), fma(uu, r[1], uv * s[1]), fma(uu, r[2], uv * s[2])
-    f = fma(uv, r[0], vv * s[0]), fma(uv, r[1], vv * s[1]), fma(uv, r[2], vv * s[2])
-    gu = a * e[0], a * e[1], a * e[2]
-    gv = fma(b, e[0], c * f[0]), fma(b, e[1], c * f[1]), fma(b, e[2], c * f[2])
-    g_scale = fma(r[0], e[0], s[0] * f[0]), fma(r[1], e[1], s[1] * f[1]), fma(r[2], e[2], s[2] * f[2])
-    g_mean, g_quat = axes_backward(camera, view, axes, gu, gv, g2x, g2y, total[SUM_DEPTH])
+    a, b, c = record[rec.A], record[rec.B], record[rec.C]
+    k = F(2) * COVARIANCE_SCALE
+    uu, uv, vv = k * total[rec.SUM_UU], k * total[rec.SUM_UV], k * total[rec.SUM_VV]
+    per_yy = 1 / (rec.dot3(v, v) + BLUR)
+    n = rec.cross(v, rec.scale3(per_yy, rec.cross(u, v)))
+    r, s = rec.scale3(a, rec.fma3(BLUR * per_yy, u, n)), rec.scale3(c, v)
+    e, f = rec.fma3(uu, r, rec.scale3(uv, s)), rec.fma3(uv, r, rec.scale3(vv, s))
+    gu, gv = rec.scale3(a, e), rec.fma3(b, e, rec.scale3(c, f))
+    g_scale = simd.fma(r[0], e[0], s[0] * f[0]), simd.fma(r[1], e[1], s[1] * f[1]), simd.fma(r[2], e[2], s[2] * f[2])
+    g_mean, g_quat = axes_backward(camera, view, axes, gu, gv, g2x, g2y, total[rec.SUM_DEPTH])
     return g_mean, g_quat, g_scale
 
 
@@ -208,10 +136,10 @@ def project_backward(
         work = scratch[thread]
         slot = work[2048:].view(np.int32)
         # Between its first and last visible splat, every thread clears the rows that it skips.
-        begin, end = vector_range(count, thread, threads)
-        row = np.int64(get(ids, begin - 1)) + 1 if begin > 0 else 0
+        begin, end = rec.vector_range(count, thread, threads)
+        row = np.int64(simd.get(ids, begin - 1)) + 1 if begin > 0 else 0
         for i in range(begin, end):
-            here = np.int64(get(ids, i))
+            here = np.int64(simd.get(ids, i))
             if here > row:
                 clear_rows(row, here, stride, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN)
             row = here + 1
@@ -222,33 +150,31 @@ def project_backward(
             prefetch_sh(g_shN, ids, start + AHEAD, end, stride, stride)
             if start + AHEAD < end:
                 for lane in range(16):
-                    row = RECORD * np.int64(get(ids, start + AHEAD + lane))
-                    prefetch(sums, RECORD * np.int64(get(integers, row + SLOT)))
+                    row = rec.RECORD * np.int64(simd.get(ids, start + AHEAD + lane))
+                    simd.prefetch(sums, rec.RECORD * np.int64(simd.get(integers, row + rec.SLOT)))
             for lane in range(16):
-                row = np.int64(get(ids, start + lane))
-                put(slot, lane, get(integers, RECORD * row + SLOT))
-                put(work, lane, get(g_means2d, 2 * row))
-                put(work, 16 + lane, get(g_means2d, 2 * row + 1))
-            g2x, g2y = load(work, 0), load(work, 16)
-            total = gather_columns(sums, slot, 0, RECORD, 0)
-            record = gather_columns(records, ids, start, RECORD, 0)
-            mean = gather_rows3(means, ids, start)
-            quat, scale = gather_rows4(quats, ids, start), gather_rows3(scales, ids, start)
+                row = np.int64(simd.get(ids, start + lane))
+                simd.put(slot, lane, simd.get(integers, rec.RECORD * row + rec.SLOT))
+                simd.put(work, lane, simd.get(g_means2d, 2 * row))
+                simd.put(work, 16 + lane, simd.get(g_means2d, 2 * row + 1))
+            g2x, g2y = simd.load(work, 0), simd.load(work, 16)
+            total = simd.gather_columns(sums, slot, 0, rec.RECORD, 0)
+            record = simd.gather_columns(records, ids, start, rec.RECORD, 0)
+            mean = simd.gather_rows3(means, ids, start)
+            quat, scale = simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start)
             g_mean, g_quat, g_scale = geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y)
-            zero = broadcast(F(0))
             # A colour below 0 was clamped.
             rgb = (
-                select(record[RED] > zero, total[SUM_RED], zero),
-                select(record[GREEN] > zero, total[SUM_GREEN], zero),
-                select(record[BLUE] > zero, total[SUM_BLUE], zero),
+                simd.select(record[rec.RED] > 0, total[rec.SUM_RED], 0),
+                simd.select(record[rec.GREEN] > 0, total[rec.SUM_GREEN], 0),
+                simd.select(record[rec.BLUE] > 0, total[rec.SUM_BLUE], 0),
             )
             gx, gy, gz = color_backward(
                 camera, degree, evaluated, stride, mean, shN, ids, start, rgb, g_sh0, g_shN, work
             )
-            scatter_rows3(g_means, ids, start, (g_mean[0] + gx, g_mean[1] + gy, g_mean[2] + gz))
-            scatter_rows4(g_quats, ids, start, g_quat)
-            scatter_rows3(g_scales, ids, start, g_scale)
-            logit = gather_rows1(logits, ids, start)
-            one = broadcast(F(1))
-            transparent = one / (one + exp2_clamped(logit * broadcast(LOG2_E)))
-            scatter_rows1(g_logits, ids, start, total[SUM_H] * transparent)
+            simd.scatter_rows3(g_means, ids, start, (g_mean[0] + gx, g_mean[1] + gy, g_mean[2] + gz))
+            simd.scatter_rows4(g_quats, ids, start, g_quat)
+            simd.scatter_rows3(g_scales, ids, start, g_scale)
+            logit = simd.gather_rows1(logits, ids, start)
+            transparent = 1 / (1 + simd.exp2_clamped(logit * rec.LOG2_E))
+            simd.scatter_rows1(g_logits, ids, start, total[rec.SUM_H] * transparent)

@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import math
 
+from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline
-from nsvq_lightning.compute.simd import broadcast, fma, get
 
 RECORD = 16
 """Floats in a record and in a slot."""
@@ -56,23 +56,46 @@ def group_grid(width: int, height: int) -> tuple[int, int]:
 
 
 @inline
-def dot3(ax, ay, az, bx, by, bz):
+def dot3(a, b):
     """Dot product of two vectors."""
-    return fma(ax, bx, fma(ay, by, az * bz))
+    return simd.fma(a[0], b[0], simd.fma(a[1], b[1], a[2] * b[2]))
 
 
 @inline
-def rotate(camera, row, x, y, z):
+def scale3(k, v):
+    """The vector k·v."""
+    return k * v[0], k * v[1], k * v[2]
+
+
+@inline
+def times3(v, w):
+    """The products of the components of two vectors."""
+    return v[0] * w[0], v[1] * w[1], v[2] * w[2]
+
+
+@inline
+def fma3(k, v, w):
+    """The vector k·v + w."""
+    return simd.fma(k, v[0], w[0]), simd.fma(k, v[1], w[1]), simd.fma(k, v[2], w[2])
+
+
+@inline
+def load3(array, offset, stride):
+    """A vector that is the same for all splats."""
+    x, y = simd.load_one(array, offset), simd.load_one(array, offset + stride)
+    return x, y, simd.load_one(array, offset + 2 * stride)
+
+
+@inline
+def rotate(camera, row, v):
     """One row of the camera rotation times a vector."""
-    o = ROTATION + 3 * row
-    return fma(broadcast(get(camera, o)), x, fma(broadcast(get(camera, o + 1)), y, broadcast(get(camera, o + 2)) * z))
+    return dot3(load3(camera, ROTATION + 3 * row, 1), v)
 
 
 @inline
-def rotate_back(camera, column, x, y, z):
+def rotate_back(camera, column, v):
     """One column of the camera rotation times a vector."""
-    o = ROTATION + column
-    return fma(broadcast(get(camera, o)), x, fma(broadcast(get(camera, o + 3)), y, broadcast(get(camera, o + 6)) * z))
+    return dot3(load3(camera, ROTATION + column, 3), v)
 
 
 @inline

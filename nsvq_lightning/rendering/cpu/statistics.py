@@ -42,10 +42,7 @@ def add_view(sums: Tensor, views: Tensor, gradients: Tensor, radii: Tensor, fact
         TypeError: A dtype is wrong.
     """
     rows = tuple(radii.shape[:1])
-    inputs = (
-        flat_checked("gradients", gradients.contiguous(), (*rows, 2)),
-        flat_checked("radii", radii, rows, INT32),
-    )
+    inputs = (flat_checked("gradients", gradients.contiguous(), (*rows, 2)), flat_checked("radii", radii, rows, INT32))
     outputs = flat_checked("sums", sums, rows), flat_checked("views", views, rows)
     _add(thread_count(), *inputs, F(factors[0]), F(factors[1]), *outputs)
 
@@ -79,12 +76,7 @@ def _add_observed(threads, observed, radii, x_factor, y_factor, partial, gradien
 
 
 def add_observed(
-    gradients: Tensor,
-    views: Tensor,
-    weights: Tensor,
-    observed: Tensor,
-    radii: Tensor,
-    factors: tuple[float, float],
+    gradients: Tensor, views: Tensor, weights: Tensor, observed: Tensor, radii: Tensor, factors: tuple[float, float]
 ) -> None:
     """Add what one view has observed, where a splat was seen; in place.
 
@@ -101,10 +93,7 @@ def add_observed(
         TypeError: A dtype is wrong.
     """
     rows = tuple(radii.shape[:1])
-    inputs = (
-        flat_checked("observed", observed.contiguous(), (*rows, 3)),
-        flat_checked("radii", radii, rows, INT32),
-    )
+    inputs = (flat_checked("observed", observed.contiguous(), (*rows, 3)), flat_checked("radii", radii, rows, INT32))
     tables = {"gradients": gradients, "views": views, "weights": weights}
     outputs = (flat_checked(name, table, rows) for name, table in tables.items())
     partial = np.empty(2 * CHUNKS)
