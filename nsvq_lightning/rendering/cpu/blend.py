@@ -181,8 +181,9 @@ def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
 
 
 @inline
-def write_block(block, left, top, width, height, background, state, image, transmittance, depth):
+def write_block(block, corner, size, background, state, planes):
     """Add the background and write one block, pixel by pixel where it extends beyond the image."""
+    (left, top), (width, height), (image, transmittance, depth) = corner, size, planes
     o = 16 * block
     x0, y0 = left + (block & 3) * BLOCK_SIDE, top + (block >> 2) * BLOCK_SIDE
     t = simd.load(state, T_LEFT + o)
@@ -211,27 +212,11 @@ def write_block(block, left, top, width, height, background, state, image, trans
 
 
 @inline
-def blend_tile(
-    records,
-    entries,
-    begin,
-    end,
-    left,
-    top,
-    width,
-    height,
-    background,
-    grid,
-    touched,
-    image,
-    transmittance,
-    depth,
-    state,
-    cull_blocks,
-    drop_closed,
-):
+def blend_tile(records, entries, begin, end, corner, size, background, grid, touched, planes, state, skips):
     """Blend one tile; returns the end of the part of its list that was processed."""
-    columns, rows = F(width - left), F(height - top)
+    cull_blocks, drop_closed = skips
+    fx, fy = F(corner[0]), F(corner[1])
+    columns, rows = F(size[0] - corner[0]), F(size[1] - corner[1])
     alive = 0
     for block in range(BLOCKS):
         inside = (simd.load(grid, 16 * block) < columns) & (simd.load(grid, 256 + 16 * block) < rows)
@@ -245,7 +230,6 @@ def blend_tile(
     # A record without effect, which fills up the last group of four.
     simd.store(batch, BATCH * rec.RECORD, 0)
     simd.put(batch, BATCH * rec.RECORD + rec.LOG2_OPACITY, F(-100))
-    fx, fy = F(left), F(top)
     for i in range(begin, min(end, begin + AHEAD)):
         simd.prefetch(records, rec.RECORD * np.int64(simd.get(entries, i)))
     i = begin
@@ -275,7 +259,7 @@ def blend_tile(
                 alive &= ~(1 << block)
         i += count
     for block in range(BLOCKS):
-        write_block(block, left, top, width, height, background, state, image, transmittance, depth)
+        write_block(block, corner, size, background, state, planes)
     return i
 
 
@@ -291,28 +275,13 @@ def tile_corner(tile, group_columns):
 
 @kernel
 def blend(
-    threads,
-    records,
-    entries,
-    offsets,
-    group_columns,
-    width,
-    height,
-    background,
-    grid,
-    touched,
-    ends,
-    image,
-    transmittance,
-    depth,
-    scratch,
-    cull_blocks,
-    drop_closed,
+    threads, records, entries, offsets, group_columns, size, background, grid, touched, ends, planes, scratch, skips,
     counter,
-):
+):  # fmt: skip
     """Blend all tiles, scheduled dynamically; a pixel depends only on its own tile.
 
-    ``cull_blocks`` skips the blocks that a splat cannot reach, ``drop_closed`` those whose pixels are all closed.
+    ``size`` is width and height, ``planes`` are image, transmittance and depth. ``skips`` says whether to skip the
+    blocks that a splat cannot reach, and those whose pixels are all closed.
     """
     tiles = offsets.shape[0] - 1
     for thread in prange(threads):
@@ -320,26 +289,27 @@ def blend(
             tile = simd.fetch_add(counter, 0, 1)
             if tile >= tiles:
                 break
-            left, top = tile_corner(tile, group_columns)
-            if left < width and top < height:
+            corner = tile_corner(tile, group_columns)
+            if corner[0] < size[0] and corner[1] < size[1]:
+                begin, end = np.int64(offsets[tile]), np.int64(offsets[tile + 1])
                 ends[tile] = blend_tile(
-                    records, entries, np.int64(offsets[tile]), np.int64(offsets[tile + 1]), left, top, width, height,
-                    background, grid, touched, image, transmittance, depth, scratch[thread], cull_blocks, drop_closed,
+                    records, entries, begin, end, corner, size, background, grid, touched, planes, scratch[thread],
+                    skips,
                 )  # fmt: skip
             else:
                 ends[tile] = offsets[tile]
 
 
 @inline
-def start_block(
-    block, left, top, width, height, image, depth, transmittance, g_image, g_alpha, g_depth, pixel_map, with_alpha,
-    with_depth, with_map, grid, state,
-):  # fmt: skip
+def start_block(block, corner, size, planes, gradients, pixel_map, wanted, grid, state):
     """Backward state of a block: transmittance 1, and ``rest`` = g · everything that this pixel received.
 
     Alpha is 1 - T, so its gradient enters as -g_alpha·T at the far end. Gradients that are not needed are not read, nor
     is a map.
     """
+    (left, top), (width, height), (image, transmittance, depth) = corner, size, planes
+    g_image, g_alpha, g_depth = gradients
+    with_alpha, with_depth, with_map = wanted
     s = BLOCK_STATE * block
     x0, y0 = left + (block & 3) * BLOCK_SIDE, top + (block >> 2) * BLOCK_SIDE
     simd.store(state, s + BACK_X, simd.load(grid, 16 * block))
@@ -386,23 +356,25 @@ def start_block(
 
 
 @inline
-def slot_of(integers, row, group_x, group_y):
+def slot_of(integers, row, group):
     """The slot in which a group sums the gradients of a splat."""
     o = rec.RECORD * row
     origin, extent = np.int64(simd.get(integers, o + rec.ORIGIN)), np.int64(simd.get(integers, o + rec.EXTENT))
     x0, y0 = origin & 0xFFFF, origin >> 16
     first_x, first_y = x0 >> rec.GROUP_SHIFT, y0 >> rec.GROUP_SHIFT
     columns = ((x0 + (extent & 0xFFFF) - 1) >> rec.GROUP_SHIFT) - first_x + 1
-    return np.int64(simd.get(integers, o + rec.SLOT)) + (group_y - first_y) * columns + group_x - first_x
+    return np.int64(simd.get(integers, o + rec.SLOT)) + (group[1] - first_y) * columns + group[0] - first_x
 
 
 @inline
-def splat_backward(records, row, blocks, left, top, with_depth, with_map, state):
+def splat_backward(records, row, blocks, corner, wanted, state):
     """Sums of one splat over the blocks it changed in a tile (the fields of a slot); advances the blocks' state."""
+    _, with_depth, with_map = wanted
     zero = simd.broadcast(0)
     r = rec.RECORD * row
     a, b, c = simd.get(records, r + rec.A), simd.get(records, r + rec.B), simd.get(records, r + rec.C)
-    u0, v0 = offsets_at(a, b, c, simd.get(records, r + rec.X) - F(left), simd.get(records, r + rec.Y) - F(top))
+    x, y = simd.get(records, r + rec.X) - F(corner[0]), simd.get(records, r + rec.Y) - F(corner[1])
+    u0, v0 = offsets_at(a, b, c, x, y)
     peak, z = simd.load_one(records, r + rec.LOG2_OPACITY), simd.load_one(records, r + rec.DEPTH)
     color = rec.load3(records, r + rec.RED, 1)
     s_r, s_g, s_b, s_h, s_u, s_v, s_uu, s_uv, s_vv, s_z = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
@@ -440,57 +412,33 @@ def splat_backward(records, row, blocks, left, top, with_depth, with_map, state)
 
 
 @inline
-def tile_backward(
-    records, integers, entries, begin, end, left, top, group_x, group_y, with_depth, with_map, touched, sums, state
-):
+def tile_backward(records, integers, entries, begin, end, corner, group, wanted, touched, sums, state):
     """Add up the gradients of all splats of a tile, front to back."""
     for i in range(begin, end):
         if i + AHEAD < end:
             simd.prefetch(records, rec.RECORD * np.int64(simd.get(entries, i + AHEAD)))
         if i + SLOT_AHEAD < end:
             coming = np.int64(simd.get(entries, i + SLOT_AHEAD))
-            simd.prefetch(sums, rec.RECORD * slot_of(integers, coming, group_x, group_y))
+            simd.prefetch(sums, rec.RECORD * slot_of(integers, coming, group))
         blocks = np.int64(simd.get(touched, i))
         if blocks == 0:
             continue
         row = np.int64(simd.get(entries, i))
-        slot = rec.RECORD * slot_of(integers, row, group_x, group_y)
-        simd.store(
-            sums,
-            slot,
-            simd.load(sums, slot) + splat_backward(records, row, blocks, left, top, with_depth, with_map, state),
-        )
+        slot = rec.RECORD * slot_of(integers, row, group)
+        here = splat_backward(records, row, blocks, corner, wanted, state)
+        simd.store(sums, slot, simd.load(sums, slot) + here)
 
 
 @kernel
 def blend_backward(
-    threads,
-    records,
-    integers,
-    entries,
-    offsets,
-    ends,
-    group_columns,
-    width,
-    height,
-    grid,
-    touched,
-    image,
-    transmittance,
-    depth,
-    g_image,
-    g_alpha,
-    g_depth,
-    pixel_map,
-    with_alpha,
-    with_depth,
-    with_map,
-    sums,
-    slots,
-    scratch,
-    counter,
-):
-    """Write the sums of every (splat, group) pair to its slot; groups are scheduled dynamically, each in one order."""
+    threads, records, integers, entries, offsets, ends, group_columns, size, grid, touched, planes, gradients,
+    pixel_map, wanted, sums, slots, scratch, counter,
+):  # fmt: skip
+    """Write the sums of every (splat, group) pair to its slot; groups are scheduled dynamically, each in one order.
+
+    ``size`` and ``planes`` are those of :func:`blend`, ``gradients`` those of image, alpha and depth; ``wanted`` says
+    whether alpha and depth have one, and whether there is a map.
+    """
     tiles = offsets.shape[0] - 1
     groups = tiles // rec.GROUP_TILES
     for thread in prange(threads):
@@ -507,16 +455,11 @@ def blend_backward(
                 begin, end = np.int64(offsets[tile]), np.int64(ends[tile])
                 if end <= begin:
                     continue
-                left, top = tile_corner(tile, group_columns)
+                corner = tile_corner(tile, group_columns)
                 for block in range(BLOCKS):
-                    start_block(
-                        block, left, top, width, height, image, depth, transmittance, g_image, g_alpha, g_depth,
-                        pixel_map, with_alpha, with_depth, with_map, grid, state,
-                    )  # fmt: skip
-                tile_backward(
-                    records, integers, entries, begin, end, left, top, group % group_columns, group // group_columns,
-                    with_depth, with_map, touched, sums, state,
-                )  # fmt: skip
+                    start_block(block, corner, size, planes, gradients, pixel_map, wanted, grid, state)
+                place = group % group_columns, group // group_columns
+                tile_backward(records, integers, entries, begin, end, corner, place, wanted, touched, sums, state)
 
 
 @kernel

@@ -129,8 +129,9 @@ def color(degree, d, sh0, columns):
 
 
 @inline
-def color_range(camera, means, sh0, shN, stride, degree, evaluated, ids, first, last, records, scratch):
+def color_range(camera, means, colors, bands, ids, first, last, records, scratch):
     """Write colours to the records of ``ids[first:last]``; the list is padded to whole vectors."""
+    (sh0, shN), (stride, degree, evaluated) = colors, bands
     coefficients = coefficients_of(evaluated)
     for start in range(first, last, 16):
         prefetch_sh(shN, ids, start + AHEAD, last, stride, coefficients)
@@ -206,8 +207,9 @@ def scatter_sh(gradient, columns, ids, start, stride, count):
 
 
 @inline
-def color_backward(camera, degree, evaluated, stride, mean, shN, ids, start, rgb, g_sh0, g_shN, scratch):
+def color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, scratch):
     """Gradients of the SH coefficients; returns that of the mean through the viewing direction."""
+    stride, degree, evaluated = bands
     d, inverse = unit_direction(camera, mean)
     coefficients = coefficients_of(evaluated)
     columns, gradient, e = scratch[:768], scratch[768:1536], scratch[1536:]

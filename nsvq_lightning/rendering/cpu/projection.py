@@ -225,34 +225,18 @@ def find_visible(threads, camera, means, quats, scales, logits, found, runs, scr
 
 
 @kernel
-def finish_records(
-    threads,
-    camera,
-    means,
-    sh0,
-    shN,
-    stride,
-    degree,
-    evaluated,
-    found,
-    counts,
-    slots,
-    records,
-    integers,
-    ids,
-    keys,
-    order,
-    boxes,
-    means2d,
-    radii,
-    scratch,
-):
+def finish_records(threads, camera, means, colors, bands, runs, records, integers, listed, means2d, radii, scratch):
     """Join the runs of all threads into ``ids`` (ascending rows, padded by 16), number the slots and add the colours.
+
+    ``colors`` are sh0 and shN, ``bands`` the floats in a row of shN, the degree that counts, and the one evaluated;
+    ``runs`` are what :func:`project_splats` found, ``listed`` ids, keys, order and boxes.
 
     Also writes, by place in ``ids``, the depths as ``keys``, the places themselves as ``order`` and the tiles that a
     splat touches as ``boxes`` (first column and row, number of columns and rows, 16 bits each), and the projected
     centres ``means2d [N·2]`` and ``radii [N]`` of the visible splats.
     """
+    found, counts, slots = runs
+    ids, keys, order, boxes = listed
     total = counts.sum()
     for thread in prange(threads):
         first, _ = rec.vector_range(records.shape[0] // rec.RECORD, thread, threads)
@@ -276,4 +260,4 @@ def finish_records(
                 simd.put(ids, total + k, simd.get(ids, total - 1))
     for thread in prange(threads):
         first, last = rec.vector_range(total, thread, threads)
-        color_range(camera, means, sh0, shN, stride, degree, evaluated, ids, first, last, records, scratch[thread])
+        color_range(camera, means, colors, bands, ids, first, last, records, scratch[thread])

@@ -31,8 +31,9 @@ def quaternion_gradient(q, inverse, r):
 
 
 @inline
-def clear_rows(first, last, stride, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN):
+def clear_rows(first, last, stride, gradients):
     """Zero the gradients of rows that are not in view."""
+    g_means, g_quats, g_scales, g_logits, g_sh0, g_shN = gradients
     clear(g_means, 3 * first, 3 * last)
     clear(g_quats, 4 * first, 4 * last)
     clear(g_scales, 3 * first, 3 * last)
@@ -102,36 +103,16 @@ def geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y):
 
 @kernel
 def project_backward(
-    threads,
-    camera,
-    means,
-    quats,
-    scales,
-    logits,
-    sh0,
-    shN,
-    stride,
-    degree,
-    evaluated,
-    ids,
-    count,
-    records,
-    integers,
-    sums,
-    g_means2d,
-    g_means,
-    g_quats,
-    g_scales,
-    g_logits,
-    g_sh0,
-    g_shN,
-    scratch,
+    threads, camera, geometry, shN, bands, ids, count, records, integers, sums, g_means2d, gradients, scratch
 ):
     """Gradients of all raw attributes from the sums of the slots of the visible splats; 0 for the others.
 
     ``sums[16·slot]`` of a splat's first slot holds its total; ``g_means2d [N·2]`` the gradient of its projected centre.
+    ``geometry`` are means, quaternions, log-scales and logits, ``bands`` as in :func:`finish_records`.
     """
-    coefficients = coefficients_of(evaluated)
+    means, quats, scales, logits = geometry
+    g_means, g_quats, g_scales, g_logits, g_sh0, g_shN = gradients
+    stride, coefficients = bands[0], coefficients_of(bands[2])
     for thread in prange(threads):
         work = scratch[thread]
         slot = work[2048:].view(np.int32)
@@ -141,10 +122,10 @@ def project_backward(
         for i in range(begin, end):
             here = np.int64(simd.get(ids, i))
             if here > row:
-                clear_rows(row, here, stride, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN)
+                clear_rows(row, here, stride, gradients)
             row = here + 1
         if thread == threads - 1:
-            clear_rows(row, logits.shape[0], stride, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN)
+            clear_rows(row, logits.shape[0], stride, gradients)
         for start in range(begin, end, 16):
             prefetch_sh(shN, ids, start + AHEAD, end, stride, coefficients)
             prefetch_sh(g_shN, ids, start + AHEAD, end, stride, stride)
@@ -169,9 +150,7 @@ def project_backward(
                 simd.select(record[rec.GREEN] > 0, total[rec.SUM_GREEN], 0),
                 simd.select(record[rec.BLUE] > 0, total[rec.SUM_BLUE], 0),
             )
-            gx, gy, gz = color_backward(
-                camera, degree, evaluated, stride, mean, shN, ids, start, rgb, g_sh0, g_shN, work
-            )
+            gx, gy, gz = color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, work)
             simd.scatter_rows3(g_means, ids, start, (g_mean[0] + gx, g_mean[1] + gy, g_mean[2] + gz))
             simd.scatter_rows4(g_quats, ids, start, g_quat)
             simd.scatter_rows3(g_scales, ids, start, g_scale)

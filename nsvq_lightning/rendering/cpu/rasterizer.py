@@ -76,8 +76,8 @@ class _Frame:
 
     def __init__(self, splats: SplatTensors, camera: Camera) -> None:
         self.camera = pack_camera(camera)
-        self.width, self.height = camera.width, camera.height
-        self.group_columns, group_rows = group_grid(camera.width, camera.height)
+        self.size = width, height = camera.width, camera.height
+        self.group_columns, group_rows = group_grid(width, height)
         self.tiles = self.group_columns * group_rows * GROUP_TILES
         self.n = splats.means.shape[0]
         self.geometry = _geometry(splats)
@@ -106,18 +106,17 @@ class _Frame:
         self.count, self.slots = int(counts.sum()), int(slots.sum())
         return found, counts, slots
 
-    def finish(
-        self, sh0: Array, shN: Array, stride: int, degrees: tuple[int, int], means2d: Array, radii: Array
-    ) -> None:
+    def finish(self, colors: tuple[Array, Array], bands: tuple[int, int, int], means2d: Array, radii: Array) -> None:
         """Complete the records; list the visible splats by row (``ids``) and, as places in it, by depth (``order``)."""
         runs = self.project()
         self.ids = self.work.array("ids", self.count + 16, np.int32)
         keys = self.work.array("keys", self.count + 1, np.int32)
         order = self.work.array("order", self.count, np.int32)
         self.boxes = self.work.array("boxes", self.count, np.int64)
+        listed = self.ids, keys, order, self.boxes
         finish_records(
-            self.threads, self.camera, self.geometry[0], sh0, shN, stride, *degrees, *runs, self.records, self.integers,
-            self.ids, keys, order, self.boxes, means2d, radii, self.scratch,
+            self.threads, self.camera, self.geometry[0], colors, bands, runs, self.records, self.integers, listed,
+            means2d, radii, self.scratch,
         )  # fmt: skip
         if self.count:
             other = self.work.array("order2", self.count, np.int32)
@@ -135,7 +134,7 @@ class _Frame:
         total = count_tiles(*listed, self.offsets)
         if total > MAX_ENTRIES:
             raise RuntimeError(
-                f"{self.count} splats cover {total} tiles of the {self.width}x{self.height} image, more than can be "
+                f"{self.count} splats cover {total} tiles of the {self.size[0]}x{self.size[1]} image, more than can be "
                 "listed; the scales have probably diverged (lower their learning rate or prune large splats)"
             )
         self.entries = self.work.array("entries", total, np.int32)
@@ -170,10 +169,10 @@ class _Project(torch.autograd.Function):
         means2d = means.new_zeros(frame.n, 2)
         radii = torch.zeros(frame.n, dtype=torch.int32)
         # Bands above the active degree count as zero, whether they are skipped or evaluated.
-        degrees = degree, degree if is_on("sh_bands") else sh_degree_of(shN)
-        ctx.frame, ctx.degrees, ctx.shapes = frame, degrees, tuple(tuple(tensor.shape) for tensor in attributes)
+        bands = 3 * shN.shape[1], degree, degree if is_on("sh_bands") else sh_degree_of(shN)
+        ctx.frame, ctx.bands, ctx.shapes = frame, bands, tuple(tuple(tensor.shape) for tensor in attributes)
         ctx.save_for_backward(*attributes)
-        frame.finish(*_colors(frame.n, sh0, shN), 3 * shN.shape[1], degrees, flat(means2d), flat(radii))
+        frame.finish(_colors(frame.n, sh0, shN), bands, flat(means2d), flat(radii))
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
         return means2d, means.new_zeros(()), radii
@@ -191,9 +190,9 @@ class _Project(torch.autograd.Function):
         _check_kept(ctx.saved_tensors, ctx.shapes)
         gradients = [recycled(shape) for shape in ctx.shapes]
         project_backward(
-            frame.threads, frame.camera, *frame.geometry, *_colors(frame.n, sh0, shN), 3 * shN.shape[1], *ctx.degrees,
-            frame.ids, frame.count, frame.records, frame.integers, frame.sums, flat(g_means2d),
-            *(flat(gradient) for gradient in gradients), frame.scratch,
+            frame.threads, frame.camera, frame.geometry, _colors(frame.n, sh0, shN)[1], ctx.bands, frame.ids,
+            frame.count, frame.records, frame.integers, frame.sums, flat(g_means2d), tuple(map(flat, gradients)),
+            frame.scratch,
         )  # fmt: skip
         return None, None, *gradients
 
@@ -211,7 +210,7 @@ class _Blend(torch.autograd.Function):
         pixel_map: Tensor | None,
         observed: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        shape = frame.height, frame.width
+        shape = frame.size[::-1]
         image, transmittance, depth, alpha = (recycled((*shape, *last)) for last in ((3,), (), (), ()))
         frame.bin()
         work = frame.work
@@ -219,9 +218,9 @@ class _Blend(torch.autograd.Function):
         frame.ends = work.array("ends", frame.tiles, np.int64)
         behind = flat_checked("background", background.contiguous(), (3,))
         blend(
-            frame.threads, frame.records, frame.entries, frame.offsets, frame.group_columns, frame.width, frame.height,
-            behind, _GRID, frame.touched, frame.ends, flat(image), flat(transmittance), flat(depth),
-            work.rows("blend", frame.threads, FORWARD_SCRATCH), is_on("blocks"), is_on("saturated"),
+            frame.threads, frame.records, frame.entries, frame.offsets, frame.group_columns, frame.size, behind, _GRID,
+            frame.touched, frame.ends, (flat(image), flat(transmittance), flat(depth)),
+            work.rows("blend", frame.threads, FORWARD_SCRATCH), (is_on("blocks"), is_on("saturated")),
             np.zeros(1, np.int64),
         )  # fmt: skip
         ctx.frame = frame
@@ -235,8 +234,9 @@ class _Blend(torch.autograd.Function):
         frame: _Frame = ctx.frame
         image, transmittance, depth, pixel_map = ctx.saved_tensors
         # Placeholders that are never read stand in for missing gradients and a missing map.
-        with_alpha, with_depth, with_map = g_alpha is not None, g_depth is not None, pixel_map is not None
-        pixel_map = flat_checked("pixel_map", pixel_map if with_map else depth, (frame.height, frame.width))
+        with_map = pixel_map is not None
+        wanted = g_alpha is not None, g_depth is not None, with_map
+        pixel_map = flat_checked("pixel_map", pixel_map if with_map else depth, frame.size[::-1])
         g_image = torch.zeros_like(image) if g_image is None else g_image
         g_alpha = transmittance if g_alpha is None else g_alpha
         g_depth = depth if g_depth is None else g_depth
@@ -245,9 +245,8 @@ class _Blend(torch.autograd.Function):
         g_means2d, g_observed = torch.zeros(frame.n, 2), torch.zeros(frame.n if with_map else 0, 3)
         blend_backward(
             frame.threads, frame.records, frame.integers, frame.entries, frame.offsets, frame.ends,
-            frame.group_columns, frame.width, frame.height, _GRID, frame.touched,
-            *(flat(tensor) for tensor in (image, transmittance, depth, g_image, g_alpha, g_depth)), pixel_map,
-            with_alpha, with_depth, with_map, frame.sums, frame.slots,
+            frame.group_columns, frame.size, _GRID, frame.touched, (flat(image), flat(transmittance), flat(depth)),
+            (flat(g_image), flat(g_alpha), flat(g_depth)), pixel_map, wanted, frame.sums, frame.slots,
             work.rows("blend_backward", frame.threads, BACKWARD_SCRATCH), np.zeros(1, np.int64),
         )  # fmt: skip
         total_slots(
