@@ -190,7 +190,7 @@ def check_gpu() -> Iterator[Finding]:
     """Whether there is a GPU, and what renders on it."""
     import torch
 
-    from nsvq_lightning.rendering.rasterize import fast_backends
+    from nsvq_lightning.compute.devices import fast_backends
 
     if torch.cuda.is_available():
         name, fast = torch.cuda.get_device_name(), fast_backends(torch.zeros(1, device="cuda"))
@@ -207,8 +207,8 @@ def check_backends() -> Iterator[Finding]:
     import torch
 
     from nsvq_lightning.commands.benchmark import render, timing, workloads
+    from nsvq_lightning.compute.devices import fast_backends
     from nsvq_lightning.compute.kernel_cache import kernel_folder
-    from nsvq_lightning.rendering.rasterize import fast_backends
     from nsvq_lightning.splats.splats import RawSplats
 
     def results(workload: Workload, backend: str, dtype: torch.dtype) -> dict[str, torch.Tensor]:

@@ -8,6 +8,7 @@ the middle of a run.
 from __future__ import annotations
 
 import importlib.util
+import logging
 import os
 from functools import cache
 from typing import Literal
@@ -15,7 +16,15 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-__all__ = ["COMPILE", "AsyncScalar", "kernels_for", "to_device", "triton_obstacle"]
+__all__ = ["BACKENDS", "COMPILE", "AsyncScalar", "fast_backends", "kernels_for", "resolve_backend", "to_device"]
+
+log = logging.getLogger(__name__)
+
+BACKENDS = ("auto", "reference", "cpu", "cuda")
+"""Names that ``render(backend=...)`` takes; ``auto`` is this package's fastest one for the device of the splats."""
+COMPILE = {"enable_fp_fusion": True}
+"""Options of every launch. Triton's default is about to change; values on which the forward and backward pass must
+agree to the bit are computed with an explicit ``fma``."""
 
 
 def kernels_for(like: Tensor) -> Literal["cpu", "cuda"] | None:
@@ -24,45 +33,75 @@ def kernels_for(like: Tensor) -> Literal["cpu", "cuda"] | None:
     None is for any other dtype or device, and for CUDA without Triton. Under Triton's interpreter, tensors on the CPU
     still go to Numba: the interpreter is for tests, which call the Triton kernels directly.
     """
-    return _kernels_for(like.dtype, like.device.type)
-
-
-@cache
-def _kernels_for(dtype: torch.dtype, device: str) -> Literal["cpu", "cuda"] | None:
-    if dtype != torch.float32:
+    if like.dtype != torch.float32:
         return None
-    if device == "cpu":
+    if like.device.type == "cpu":
         return "cpu"
-    return "cuda" if device == "cuda" and _has_triton() else None
+    return "cuda" if like.is_cuda and _has_triton() else None
 
 
-def triton_obstacle(like: Tensor) -> str | None:
-    """Why Triton's kernels cannot take tensors such as ``like``, with a remedy; None where they can."""
-    problem = None if _interpreted() and like.dtype == torch.float32 else _not_on_cuda(like)
-    if problem is None and not _has_triton():
-        return "it needs Triton, which comes with CUDA builds of PyTorch for Linux (pip install triton)"
-    return problem
+def _obstacle(kernels: str, like: Tensor) -> str | None:
+    """Why ``cpu`` or ``cuda`` kernels cannot take tensors such as ``like``, with a remedy; None where they can.
 
-
-def _not_on_cuda(like: Tensor) -> str | None:
-    """Why GPU kernels cannot take tensors such as ``like``, with a remedy; None for float32 on a CUDA device."""
-    if like.is_cuda and like.dtype == torch.float32:
+    Under Triton's interpreter those of ``cuda`` take float32 tensors on the CPU: slow, for tests.
+    """
+    got = f"got {like.dtype} on {like.device}"
+    if kernels == "cpu":
+        fits = like.dtype == torch.float32 and like.device.type == "cpu"
+        return None if fits else f"it renders float32 tensors on the CPU, {got}; move the splats"
+    interpreted = os.environ.get("TRITON_INTERPRET", "0") == "1"
+    if like.dtype != torch.float32 or not (like.is_cuda or interpreted):
+        help_ = "move the splats (nsvq fit --trainer.accelerator=cuda)"
+        if not torch.cuda.is_available():
+            help_ = "torch finds no CUDA device here (nsvq doctor says why)"
+        return f"it renders float32 tensors on a CUDA device, {got}; {help_}"
+    if _has_triton():
         return None
-    help_ = "move the splats (nsvq fit --trainer.accelerator=cuda)"
-    if not torch.cuda.is_available():
-        help_ = "torch finds no CUDA device here (nsvq doctor says why)"
-    return f"it renders float32 tensors on a CUDA device, got {like.dtype} on {like.device}; {help_}"
-
-
-def _interpreted() -> bool:
-    """Whether Triton's interpreter runs the kernels on the CPU: slow, for tests."""
-    return os.environ.get("TRITON_INTERPRET", "0") == "1"
+    return "it needs Triton, which comes with CUDA builds of PyTorch for Linux (pip install triton)"
 
 
 @cache
 def _has_triton() -> bool:
     """Whether Triton is installed; a render with ``backend="cuda"`` asks each time."""
     return importlib.util.find_spec("triton") is not None
+
+
+def resolve_backend(backend: str, like: Tensor) -> str:
+    """The back-end that ``backend`` stands for with tensors such as ``like``.
+
+    ``auto`` is ``cpu`` for float32 on the CPU, ``cuda`` for float32 on a CUDA device where Triton is installed, and
+    otherwise ``reference``: plain torch, for any dtype and any device of torch, and slow.
+
+    Raises:
+        ValueError: It is unknown, or cannot take this device or floating-point type.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"unknown render backend {backend!r}; choose one of {', '.join(BACKENDS)}")
+    if backend == "auto":
+        kernels = kernels_for(like)
+        # Another dtype is meant for the oracle.
+        if kernels is None and like.dtype == torch.float32 and (problem := _obstacle("cuda", like)) is not None:
+            _warn_of_plain_torch(like.device.type, problem)
+        return kernels or "reference"
+    if backend != "reference" and (problem := _obstacle(backend, like)) is not None:
+        raise ValueError(f"backend {backend!r} cannot be used: {problem}, or use backend='auto'")
+    return backend
+
+
+def fast_backends(like: Tensor) -> list[str]:
+    """Back-ends other than plain torch that take tensors such as ``like``."""
+    return [name for name in ("cpu", "cuda") if _obstacle(name, like) is None]
+
+
+@cache
+def _warn_of_plain_torch(device: str, problem: str) -> None:
+    """Warn once that a device has no kernels of its own; a run of hours would else silently become one of weeks."""
+    log.warning(
+        "rendering on %s in plain torch, much slower than on the CPU (--trainer.accelerator=cpu); "
+        "backend 'cuda' cannot be used: %s",
+        device,
+        problem,
+    )
 
 
 def to_device(tensor: Tensor, device: torch.device | str) -> Tensor:
@@ -101,8 +140,3 @@ class AsyncScalar:
         if self._copied is not None:
             self._copied.synchronize()
         return float(self._host)
-
-
-COMPILE = {"enable_fp_fusion": True}
-"""Options of every launch. Triton's default is about to change; values on which the forward and backward pass must
-agree to the bit are computed with an explicit ``fma``."""

@@ -2,21 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = [
-    "ALPHA_MAX",
-    "ALPHA_MIN",
-    "BLUR",
-    "FAINTEST",
-    "FINITE",
-    "FRUSTUM_MARGIN",
-    "HUGE_FOOTPRINT",
-    "HUGE_QUATERNION",
-    "LARGEST_FOOTPRINT",
-    "NEAR",
-    "SHRINK",
-    "TRANSMITTANCE_MIN",
-]
-
 NEAR = 0.2
 """Splats whose centre is nearer than this along the viewing axis are culled, scene units."""
 

@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 import importlib
-import logging
-from collections.abc import Callable
-from functools import cache
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from nsvq_lightning.compute.devices import kernels_for, triton_obstacle
-from nsvq_lightning.rendering.antialias import compensated
+from nsvq_lightning.compute.devices import resolve_backend
+from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.reference import render_reference, visible_rows
-from nsvq_lightning.splats.splats import ATTRIBUTES, SplatTensors, check_shapes, sh_degree_of
+from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats, SplatTensors, check_shapes, sh_degree_of
 
-__all__ = ["BACKENDS", "Render", "fast_backends", "render", "resolve_backend", "visible"]
+__all__ = ["Render", "render", "visible"]
 
-log = logging.getLogger(__name__)
-
-_Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-
-BACKENDS = ("auto", "reference", "cpu", "cuda")
-"""Names that ``render(backend=...)`` takes; ``auto`` is this package's fastest one for the device of the splats."""
+OPAQUE = 1 - 2.0**-20
+"""Largest opacity of a splat that anti-aliasing has changed: the rasterizer caps it lower, and its logit is finite."""
 
 
 class Render(NamedTuple):
@@ -70,9 +62,8 @@ def render(
         background: RGB ``[3]`` behind the splats; black by default.
         observe: Strength of each pixel ``[H, W]``; the backward pass then also sums up what ``Render.observed`` holds.
         antialiased: Make splats fainter as the rasterizer's blur makes them larger, so that those smaller than a pixel
-            look alike from near and far (:func:`nsvq_lightning.rendering.antialias.compensated`). For scenes that were
-            trained so.
-        backend: One of :data:`BACKENDS`.
+            look alike from near and far (Mip-Splatting, Yu et al. 2024). For scenes that were trained so.
+        backend: One of :data:`nsvq_lightning.compute.devices.BACKENDS`.
 
     Returns:
         Image, alpha, radii, projected centres and depth; see :class:`Render`.
@@ -93,16 +84,31 @@ def render(
     elif tuple(background.shape) != (3,):
         raise ValueError(f"background must be one RGB colour of shape [3], got {list(background.shape)}")
     background = background.to(means)
-    name = resolve_backend(backend, means)
+    module = _module_of(backend, means)
     if antialiased:
-        splats = compensated(splats, camera, visible(splats, camera, backend=name))
+        splats = _compensated(splats, camera, module)
     if observe is None:
-        return Render(*_rasterizer(name)(splats, camera, degree, background))
+        return Render(*module.render(splats, camera, degree, background))
     if tuple(observe.shape) != (camera.height, camera.width):
         raise ValueError(f"observe must be [{camera.height}, {camera.width}], got {list(observe.shape)}")
     observed = means.new_zeros(means.shape[0], 3).requires_grad_()
     pixel_map = observe.detach().to(means).contiguous()
-    return Render(*_rasterizer(name)(splats, camera, degree, background, pixel_map, observed), observed)
+    return Render(*module.render(splats, camera, degree, background, pixel_map, observed), observed)
+
+
+def _compensated(splats: SplatTensors, camera: Camera, module: Any) -> RawSplats:
+    """The splats with the opacities that keep their light when the rasterizer blurs them by 0.3 square pixels.
+
+    Each opacity in view is multiplied by √(det Σ / det(Σ + 0.3·I)) with Σ the projected covariance before the blur, the
+    factor of Mip-Splatting's 2D filter (Yu et al. 2024): a splat that the blur makes twice as large becomes half as
+    opaque. The factor is differentiable in means, quaternions and scales, and depends on the camera.
+    """
+    with torch.no_grad():
+        rows = module.visible(splats, camera)
+    opacity = take_rows(splats.opacities, rows).sigmoid() * module.light_kept(splats, camera, rows)
+    opacity = opacity.clamp_max(OPAQUE)
+    seen = splats.opacities.index_copy(0, rows, opacity.log() - (-opacity).log1p())
+    return RawSplats(splats.means, splats.quats, splats.scales, seen, splats.sh0, splats.shN)
 
 
 def _check_alike(splats: SplatTensors) -> None:
@@ -123,77 +129,20 @@ def visible(splats: SplatTensors, camera: Camera, *, backend: str = "auto") -> T
     Args:
         splats: Raw attributes; only means, quats, scales and opacities are read.
         camera: Where to look from.
-        backend: One of :data:`BACKENDS`.
+        backend: One of :data:`nsvq_lightning.compute.devices.BACKENDS`.
 
     Raises:
         ValueError: As for :func:`render`.
     """
     _check_alike(splats)
-    name = resolve_backend(backend, splats.means)
-    if name == "reference":
-        return visible_rows(splats, camera)
-    rows: Tensor = _fast_function("visible", name)(splats, camera)
+    rows: Tensor = _module_of(backend, splats.means).visible(splats, camera)
     return rows
 
 
-def resolve_backend(backend: str, like: Tensor) -> str:
-    """The back-end that ``backend`` stands for with tensors such as ``like``.
+def _module_of(backend: str, like: Tensor) -> Any:
+    """The module of a back-end, imported only now because that imports the kernels' compiler.
 
-    ``auto`` is ``cpu`` for float32 on the CPU, ``cuda`` for float32 on a CUDA device where Triton is installed, and
-    otherwise ``reference``: plain torch, for any dtype and any device of torch, and slow.
-
-    Raises:
-        ValueError: It is unknown, or cannot take this device or floating-point type.
+    It has the functions ``render``, ``visible`` and ``light_kept``; see :mod:`nsvq_lightning.rendering.reference`.
     """
-    if backend not in BACKENDS:
-        raise ValueError(f"unknown render backend {backend!r}; choose one of {', '.join(BACKENDS)}")
-    if backend == "auto":
-        return _automatic(like)
-    problem = _obstacle(backend, like)
-    if problem is not None:
-        raise ValueError(f"backend {backend!r} cannot be used: {problem}, or use backend='auto'")
-    return backend
-
-
-def fast_backends(like: Tensor) -> list[str]:
-    """Back-ends other than plain torch that take tensors such as ``like``."""
-    return [name for name in BACKENDS if name not in ("auto", "reference") and _obstacle(name, like) is None]
-
-
-def _automatic(like: Tensor) -> str:
-    kernels = kernels_for(like)
-    if kernels is not None:
-        return kernels
-    problem = _obstacle("cuda", like)
-    if problem is not None and like.dtype == torch.float32:  # another dtype is meant for the oracle
-        _warn_of_plain_torch(like.device.type, problem)
-    return "reference"
-
-
-@cache
-def _warn_of_plain_torch(device: str, problem: str) -> None:
-    """Warn once that a device has no kernels of its own; a run of hours would else silently become one of weeks."""
-    log.warning(
-        "rendering on %s in plain torch, much slower than on the CPU (--trainer.accelerator=cpu); "
-        "backend 'cuda' cannot be used: %s",
-        device,
-        problem,
-    )
-
-
-def _obstacle(backend: str, like: Tensor) -> str | None:
-    """Why a back-end cannot take tensors such as ``like``, with a remedy; None where it can."""
-    if backend == "cpu" and not (like.device.type == "cpu" and like.dtype == torch.float32):
-        return f"it renders float32 tensors on the CPU, got {like.dtype} on {like.device}; move the splats"
-    return triton_obstacle(like) if backend == "cuda" else None
-
-
-def _rasterizer(backend: str) -> Callable[..., _Outputs]:
-    return render_reference if backend == "reference" else _fast_function("render", backend)
-
-
-def _fast_function(name: str, backend: str) -> Callable[..., Any]:
-    """The function ``name`` of a fast back-end, imported only now because that imports the kernels' compiler."""
-    module = importlib.import_module(f"nsvq_lightning.rendering.{backend}.rasterizer")
-    function: Callable[..., Any] = getattr(module, f"{name}_{backend}")
-    return function
+    name = resolve_backend(backend, like)
+    return importlib.import_module(f"{__package__}.{name}{'' if name == 'reference' else '.rasterizer'}")

@@ -11,11 +11,13 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
     BLUR,
+    FAINTEST,
     FRUSTUM_MARGIN,
     HUGE_FOOTPRINT,
     HUGE_QUATERNION,
@@ -27,7 +29,7 @@ from nsvq_lightning.rendering.sh import sh_colors
 from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors
 
-__all__ = ["Projection", "project", "render_reference", "rotation_matrices", "times_vectors", "visible_rows"]
+__all__ = ["Projection", "light_kept", "project", "render", "rotation_matrices", "times_vectors", "visible"]
 
 TILE = 32
 """Side in pixels of the squares that are blended at a time."""
@@ -111,12 +113,39 @@ def _on_image(projection: Projection, camera: Camera) -> Tensor:
 
 
 @torch.no_grad()
-def visible_rows(splats: SplatTensors, camera: Camera) -> Tensor:
+def visible(splats: SplatTensors, camera: Camera) -> Tensor:
     """Rows of the splats that can change the image ``[V]``; splats with a non-finite geometry are left out."""
     return _on_image(project(splats, camera), camera).nonzero()[:, 0]
 
 
-def render_reference(
+def light_kept(splats: SplatTensors, camera: Camera, rows: Tensor) -> Tensor:
+    """What anti-aliasing multiplies the opacities of the splats ``rows [V]`` by, int64, ascending: ``[V]``.
+
+    √(det Σ / det(Σ + blur·I)) with Σ the projected covariance, differentiable in means, quaternions and log-scales.
+    """
+    means, quats, scales = (take_rows(getattr(splats, name), rows) for name in ("means", "quats", "scales"))
+    viewmat = camera.viewmat.to(means)
+    fx, fy, cx, cy = camera.intrinsics
+    rotation = viewmat[:3, :3]
+    x, y, z = (times_vectors(rotation, means) + viewmat[:3, 3]).unbind(1)
+    margin_x, margin_y = (FRUSTUM_MARGIN * 0.5 * side / f for side, f in ((camera.width, fx), (camera.height, fy)))
+    slope_x = (x / z).clamp(-cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
+    slope_y = (y / z).clamp(-cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
+    right, down, forward = rotation
+    across = (right - slope_x[:, None] * forward) * (fx / z)[:, None]
+    along = (down - slope_y[:, None] * forward) * (fy / z)[:, None]
+    axes = rotation_matrices(quats) * scales.exp()[:, None, :]
+    u, v = (across[:, :, None] * axes).sum(1), (along[:, :, None] * axes).sum(1)
+    # The blur does not matter to splats so large that squares of their area would overflow.
+    counts = (u.square().sum(1) + v.square().sum(1)).detach() < HUGE_FOOTPRINT
+    u, v = torch.where(counts[:, None], u, 0.0), torch.where(counts[:, None], v, 0.0)
+    area = torch.linalg.cross(u, v).square().sum(1)  # det Σ by Lagrange's identity, which loses no digits
+    blurred = BLUR * (u.square().sum(1) + v.square().sum(1)) + BLUR * BLUR
+    factor = (area / (area + blurred)).clamp_min(FAINTEST * FAINTEST).sqrt()
+    return torch.where(counts, factor, 1.0)
+
+
+def render(
     splats: SplatTensors,
     camera: Camera,
     sh_degree: int,
@@ -128,7 +157,7 @@ def render_reference(
 
     See :func:`nsvq_lightning.render` for the meaning of arguments and results.
     """
-    rows = visible_rows(splats, camera)
+    rows = visible(splats, camera)
     seen = RawSplats(*(getattr(splats, name)[rows] for name in ("means", "quats", "scales", "opacities", "sh0", "shN")))
     projection = project(seen, camera)
     n = splats.means.shape[0]

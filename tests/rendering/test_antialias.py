@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
-from nsvq_lightning.rendering.antialias import compensated
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render, visible
+from nsvq_lightning.rendering.reference import light_kept
 from nsvq_lightning.splats.splats import RawSplats
 from tests.support.splat_scenes import front_camera, random_splats
 
@@ -61,13 +63,9 @@ def test_the_factor_is_that_of_the_determinants() -> None:
         sh0=torch.zeros(1, 1, 3),
         shN=torch.zeros(1, 0, 3),
     )
-    fainter = compensated(splats, camera, torch.tensor([0])).opacities.sigmoid()
     along = camera.intrinsics[1] / camera.intrinsics[0]
-    sizes = pixels**2, (pixels * along) ** 2
-    expected = torch.tensor(0.3).sigmoid()
-    for size in sizes:
-        expected = expected * (size / (size + 0.3)) ** 0.5
-    torch.testing.assert_close(fainter[0], expected, rtol=1e-3, atol=0)
+    expected = math.prod((size / (size + 0.3)) ** 0.5 for size in (pixels**2, (pixels * along) ** 2))
+    assert float(light_kept(splats, camera, torch.tensor([0]))) == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])

@@ -13,9 +13,11 @@ from oracle import run
 from splat_scenes import front_camera, pixel_map, random_splats, uneven_splats
 
 from nsvq_lightning.compression.importance import contributions
+from nsvq_lightning.compute.devices import _warn_of_plain_torch, resolve_backend
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu import rasterizer
-from nsvq_lightning.rendering.rasterize import _warn_of_plain_torch, render, resolve_backend, visible
+from nsvq_lightning.rendering.cpu.records import MAX_SIDE
+from nsvq_lightning.rendering.rasterize import render, visible
 from nsvq_lightning.skips import switched
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
@@ -339,7 +341,7 @@ def test_what_the_rasterizer_skips_changes_no_bit(name: str, sh_degree: int) -> 
 @pytest.mark.parametrize("upright", [True, False])
 def test_the_largest_image_is_right_and_a_larger_one_refused(upright: bool) -> None:
     """Against a small image of the same view by the oracle. More tiles have no place in a record of 16 bits."""
-    splats, largest, small = random_splats(5, seed=8, log_scale=0.0), rasterizer.MAX_SIDE, 2048
+    splats, largest, small = random_splats(5, seed=8, log_scale=0.0), MAX_SIDE, 2048
 
     def camera(side: int) -> Camera:
         width, height = (1, side) if upright else (side, 1)

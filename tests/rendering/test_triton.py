@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nsvq_lightning.rendering.rasterize import resolve_backend
+from nsvq_lightning.compute.devices import resolve_backend
 
 HERE = Path(__file__).parent
 

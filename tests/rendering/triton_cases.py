@@ -19,11 +19,12 @@ from oracle import run
 from splat_scenes import front_camera, pixel_map, random_splats, uneven_splats
 from triton.runtime.interpreter import InterpreterBuilder
 
+from nsvq_lightning.compute.devices import resolve_backend
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda.binning import list_tiles
 from nsvq_lightning.rendering.cuda.blend import SLOTS, blend, tile_grid
 from nsvq_lightning.rendering.cuda.projection import Lens, project
-from nsvq_lightning.rendering.rasterize import render, resolve_backend, visible
+from nsvq_lightning.rendering.rasterize import render, visible
 from nsvq_lightning.splats.splats import RawSplats
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"

@@ -186,17 +186,11 @@ def _render_and_back(function: Callable[..., Any], splats: RawSplats, **argument
     return [image.detach(), radii, means2d.detach(), *gradients]
 
 
-def _light() -> dict[str, Any]:
-    splats, rows = _splats(), torch.arange(3, 60, 2)
-    return {"means": splats.means, "quats": splats.quats, "scales": splats.scales, "camera": _camera(), "rows": rows}
-
-
-def _kept_and_back(function: Callable[..., Any], **arguments: Any) -> list[Any]:
+def _kept_and_back(function: Callable[..., Any], splats: RawSplats, **arguments: Any) -> list[Any]:
     """The factors and the gradients."""
-    names = ("means", "quats", "scales")
-    leaves = {name: arguments[name].detach().requires_grad_() for name in names}
-    factors = function(**{**arguments, **leaves})
-    return [factors.detach(), *torch.autograd.grad(factors.sum(), list(leaves.values()))]
+    leaves = RawSplats(*(tensor.detach().requires_grad_() for tensor in splats))
+    factors = function(leaves, **arguments)
+    return [factors.detach(), *torch.autograd.grad(factors.sum(), leaves[:3])]
 
 
 def _tensors(arrays: dict[str, Any]) -> dict[str, Any]:
@@ -208,10 +202,15 @@ _ROWS, _SSIM = "nsvq_lightning.compute.rows", "nsvq_lightning.quality.ssim"
 
 NUMBA: dict[str, list[Case]] = {
     f"{_SSIM}_cpu.l1_dssim": [Case(_pictures), Case(lambda: _pictures(torch.uint8))],
-    f"{_CPU}.rasterizer.render_cpu": [Case(_render, call=_render_and_back)],
-    f"{_CPU}.rasterizer.visible_cpu": [Case(lambda: {"splats": _splats(), "camera": _camera()})],
-    f"{_CPU}.antialias.light_kept_cpu": [
-        Case(_light, rows=("means", "quats", "scales", "rows"), numbers=("rows",), call=_kept_and_back)
+    f"{_CPU}.rasterizer.render": [Case(_render, call=_render_and_back)],
+    f"{_CPU}.rasterizer.visible": [Case(lambda: {"splats": _splats(), "camera": _camera()})],
+    f"{_CPU}.antialias.light_kept": [
+        Case(
+            lambda: {"splats": _splats(), "camera": _camera(), "rows": torch.arange(3, 60, 2)},
+            rows=("splats", "rows"),
+            numbers=("rows",),
+            call=_kept_and_back,
+        )
     ],
     f"{_ROWS}.gather_rows": [
         Case(

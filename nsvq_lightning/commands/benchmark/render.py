@@ -19,10 +19,11 @@ from nsvq_lightning.commands.benchmark import Scope
 from nsvq_lightning.commands.benchmark.report import Panel
 from nsvq_lightning.commands.benchmark.timing import Case, Measurement, measure, use_threads
 from nsvq_lightning.commands.benchmark.workloads import Workload, relative_l2, workloads
+from nsvq_lightning.compute.devices import fast_backends
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quality.ssim import in_range, plain_ssim
 from nsvq_lightning.random import generator
-from nsvq_lightning.rendering.rasterize import fast_backends, render
+from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats
 
 __all__ = ["PANELS", "Painter", "crop_for_oracle", "errors_of", "gradients_of", "painter", "run", "trace"]

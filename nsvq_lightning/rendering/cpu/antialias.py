@@ -1,6 +1,6 @@
 """How much of a splat's light the blur leaves, 16 splats at a time, and its gradient.
 
-The equation is in :mod:`nsvq_lightning.rendering.antialias`.
+The equation is that of :func:`nsvq_lightning.rendering.reference.light_kept`.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.projection import BLUR, BLUR_SQUARED, HUGE_FOOTPRINT, affine, axes_of, image_axes
 from nsvq_lightning.rendering.cpu.projection_backward import axes_backward
-from nsvq_lightning.rendering.cpu.rasterizer import pack_camera
+from nsvq_lightning.splats.splats import SplatTensors
 
-__all__ = ["light_kept_cpu"]
+__all__ = ["light_kept"]
 
 LEAST = F(constants.FAINTEST**2)
 
@@ -117,7 +117,7 @@ def _flat(attributes: tuple[Tensor, ...]) -> list[Array]:
     return [flat_checked(name, tensor.contiguous(), (count, width)) for name, tensor, width in named]
 
 
-def light_kept_cpu(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera, rows: Tensor) -> Tensor:
+def light_kept(splats: SplatTensors, camera: Camera, rows: Tensor) -> Tensor:
     """Factors ``[V]`` of the splats ``rows [V]`` int64, differentiable in means, quaternions and log-scales.
 
     Raises:
@@ -126,12 +126,12 @@ def light_kept_cpu(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera,
     """
     count = len(rows)
     if count == 0:
-        return means.new_zeros(0)
+        return splats.means.new_zeros(0)
     numbers = rows.detach().numpy()
-    if int(numbers.min()) < 0 or int(numbers.max()) >= len(means):
-        raise outside("rows", numbers, len(means))
+    if int(numbers.min()) < 0 or int(numbers.max()) >= len(splats.means):
+        raise outside("rows", numbers, len(splats.means))
     # A last, incomplete vector repeats the last splat; each of its lanes computes and writes the same.
     ids = np.full(16 * ((count + 15) // 16), numbers[-1], np.int32)
     ids[:count] = numbers
-    factors: Tensor = _LightKept.apply(pack_camera(camera), ids, count, means, quats, scales)
+    factors: Tensor = _LightKept.apply(rec.pack_camera(camera), ids, count, splats.means, splats.quats, splats.scales)
     return factors

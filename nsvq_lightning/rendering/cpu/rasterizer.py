@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from torch.autograd.function import once_differentiable
 from nsvq_lightning.compute.jit import thread_count
 from nsvq_lightning.compute.memory import Array, Workspace, flat, flat_checked, recycled
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.constants import FRUSTUM_MARGIN
+from nsvq_lightning.rendering.cpu.antialias import light_kept
 from nsvq_lightning.rendering.cpu.binning import DIGITS, count_tiles, fill_tiles, sort_by_depth
 from nsvq_lightning.rendering.cpu.blend import (
     BACKWARD_SCRATCH,
@@ -26,42 +25,14 @@ from nsvq_lightning.rendering.cpu.blend import (
 )
 from nsvq_lightning.rendering.cpu.projection import find_visible, finish_records, project_splats
 from nsvq_lightning.rendering.cpu.projection_backward import project_backward
-from nsvq_lightning.rendering.cpu.records import CAMERA, GROUP_TILES, RECORD, TILE, group_grid
+from nsvq_lightning.rendering.cpu.records import GROUP_TILES, RECORD, group_grid, pack_camera
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.splats import ATTRIBUTES, SplatTensors, sh_degree_of
 
-__all__ = ["pack_camera", "render_cpu", "visible_cpu"]
+__all__ = ["light_kept", "render", "visible"]
 
 PROJECTION_SCRATCH = 2048 + 64
 MAX_ENTRIES = 2**31 - 1
-MAX_SIDE = TILE * (2**15 - 1)
-"""Largest image side in pixels: a record has 16 bits, one of them the sign, for a tile's column or row."""
-
-
-_packed: WeakKeyDictionary[Camera, tuple[int, Array]] = WeakKeyDictionary()
-"""Cameras as kernels read them, and the version of the matrix that it was made from."""
-
-
-def pack_camera(camera: Camera) -> Array:
-    """A camera as kernels read it; packed once."""
-    version, packed = _packed.get(camera, (-1, np.empty(0)))
-    if version != camera.viewmat._version:
-        packed = _packed_now(camera)
-        _packed[camera] = camera.viewmat._version, packed
-    return packed
-
-
-def _packed_now(camera: Camera) -> Array:
-    if max(camera.width, camera.height) > MAX_SIDE:
-        raise ValueError(
-            f"an image may have {MAX_SIDE} pixels along a side, got {camera.width}x{camera.height}; render it in parts"
-        )
-    fx, fy, cx, cy = camera.intrinsics
-    margin_x, margin_y = (FRUSTUM_MARGIN * 0.5 * side / f for side, f in ((camera.width, fx), (camera.height, fy)))
-    limits = [-cx / fx - margin_x, (camera.width - cx) / fx + margin_x]
-    limits += [-cy / fy - margin_y, (camera.height - cy) / fy + margin_y]
-    packed = [*camera.packed_view, fx, fy, cx, cy, *limits, camera.width, camera.height]
-    return np.array(packed, np.float32).reshape(CAMERA)
 
 
 def _geometry(splats: SplatTensors) -> tuple[Array, ...]:
@@ -259,7 +230,7 @@ class _Blend(torch.autograd.Function):
         return None, g_means2d, torch.zeros(()), g_background, None, g_observed if with_map else None
 
 
-def render_cpu(
+def render(
     splats: SplatTensors,
     camera: Camera,
     sh_degree: int,
@@ -272,11 +243,9 @@ def render_cpu(
     See :func:`nsvq_lightning.render` for the meaning of arguments and results.
 
     Raises:
-        ValueError: The attributes do not fit together, ``sh_degree`` is out of range, or the image is too large.
+        ValueError: The attributes do not fit together, or the image is too large.
         TypeError: An attribute is not float32.
     """
-    if not 0 <= sh_degree <= sh_degree_of(splats.shN):
-        raise ValueError(f"sh_degree must be between 0 and that of shN {list(splats.shN.shape)}, got {sh_degree}")
     attributes = splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN
     frame = _Frame(splats, camera)
     means2d, token, radii = _Project.apply(frame, sh_degree, *attributes)
@@ -284,7 +253,7 @@ def render_cpu(
     return image, alpha, radii, means2d, depth
 
 
-def visible_cpu(splats: SplatTensors, camera: Camera) -> Tensor:
+def visible(splats: SplatTensors, camera: Camera) -> Tensor:
     """Rows ``[V]`` int64, ascending, of the splats that can change the image.
 
     Raises:

@@ -13,9 +13,15 @@ fixed order, whichever thread processed which group: results have the same bits 
 from __future__ import annotations
 
 import math
+from weakref import WeakKeyDictionary
+
+import numpy as np
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline
+from nsvq_lightning.compute.memory import Array
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.constants import FRUSTUM_MARGIN
 
 RECORD = 16
 """Floats in a record and in a slot."""
@@ -47,6 +53,36 @@ ROTATION, TRANSLATION, POSITION, FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, W
     0, 9, 12, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24,
 )  # fmt: skip
 CAMERA = 25
+
+
+MAX_SIDE = TILE * (2**15 - 1)
+"""Largest image side in pixels: a record has 16 bits, one of them the sign, for a tile's column or row."""
+
+
+_packed: WeakKeyDictionary[Camera, tuple[int, Array]] = WeakKeyDictionary()
+"""Cameras as kernels read them, and the version of the matrix that it was made from."""
+
+
+def pack_camera(camera: Camera) -> Array:
+    """A camera as kernels read it; packed once."""
+    version, packed = _packed.get(camera, (-1, np.empty(0)))
+    if version != camera.viewmat._version:
+        packed = _packed_now(camera)
+        _packed[camera] = camera.viewmat._version, packed
+    return packed
+
+
+def _packed_now(camera: Camera) -> Array:
+    if max(camera.width, camera.height) > MAX_SIDE:
+        raise ValueError(
+            f"an image may have {MAX_SIDE} pixels along a side, got {camera.width}x{camera.height}; render it in parts"
+        )
+    fx, fy, cx, cy = camera.intrinsics
+    margin_x, margin_y = (FRUSTUM_MARGIN * 0.5 * side / f for side, f in ((camera.width, fx), (camera.height, fy)))
+    limits = [-cx / fx - margin_x, (camera.width - cx) / fx + margin_x]
+    limits += [-cy / fy - margin_y, (camera.height - cy) / fy + margin_y]
+    packed = [*camera.packed_view, fx, fy, cx, cy, *limits, camera.width, camera.height]
+    return np.array(packed, np.float32).reshape(CAMERA)
 
 
 def group_grid(width: int, height: int) -> tuple[int, int]:

@@ -42,7 +42,7 @@ from nsvq_lightning.rendering.cuda.records import (
     Y,
 )
 from nsvq_lightning.splats import conventions
-from nsvq_lightning.splats.splats import ATTRIBUTES, sh_degree_of
+from nsvq_lightning.splats.splats import ATTRIBUTES
 
 __all__ = ["Lens", "Projected", "project", "project_backward", "project_radii"]
 
@@ -425,12 +425,6 @@ def _check_attributes(lens: Lens, attributes: tuple[Tensor, ...]) -> None:
         check_tensor(name, attribute, shape, device)
 
 
-def _check_degree(degree: int, attributes: tuple[Tensor, ...]) -> None:
-    stored = sh_degree_of(attributes[-1])
-    if not 0 <= degree <= stored:
-        raise ValueError(f"the degree must be between 0 and the stored one, {stored}, got {degree}")
-
-
 def _launch_projection(
     lens: Lens, attributes: tuple[Tensor, ...], degree: int, records: Tensor, boxes: Tensor, means2d: Tensor
 ) -> Tensor:
@@ -462,13 +456,12 @@ def project(lens: Lens, attributes: tuple[Tensor, ...], degree: int) -> Projecte
     Args:
         lens: The camera.
         attributes: The six raw attributes, contiguous float32, in the order of :class:`~nsvq_lightning.RawSplats`.
-        degree: Highest SH degree that is evaluated.
+        degree: Highest SH degree that is evaluated, at most the stored one.
 
     Raises:
-        ValueError: The tensors do not fit together, or the degree is above the stored one.
+        ValueError: The tensors do not fit together.
         TypeError: A dtype is wrong.
     """
-    _check_degree(degree, attributes)
     means = attributes[0]
     n = means.shape[0]
     records = means.new_empty(n, RECORD.value)
@@ -501,10 +494,9 @@ def project_backward(
         g_means2d: Gradient of the projected centres ``[N, 2]``.
 
     Raises:
-        ValueError: The tensors do not fit together, or the degree is above the stored one.
+        ValueError: The tensors do not fit together.
         TypeError: A dtype is wrong.
     """
-    _check_degree(degree, attributes)
     _check_attributes(lens, attributes)
     device = attributes[0].device
     check_tensor("ids", ids, (len(ids),), device, torch.int64)

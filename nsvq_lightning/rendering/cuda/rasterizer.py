@@ -12,9 +12,10 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda.binning import Tiles, list_tiles
 from nsvq_lightning.rendering.cuda.blend import blend, blend_backward, tile_grid
 from nsvq_lightning.rendering.cuda.projection import Lens, project, project_backward, project_radii
+from nsvq_lightning.rendering.reference import light_kept
 from nsvq_lightning.splats.splats import SplatTensors
 
-__all__ = ["render_cuda", "visible_cuda"]
+__all__ = ["light_kept", "render", "visible"]
 
 
 def _attributes(splats: SplatTensors) -> tuple[Tensor, ...]:
@@ -84,7 +85,7 @@ class _Blend(torch.autograd.Function):
         return None, g_means2d, None, moments, None, g_background, None, g_observed
 
 
-def render_cuda(
+def render(
     splats: SplatTensors,
     camera: Camera,
     sh_degree: int,
@@ -104,7 +105,7 @@ def render_cuda(
     return image, alpha, radii, means2d, depth
 
 
-def visible_cuda(splats: SplatTensors, camera: Camera) -> Tensor:
+def visible(splats: SplatTensors, camera: Camera) -> Tensor:
     """Rows ``[V]`` int64, ascending, of the splats that can change the image."""
     attributes = _attributes(splats)
     with torch.cuda.device_of(attributes[0]):

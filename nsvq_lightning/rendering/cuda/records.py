@@ -19,44 +19,6 @@ import triton.language as tl
 
 from nsvq_lightning.rendering import constants
 
-__all__ = [
-    "ALPHA_MAX",
-    "BLUE",
-    "COVARIANCE_SCALE",
-    "DEPTH",
-    "FACTOR_SCALE",
-    "FIELDS",
-    "GREEN",
-    "LN2",
-    "LOG2_ALPHA_MIN",
-    "LOG2_E",
-    "LOG2_OPACITY",
-    "OBSERVED_FIELDS",
-    "OBSERVED_SLOT",
-    "RECORD",
-    "RED",
-    "SUM_ABS_X",
-    "SUM_ABS_Y",
-    "SUM_BLUE",
-    "SUM_DEPTH",
-    "SUM_GREEN",
-    "SUM_H",
-    "SUM_MAP",
-    "SUM_RED",
-    "SUM_U",
-    "SUM_UU",
-    "SUM_UV",
-    "SUM_V",
-    "SUM_VV",
-    "TILE",
-    "TRANSMITTANCE_MIN",
-    "A",
-    "B",
-    "C",
-    "X",
-    "Y",
-]
-
 RECORD = tl.constexpr(12)
 """Stride between records, or slots, in floats: whole 16-byte words."""
 FIELDS = tl.constexpr(10)
