@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import threading
 from collections.abc import Callable
@@ -12,7 +13,7 @@ import numpy as np
 import torch
 from numba.core import event
 
-from nsvq_lightning.compute.kernel_cache import KernelStore
+from nsvq_lightning.compute.kernel_cache import KernelCache
 
 __all__ = ["F", "inline", "kernel", "kernels_ready", "thread_count"]
 
@@ -57,7 +58,7 @@ class _HelperLevel(event.Listener):
 event.register("numba:compile", _HelperLevel())
 
 
-class _Store(KernelStore):
+class _Cache(KernelCache):
     """Its first question to the disk is the first that happens when a kernel is called."""
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -85,10 +86,11 @@ def kernel(function: Callable[..., Any], parallel: bool = True, allocates: bool 
     arrays may pass ``allocates=False``: the arrays that it passes to inlined helpers are then not reference-counted,
     with atomic operations, at every call, and a loop of few instructions becomes seven times as fast.
 
-    It is compiled again when anything that it is built from has changed.
+    It is compiled again when its module, or one that this imports, has changed.
     """
     dispatcher = numba.njit(parallel=parallel, _nrt=allocates, **_OPTIONS)(function)
-    dispatcher._cache = _Store(function, {**dispatcher.targetoptions, "helpers": _HelperLevel.LEVEL})
+    with contextlib.suppress(RuntimeError):  # nowhere to keep it
+        dispatcher._cache = _Cache(function)
     _kernels.append(dispatcher)
     return dispatcher
 
