@@ -305,9 +305,7 @@ def _exp2(builder: Any, x: Any) -> Any:
     fraction = builder.fsub(x, builder.fsub(shifted, magic))
     # Minimax polynomial of 2**f on [-1/2, 1/2].
     power = _polynomial(
-        builder,
-        fraction,
-        (1.32764715e-3, 9.67554133e-3, 5.55071327e-2, 2.40221197e-1, 6.93146967e-1, 1.00000007),
+        builder, fraction, (1.32764715e-3, 9.67554133e-3, 5.55071327e-2, 2.40221197e-1, 6.93146967e-1, 1.00000007)
     )
     exponent = builder.shl(builder.bitcast(shifted, _VI), _integers(23))
     return builder.bitcast(builder.add(builder.bitcast(power, _VI), exponent), _VF)

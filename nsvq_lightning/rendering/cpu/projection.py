@@ -76,11 +76,7 @@ def affine(camera, mean):
 def image_axes(t, m):
     """One row of U = T·M: the splat's axes along one image axis."""
     m0, m1, m2 = m
-    return (
-        rec.dot3(t, (m0[0], m1[0], m2[0])),
-        rec.dot3(t, (m0[1], m1[1], m2[1])),
-        rec.dot3(t, (m0[2], m1[2], m2[2])),
-    )
+    return (rec.dot3(t, (m0[0], m1[0], m2[0])), rec.dot3(t, (m0[1], m1[1], m2[1])), rec.dot3(t, (m0[2], m1[2], m2[2])))
 
 
 @inline
