@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from nsvq_lightning.rendering.constants import FRUSTUM_MARGIN
+
 __all__ = ["Camera", "looked_at", "poses", "up_of"]
 
 
@@ -57,6 +59,16 @@ class Camera:
         """``(fx, fy, cx, cy)`` in pixels."""
         assert self._intrinsics is not None  # set by __post_init__
         return self._intrinsics
+
+    @property
+    def slope_limits(self) -> tuple[float, float, float, float]:
+        """Lowest and highest x/z, then y/z, at which a Jacobian is evaluated: a margin beyond the image."""
+        fx, fy, cx, cy = self.intrinsics
+        margin_x, margin_y = 0.5 * FRUSTUM_MARGIN * self.width / fx, 0.5 * FRUSTUM_MARGIN * self.height / fy
+        return (
+            -cx / fx - margin_x, (self.width - cx) / fx + margin_x,
+            -cy / fy - margin_y, (self.height - cy) / fy + margin_y,
+        )  # fmt: skip
 
     @property
     def packed_view(self) -> list[float]:

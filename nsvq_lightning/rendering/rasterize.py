@@ -87,13 +87,14 @@ def render(
     module = _module_of(backend, means)
     if antialiased:
         splats = _compensated(splats, camera, module)
-    if observe is None:
-        return Render(*module.render(splats, camera, degree, background))
-    if tuple(observe.shape) != (camera.height, camera.width):
-        raise ValueError(f"observe must be [{camera.height}, {camera.width}], got {list(observe.shape)}")
-    observed = means.new_zeros(means.shape[0], 3).requires_grad_()
-    pixel_map = observe.detach().to(means).contiguous()
-    return Render(*module.render(splats, camera, degree, background, pixel_map, observed), observed)
+    pixel_map = observed = None
+    if observe is not None:
+        if tuple(observe.shape) != (camera.height, camera.width):
+            raise ValueError(f"observe must be [{camera.height}, {camera.width}], got {list(observe.shape)}")
+        observed = means.new_zeros(means.shape[0], 3).requires_grad_()
+        pixel_map = observe.detach().to(means).contiguous()
+    image, alpha, radii, means2d, depth = module.render(splats, camera, degree, background, pixel_map, observed)
+    return Render(image, alpha, radii, means2d, depth, observed)
 
 
 def _compensated(splats: SplatTensors, camera: Camera, module: Any) -> RawSplats:

@@ -12,22 +12,11 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from nsvq_lightning.compute.rows import take_rows
+from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.constants import (
-    ALPHA_MAX,
-    ALPHA_MIN,
-    BLUR,
-    FAINTEST,
-    FRUSTUM_MARGIN,
-    HUGE_FOOTPRINT,
-    HUGE_QUATERNION,
-    NEAR,
-    SHRINK,
-    TRANSMITTANCE_MIN,
-)
 from nsvq_lightning.rendering.sh import sh_colors
 from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM
-from nsvq_lightning.splats.splats import RawSplats, SplatTensors
+from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats, SplatTensors
 
 __all__ = ["Projection", "light_kept", "project", "render", "rotation_matrices", "times_vectors", "visible"]
 
@@ -55,7 +44,9 @@ class Projection(NamedTuple):
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotations ``[N, 3, 3]`` of quaternions ``[N, 4]`` (wxyz, any norm; zero is the identity)."""
     # Squares of a huge quaternion would overflow.
-    quats = quats * torch.where(quats.detach().abs().amax(-1, keepdim=True) > HUGE_QUATERNION, SHRINK, 1.0)
+    quats = quats * torch.where(
+        quats.detach().abs().amax(-1, keepdim=True) > constants.HUGE_QUATERNION, constants.SHRINK, 1.0
+    )
     norm = quats.square().sum(-1, keepdim=True).clamp_min(MIN_SQUARED_NORM).sqrt()
     w, x, y, z = (quats / norm).unbind(-1)
     rows = [
@@ -85,37 +76,35 @@ def project(splats: SplatTensors, camera: Camera) -> Projection:
     fx, fy, cx, cy = camera.intrinsics
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     x, y, z = (means @ rotation.T + translation).unbind(-1)
-    margin_x, margin_y = (FRUSTUM_MARGIN * 0.5 * side / f for side, f in ((camera.width, fx), (camera.height, fy)))
-    slope_x = (x / z).clamp(-cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
-    slope_y = (y / z).clamp(-cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
+    low_x, high_x, low_y, high_y = camera.slope_limits
+    slope_x, slope_y = (x / z).clamp(low_x, high_x), (y / z).clamp(low_y, high_y)
     zero = torch.zeros_like(z)
     jacobian = torch.stack([fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], -1).view(-1, 2, 3)
     axes = rotation_matrices(splats.quats) * splats.scales.exp()[:, None, :]
     u, v = (jacobian @ rotation @ axes).unbind(1)
     xx, xy, yy = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
     size = (xx + yy).detach()
-    unit = torch.where(size > HUGE_FOOTPRINT, 1 / size, torch.ones_like(size))
+    unit = torch.where(size > constants.HUGE_FOOTPRINT, 1 / size, torch.ones_like(size))
     determinant = (torch.linalg.cross(u, v) * unit[:, None]).square().sum(-1)
-    determinant = determinant + (BLUR * (xx + yy) + BLUR * BLUR) * unit * unit
-    conics = torch.stack([yy + BLUR, -xy, xx + BLUR], -1) * (unit / determinant * unit)[:, None]
-    reach = 2 * (torch.sigmoid(splats.opacities.detach()) / ALPHA_MIN).log().clamp_min(0)
-    half = (reach[:, None] * (torch.stack([xx, yy], -1).detach() + BLUR)).sqrt()
+    determinant = determinant + (constants.BLUR * (xx + yy) + constants.BLUR * constants.BLUR) * unit * unit
+    conics = torch.stack([yy + constants.BLUR, -xy, xx + constants.BLUR], -1) * (unit / determinant * unit)[:, None]
+    reach = 2 * (torch.sigmoid(splats.opacities.detach()) / constants.ALPHA_MIN).log().clamp_min(0)
+    half = (reach[:, None] * (torch.stack([xx, yy], -1).detach() + constants.BLUR)).sqrt()
     return Projection(torch.stack([fx * x / z + cx, fy * y / z + cy], -1), conics, z, half)
-
-
-def _on_image(projection: Projection, camera: Camera) -> Tensor:
-    """Which splats are in front of the near plane and reach 1/255 at a pixel centre of the image ``[N]`` bool."""
-    low = (projection.means2d - projection.half_sizes - 0.5).ceil().clamp_min(0)
-    size = projection.means2d.new_tensor([camera.width - 1, camera.height - 1])
-    high = torch.minimum((projection.means2d + projection.half_sizes - 0.5).floor(), size)
-    reached = (projection.half_sizes > 0).all(-1) & (low <= high).all(-1)
-    return (projection.depths > NEAR) & reached & torch.isfinite(projection.conics).all(-1)
 
 
 @torch.no_grad()
 def visible(splats: SplatTensors, camera: Camera) -> Tensor:
-    """Rows of the splats that can change the image ``[V]``; splats with a non-finite geometry are left out."""
-    return _on_image(project(splats, camera), camera).nonzero()[:, 0]
+    """Rows ``[V]`` of the splats in front of the near plane that reach 1/255 at a pixel centre of the image.
+
+    Those with a non-finite geometry are left out.
+    """
+    means2d, conics, depths, half_sizes = project(splats, camera)
+    low = (means2d - half_sizes - 0.5).ceil().clamp_min(0)
+    size = means2d.new_tensor([camera.width - 1, camera.height - 1])
+    high = torch.minimum((means2d + half_sizes - 0.5).floor(), size)
+    reached = (half_sizes > 0).all(-1) & (low <= high).all(-1)
+    return ((depths > constants.NEAR) & reached & torch.isfinite(conics).all(-1)).nonzero()[:, 0]
 
 
 def light_kept(splats: SplatTensors, camera: Camera, rows: Tensor) -> Tensor:
@@ -125,23 +114,22 @@ def light_kept(splats: SplatTensors, camera: Camera, rows: Tensor) -> Tensor:
     """
     means, quats, scales = (take_rows(getattr(splats, name), rows) for name in ("means", "quats", "scales"))
     viewmat = camera.viewmat.to(means)
-    fx, fy, cx, cy = camera.intrinsics
+    fx, fy, _, _ = camera.intrinsics
     rotation = viewmat[:3, :3]
     x, y, z = (times_vectors(rotation, means) + viewmat[:3, 3]).unbind(1)
-    margin_x, margin_y = (FRUSTUM_MARGIN * 0.5 * side / f for side, f in ((camera.width, fx), (camera.height, fy)))
-    slope_x = (x / z).clamp(-cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
-    slope_y = (y / z).clamp(-cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
+    low_x, high_x, low_y, high_y = camera.slope_limits
+    slope_x, slope_y = (x / z).clamp(low_x, high_x), (y / z).clamp(low_y, high_y)
     right, down, forward = rotation
     across = (right - slope_x[:, None] * forward) * (fx / z)[:, None]
     along = (down - slope_y[:, None] * forward) * (fy / z)[:, None]
     axes = rotation_matrices(quats) * scales.exp()[:, None, :]
     u, v = (across[:, :, None] * axes).sum(1), (along[:, :, None] * axes).sum(1)
     # The blur does not matter to splats so large that squares of their area would overflow.
-    counts = (u.square().sum(1) + v.square().sum(1)).detach() < HUGE_FOOTPRINT
+    counts = (u.square().sum(1) + v.square().sum(1)).detach() < constants.HUGE_FOOTPRINT
     u, v = torch.where(counts[:, None], u, 0.0), torch.where(counts[:, None], v, 0.0)
     area = torch.linalg.cross(u, v).square().sum(1)  # det Σ by Lagrange's identity, which loses no digits
-    blurred = BLUR * (u.square().sum(1) + v.square().sum(1)) + BLUR * BLUR
-    factor = (area / (area + blurred)).clamp_min(FAINTEST * FAINTEST).sqrt()
+    blurred = constants.BLUR * (u.square().sum(1) + v.square().sum(1)) + constants.BLUR * constants.BLUR
+    factor = (area / (area + blurred)).clamp_min(constants.FAINTEST * constants.FAINTEST).sqrt()
     return torch.where(counts, factor, 1.0)
 
 
@@ -158,7 +146,7 @@ def render(
     See :func:`nsvq_lightning.render` for the meaning of arguments and results.
     """
     rows = visible(splats, camera)
-    seen = RawSplats(*(getattr(splats, name)[rows] for name in ("means", "quats", "scales", "opacities", "sh0", "shN")))
+    seen = RawSplats(*(getattr(splats, name)[rows] for name in ATTRIBUTES))
     projection = project(seen, camera)
     n = splats.means.shape[0]
     means2d = splats.means.new_zeros(n, 2).index_copy(0, rows, projection.means2d)
@@ -242,10 +230,10 @@ def _blend(
     offsets: Tensor = _WatchOffsets.apply(pixels[:, None] - centres[None], observed[:, :2])  # type: ignore[no-untyped-call]
     dx, dy = offsets.unbind(-1)
     power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy
-    alpha = (opacities * power.clamp_max(0).exp()).clamp_max(ALPHA_MAX)
-    alpha = torch.where(alpha >= ALPHA_MIN, alpha, torch.zeros_like(alpha))
+    alpha = (opacities * power.clamp_max(0).exp()).clamp_max(constants.ALPHA_MAX)
+    alpha = torch.where(alpha >= constants.ALPHA_MIN, alpha, torch.zeros_like(alpha))
     with torch.no_grad():
-        running = (1 - alpha).cumprod(1) >= TRANSMITTANCE_MIN
+        running = (1 - alpha).cumprod(1) >= constants.TRANSMITTANCE_MIN
     alpha = torch.where(running, alpha, torch.zeros_like(alpha))
     transmittance = torch.cat([pixels.new_ones(pixels.shape[0], 1), (1 - alpha).cumprod(1)], 1)
     weights = alpha * transmittance[:, :-1]

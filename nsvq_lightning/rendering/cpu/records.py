@@ -21,7 +21,6 @@ from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline
 from nsvq_lightning.compute.memory import Array
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.constants import FRUSTUM_MARGIN
 
 RECORD = 16
 """Floats in a record and in a slot."""
@@ -77,11 +76,7 @@ def _packed_now(camera: Camera) -> Array:
         raise ValueError(
             f"an image may have {MAX_SIDE} pixels along a side, got {camera.width}x{camera.height}; render it in parts"
         )
-    fx, fy, cx, cy = camera.intrinsics
-    margin_x, margin_y = (FRUSTUM_MARGIN * 0.5 * side / f for side, f in ((camera.width, fx), (camera.height, fy)))
-    limits = [-cx / fx - margin_x, (camera.width - cx) / fx + margin_x]
-    limits += [-cy / fy - margin_y, (camera.height - cy) / fy + margin_y]
-    packed = [*camera.packed_view, fx, fy, cx, cy, *limits, camera.width, camera.height]
+    packed = [*camera.packed_view, *camera.intrinsics, *camera.slope_limits, camera.width, camera.height]
     return np.array(packed, np.float32).reshape(CAMERA)
 
 
