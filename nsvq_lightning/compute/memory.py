@@ -12,25 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = [
-    "FLOAT32",
-    "FLOAT64",
-    "INT32",
-    "INT64",
-    "UINT8",
-    "UINT64",
-    "Array",
-    "Workspace",
-    "aligned_empty",
-    "check_array",
-    "check_table",
-    "check_tensor",
-    "flat",
-    "flat_checked",
-    "outside",
-    "recycled",
-]
-
 Array = np.ndarray[Any, np.dtype[Any]]
 
 FLOAT32, FLOAT64, INT32, INT64, UINT8, UINT64 = (

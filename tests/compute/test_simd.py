@@ -43,6 +43,30 @@ def test_operators(values: Array) -> None:
     np.testing.assert_allclose(out[6], z - exact, atol=1e-6)
 
 
+def test_a_scalar_stands_for_a_vector_of_it(values: Array) -> None:
+    third = np.float32(1 / 3)
+
+    def kernel(a: Array, out: Array) -> None:
+        x = simd.load(a, 0)
+        simd.store(out, 0, 2 * x - third)
+        simd.store(out, 16, 1 / (x + 0.1))
+        simd.store(out, 32, simd.select(x > third, simd.fma(third, x, 1), 0))
+        simd.store(out, 48, simd.vmax(2, simd.vmin(x, 3)))
+        simd.store(out, 64, third)
+        simd.store(out, 80, simd.load_one(a, 5))
+        simd.store(out, 96, simd.load_vectors(a, 16)[2])
+
+    x, one = values[:16], np.float32(1)
+    out = run(kernel, values, outputs=7)
+    np.testing.assert_allclose(out[0], 2 * x - third, rtol=1e-6)
+    np.testing.assert_array_equal(out[1], one / (x + np.float32(0.1)))
+    np.testing.assert_allclose(out[2], np.where(x > third, third * x + one, 0), rtol=2e-7)
+    np.testing.assert_array_equal(out[3], np.clip(x, 2, 3))
+    assert (out[4] == third).all()
+    assert (out[5] == values[5]).all()
+    np.testing.assert_array_equal(out[6], values[48:64])
+
+
 def test_minimum_and_maximum_take_the_second_argument_for_nan(values: Array) -> None:
     def kernel(a: Array, out: Array) -> None:
         simd.store(out, 0, simd.vmin(simd.load(a, 0), simd.load(a, 16)))

@@ -1,4 +1,4 @@
-"""PSNR by hand, SSIM against scikit-image, distributed state against one process."""
+"""PSNR by hand, distributed state against one process."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from skimage.metrics import peak_signal_noise_ratio
 from torch import Tensor
 
-from nsvq_lightning.quality.metrics import PSNR, SSIM, build_lpips, eight_bit, image_metrics, psnr
+from nsvq_lightning.quality.metrics import PSNR, build_lpips, eight_bit, image_metrics, psnr
 
 
 def picture(seed: int, height: int = 40, width: int = 52) -> Tensor:
@@ -40,29 +40,6 @@ def test_renders_are_rounded_to_eight_bit_and_clamped() -> None:
     almost = torch.full((2, 2, 3), 128.4 / 255)
     assert PSNR()(almost, target).isinf()
     assert torch.equal(eight_bit(torch.tensor([-0.5, 1.7])), torch.tensor([0.0, 1.0]))
-
-
-def test_ssim_is_scikit_images_with_zero_padding() -> None:
-    image, target = picture(3), picture(4)
-    # Zero padding is scikit-image on zero-padded images, cropped: its own borders never enter.
-    pad = [(16, 16), (16, 16), (0, 0)]
-    padded = [np.pad(x.double().numpy(), pad) for x in (image, target)]
-    _, full = structural_similarity(
-        *padded,
-        channel_axis=2,
-        data_range=1.0,
-        gaussian_weights=True,
-        sigma=1.5,
-        truncate=3.5,  # a radius of 5: the 11×11 window
-        use_sample_covariance=False,
-        full=True,
-    )
-    oracle = full[16:-16, 16:-16].mean()
-    assert SSIM()(image, target).item() == pytest.approx(oracle, abs=2e-6)
-
-
-def test_equal_images_have_ssim_one() -> None:
-    assert SSIM()(picture(5), picture(5)).item() == pytest.approx(1.0, abs=1e-6)
 
 
 def test_the_state_of_two_processes_adds_up_to_that_of_one() -> None:

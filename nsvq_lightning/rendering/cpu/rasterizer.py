@@ -67,27 +67,22 @@ class _Frame:
         if work is not None:
             work.give_back()
 
-    def project(self) -> tuple[Array, Array, Array]:
-        """Find the visible splats; returns their rows, one run per thread, the runs' lengths and their slots."""
+    def project(self, colors: tuple[Array, Array], bands: tuple[int, int, int], means2d: Array, radii: Array) -> None:
+        """Write the records; list the visible splats by row (``ids``) and, as places in it, by depth (``order``)."""
         found = self.work.array("found", self.n, np.int32)
         counts, slots = (self.work.array(name, self.threads, np.int64) for name in ("counts", "slot_counts"))
         project_splats(
             self.threads, self.camera, *self.geometry, self.records, self.integers, found, counts, slots, self.scratch
         )
         self.count, self.slots = int(counts.sum()), int(slots.sum())
-        return found, counts, slots
-
-    def finish(self, colors: tuple[Array, Array], bands: tuple[int, int, int], means2d: Array, radii: Array) -> None:
-        """Complete the records; list the visible splats by row (``ids``) and, as places in it, by depth (``order``)."""
-        runs = self.project()
         self.ids = self.work.array("ids", self.count + 16, np.int32)
         keys = self.work.array("keys", self.count + 1, np.int32)
         order = self.work.array("order", self.count, np.int32)
         self.boxes = self.work.array("boxes", self.count, np.int64)
         listed = self.ids, keys, order, self.boxes
         finish_records(
-            self.threads, self.camera, self.geometry[0], colors, bands, runs, self.records, self.integers, listed,
-            means2d, radii, self.scratch,
+            self.threads, self.camera, self.geometry[0], colors, bands, (found, counts, slots), self.records,
+            self.integers, listed, means2d, radii, self.scratch,
         )  # fmt: skip
         if self.count:
             other = self.work.array("order2", self.count, np.int32)
@@ -143,7 +138,7 @@ class _Project(torch.autograd.Function):
         bands = 3 * shN.shape[1], degree, degree if is_on("sh_bands") else sh_degree_of(shN)
         ctx.frame, ctx.bands, ctx.shapes = frame, bands, tuple(tuple(tensor.shape) for tensor in attributes)
         ctx.save_for_backward(*attributes)
-        frame.finish(_colors(frame.n, sh0, shN), bands, flat(means2d), flat(radii))
+        frame.project(_colors(frame.n, sh0, shN), bands, flat(means2d), flat(radii))
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
         return means2d, means.new_zeros(()), radii

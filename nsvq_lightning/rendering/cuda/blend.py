@@ -19,7 +19,8 @@ from torch import Tensor
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.rendering.cuda.binning import Tiles
-from nsvq_lightning.rendering.cuda.projection import Lens, load3
+from nsvq_lightning.rendering.cuda.harmonics import load3
+from nsvq_lightning.rendering.cuda.projection import Lens
 from nsvq_lightning.rendering.cuda.records import (
     ALPHA_MAX,
     BLUE,

@@ -11,11 +11,28 @@ import triton.language as tl
 
 from nsvq_lightning.rendering import sh
 
-__all__ = ["color", "color_backward"]
+__all__ = ["color", "color_backward", "load3", "store3"]
 
 C0, C1 = tl.constexpr(sh.C0), tl.constexpr(sh.C1)
 C2A, C2B, C2C = (tl.constexpr(value) for value in sh.C2)
 C3A, C3B, C3C, C3D, C3E = (tl.constexpr(value) for value in sh.C3)
+
+
+@triton.jit
+def load3(pointer, mask):
+    """Three consecutive floats at each of the pointers."""
+    a = tl.load(pointer, mask=mask, other=0.0)
+    b = tl.load(pointer + 1, mask=mask, other=0.0)
+    c = tl.load(pointer + 2, mask=mask, other=0.0)
+    return a, b, c
+
+
+@triton.jit
+def store3(pointer, a, b, c, mask):
+    """The inverse of :func:`load3`."""
+    tl.store(pointer, a, mask=mask)
+    tl.store(pointer + 1, b, mask=mask)
+    tl.store(pointer + 2, c, mask=mask)
 
 
 @triton.jit
@@ -48,26 +65,16 @@ def bands3(x, y, z):
 
 
 @triton.jit
-def coefficient(shN, base, k, mask):
-    """Coefficient k, counted without the constant one, of all three channels."""
-    at = shN + base + 3 * k
-    r = tl.load(at, mask=mask, other=0.0)
-    g = tl.load(at + 1, mask=mask, other=0.0)
-    b = tl.load(at + 2, mask=mask, other=0.0)
-    return r, g, b
-
-
-@triton.jit
 def add_band(shN, base, k, basis, r, g, b, mask):
-    """Add coefficient k times its basis value to a colour."""
-    cr, cg, cb = coefficient(shN, base, k, mask)
+    """Add coefficient k, counted without the constant one, times its basis value to a colour."""
+    cr, cg, cb = load3(shN + base + 3 * k, mask)
     return r + cr * basis, g + cg * basis, b + cb * basis
 
 
 @triton.jit
 def color(sh0, shN, row, base, x, y, z, mask, DEGREE: tl.constexpr):
     """0.5 + Σ coefficient·basis, before the clamp at 0."""
-    r, g, b = coefficient(sh0, 3 * row, 0, mask)
+    r, g, b = load3(sh0 + 3 * row, mask)
     r, g, b = r * C0 + 0.5, g * C0 + 0.5, b * C0 + 0.5
     if DEGREE > 0:
         b0, b1, b2 = bands1(x, y, z)
@@ -96,11 +103,8 @@ def color(sh0, shN, row, base, x, y, z, mask, DEGREE: tl.constexpr):
 @triton.jit
 def put_band(g_shN, shN, base, k, basis, r, g, b, mask, inside):
     """Store the gradient of coefficient k; returns Σ_channel coefficient·gradient, the gradient of the basis value."""
-    cr, cg, cb = coefficient(shN, base, k, mask)
-    at = g_shN + base + 3 * k
-    tl.store(at, basis * r, mask=inside)
-    tl.store(at + 1, basis * g, mask=inside)
-    tl.store(at + 2, basis * b, mask=inside)
+    cr, cg, cb = load3(shN + base + 3 * k, mask)
+    store3(g_shN + base + 3 * k, basis * r, basis * g, basis * b, inside)
     return cr * r + cg * g + cb * b
 
 
@@ -110,10 +114,7 @@ def color_backward(g_sh0, g_shN, shN, row, base, x, y, z, r, g, b, mask, inside,
 
     Coefficients are read where ``mask`` says, gradients written to all rows ``inside`` the table.
     """
-    at = g_sh0 + 3 * row
-    tl.store(at, r * C0, mask=inside)
-    tl.store(at + 1, g * C0, mask=inside)
-    tl.store(at + 2, b * C0, mask=inside)
+    store3(g_sh0 + 3 * row, r * C0, g * C0, b * C0, inside)
     gx, gy, gz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     if DEGREE > 0:
         b0, b1, b2 = bands1(x, y, z)

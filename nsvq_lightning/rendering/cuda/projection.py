@@ -17,7 +17,7 @@ from nsvq_lightning.compute.devices import COMPILE, to_device
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.cuda.harmonics import color, color_backward
+from nsvq_lightning.rendering.cuda.harmonics import color, color_backward, load3, store3
 from nsvq_lightning.rendering.cuda.records import (
     BLUE,
     COVARIANCE_SCALE,
@@ -78,23 +78,6 @@ def cross(a, b):
 def positive(x):
     """max(x, 0) that keeps NaN, so that the loss shows it; ``tl.maximum`` drops NaN on a GPU."""
     return tl.where(x < 0, 0.0, x)
-
-
-@triton.jit
-def load3(pointer, mask):
-    """Three consecutive floats at each of the pointers."""
-    a = tl.load(pointer, mask=mask, other=0.0)
-    b = tl.load(pointer + 1, mask=mask, other=0.0)
-    c = tl.load(pointer + 2, mask=mask, other=0.0)
-    return a, b, c
-
-
-@triton.jit
-def store3(pointer, a, b, c, mask):
-    """The inverse of :func:`load3`."""
-    tl.store(pointer, a, mask=mask)
-    tl.store(pointer + 1, b, mask=mask)
-    tl.store(pointer + 2, c, mask=mask)
 
 
 @triton.jit
