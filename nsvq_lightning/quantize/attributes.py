@@ -14,18 +14,6 @@ from nsvq_lightning.quantize.base import Quantizer, as_quantizer, held_codes
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
-__all__ = [
-    "QUANTIZED",
-    "QuantizedAttribute",
-    "attribute_rows",
-    "build_quantizers",
-    "check_attributes",
-    "codebook_sizes",
-    "codes_of",
-    "decoded",
-    "noisy_rows",
-]
-
 
 @dataclass(frozen=True)
 class QuantizedAttribute:

@@ -9,20 +9,6 @@ from torch import Tensor, nn
 
 from nsvq_lightning.protocols import missing_members
 
-__all__ = [
-    "Holding",
-    "Limitable",
-    "Mendable",
-    "Quantizer",
-    "Refittable",
-    "as_quantizer",
-    "held_codes",
-    "is_holding",
-    "is_limitable",
-    "is_mendable",
-    "is_refittable",
-]
-
 
 class Quantizer(Protocol):
     """Vector quantizer of one attribute: maps rows ``[N, D]`` to codes ``[N]``, indices into a codebook ``[K, D]``.

@@ -6,81 +6,58 @@ exceeds the float32 distance of a code inside: pruning needs no safety margin, a
 all codes, bit for bit. The first candidate is the best code of the leaf that looks nearest; a bad one costs time but
 does not change the result.
 
-Most queries of a later step need no search: :class:`BoxMemory` keeps where a query was last searched and how far the
+Most queries of a later step need no search: :class:`Memory` keeps where a query was last searched and how far the
 second-nearest code was then. As long as the distance to its code and the distances that the query and the codes have
 moved add up to less, the code is still the nearest (:mod:`tracking`).
 """
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from nsvq_lightning.compute import lanes as simd
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
-from nsvq_lightning.compute.memory import (
-    FLOAT32,
-    FLOAT64,
-    INT32,
-    INT64,
-    aligned_empty,
-    check_array,
-    check_table,
-    outside,
-)
+from nsvq_lightning.compute.memory import aligned_empty, check_array, check_table, outside
 from nsvq_lightning.compute.rows import count_outside
-from nsvq_lightning.compute.simd import (
-    broadcast,
-    fma,
-    get,
-    lane_min,
-    load,
-    lowest_bit,
-    mask_bits,
-    put,
-    select,
-    store,
-    vmax,
-    vmin,
-)
 
-__all__ = [
-    "MAX_DIM",
-    "NO_CODE",
-    "ROUNDING",
-    "UNKNOWN",
-    "BoxMemory",
-    "Boxes",
-    "box_search",
-    "build_boxes",
-    "check_boxes",
-    "empty_memory",
-]
+MAX_DIM = 8
+"""Beyond this dimension, boxes prune too little, and the scores of :mod:`scores` are faster."""
+ROUNDING = 1.0 + 1e-5
+"""Factor on the bounds, far above the relative rounding error of a float32 distance."""
+
+_UNKNOWN = np.int32(-1)  # stands for the last code of a row that has not been searched
+_NO_CODE = np.int32(np.iinfo(np.int32).max)  # label of a lane without a code
+_LARGEST = np.finfo(np.float32).max
+_ROWS = 512  # queries per unit of parallel work; a pass over them hides the latency of one behind the others
+_TASKS = 2048  # capacity for visits to leaves, which are deferred and processed together
+
+Floats = NDArray[np.float32]
+Order = NDArray[np.int32]
 
 
-NO_CODE = np.int32(np.iinfo(np.int32).max)
-"""Label of a lane without a code."""
-
-
-class Boxes(NamedTuple):
-    """Codes sorted into boxes.
+class Memory(NamedTuple):
+    """What is known about rows from their last search.
 
     Attributes:
-        codes: Leaves, ``[nodes · 16, D, 16]``; lanes without a code are at infinity.
-        labels: Codes of the lanes, ``[nodes · 16, 16]`` int32.
-        leaves: Lower and upper corners of the leaves of a node, ``[nodes, D, 2, 16]``.
-        nodes: Lower and upper corners of the nodes, ``[nodes / 16, D, 2, 16]``.
-        order: Codes in lane order, ``[K]`` int32.
+        last: Code, or -1 for a row that has not been searched, ``[N]`` int32.
+        anchors: Where the row was then, ``[N, D]``.
+        clearance: Distance below which there was no other code, plus how far the codes had moved by then, ``[N]`` in
+            float64, because movements add up over a whole run.
     """
 
-    codes: NDArray[np.float32]
-    labels: NDArray[np.int32]
-    leaves: NDArray[np.float32]
-    nodes: NDArray[np.float32]
-    order: NDArray[np.int32]
+    last: NDArray[np.int32]
+    anchors: Floats
+    clearance: NDArray[np.float64]
+
+    @classmethod
+    def empty(cls, count: int, dim: int) -> Memory:
+        """Memory of ``count`` rows that have not been searched."""
+        return cls(np.full(count, _UNKNOWN), np.zeros((count, dim), np.float32), np.full(count, -np.inf))
 
 
 @inline
@@ -119,11 +96,11 @@ def _split(values, order, start, stop, middle):  # type: ignore[no-untyped-def]
             return
 
 
-@inline
-def _sort_into_leaves(points, order, start, stop):  # type: ignore[no-untyped-def]
+@partial(kernel, parallel=False)
+def _sort_into_leaves(points, order):  # type: ignore[no-untyped-def]
     """Split by medians at multiples of 256 codes (a node), then of 16 (a leaf)."""
     stack = np.empty((64, 2), np.int64)
-    stack[0, 0], stack[0, 1] = start, stop
+    stack[0, 0], stack[0, 1] = 0, order.shape[0]
     depth = 1
     while depth > 0:
         depth -= 1
@@ -138,15 +115,29 @@ def _sort_into_leaves(points, order, start, stop):  # type: ignore[no-untyped-de
         depth += 2
 
 
-@kernel
-def _order_codes(points, order, cuts):  # type: ignore[no-untyped-def]
-    """Sort the parts between ``cuts`` into leaves, in parallel."""
-    for part in prange(cuts.shape[0] - 1):
-        _sort_into_leaves(points, order, cuts[part], cuts[part + 1])
+def sort_into_leaves(codebook: Floats) -> Order:
+    """Codes ``[K]`` int32 in an order in which each 16, a leaf, are near each other, and each 256, a node.
+
+    Raises:
+        ValueError: The codebook is not contiguous ``[K, D]``.
+        TypeError: It is not float32.
+    """
+    check_table("codebook", codebook)
+    order = np.arange(len(codebook), dtype=np.int32)
+    _sort_into_leaves(_points(codebook), order)
+    return order
+
+
+def _points(codebook: Floats) -> Floats:
+    """Columns ``[D, K]`` of the codes; those with a NaN lie at infinity and are never chosen."""
+    points = np.ascontiguousarray(codebook.T)
+    points[np.isnan(points)] = np.inf
+    return points
 
 
 @kernel
 def _pack(points, order, codes, labels, leaves, nodes):  # type: ignore[no-untyped-def]
+    """Put codes and the corners of their boxes into the arrays of :func:`_boxes`."""
     dim, count = points.shape
     for node in prange(leaves.shape[0]):
         for j in range(dim):
@@ -156,7 +147,7 @@ def _pack(points, order, codes, labels, leaves, nodes):  # type: ignore[no-untyp
                 low, high = np.float32(np.inf), np.float32(-np.inf)
                 for lane in range(16):
                     place = leaf * 16 + lane
-                    value, label = np.float32(np.inf), NO_CODE
+                    value, label = np.float32(np.inf), _NO_CODE
                     if place < count:
                         label = order[place]
                         value = points[j, label]
@@ -170,115 +161,41 @@ def _pack(points, order, codes, labels, leaves, nodes):  # type: ignore[no-untyp
             nodes[node // 16, j, 1, node % 16] = node_high
 
 
-def build_boxes(codebook: NDArray[np.float32], order: NDArray[np.int32] | None = None) -> Boxes:
-    """Put the codes ``[K, D]`` into boxes. Codes with a NaN are placed at infinity and never chosen.
+def _boxes(codebook: Floats, order: Order) -> tuple[Any, ...]:
+    """The codes in boxes, flat.
 
-    ``order`` may be that of earlier boxes: much faster, correct in any case, and good while codes have moved little.
-
-    Raises:
-        ValueError: There is no code, the codebook is not contiguous, or ``order`` does not hold ``[K]`` codes.
-        TypeError: A dtype is wrong.
-    """
-    check_table("codebook", codebook)
-    count, dim = codebook.shape
-    if count == 0:
-        raise ValueError(f"the codebook must have at least one code, got shape {list(codebook.shape)}; fit it first")
-    points = np.ascontiguousarray(codebook.T)
-    points[np.isnan(points)] = np.inf
-    nodes = -(-count // 4096) * 16
-    thread_count()
-    if order is None:
-        order = np.arange(count, dtype=np.int32)
-        _order_codes(points, order, np.array([0, count]))
-    else:
-        check_array("order", order, (count,), INT32)
-        if order.min() < 0 or order.max() >= count:
-            raise outside("order", order, count)
-    boxes = Boxes(
-        aligned_empty((nodes * 16, dim, 16)),
-        np.empty((nodes * 16, 16), np.int32),
-        aligned_empty((nodes, dim, 2, 16)),
-        aligned_empty((nodes // 16, dim, 2, 16)),
-        order,
-    )
-    _pack(points, order, *boxes[:4])
-    return boxes
-
-
-def check_boxes(boxes: Boxes, codebook: NDArray[np.float32]) -> None:
-    """Refuse boxes that do not fit a codebook ``[K, D]`` with K at least 1.
-
-    Raises:
-        ValueError: There is no code, or an array has another shape or is not contiguous.
-        TypeError: A dtype is wrong.
+    Leaves ``[nodes · 16, D, 16]``, lanes without a code at infinity; the codes of their lanes ``[nodes · 16, 16]``;
+    lower and upper corners of the leaves of a node ``[nodes, D, 2, 16]``, and of the nodes ``[nodes / 16, D, 2, 16]``.
     """
     count, dim = codebook.shape
     nodes = -(-count // 4096) * 16
-    if count == 0:
-        raise ValueError(f"the codebook must have at least one code, got shape {list(codebook.shape)}; fit it first")
-    check_array("boxes.codes", boxes.codes, (nodes * 16, dim, 16), FLOAT32)
-    check_array("boxes.labels", boxes.labels, (nodes * 16, 16), INT32)
-    check_array("boxes.leaves", boxes.leaves, (nodes, dim, 2, 16), FLOAT32)
-    check_array("boxes.nodes", boxes.nodes, (nodes // 16, dim, 2, 16), FLOAT32)
-
-
-MAX_DIM = 8
-"""Beyond this dimension, boxes prune too little, and the scores of :mod:`scores` are faster."""
-
-UNKNOWN = np.int32(-1)
-"""Stands for the last code of a row that has not been searched."""
-
-ROUNDING = 1.0 + 1e-5
-"""Factor on the bounds, far above the relative rounding error of a float32 distance."""
-
-_LARGEST = np.finfo(np.float32).max
-_ROWS = 512
-"""Queries per unit of parallel work; a pass over them hides the latency of one query behind the others."""
-_TASKS = 2048
-"""Capacity for visits to leaves, which are deferred and processed together."""
-
-
-class BoxMemory(NamedTuple):
-    """What is known about rows from their last search.
-
-    Attributes:
-        last: Code, or ``UNKNOWN``, ``[N]`` int32.
-        anchors: Where the row was then, ``[N, D]``.
-        clearance: Distance below which there was no other code, plus how far the codes had moved by then, ``[N]`` in
-            float64, because movements add up over a whole run.
-    """
-
-    last: NDArray[np.int32]
-    anchors: NDArray[np.float32]
-    clearance: NDArray[np.float64]
-
-
-def empty_memory(count: int, dim: int) -> BoxMemory:
-    """Memory of ``count`` rows that have not been searched."""
-    return BoxMemory(np.full(count, UNKNOWN), np.zeros((count, dim), np.float32), np.full(count, -np.inf))
+    codes, labels = aligned_empty((nodes * 16, dim, 16)), np.empty((nodes * 16, 16), np.int32)
+    corners = aligned_empty((nodes, dim, 2, 16)), aligned_empty((nodes // 16, dim, 2, 16))
+    _pack(_points(codebook), order, codes, labels, *corners)
+    return codes.ravel(), labels.ravel(), corners[0].ravel(), corners[1].ravel()
 
 
 @inline
 def _box_distances(dim, boxes, at, x, row):  # type: ignore[no-untyped-def]
     """Squared distances of a query to 16 boxes."""
-    zero = broadcast(np.float32(0.0))
+    zero = simd.broadcast(np.float32(0.0))
     total = zero
     for j in range(dim):
-        value = broadcast(get(x, row + j))
-        below = load(boxes, at + 32 * j) - value
-        above = value - load(boxes, at + 32 * j + 16)
-        gap = vmax(vmax(below, above), zero)
-        total = fma(gap, gap, total)
+        value = simd.broadcast(simd.get(x, row + j))
+        below = simd.load(boxes, at + 32 * j) - value
+        above = value - simd.load(boxes, at + 32 * j + 16)
+        gap = simd.vmax(simd.vmax(below, above), zero)
+        total = simd.fma(gap, gap, total)
     return total
 
 
 @inline
 def _code_distances(dim, codes, leaf, x, row):  # type: ignore[no-untyped-def]
     """Squared distances of a query to the 16 codes of a leaf."""
-    total = broadcast(np.float32(0.0))
+    total = simd.broadcast(np.float32(0.0))
     for j in range(dim):
-        difference = load(codes, (leaf * dim + j) * 16) - broadcast(get(x, row + j))
-        total = fma(difference, difference, total)
+        difference = simd.load(codes, (leaf * dim + j) * 16) - simd.broadcast(simd.get(x, row + j))
+        total = simd.fma(difference, difference, total)
     return total
 
 
@@ -290,13 +207,13 @@ def _visit_leaf(dim, codes, labels, leaf, x, row, limit, scratch, found):  # typ
     """
     best, label, second = found
     distances = _code_distances(dim, codes, leaf, x, row)
-    bits = mask_bits(distances <= broadcast(limit))
+    bits = simd.mask_bits(distances <= simd.broadcast(limit))
     if bits != 0:
-        store(scratch, 0, distances)
+        simd.store(scratch, 0, distances)
         while bits != 0:
-            lane = lowest_bit(bits)
+            lane = simd.lowest_bit(bits)
             bits &= bits - 1
-            distance, code = get(scratch, lane), get(labels, leaf * 16 + lane)
+            distance, code = simd.get(scratch, lane), simd.get(labels, leaf * 16 + lane)
             if distance < best or (distance == best and code < label):
                 best, label, second = distance, code, best
             elif distance < second:
@@ -305,17 +222,23 @@ def _visit_leaf(dim, codes, labels, leaf, x, row, limit, scratch, found):  # typ
 
 
 @inline
+def place_of_least(least, block_of):  # type: ignore[no-untyped-def]
+    """Where the least of blocks of 16 numbers is, the first of equal ones; lanes hold their least and its block."""
+    smallest = simd.broadcast(simd.lane_min(least))
+    block = simd.lane_min(simd.select(least <= smallest, block_of, simd.broadcast(np.float32(np.inf))))
+    lane = simd.mask_bits((least <= smallest) & (block_of <= simd.broadcast(block)))
+    return np.int64(block) * 16 + simd.lowest_bit(lane)
+
+
+@inline
 def _nearest_node(dim, nodes, x, row):  # type: ignore[no-untyped-def]
     """Node whose box is nearest (0 for a query with a NaN)."""
-    nearest, group_of = broadcast(np.float32(np.inf)), broadcast(np.float32(0.0))
+    nearest, group_of = simd.broadcast(np.float32(np.inf)), simd.broadcast(np.float32(0.0))
     for group in range(nodes.size // (32 * dim)):
         distances = _box_distances(dim, nodes, group * 32 * dim, x, row)
-        group_of = select(distances < nearest, broadcast(np.float32(group)), group_of)
-        nearest = vmin(distances, nearest)
-    smallest = broadcast(lane_min(nearest))
-    group = lane_min(select(nearest <= smallest, group_of, broadcast(np.float32(np.inf))))
-    lane = mask_bits((nearest <= smallest) & (group_of <= broadcast(group)))
-    return np.int64(group) * 16 + lowest_bit(lane)
+        group_of = simd.select(distances < nearest, simd.broadcast(np.float32(group)), group_of)
+        nearest = simd.vmin(distances, nearest)
+    return place_of_least(nearest, group_of)
 
 
 @inline
@@ -324,12 +247,12 @@ def _prove(dim, codebook, x, row, code, memory, travelled):  # type: ignore[no-u
     _, anchors, clearance = memory
     moved = distance = np.float32(0.0)
     for j in range(dim):
-        value = get(x, row * dim + j)
-        from_anchor, from_code = value - get(anchors, row * dim + j), value - get(codebook, code * dim + j)
+        value = simd.get(x, row * dim + j)
+        from_anchor, from_code = value - simd.get(anchors, row * dim + j), value - simd.get(codebook, code * dim + j)
         moved += from_anchor * from_anchor
         distance += from_code * from_code
     way = (np.float64(np.sqrt(distance)) + np.float64(np.sqrt(moved))) * ROUNDING
-    return way < get(clearance, row) - travelled
+    return way < simd.get(clearance, row) - travelled
 
 
 @inline
@@ -337,11 +260,11 @@ def _remember(dim, x, at, found, memory, row, travelled):  # type: ignore[no-unt
     """Keep where a row was searched and the distance of its second-nearest code."""
     last, anchors, clearance = memory
     _, code, second = found
-    put(last, row, code)
+    simd.put(last, row, code)
     for j in range(dim):
-        put(anchors, row * dim + j, get(x, at + j))
+        simd.put(anchors, row * dim + j, simd.get(x, at + j))
     # There may still be codes beyond the largest float32 number.
-    put(clearance, row, np.sqrt(np.float64(min(second, _LARGEST))) / ROUNDING + travelled)
+    simd.put(clearance, row, np.sqrt(np.float64(min(second, _LARGEST))) / ROUNDING + travelled)
 
 
 @inline
@@ -351,22 +274,22 @@ def _guess(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
     best, label, second, guess, _, scratch, bounded = state
     infinity = np.float32(np.inf)
     for i in range(count):
-        put(guess, i, _nearest_node(dim, nodes, x, i * dim))
+        simd.put(guess, i, _nearest_node(dim, nodes, x, i * dim))
     for i in range(count):
-        node = get(guess, i)
+        node = simd.get(guess, i)
         distances = _box_distances(dim, leaves, node * 32 * dim, x, i * dim)
-        lane = lowest_bit(mask_bits(distances <= broadcast(lane_min(distances))))
-        put(guess, i, node * 16 + lane)
+        lane = simd.lowest_bit(simd.mask_bits(distances <= simd.broadcast(simd.lane_min(distances))))
+        simd.put(guess, i, node * 16 + lane)
     for i in range(count):
-        leaf = get(guess, i)
+        leaf = simd.get(guess, i)
         distances = _code_distances(dim, codes, leaf, x, i * dim)
-        limit = lane_min(distances)
+        limit = simd.lane_min(distances)
         if bounded:
-            limit = lane_min(select(distances > broadcast(limit), distances, broadcast(infinity)))
-        found = _visit_leaf(dim, codes, labels, leaf, x, i * dim, limit, scratch, (infinity, NO_CODE, infinity))
-        put(best, i, found[0])
-        put(label, i, found[1])
-        put(second, i, found[2])
+            limit = simd.lane_min(simd.select(distances > simd.broadcast(limit), distances, simd.broadcast(infinity)))
+        found = _visit_leaf(dim, codes, labels, leaf, x, i * dim, limit, scratch, (infinity, _NO_CODE, infinity))
+        simd.put(best, i, found[0])
+        simd.put(label, i, found[1])
+        simd.put(second, i, found[2])
 
 
 @inline
@@ -375,13 +298,13 @@ def _visit_leaves(dim, tree, x, state, pending):  # type: ignore[no-untyped-def]
     codes, labels, _, _ = tree
     best, label, second, _, tasks, scratch, bounded = state
     for t in range(pending):
-        i, leaf = get(tasks, 2 * t), get(tasks, 2 * t + 1)
-        found = get(best, i), get(label, i), get(second, i)
+        i, leaf = simd.get(tasks, 2 * t), simd.get(tasks, 2 * t + 1)
+        found = simd.get(best, i), simd.get(label, i), simd.get(second, i)
         limit = found[2] if bounded else found[0]
         found = _visit_leaf(dim, codes, labels, leaf, x, i * dim, limit, scratch, found)
-        put(best, i, found[0])
-        put(label, i, found[1])
-        put(second, i, found[2])
+        simd.put(best, i, found[0])
+        simd.put(label, i, found[1])
+        simd.put(second, i, found[2])
 
 
 @inline
@@ -391,19 +314,19 @@ def _visit_near(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
     best, _, second, guess, tasks, _, bounded = state
     pending = 0
     for i in range(count):
-        row, limit = i * dim, broadcast(get(second, i) if bounded else get(best, i))
+        row, limit = i * dim, simd.broadcast(simd.get(second, i) if bounded else simd.get(best, i))
         for group in range(nodes.size // (32 * dim)):
-            near_nodes = mask_bits(_box_distances(dim, nodes, group * 32 * dim, x, row) <= limit)
+            near_nodes = simd.mask_bits(_box_distances(dim, nodes, group * 32 * dim, x, row) <= limit)
             while near_nodes != 0:
-                node = group * 16 + lowest_bit(near_nodes)
+                node = group * 16 + simd.lowest_bit(near_nodes)
                 near_nodes &= near_nodes - 1
-                near_leaves = mask_bits(_box_distances(dim, leaves, node * 32 * dim, x, row) <= limit)
+                near_leaves = simd.mask_bits(_box_distances(dim, leaves, node * 32 * dim, x, row) <= limit)
                 while near_leaves != 0:
-                    leaf = node * 16 + lowest_bit(near_leaves)
+                    leaf = node * 16 + simd.lowest_bit(near_leaves)
                     near_leaves &= near_leaves - 1
-                    put(tasks, 2 * pending, i)
-                    put(tasks, 2 * pending + 1, leaf)
-                    pending += leaf != get(guess, i)
+                    simd.put(tasks, 2 * pending, i)
+                    simd.put(tasks, 2 * pending + 1, leaf)
+                    pending += leaf != simd.get(guess, i)
                 if pending > _TASKS - 16:
                     _visit_leaves(dim, tree, x, state, pending)
                     pending = 0
@@ -426,72 +349,73 @@ def _search_kernel(dim: int) -> Any:
             found_outside = count_outside(rows, first, stop, x.shape[0] // dim)
             missing += found_outside
             for i in range(first, stop if found_outside == 0 else first):
-                row = get(rows, i)
-                last = np.int64(get(memory[0], row)) if bounded else np.int64(UNKNOWN)
-                put(result, i, last)
-                put(places, count, i)
+                row = simd.get(rows, i)
+                last = np.int64(simd.get(memory[0], row)) if bounded else np.int64(_UNKNOWN)
+                simd.put(result, i, last)
+                simd.put(places, count, i)
                 known = last >= 0 and last < codebook.shape[0] // dim
                 count += not (known and _prove(dim, codebook, x, row, last, memory, travelled))
             for i in range(count):
-                row = get(rows, get(places, i))
+                row = simd.get(rows, simd.get(places, i))
                 for j in range(dim):
-                    put(queries, i * dim + j, get(x, row * dim + j))
+                    simd.put(queries, i * dim + j, simd.get(x, row * dim + j))
             _guess(dim, tree, queries, count, state)
             _visit_near(dim, tree, queries, count, state)
             for i in range(count):
-                nearest = get(label, i) if get(label, i) != NO_CODE else np.int32(0)
-                put(result, get(places, i), np.int64(nearest))
+                nearest = simd.get(label, i) if simd.get(label, i) != _NO_CODE else np.int32(0)
+                simd.put(result, simd.get(places, i), np.int64(nearest))
                 if bounded:
-                    found = get(best, i), nearest, get(second, i)
-                    _remember(dim, queries, i * dim, found, memory, get(rows, get(places, i)), travelled)
+                    found = simd.get(best, i), nearest, simd.get(second, i)
+                    _remember(dim, queries, i * dim, found, memory, simd.get(rows, simd.get(places, i)), travelled)
         return missing
 
     return kernel(search)
 
 
 def box_search(
-    x: NDArray[np.float32],
-    codebook: NDArray[np.float32],
-    boxes: Boxes,
+    x: Floats,
+    codebook: Floats,
+    order: Order | None = None,
     rows: NDArray[np.int64] | None = None,
-    memory: BoxMemory | None = None,
+    memory: Memory | None = None,
     travelled: float = 0.0,
 ) -> NDArray[np.int64]:
     """Nearest codes ``[V]`` of contiguous queries; one with a NaN gets code 0.
 
     Args:
         x: Queries ``[N, D]``.
-        codebook: Codes ``[K, D]``, contiguous.
-        boxes: The same codes in boxes.
+        codebook: Codes ``[K, D]``, contiguous, K at least 1.
+        order: From :func:`sort_into_leaves`. That of an earlier codebook saves the sorting, is correct in any case, and
+            good while codes have moved little.
         rows: Which queries, ``[V]``, distinct; all of them by default.
-        memory: Results of earlier searches, updated in place; without it every query is searched.
+        memory: Results of earlier searches of these rows (it may have more), updated in place; without it every query
+            is searched.
         travelled: Upper bound on how far any code has moved in total since ``memory`` was empty.
 
     Raises:
-        ValueError: The arrays do not fit together, one is not contiguous, a row is out of range, or there is no code.
+        ValueError: The arrays do not fit together, one is not contiguous, or a row or a code is out of range.
         TypeError: A dtype is wrong.
     """
     check_table("x", x)
-    rows = np.arange(len(x)) if rows is None else rows
-    memory = empty_memory(0, x.shape[1]) if memory is None else memory
-    check_array("rows", rows, (rows.size,), INT64)
-    check_array("codebook", codebook, (len(codebook), x.shape[1]), FLOAT32)
-    check_boxes(boxes, codebook)
-    _check_memory(memory, x)
+    (count, dim), num_codes = x.shape, len(codebook)
+    check_array("codebook", codebook, (num_codes, dim), x.dtype)
+    order = sort_into_leaves(codebook) if order is None else order
+    rows = np.arange(count) if rows is None else rows
+    known = Memory.empty(0, dim) if memory is None else memory
+    remembered = max(count, len(known.last)) if memory is not None else 0
+    for name, array, shape, kind in (
+        ("order", order, (num_codes,), np.int32),
+        ("rows", rows, (rows.size,), np.int64),
+        ("memory.last", known.last, (remembered,), np.int32),
+        ("memory.anchors", known.anchors, (remembered, dim), np.float32),
+        ("memory.clearance", known.clearance, (remembered,), np.float64),
+    ):
+        check_array(name, array, shape, np.dtype(kind))
+    if order.min() < 0 or order.max() >= num_codes:
+        raise outside("order", order, num_codes)
     result = np.empty(len(rows), np.int64)
     thread_count()
-    tree = (part.ravel() for part in boxes[:4])
-    flat = memory.last, memory.anchors.ravel(), memory.clearance
-    if _search_kernel(x.shape[1])(x.ravel(), rows, codebook.ravel(), *tree, flat, float(travelled), result):
-        raise outside("rows", rows, len(x))
+    flat = known.last, known.anchors.ravel(), known.clearance
+    if _search_kernel(dim)(x.ravel(), rows, codebook.ravel(), *_boxes(codebook, order), flat, float(travelled), result):
+        raise outside("rows", rows, count)
     return result
-
-
-def _check_memory(memory: BoxMemory, x: NDArray[np.float32]) -> None:
-    """Check that the memory is empty or has at least all rows; it may have more if the scene was larger before."""
-    count = len(memory.last)
-    if 0 < count < len(x):
-        raise ValueError(f"memory must have the {len(x)} rows of x, got {count}")
-    check_array("memory.last", memory.last, (count,), INT32)
-    check_array("memory.anchors", memory.anchors, (count, x.shape[1]), FLOAT32)
-    check_array("memory.clearance", memory.clearance, (count,), FLOAT64)

@@ -17,8 +17,6 @@ from nsvq_lightning.quantize.tracking import NearestTracker
 from nsvq_lightning.random import generator as seeded
 from nsvq_lightning.skips import is_on
 
-__all__ = ["CodebookQuantizer", "choose_replacements", "copy_codes", "inactive_codes", "split_codes"]
-
 
 def inactive_codes(usage: Tensor, window: Tensor | int, threshold: float) -> Tensor:
     """Mask ``[K]`` of the codes hit in fewer than ``threshold`` of the ``window`` iterations; none in an empty window.

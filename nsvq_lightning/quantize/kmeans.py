@@ -19,8 +19,6 @@ from nsvq_lightning.compute.jit import kernel, thread_count
 from nsvq_lightning.compute.memory import INT64, flat_checked, outside
 from nsvq_lightning.quantize.nearest import nearest
 
-__all__ = ["count_hits", "distinct_rows", "draw_far_rows", "kmeans", "lookup", "rows_far_apart", "sum_by_code"]
-
 
 @kernel
 def _sum_rows(values, codes, sums, parts):  # type: ignore[no-untyped-def]

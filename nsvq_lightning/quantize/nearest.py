@@ -20,36 +20,14 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nsvq_lightning.compute import lanes as simd
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import kernel, thread_count
-from nsvq_lightning.compute.simd import (
-    broadcast,
-    fma,
-    get,
-    lane_min,
-    load,
-    lowest_bit,
-    mask_bits,
-    put,
-    select,
-)
-from nsvq_lightning.quantize.box_search import MAX_DIM, box_search, build_boxes
-from nsvq_lightning.quantize.scores import centre_codes, score_search
+from nsvq_lightning.quantize.box_search import MAX_DIM, box_search, place_of_least
+from nsvq_lightning.quantize.scores import score_search
 
-__all__ = [
-    "cheapest",
-    "cheapest_reference",
-    "check_rows",
-    "code_rates",
-    "distance_parts",
-    "least",
-    "nearest",
-    "nearest_reference",
-]
-
-
+# Distances that the plain version holds at once: what fits the caches of a CPU, or enough to keep a GPU busy.
 _CPU_CHUNK, _DEVICE_CHUNK = 1 << 22, 1 << 26
-"""Distances that the plain version holds at once: what fits the caches of a CPU, or enough to keep a GPU busy."""
 
 
 def check_rows(x: Tensor, codebook: Tensor) -> None:
@@ -119,7 +97,8 @@ def nearest(x: Tensor, codebook: Tensor) -> Tensor:
     x, codebook = x.detach().contiguous(), codebook.detach().contiguous()
     kernels = kernels_for(x)
     if kernels == "cpu":
-        return torch.from_numpy(_search(x.numpy(), codebook.numpy()))
+        rows, codes = x.numpy(), codebook.numpy()
+        return torch.from_numpy(box_search(rows, codes) if x.shape[1] <= MAX_DIM else score_search(rows, codes)[0])
     if kernels == "cuda":
         from nsvq_lightning.quantize.cuda.nearest import nearest_codes
 
@@ -127,14 +106,7 @@ def nearest(x: Tensor, codebook: Tensor) -> Tensor:
     return nearest_reference(x, codebook)
 
 
-def _search(x: NDArray[np.float32], codebook: NDArray[np.float32]) -> NDArray[np.int64]:
-    if x.shape[1] <= MAX_DIM:
-        return box_search(x, codebook, build_boxes(codebook))
-    return score_search(x, centre_codes(codebook))[0]
-
-
-_UNSEEN = 0.3
-"""Uses that a code counts beyond those it has: one that is not used costs bits, too, but finitely many."""
+_UNSEEN = 0.3  # uses that a code counts beyond those it has: one that is not used costs bits, too, but finitely many
 
 
 def code_rates(codes: Tensor, count: int) -> Tensor:
@@ -196,21 +168,18 @@ def _search_kernel(dim: int) -> Any:
     def search(x, prices, table, result):  # type: ignore[no-untyped-def]
         blocks = table.shape[0] // (16 * (dim + 1))
         for i in prange(result.shape[0]):
-            price = broadcast(get(prices, i))
-            best, block_of = broadcast(np.float32(np.inf)), broadcast(np.float32(0.0))
+            price = simd.broadcast(simd.get(prices, i))
+            best, block_of = simd.broadcast(np.float32(np.inf)), simd.broadcast(np.float32(0.0))
             for block in range(blocks):
                 at = block * 16 * (dim + 1)
-                total = broadcast(np.float32(0.0))
+                total = simd.broadcast(np.float32(0.0))
                 for j in range(dim):
-                    difference = load(table, at + 16 * j) - broadcast(get(x, i * dim + j))
-                    total = fma(difference, difference, total)
-                total = fma(price, load(table, at + 16 * dim), total)
+                    difference = simd.load(table, at + 16 * j) - simd.broadcast(simd.get(x, i * dim + j))
+                    total = simd.fma(difference, difference, total)
+                total = simd.fma(price, simd.load(table, at + 16 * dim), total)
                 cheaper = total < best
-                best = select(cheaper, total, best)
-                block_of = select(cheaper, broadcast(np.float32(block)), block_of)
-            smallest = broadcast(lane_min(best))
-            first = lane_min(select(best <= smallest, block_of, broadcast(np.float32(np.inf))))
-            lane = lowest_bit(mask_bits((best <= smallest) & (block_of <= broadcast(first))))
-            put(result, i, np.int64(first) * 16 + lane)
+                best = simd.select(cheaper, total, best)
+                block_of = simd.select(cheaper, simd.broadcast(np.float32(block)), block_of)
+            simd.put(result, i, place_of_least(best, block_of))
 
     return kernel(search)

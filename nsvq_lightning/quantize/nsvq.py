@@ -15,8 +15,6 @@ from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize.kmeans import sum_by_code
 from nsvq_lightning.quantize.substitution import draw_seed, substitute, substitute_backward
 
-__all__ = ["NSVQ", "DiVeQ", "noise_substitution"]
-
 
 class NSVQ(CodebookQuantizer):
     """Quantizer that replaces the quantization error by noise of the same length (paper, section 3.1).

@@ -11,60 +11,26 @@ skip most searches.
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from nsvq_lightning.compute import lanes as simd
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, aligned_empty, check_array, check_table
-from nsvq_lightning.compute.simd import (
-    broadcast,
-    fma,
-    fnma,
-    get,
-    lane_min,
-    load,
-    lowest_bit,
-    mask_bits,
-    put,
-    store,
-    vmin,
-)
-
-__all__ = ["LIST", "CentredCodes", "centre_codes", "score_search", "true_distance"]
 
 LIST = 8
 """Codes in the list of a row."""
-_BEST = LIST + 1
-"""Scores that a row keeps: those of a list, and the smallest of a code outside it."""
-_FEW = 4
-"""Scores that a row keeps where no list is requested."""
-_GROUP = 6
-"""Rows scored together."""
-_TILE = 8 * _GROUP
-"""Rows that pass over a chunk of codes while it stays in the L1 cache."""
-_CHUNK = 4
-"""Blocks of 32 codes in a chunk."""
 
+_BEST = LIST + 1  # scores that a row keeps: those of a list, and the smallest of a code outside it
+_FEW = 4  # scores that a row keeps where no list is requested
+_GROUP = 6  # rows scored together
+_TILE = 8 * _GROUP  # rows that pass over a chunk of codes while it stays in the L1 cache
+_CHUNK = 4  # blocks of 32 codes in a chunk
 
-class CentredCodes(NamedTuple):
-    """Codes ready for :func:`score_search`.
-
-    Attributes:
-        codebook: The original codes, ``[K, D]``.
-        centre: Mean of the finite codes, ``[D]``.
-        blocks: Centred codes, ``[⌈K/32⌉, D, 32]``.
-        halves: Half their squared norms, ``[⌈K/32⌉ · 32]``; infinite where there is no finite code.
-        longest: Largest norm of a centred code.
-    """
-
-    codebook: NDArray[np.float32]
-    centre: NDArray[np.float32]
-    blocks: NDArray[np.float32]
-    halves: NDArray[np.float32]
-    longest: float
+Floats = NDArray[np.float32]
 
 
 @kernel
@@ -88,108 +54,124 @@ def _lay_out(codebook, centre, blocks, halves):  # type: ignore[no-untyped-def]
                 blocks[block, j, lane] = 0
 
 
-def centre_codes(codebook: NDArray[np.float32]) -> CentredCodes:
-    """Centre the codes ``[K, D]`` and lay them out in blocks of 32.
+def _centred(codebook: Floats) -> tuple[Floats, Floats, Floats, np.float32]:
+    """Mean of the finite codes ``[D]``, and what is centred on it.
 
-    Raises:
-        ValueError: There is no code, or the codebook is not contiguous.
-        TypeError: It is not float32.
+    The codes in blocks of 32, ``[⌈K/32⌉, D, 32]`` flat; half their squared norms ``[⌈K/32⌉ · 32]``, infinite where
+    there is no finite code; and the largest norm.
     """
-    check_table("codebook", codebook)
-    if len(codebook) == 0:
-        raise ValueError(f"the codebook must have at least one code, got shape {list(codebook.shape)}; fit it first")
     count, dim = codebook.shape
-    with np.errstate(invalid="ignore"):
-        centre = codebook.mean(0, dtype=np.float64).astype(np.float32)
-    if not np.isfinite(centre).all():
-        finite = np.isfinite(codebook).all(1)
-        centre = codebook[finite].mean(0, dtype=np.float64).astype(np.float32) if finite.any() else codebook[0] * 0
+    finite = np.isfinite(codebook).all(1)
+    centre = (codebook[finite] if finite.any() else np.zeros((1, dim))).mean(0, dtype=np.float64).astype(np.float32)
     blocks, halves = aligned_empty((-(-count // 32), dim, 32)), np.empty(-(-count // 32) * 32, np.float32)
-    thread_count()
     _lay_out(codebook, centre, blocks, halves)
     longest = float(halves[np.isfinite(halves)].max(initial=0.0))
-    return CentredCodes(codebook, centre, blocks, halves, float(np.sqrt(2.0 * longest)))
+    return centre, blocks.ravel(), halves, np.float32(np.sqrt(2.0 * longest))
 
 
 @inline
 def true_distance(dim, x, row, codebook, code):  # type: ignore[no-untyped-def]
     """Squared distance as a sum of squared differences in one fixed order; it decides between codes that tie."""
-    total = broadcast(np.float32(0.0))
+    total = simd.broadcast(np.float32(0.0))
     for j in range(dim):
-        difference = broadcast(get(codebook, code * dim + j) - get(x, row * dim + j))
-        total = fma(difference, difference, total)
-    return lane_min(total)
+        difference = simd.broadcast(simd.get(codebook, code * dim + j) - simd.get(x, row * dim + j))
+        total = simd.fma(difference, difference, total)
+    return simd.lane_min(total)
+
+
+@inline
+def squares(dim, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
+    """Squared differences of two rows, to be summed. ``keep`` masks the overlap of the last two vectors."""
+    total = simd.broadcast(np.float32(0.0))
+    if dim < 16:
+        for j in range(dim):
+            difference = simd.broadcast(simd.get(a, at_a + j) - simd.get(b, at_b + j)) * simd.load(keep, 0)
+            total = simd.fma(difference, difference, total)
+        return total
+    for j in range(0, dim // 16 * 16, 16):
+        difference = simd.load(a, at_a + j) - simd.load(b, at_b + j)
+        total = simd.fma(difference, difference, total)
+    if dim % 16:
+        difference = (simd.load(a, at_a + dim - 16) - simd.load(b, at_b + dim - 16)) * simd.load(keep, 0)
+        total = simd.fma(difference, difference, total)
+    return total
 
 
 @inline
 def _insert(scores, codes, at, kept, score, code):  # type: ignore[no-untyped-def]
     """Insert a score into the sorted scores of a row; the last one drops out."""
     place = at + kept - 1
-    while place > at and get(scores, place - 1) > score:
-        put(scores, place, get(scores, place - 1))
-        put(codes, place, get(codes, place - 1))
+    while place > at and simd.get(scores, place - 1) > score:
+        simd.put(scores, place, simd.get(scores, place - 1))
+        simd.put(codes, place, simd.get(codes, place - 1))
         place -= 1
-    put(scores, place, score)
-    put(codes, place, code)
+    simd.put(scores, place, score)
+    simd.put(codes, place, code)
 
 
 @inline
 def _keep(scores, codes, limits, slack, kept, first, block, found):  # type: ignore[no-untyped-def]
     """Of the scores ``found`` of a block, insert those below the limits of 6 rows."""
     for i in range(_GROUP):
-        limit = broadcast(get(limits, first + i))
-        below = mask_bits(load(found, 32 * i) < limit) | (mask_bits(load(found, 32 * i + 16) < limit) << 16)
+        limit = simd.broadcast(simd.get(limits, first + i))
+        below = simd.mask_bits(simd.load(found, 32 * i) < limit) | (
+            simd.mask_bits(simd.load(found, 32 * i + 16) < limit) << 16
+        )
         while below != 0:
-            lane = lowest_bit(below)
+            lane = simd.lowest_bit(below)
             below &= below - 1
-            score, at = get(found, 32 * i + lane), (first + i) * _BEST
-            if score < get(limits, first + i):
+            score, at = simd.get(found, 32 * i + lane), (first + i) * _BEST
+            if score < simd.get(limits, first + i):
                 _insert(scores, codes, at, kept, score, np.int32(block * 32 + lane))
-                put(limits, first + i, min(get(scores, at + kept - 1), get(scores, at) + get(slack, first + i)))
+                simd.put(
+                    limits,
+                    first + i,
+                    min(simd.get(scores, at + kept - 1), simd.get(scores, at) + simd.get(slack, first + i)),
+                )
 
 
 @inline
 def _score_block(dim, blocks, halves, block, rows, first, kept, state):  # type: ignore[no-untyped-def]
     """Scores of 6 rows against 32 codes: 12 sums that hide each other's latency."""
     scores, codes, limits, slack, found = state
-    a0 = a1 = a2 = a3 = a4 = a5 = load(halves, block * 32)
-    b0 = b1 = b2 = b3 = b4 = b5 = load(halves, block * 32 + 16)
+    a0 = a1 = a2 = a3 = a4 = a5 = simd.load(halves, block * 32)
+    b0 = b1 = b2 = b3 = b4 = b5 = simd.load(halves, block * 32 + 16)
     at, row = block * dim * 32, first * dim
     for j in range(dim):
-        low, high = load(blocks, at + 32 * j), load(blocks, at + 32 * j + 16)
-        value = broadcast(get(rows, row + j))
-        a0, b0 = fnma(value, low, a0), fnma(value, high, b0)
-        value = broadcast(get(rows, row + dim + j))
-        a1, b1 = fnma(value, low, a1), fnma(value, high, b1)
-        value = broadcast(get(rows, row + 2 * dim + j))
-        a2, b2 = fnma(value, low, a2), fnma(value, high, b2)
-        value = broadcast(get(rows, row + 3 * dim + j))
-        a3, b3 = fnma(value, low, a3), fnma(value, high, b3)
-        value = broadcast(get(rows, row + 4 * dim + j))
-        a4, b4 = fnma(value, low, a4), fnma(value, high, b4)
-        value = broadcast(get(rows, row + 5 * dim + j))
-        a5, b5 = fnma(value, low, a5), fnma(value, high, b5)
+        low, high = simd.load(blocks, at + 32 * j), simd.load(blocks, at + 32 * j + 16)
+        value = simd.broadcast(simd.get(rows, row + j))
+        a0, b0 = simd.fnma(value, low, a0), simd.fnma(value, high, b0)
+        value = simd.broadcast(simd.get(rows, row + dim + j))
+        a1, b1 = simd.fnma(value, low, a1), simd.fnma(value, high, b1)
+        value = simd.broadcast(simd.get(rows, row + 2 * dim + j))
+        a2, b2 = simd.fnma(value, low, a2), simd.fnma(value, high, b2)
+        value = simd.broadcast(simd.get(rows, row + 3 * dim + j))
+        a3, b3 = simd.fnma(value, low, a3), simd.fnma(value, high, b3)
+        value = simd.broadcast(simd.get(rows, row + 4 * dim + j))
+        a4, b4 = simd.fnma(value, low, a4), simd.fnma(value, high, b4)
+        value = simd.broadcast(simd.get(rows, row + 5 * dim + j))
+        a5, b5 = simd.fnma(value, low, a5), simd.fnma(value, high, b5)
     below = (
-        (vmin(a0, b0) < broadcast(get(limits, first)))
-        | (vmin(a1, b1) < broadcast(get(limits, first + 1)))
-        | (vmin(a2, b2) < broadcast(get(limits, first + 2)))
-        | (vmin(a3, b3) < broadcast(get(limits, first + 3)))
-        | (vmin(a4, b4) < broadcast(get(limits, first + 4)))
-        | (vmin(a5, b5) < broadcast(get(limits, first + 5)))
+        (simd.vmin(a0, b0) < simd.broadcast(simd.get(limits, first)))
+        | (simd.vmin(a1, b1) < simd.broadcast(simd.get(limits, first + 1)))
+        | (simd.vmin(a2, b2) < simd.broadcast(simd.get(limits, first + 2)))
+        | (simd.vmin(a3, b3) < simd.broadcast(simd.get(limits, first + 3)))
+        | (simd.vmin(a4, b4) < simd.broadcast(simd.get(limits, first + 4)))
+        | (simd.vmin(a5, b5) < simd.broadcast(simd.get(limits, first + 5)))
     )
-    if mask_bits(below) != 0:
-        store(found, 0, a0)
-        store(found, 16, b0)
-        store(found, 32, a1)
-        store(found, 48, b1)
-        store(found, 64, a2)
-        store(found, 80, b2)
-        store(found, 96, a3)
-        store(found, 112, b3)
-        store(found, 128, a4)
-        store(found, 144, b4)
-        store(found, 160, a5)
-        store(found, 176, b5)
+    if simd.mask_bits(below) != 0:
+        simd.store(found, 0, a0)
+        simd.store(found, 16, b0)
+        simd.store(found, 32, a1)
+        simd.store(found, 48, b1)
+        simd.store(found, 64, a2)
+        simd.store(found, 80, b2)
+        simd.store(found, 96, a3)
+        simd.store(found, 112, b3)
+        simd.store(found, 128, a4)
+        simd.store(found, 144, b4)
+        simd.store(found, 160, a5)
+        simd.store(found, 176, b5)
         _keep(scores, codes, limits, slack, kept, first, block, found)
 
 
@@ -197,10 +179,10 @@ def _score_block(dim, blocks, halves, block, rows, first, kept, state):  # type:
 def _score_tile(dim, blocks, halves, rows, count, kept, state):  # type: ignore[no-untyped-def]
     scores, codes, limits, _, _ = state
     for i in range(count * _BEST):
-        put(scores, i, np.float32(np.inf))
-        put(codes, i, np.int32(0))
+        simd.put(scores, i, np.float32(np.inf))
+        simd.put(codes, i, np.int32(0))
     for i in range(count):
-        put(limits, i, np.float32(np.inf))
+        simd.put(limits, i, np.float32(np.inf))
     total = halves.shape[0] // 32
     for chunk in range(0, total, _CHUNK):
         for first in range(0, count, _GROUP):
@@ -211,13 +193,13 @@ def _score_tile(dim, blocks, halves, rows, count, kept, state):  # type: ignore[
 @inline
 def _settle(dim, x, row, codebook, scores, codes, at, kept, limit):  # type: ignore[no-untyped-def]
     """Nearest code by true distance among those with a score up to ``limit``."""
-    code = np.int64(get(codes, at))
-    if get(scores, at + 1) > limit:
+    code = np.int64(simd.get(codes, at))
+    if simd.get(scores, at + 1) > limit:
         return code
     distance = np.float32(np.inf)
     for place in range(at, at + kept):
-        if get(scores, place) <= limit:
-            candidate = np.int64(get(codes, place))
+        if simd.get(scores, place) <= limit:
+            candidate = np.int64(simd.get(codes, place))
             candidate_distance = true_distance(dim, x, row, codebook, candidate)
             if candidate_distance < distance or (candidate_distance == distance and candidate < code):
                 code, distance = candidate, candidate_distance
@@ -281,13 +263,13 @@ def _search_kernel(dim: int) -> Any:
 
 
 def score_search(
-    x: NDArray[np.float32], codes: CentredCodes, with_lists: bool = False
-) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+    x: Floats, codebook: Floats, with_lists: bool = False
+) -> tuple[NDArray[np.int64], NDArray[np.int32], Floats]:
     """Nearest codes of contiguous rows ``x [N, D]``; a row with a NaN gets code 0.
 
     Args:
         x: Rows.
-        codes: The codes from :func:`centre_codes`.
+        codebook: Codes ``[K, D]``, contiguous, K at least 1.
         with_lists: Whether to return what else the search finds.
 
     Returns:
@@ -301,31 +283,10 @@ def score_search(
     """
     check_table("x", x)
     count, dim = x.shape
-    _check_codes(codes, dim)
+    check_array("codebook", codebook, (len(codebook), dim), FLOAT32)
     result = np.empty(count, np.int64)
     lists = np.empty((count if with_lists else 0, LIST), np.int32)
     distances = np.empty((2, count if with_lists else 0), np.float32)
     thread_count()
-    _search_kernel(dim)(
-        x.ravel(),
-        codes.codebook.ravel(),
-        codes.centre,
-        codes.blocks.ravel(),
-        codes.halves,
-        np.float32(codes.longest),
-        result,
-        lists.ravel(),
-        distances.ravel(),
-    )
+    _search_kernel(dim)(x.ravel(), codebook.ravel(), *_centred(codebook), result, lists.ravel(), distances.ravel())
     return result, lists, distances
-
-
-def _check_codes(codes: CentredCodes, dim: int) -> None:
-    """Check that the arrays have the same number of codes, and that the padding of the last block is infinite."""
-    count, blocks = len(codes.codebook), -(-len(codes.codebook) // 32)
-    check_array("codes.codebook", codes.codebook, (count, dim), FLOAT32)
-    check_array("codes.centre", codes.centre, (dim,), FLOAT32)
-    check_array("codes.blocks", codes.blocks, (blocks, dim, 32), FLOAT32)
-    check_array("codes.halves", codes.halves, (32 * blocks,), FLOAT32)
-    if count == 0 or not np.isposinf(codes.halves[count:]).all():
-        raise ValueError(f"codes must come from `centre_codes` for one codebook, got {count} codes of another origin")

@@ -13,8 +13,6 @@ from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize.kmeans import kmeans, sum_by_code
 from nsvq_lightning.random import generator as seeded
 
-__all__ = ["PostHoc", "StraightThrough", "TrainedStraightThrough"]
-
 
 class StraightThrough(CodebookQuantizer):
     """Quantizer that renders the nearest code itself and copies the gradient to the input (Bengio et al. 2013).

@@ -23,22 +23,11 @@ import torch
 from numba import prange
 from numpy.typing import NDArray
 
+from nsvq_lightning.compute import lanes as simd
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, INT64, check_array, check_table, outside, recycled
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside
 from nsvq_lightning.compute.simd import broadcast, fma, get, lane_sum, load, log2, put, select, store, vsqrt
-
-__all__ = [
-    "COS",
-    "MULTIPLIERS",
-    "SIN",
-    "draw_seed",
-    "fill_normal",
-    "normal_vectors",
-    "substitute",
-    "substitute_backward",
-]
-
 
 MULTIPLIERS = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 _GOLDEN, _FIRST, _SECOND = (np.uint64(value) for value in MULTIPLIERS)
@@ -74,16 +63,16 @@ def _uniforms(seed, pair, radius, angle):  # type: ignore[no-untyped-def]
 
 @inline
 def _cosine(t):  # type: ignore[no-untyped-def]
-    value = fma(broadcast(_C0), t, broadcast(_C1))
-    value = fma(fma(value, t, broadcast(_C2)), t, broadcast(_C3))
-    return fma(fma(value, t, broadcast(_C4)), t, broadcast(_C5))
+    value = simd.fma(simd.broadcast(_C0), t, simd.broadcast(_C1))
+    value = simd.fma(simd.fma(value, t, simd.broadcast(_C2)), t, simd.broadcast(_C3))
+    return simd.fma(simd.fma(value, t, simd.broadcast(_C4)), t, simd.broadcast(_C5))
 
 
 @inline
 def _sine(t):  # type: ignore[no-untyped-def]
-    value = fma(broadcast(_S0), t, broadcast(_S1))
-    value = fma(fma(value, t, broadcast(_S2)), t, broadcast(_S3))
-    return fma(fma(value, t, broadcast(_S4)), t, broadcast(_S5))
+    value = simd.fma(simd.broadcast(_S0), t, simd.broadcast(_S1))
+    value = simd.fma(simd.fma(value, t, simd.broadcast(_S2)), t, simd.broadcast(_S3))
+    return simd.fma(simd.fma(value, t, simd.broadcast(_S4)), t, simd.broadcast(_S5))
 
 
 @inline
@@ -94,10 +83,10 @@ def fill_normal(seed, first, count, out, radius, angle):  # type: ignore[no-unty
     """
     for pair in range(count // 2):
         _uniforms(seed, (first // 2 + pair) * 16, radius, angle)
-        length = vsqrt(log2(load(radius, 0)) * broadcast(_MINUS_TWO_LN2))
-        turn = load(angle, 0)
-        store(out, pair * 32, length * _cosine(turn * turn))
-        store(out, pair * 32 + 16, length * (turn * _sine(turn * turn)))
+        length = simd.vsqrt(simd.log2(simd.load(radius, 0)) * simd.broadcast(_MINUS_TWO_LN2))
+        turn = simd.load(angle, 0)
+        simd.store(out, pair * 32, length * _cosine(turn * turn))
+        simd.store(out, pair * 32 + 16, length * (turn * _sine(turn * turn)))
 
 
 @kernel
@@ -138,9 +127,9 @@ Integers = NDArray[np.int64]
 def _copy_in(dim, source, rows, first, count, group):  # type: ignore[no-untyped-def]
     """Copy chosen rows into vectors, one row per lane."""
     for lane in range(count):
-        start = get(rows, first + lane) * dim
+        start = simd.get(rows, first + lane) * dim
         for j in range(dim):
-            put(group, j * 16 + lane, get(source, start + j))
+            simd.put(group, j * 16 + lane, simd.get(source, start + j))
 
 
 @inline
@@ -167,49 +156,51 @@ def _part(dim, x, rows, codebook, codes, part, parts):  # type: ignore[no-untype
 @inline
 def _dots(dim, a, b):  # type: ignore[no-untyped-def]
     """Dot products of rows with rows, one per lane."""
-    total = broadcast(np.float32(0.0))
+    total = simd.broadcast(np.float32(0.0))
     for j in range(dim):
-        total = fma(load(a, 16 * j), load(b, 16 * j), total)
+        total = simd.fma(simd.load(a, 16 * j), simd.load(b, 16 * j), total)
     return total
 
 
 @inline
 def _residuals_squared(dim, rows, chosen):  # type: ignore[no-untyped-def]
-    total = broadcast(np.float32(0.0))
+    total = simd.broadcast(np.float32(0.0))
     for j in range(dim):
-        residual = load(rows, 16 * j) - load(chosen, 16 * j)
-        total = fma(residual, residual, total)
+        residual = simd.load(rows, 16 * j) - simd.load(chosen, 16 * j)
+        total = simd.fma(residual, residual, total)
     return total
 
 
 @inline
 def _inverses(squared):  # type: ignore[no-untyped-def]
     """1/s, and 0 where s is 0 (or its inverse too large): a zero vector has no direction."""
-    return select(squared > broadcast(_TINY), broadcast(np.float32(1.0)) / squared, broadcast(np.float32(0.0)))
+    return simd.select(
+        squared > simd.broadcast(_TINY), simd.broadcast(np.float32(1.0)) / squared, simd.broadcast(np.float32(0.0))
+    )
 
 
 @inline
 def _dot_difference(dim, g, at_g, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
     """Dot product of a long row with a difference. ``keep`` masks the overlap of the last two vectors."""
-    total = broadcast(np.float32(0.0))
+    total = simd.broadcast(np.float32(0.0))
     for j in range(0, dim // 16 * 16, 16):
-        total = fma(load(g, at_g + j), load(a, at_a + j) - load(b, at_b + j), total)
+        total = simd.fma(simd.load(g, at_g + j), simd.load(a, at_a + j) - simd.load(b, at_b + j), total)
     if dim % 16:
-        difference = load(a, at_a + dim - 16) - load(b, at_b + dim - 16)
-        total = fma(load(g, at_g + dim - 16) * load(keep, 0), difference, total)
-    return lane_sum(total)
+        difference = simd.load(a, at_a + dim - 16) - simd.load(b, at_b + dim - 16)
+        total = simd.fma(simd.load(g, at_g + dim - 16) * simd.load(keep, 0), difference, total)
+    return simd.lane_sum(total)
 
 
 @inline
 def _residual_squared(dim, x, at, codebook, code, keep):  # type: ignore[no-untyped-def]
-    total = broadcast(np.float32(0.0))
+    total = simd.broadcast(np.float32(0.0))
     for j in range(0, dim // 16 * 16, 16):
-        residual = load(x, at + j) - load(codebook, code + j)
-        total = fma(residual, residual, total)
+        residual = simd.load(x, at + j) - simd.load(codebook, code + j)
+        total = simd.fma(residual, residual, total)
     if dim % 16:
-        residual = (load(x, at + dim - 16) - load(codebook, code + dim - 16)) * load(keep, 0)
-        total = fma(residual, residual, total)
-    return lane_sum(total)
+        residual = (simd.load(x, at + dim - 16) - simd.load(codebook, code + dim - 16)) * simd.load(keep, 0)
+        total = simd.fma(residual, residual, total)
+    return simd.lane_sum(total)
 
 
 @inline
@@ -231,18 +222,22 @@ def _short_forward(dim: int) -> Any:
                 _copy_in(dim, x, rows, first, valid, values)
                 _copy_in(dim, codebook, codes, first, valid, chosen)
                 at = (first - block * _ROWS) * dim
-                error, squared = broadcast(np.float32(0.0)), broadcast(np.float32(0.0))
+                error, squared = simd.broadcast(np.float32(0.0)), simd.broadcast(np.float32(0.0))
                 for j in range(dim):
-                    residual = load(chosen, 16 * j) - load(values, 16 * j)
-                    direction = fma(broadcast(aim), residual, broadcast(spread) * load(noise, at + 16 * j))
-                    store(noise, at + 16 * j, direction)
-                    error, squared = fma(residual, residual, error), fma(direction, direction, squared)
-                length = vsqrt(error * _inverses(squared))
+                    residual = simd.load(chosen, 16 * j) - simd.load(values, 16 * j)
+                    direction = simd.fma(
+                        simd.broadcast(aim), residual, simd.broadcast(spread) * simd.load(noise, at + 16 * j)
+                    )
+                    simd.store(noise, at + 16 * j, direction)
+                    error, squared = simd.fma(residual, residual, error), simd.fma(direction, direction, squared)
+                length = simd.vsqrt(error * _inverses(squared))
                 for j in range(dim):
-                    store(values, 16 * j, fma(length, load(noise, at + 16 * j), load(values, 16 * j)))
+                    simd.store(
+                        values, 16 * j, simd.fma(length, simd.load(noise, at + 16 * j), simd.load(values, 16 * j))
+                    )
                 for lane in range(valid):
                     for j in range(dim):
-                        put(out, (first + lane) * dim + j, get(values, j * 16 + lane))
+                        simd.put(out, (first + lane) * dim + j, simd.get(values, j * 16 + lane))
         return missing
 
     return kernel(forward)
@@ -263,20 +258,24 @@ def _long_forward(dim: int) -> Any:
                 start = i % 2 * vectors * 16
                 if start == 0:
                     fill_normal(seed, i * vectors, 2 * vectors, noise, radius, angle)
-                at, code = get(rows, i) * dim, get(codes, i) * dim
-                error, squared = broadcast(np.float32(0.0)), broadcast(np.float32(0.0))
+                at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
+                error, squared = simd.broadcast(np.float32(0.0)), simd.broadcast(np.float32(0.0))
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
-                    residual = load(codebook, code + place) - load(x, at + place)
-                    way = fma(broadcast(aim), residual, broadcast(spread) * load(noise, start + place))
-                    store(direction, place, way)
+                    residual = simd.load(codebook, code + place) - simd.load(x, at + place)
+                    way = simd.fma(
+                        simd.broadcast(aim), residual, simd.broadcast(spread) * simd.load(noise, start + place)
+                    )
+                    simd.store(direction, place, way)
                     if j == vectors - 1:
-                        residual, way = residual * load(keep, 0), way * load(keep, 0)
-                    error, squared = fma(residual, residual, error), fma(way, way, squared)
-                length = broadcast(np.sqrt(lane_sum(error) * _inverse(lane_sum(squared))))
+                        residual, way = residual * simd.load(keep, 0), way * simd.load(keep, 0)
+                    error, squared = simd.fma(residual, residual, error), simd.fma(way, way, squared)
+                length = simd.broadcast(np.sqrt(simd.lane_sum(error) * _inverse(simd.lane_sum(squared))))
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
-                    store(out, i * dim + place, fma(length, load(direction, place), load(x, at + place)))
+                    simd.store(
+                        out, i * dim + place, simd.fma(length, simd.load(direction, place), simd.load(x, at + place))
+                    )
         return missing
 
     return kernel(forward)
@@ -298,22 +297,22 @@ def _short_backward(dim: int) -> Any:
                 _copy_in(dim, codebook, codes, first, valid, chosen)
                 for lane in range(valid):
                     for j in range(dim):
-                        put(moved, j * 16 + lane, get(out, (first + lane) * dim + j))
-                        put(slope, j * 16 + lane, get(grad, (first + lane) * dim + j))
+                        simd.put(moved, j * 16 + lane, simd.get(out, (first + lane) * dim + j))
+                        simd.put(slope, j * 16 + lane, simd.get(grad, (first + lane) * dim + j))
                 for j in range(dim):
-                    store(moved, 16 * j, load(moved, 16 * j) - load(values, 16 * j))
+                    simd.store(moved, 16 * j, simd.load(moved, 16 * j) - simd.load(values, 16 * j))
                 scale = _dots(dim, slope, moved) * _inverses(_residuals_squared(dim, values, chosen))
                 for j in range(dim):
-                    radial = scale * (load(values, 16 * j) - load(chosen, 16 * j))
-                    store(chosen, 16 * j, radial)
-                    store(slope, 16 * j, load(slope, 16 * j) + radial)
+                    radial = scale * (simd.load(values, 16 * j) - simd.load(chosen, 16 * j))
+                    simd.store(chosen, 16 * j, radial)
+                    simd.store(slope, 16 * j, simd.load(slope, 16 * j) + radial)
                 for lane in range(valid):
                     i = first + lane
                     clear_between(rows, i, dim, grad_x)
-                    at, code = get(rows, i) * dim, get(codes, i) * dim
+                    at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
                     for j in range(dim):
-                        put(grad_x, at + j, get(slope, j * 16 + lane))
-                        put(total, code + j, get(total, code + j) - get(chosen, j * 16 + lane))
+                        simd.put(grad_x, at + j, simd.get(slope, j * 16 + lane))
+                        simd.put(total, code + j, simd.get(total, code + j) - simd.get(chosen, j * 16 + lane))
             if part == parts - 1 and found == 0:
                 clear_between(rows, count, dim, grad_x)
         return missing
@@ -334,18 +333,18 @@ def _long_backward(dim: int) -> Any:
             begin, stop, found = _part(dim, x, rows, codebook, codes, part, parts)
             missing += found
             for i in range(begin, stop):
-                at, code = get(rows, i) * dim, get(codes, i) * dim
+                at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
                 scale = _dot_difference(dim, grad, i * dim, out, i * dim, x, at, keep)
                 scale *= _inverse(_residual_squared(dim, x, at, codebook, code, keep))
                 clear_between(rows, i, dim, grad_x)
                 # The last two vectors overlap, so the last sums are read before any are written.
-                last = load(total, code + dim - 16)
+                last = simd.load(total, code + dim - 16)
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
-                    radial = broadcast(scale) * (load(x, at + place) - load(codebook, code + place))
-                    store(grad_x, at + place, load(grad, i * dim + place) + radial)
-                    before = last if j == vectors - 1 else load(total, code + place)
-                    store(total, code + place, before - radial)
+                    radial = simd.broadcast(scale) * (simd.load(x, at + place) - simd.load(codebook, code + place))
+                    simd.store(grad_x, at + place, simd.load(grad, i * dim + place) + radial)
+                    before = last if j == vectors - 1 else simd.load(total, code + place)
+                    simd.store(total, code + place, before - radial)
             if part == parts - 1 and found == 0:
                 clear_between(rows, count, dim, grad_x)
         return missing

@@ -11,8 +11,8 @@ of all (the triangle inequality, as in Hamerly's k-means). In few dimensions the
 
 from __future__ import annotations
 
-from functools import cache, partial
-from typing import TYPE_CHECKING, Any
+from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,58 +20,22 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nsvq_lightning.compute import lanes as simd
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
 from nsvq_lightning.compute.memory import INT64, check_array
-from nsvq_lightning.compute.simd import (
-    broadcast,
-    fma,
-    get,
-    lane_min,
-    lane_sum,
-    lane_sums,
-    load,
-    lowest_bit,
-    mask_bits,
-    put,
-    store,
-)
-from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, BoxMemory, box_search, build_boxes, empty_memory
+from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, Memory, box_search, sort_into_leaves
 from nsvq_lightning.quantize.nearest import check_rows, nearest
-from nsvq_lightning.quantize.scores import LIST, centre_codes, score_search, true_distance
+from nsvq_lightning.quantize.scores import LIST, score_search, squares, true_distance
 
-if TYPE_CHECKING:
-    from nsvq_lightning.quantize.cuda.tracking import DeviceTracker
-
-__all__ = ["NearestTracker"]
-
-_BLOCK = 256
-"""Rows per unit of parallel work."""
-_BOX_STEPS = 32
-"""Searches after which the codes are sorted into boxes anew; boxes in an old order are correct, but larger."""
+_BLOCK = 256  # rows per unit of parallel work
+_BOX_STEPS = 32  # searches after which the codes are sorted into boxes anew; those in an old order are larger
+# Searches between two snapshots of the codebook. How far a code has moved is the sum of its distances from snapshot to
+# snapshot: the more snapshots, the more a random walk counts as if it were a straight line.
 _SNAPSHOT_STEPS = 16
-"""Searches between two snapshots of the codebook. How far a code has moved is the sum of its distances from snapshot to
-snapshot: the more snapshots, the more a random walk counts as if it were a straight line."""
 
 Floats = NDArray[np.float32]
-
-
-@inline
-def _squares(dim, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
-    """Squared differences of two rows, to be summed. ``keep`` masks the overlap of the last two vectors."""
-    total = broadcast(np.float32(0.0))
-    if dim < 16:
-        for j in range(dim):
-            difference = broadcast(get(a, at_a + j) - get(b, at_b + j)) * load(keep, 0)
-            total = fma(difference, difference, total)
-        return total
-    for j in range(0, dim // 16 * 16, 16):
-        difference = load(a, at_a + j) - load(b, at_b + j)
-        total = fma(difference, difference, total)
-    if dim % 16:
-        difference = (load(a, at_a + dim - 16) - load(b, at_b + dim - 16)) * load(keep, 0)
-        total = fma(difference, difference, total)
-    return total
+Integers = NDArray[np.int64]
 
 
 def _overlap(dim: int) -> Floats:
@@ -83,13 +47,13 @@ def _overlap(dim: int) -> Floats:
 
 @inline
 def _member(dim, x, at, codebook, lists, place, keep):  # type: ignore[no-untyped-def]
-    return _squares(dim, x, at, codebook, np.int64(get(lists, place)) * dim, keep)
+    return squares(dim, x, at, codebook, np.int64(simd.get(lists, place)) * dim, keep)
 
 
 @inline
 def _list_squared(dim, x, at, codebook, lists, start, keep):  # type: ignore[no-untyped-def]
     """Squared distances to the codes of a list, one per lane; the other lanes hold 0."""
-    return lane_sums(
+    return simd.lane_sums(
         (
             _member(dim, x, at, codebook, lists, start, keep),
             _member(dim, x, at, codebook, lists, start + 1, keep),
@@ -106,12 +70,12 @@ def _list_squared(dim, x, at, codebook, lists, start, keep):  # type: ignore[no-
 @inline
 def _settle(dim, x, row, codebook, lists, start, near):  # type: ignore[no-untyped-def]
     """Nearest code by true distance among the members of a list whose bits are set."""
-    code = np.int64(get(lists, start + lowest_bit(near)))
+    code = np.int64(simd.get(lists, start + simd.lowest_bit(near)))
     if near & (near - 1) == 0:
         return code
     distance = np.float32(np.inf)
     while near != 0:
-        candidate = np.int64(get(lists, start + lowest_bit(near)))
+        candidate = np.int64(simd.get(lists, start + simd.lowest_bit(near)))
         near &= near - 1
         candidate_distance = true_distance(dim, x, row, codebook, candidate)
         if candidate_distance < distance or (candidate_distance == distance and candidate < code):
@@ -122,9 +86,9 @@ def _settle(dim, x, row, codebook, lists, start, near):  # type: ignore[no-untyp
 @inline
 def _second_smallest(squared, near, scratch):  # type: ignore[no-untyped-def]
     """Smallest lane other than the lowest one whose bit is set."""
-    store(scratch, 0, squared)
-    put(scratch, lowest_bit(near), np.float32(np.inf))
-    return lane_min(load(scratch, 0))
+    simd.store(scratch, 0, squared)
+    simd.put(scratch, simd.lowest_bit(near), np.float32(np.inf))
+    return simd.lane_min(simd.load(scratch, 0))
 
 
 @cache
@@ -138,54 +102,34 @@ def _check_kernel(dim: int) -> Any:
             unused, scratch = np.zeros(16, np.float32), np.empty(16, np.float32)
             unused[LIST:] = np.inf
             for i in range(block * _BLOCK, min(rows.shape[0], (block + 1) * _BLOCK)):
-                row = get(rows, i)
-                at, start, code = row * dim, row * LIST, np.int64(get(last, row))
-                put(result, i, np.int64(-1))
+                row = simd.get(rows, i)
+                at, start, code = row * dim, row * LIST, np.int64(simd.get(last, row))
+                simd.put(result, i, np.int64(-1))
                 if code < 0:
                     continue
-                moved = np.float64(np.sqrt(lane_sum(_squares(dim, x, at, anchors, at, keep)))) * ROUNDING
-                distance = np.sqrt(lane_sum(_squares(dim, x, at, codebook, code * dim, keep)))
-                if np.float64(distance) * ROUNDING + moved < get(clearance, row) - way:
-                    put(result, i, code)
+                moved = np.float64(np.sqrt(simd.lane_sum(squares(dim, x, at, anchors, at, keep)))) * ROUNDING
+                distance = np.sqrt(simd.lane_sum(squares(dim, x, at, codebook, code * dim, keep)))
+                if np.float64(distance) * ROUNDING + moved < simd.get(clearance, row) - way:
+                    simd.put(result, i, code)
                     continue
-                squared = _list_squared(dim, x, at, codebook, lists, start, keep) + load(unused, 0)
-                best = lane_min(squared)
+                squared = _list_squared(dim, x, at, codebook, lists, start, keep) + simd.load(unused, 0)
+                best = simd.lane_min(squared)
                 distance = np.sqrt(best)
-                if np.float64(distance) * ROUNDING + moved < get(limits, row) - way:
-                    near = mask_bits(squared <= broadcast(best * np.float32(ROUNDING)))
+                if np.float64(distance) * ROUNDING + moved < simd.get(limits, row) - way:
+                    near = simd.mask_bits(squared <= simd.broadcast(best * np.float32(ROUNDING)))
                     code = _settle(dim, x, row, codebook, lists, start, near)
-                    put(result, i, code)
-                    put(last, row, np.int32(code))
+                    simd.put(result, i, code)
+                    simd.put(last, row, np.int32(code))
                     second = np.float64(np.sqrt(_second_smallest(squared, near, scratch)))
                     if near & (near - 1) == 0 and second - distance > moved:
                         # The gap to the second code now exceeds how far the row has moved, so a new anchor pays.
                         for j in range(dim):
-                            put(anchors, at + j, get(x, at + j))
-                        limit = get(limits, row) - moved
-                        put(limits, row, limit)
-                        put(clearance, row, min(limit, second / ROUNDING - drift + travelled))
+                            simd.put(anchors, at + j, simd.get(x, at + j))
+                        limit = simd.get(limits, row) - moved
+                        simd.put(limits, row, limit)
+                        simd.put(clearance, row, min(limit, second / ROUNDING - drift + travelled))
 
     return kernel(check)
-
-
-@kernel
-def _row_distances(a, b, squares):  # type: ignore[no-untyped-def]
-    """Squared distances of the rows of two tables."""
-    for i in prange(a.shape[0]):
-        total = np.float32(0.0)
-        for j in range(a.shape[1]):
-            difference = a[i, j] - b[i, j]
-            total += difference * difference
-        squares[i] = total
-
-
-@partial(kernel, parallel=False)
-def _ascending(rows, count):  # type: ignore[no-untyped-def]
-    """Whether row numbers are ascending, distinct and in [0, count)."""
-    right = rows.shape[0] == 0 or (rows[0] >= 0 and rows[-1] < count)
-    for i in range(1, rows.shape[0]):
-        right &= rows[i - 1] < rows[i]
-    return right
 
 
 class NearestTracker:
@@ -200,17 +144,13 @@ class NearestTracker:
 
     def forget(self) -> None:
         """Forget all searches; worth calling when codes have jumped."""
-        self._on_device: DeviceTracker | None = None
+        self._on_device: Any = None
         self._steps = 0
         self._order: NDArray[np.int32] | None = None
-        self._snapshot: Floats | None = None
-        self._codebook_shape = (0, 0)
+        self._snapshot = np.zeros((0, 0), np.float32)
         self._travelled = 0.0
-        self._last = np.zeros(0, np.int32)
-        self._lists = np.zeros((0, LIST), np.int32)
-        self._anchors = np.zeros((0, 0), np.float32)
-        # In float64, because movements add up over a whole run.
-        self._clearance, self._limits = np.zeros(0), np.zeros(0)
+        self._memory = Memory.empty(0, 0)
+        self._lists, self._limits = np.zeros((0, LIST), np.int32), np.zeros(0)
 
     def search(self, x: Tensor, codebook: Tensor, rows: Tensor | None = None) -> Tensor:
         """Nearest codes, the result of :func:`nearest` for the chosen rows.
@@ -232,42 +172,50 @@ class NearestTracker:
         if rows is not None and rows.dim() != 1:
             raise ValueError(f"rows must have shape [V], got {list(rows.shape)}")
         kernels = kernels_for(x)
-        if kernels == "cuda":
-            return self._search_device(x.detach().contiguous(), codebook.detach().contiguous(), rows)
         if kernels is None:
             return nearest(x if rows is None else x.index_select(0, rows), codebook)
-        values, codes = x.detach().contiguous().numpy(), codebook.detach().contiguous().numpy()
-        chosen = np.arange(len(values)) if rows is None else rows.contiguous().numpy()
-        check_array("rows", chosen, (len(chosen),), INT64)
-        if not _ascending(chosen, len(values)):
-            raise ValueError(f"rows must be ascending, distinct and in [0, {len(values)})")
-        if self._codebook_shape != codes.shape:
-            self.forget()
-            self._codebook_shape = codes.shape
-        self._grow(len(values))
-        search = self._search_boxes if codes.shape[1] <= MAX_DIM else self._search_lists
-        return torch.from_numpy(search(values, codes, chosen))
-
-    def _search_device(self, x: Tensor, codebook: Tensor, rows: Tensor | None) -> Tensor:
-        from nsvq_lightning.quantize.cuda.tracking import DeviceTracker
-
-        if self._on_device is None or not self._on_device.fits(codebook):
-            self._on_device = DeviceTracker(len(codebook), codebook.shape[1], codebook.device)
+        x, codebook = x.detach().contiguous(), codebook.detach().contiguous()
         chosen = torch.arange(len(x), device=x.device) if rows is None else rows.contiguous()
-        return self._on_device.search(x, codebook, chosen)
+        if kernels == "cuda":
+            from nsvq_lightning.quantize.cuda.tracking import DeviceTracker
 
-    def _search_boxes(self, x: Floats, codebook: Floats, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        boxes = build_boxes(codebook, self._order if self._steps % _BOX_STEPS else None)
-        self._order = boxes.order
+            if self._on_device is None or not self._on_device.fits(codebook):
+                self._on_device = DeviceTracker(len(codebook), codebook.shape[1], codebook.device)
+            codes: Tensor = self._on_device.search(x, codebook, chosen)
+            return codes
+        numbers = chosen.numpy()
+        check_array("rows", numbers, (len(numbers),), INT64)
+        if len(numbers) and (numbers[0] < 0 or numbers[-1] >= len(x) or not (numbers[1:] > numbers[:-1]).all()):
+            raise ValueError(f"rows must be ascending, distinct and in [0, {len(x)})")
+        self._make_room(len(x), codebook.numpy())
+        search = self._search_boxes if codebook.shape[1] <= MAX_DIM else self._search_lists
+        return torch.from_numpy(search(x.numpy(), codebook.numpy(), numbers))
+
+    def _make_room(self, count: int, codebook: Floats) -> None:
+        """Have a memory of at least ``count`` rows, an empty one if the codebook has another shape than the last."""
+        dim = codebook.shape[1]
+        if self._snapshot.shape != codebook.shape:
+            self.forget()
+            self._snapshot, self._memory = codebook.copy(), Memory.empty(0, dim)
+        new = count - len(self._memory.last)
+        if new > 0:
+            both = zip(self._memory, Memory.empty(new, dim), strict=True)
+            self._memory = Memory(*(np.append(old, more, 0) for old, more in both))
+            if dim > MAX_DIM:
+                self._lists = np.append(self._lists, np.zeros((new, LIST), np.int32), 0)
+                self._limits = np.append(self._limits, np.full(new, -np.inf))
+
+    def _search_boxes(self, x: Floats, codebook: Floats, rows: Integers) -> Integers:
+        if self._steps % _BOX_STEPS == 0 or self._order is None:
+            self._order = sort_into_leaves(codebook)
         self._drift(codebook, 1)
-        return box_search(
-            x, codebook, boxes, rows, BoxMemory(self._last, self._anchors, self._clearance), self._travelled
-        )
+        return box_search(x, codebook, self._order, rows, self._memory, self._travelled)
 
-    def _search_lists(self, x: Floats, codebook: Floats, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _search_lists(self, x: Floats, codebook: Floats, rows: Integers) -> Integers:
         drift = self._drift(codebook, _SNAPSHOT_STEPS)
         result = np.empty(len(rows), np.int64)
-        memory = self._last, self._lists.ravel(), self._anchors.ravel(), self._clearance, self._limits
+        last, anchors, clearance = self._memory
+        memory = last, self._lists.ravel(), anchors.ravel(), clearance, self._limits
         dim = x.shape[1]
         thread_count()
         _check_kernel(dim)(x.ravel(), rows, codebook.ravel(), memory, _overlap(dim), self._travelled, drift, result)
@@ -276,20 +224,16 @@ class NearestTracker:
             drift = self._take_snapshot(codebook, drift)
         if len(unsure):
             where = rows[unsure]
-            found, lists, distances = score_search(x[where], centre_codes(codebook), with_lists=True)
-            self._last[where] = result[unsure] = found
-            self._lists[where], self._anchors[where] = lists, x[where]
-            self._limits[where], self._clearance[where] = distances / ROUNDING - drift + self._travelled
+            found, lists, distances = score_search(x[where], codebook, with_lists=True)
+            last[where] = result[unsure] = found
+            self._lists[where], anchors[where] = lists, x[where]
+            self._limits[where], clearance[where] = distances / ROUNDING - drift + self._travelled
         return result
 
     def _drift(self, codebook: Floats, every: int) -> float:
         """Farthest that any code has moved since the snapshot; a new one is taken after ``every`` searches."""
-        if self._snapshot is None:
-            self._snapshot = codebook.copy()
-        squares = np.empty(len(codebook), np.float32)
-        thread_count()
-        _row_distances(codebook, self._snapshot, squares)
-        drift = float(np.sqrt(squares.max())) * ROUNDING
+        moved = codebook - self._snapshot
+        drift = float(np.sqrt(np.einsum("ij,ij->i", moved, moved).max())) * ROUNDING
         self._steps += 1
         return self._take_snapshot(codebook, drift) if self._steps % every == 0 else drift
 
@@ -298,16 +242,3 @@ class NearestTracker:
         self._travelled += drift
         self._snapshot = codebook.copy()
         return 0.0
-
-    def _grow(self, count: int) -> None:
-        """Make room for ``count`` rows."""
-        old = len(self._last)
-        if count <= old:
-            return
-        with_lists, dim = self._codebook_shape[1] > MAX_DIM, self._codebook_shape[1]
-        more = empty_memory(count - old, dim)
-        self._last, self._clearance = np.append(self._last, more.last), np.append(self._clearance, more.clearance)
-        self._anchors = np.append(self._anchors.reshape(old, dim), more.anchors, 0)
-        if with_lists:
-            self._lists = np.append(self._lists, np.zeros((count - old, LIST), np.int32), 0)
-            self._limits = np.append(self._limits, more.clearance)

@@ -10,8 +10,6 @@ from torch import Tensor
 from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
 
-__all__ = ["VectorQuantizeAdapter"]
-
 
 class VectorQuantizeAdapter(CodebookQuantizer):
     """Quantizer that leaves the search, the codebook updates and the gradients to the library vector_quantize_pytorch.

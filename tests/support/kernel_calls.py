@@ -88,24 +88,19 @@ def _gradient(dim: int) -> dict[str, Any]:
 
 
 def _box_search() -> dict[str, Any]:
-    from nsvq_lightning.quantize.box_search import BoxMemory, build_boxes
+    from nsvq_lightning.quantize.box_search import Memory, sort_into_leaves
 
     codebook = _normal(300, 3, seed=1)
-    memory = BoxMemory(_codes(70, 300).astype(np.int32), _normal(70, 3), np.full(70, 0.2))
+    memory = Memory(_codes(70, 300).astype(np.int32), _normal(70, 3), np.full(70, 0.2))
     return {
-        "x": _normal(70, 3), "codebook": codebook, "boxes": build_boxes(codebook), "rows": _rows(), "memory": memory
+        "x": _normal(70, 3), "codebook": codebook, "order": sort_into_leaves(codebook), "rows": _rows(),
+        "memory": memory,
     }  # fmt: skip
 
 
 def _priced() -> dict[str, Any]:
     table = {"x": _tensor(70, 3), "codebook": _tensor(50, 3, seed=1)}
     return table | {"rates": _tensor(50, seed=2).abs(), "prices": _tensor(70, seed=3).abs()}
-
-
-def _score_search() -> dict[str, Any]:
-    from nsvq_lightning.quantize.scores import centre_codes
-
-    return {"x": _normal(70, 12), "codes": centre_codes(_normal(50, 12, seed=1)), "with_lists": True}
 
 
 def _search(function: Callable[..., Any], **arguments: Any) -> list[Tensor]:
@@ -229,22 +224,19 @@ NUMBA: dict[str, list[Case]] = {
     ],
     f"{_CPU}.statistics.add_view": [Case(_statistics)],
     f"{_CPU}.statistics.add_observed": [Case(_observed)],
-    f"{_Q}.box_search.box_search": [Case(_box_search, rows=("x", "rows"), numbers=("rows",))],
-    f"{_Q}.box_search.build_boxes": [
-        Case(lambda: {"codebook": _normal(300, 3)}, rows=("codebook",), columns=("codebook",)),
-        Case(
-            lambda: {"codebook": _normal(300, 3), "order": np.arange(300, dtype=np.int32)[::-1].copy()},
-            columns=("codebook",),
-            numbers=("order",),
-        ),
+    f"{_Q}.box_search.box_search": [Case(_box_search, rows=("x", "rows"), numbers=("order", "rows"))],
+    f"{_Q}.box_search.sort_into_leaves": [
+        Case(lambda: {"codebook": _normal(300, 3)}, rows=("codebook",), columns=("codebook",))
     ],
     f"{_Q}.nearest.cheapest": [Case(_priced, rows=("x", "prices"), types=("x", "codebook"))],
     f"{_Q}.kmeans.distinct_rows": [Case(lambda: {"x": _tensor(70, 3)}, rows=("x",), columns=("x",), types=("x",))],
     f"{_Q}.substitution.normal_vectors": [Case(lambda: {"seed": 5, "vectors": 4})],
-    f"{_Q}.scores.centre_codes": [
-        Case(lambda: {"codebook": _normal(50, 12)}, rows=("codebook",), columns=("codebook",))
+    f"{_Q}.scores.score_search": [
+        Case(
+            lambda: {"x": _normal(70, 12), "codebook": _normal(50, 12, seed=1), "with_lists": True},
+            rows=("x", "codebook"),
+        )
     ],
-    f"{_Q}.scores.score_search": [Case(_score_search, rows=("x",))],
     f"{_Q}.substitution.substitute": [
         Case(lambda dim=dim: {"seed": 5} | _substitution(dim), rows=("x", "codebook"), numbers=("rows", "codes"))
         for dim in (3, 20)
@@ -302,7 +294,7 @@ SCALAR = [
     name
     for name in NUMBA
     if name.startswith(_IO)
-    or name.rpartition(".")[2] in ("build_boxes", "centre_codes", "count_hits", "distinct_rows", "sum_by_code")
+    or name.rpartition(".")[2] in ("sort_into_leaves", "count_hits", "distinct_rows", "sum_by_code")
 ]
 """Entry points whose kernels index arrays as Python does, so that Numba can check the bounds."""
 

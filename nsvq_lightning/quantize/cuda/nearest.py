@@ -19,8 +19,6 @@ from torch import Tensor
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 
-__all__ = ["CODES", "ROWS", "by_column", "compare", "least_of", "nearest_codes"]
-
 ROWS = 8
 """Rows per program."""
 CODES = 128

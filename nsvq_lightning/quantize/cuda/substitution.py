@@ -19,9 +19,6 @@ from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quantize import substitution
 from nsvq_lightning.quantize.cuda.sums import sum_rows
 
-__all__ = ["normal", "normal_vectors", "substitute", "substitute_backward"]
-
-
 GOLDEN, FIRST, SECOND = (tl.constexpr(value) for value in substitution.MULTIPLIERS)
 C0, C1, C2, C3, C4, C5 = (tl.constexpr(value) for value in substitution.COS)
 S0, S1, S2, S3, S4, S5 = (tl.constexpr(value) for value in substitution.SIN)

@@ -11,8 +11,6 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 
-__all__ = ["sorted_by_code", "sum_rows"]
-
 ROWS = 16
 """Rows of a code that are added up side by side."""
 WIDTH = 64

@@ -19,8 +19,6 @@ from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quantize.box_search import ROUNDING
 from nsvq_lightning.quantize.cuda.nearest import CODES, ROWS, by_column, compare, least_of
 
-__all__ = ["DeviceTracker"]
-
 LIST = 8
 """Codes in the list of a row."""
 BLOCK = 64
