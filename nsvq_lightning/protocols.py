@@ -14,7 +14,7 @@ def missing_members(value: object, protocol: type) -> list[str]:
 
     Args:
         value: Any object.
-        protocol: A :class:`typing.Protocol` that inherits from no other.
+        protocol: A :class:`typing.Protocol`; what it inherits from others is not looked at.
     """
     declared = (*protocol.__annotations__, *vars(protocol))
     return sorted({name for name in declared if not name.startswith("_") and not hasattr(value, name)})

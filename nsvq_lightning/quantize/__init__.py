@@ -7,8 +7,12 @@ from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest, nearest_reference
 from nsvq_lightning.quantize.nsvq import NSVQ, DiVeQ
-from nsvq_lightning.quantize.straight_through import PostHoc, StraightThrough, TrainedStraightThrough
-from nsvq_lightning.quantize.vector_quantize import VectorQuantizeAdapter
+from nsvq_lightning.quantize.straight_through import (
+    PostHoc,
+    StraightThrough,
+    TrainedStraightThrough,
+    VectorQuantizeAdapter,
+)
 
 __all__ = [
     "NSVQ",

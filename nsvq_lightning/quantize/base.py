@@ -57,27 +57,22 @@ class Quantizer(Protocol):
         """Fix the codes ``[N]``; from now on only the codebook is trained."""
 
 
-class Refittable(Protocol):
+class Refittable(Quantizer, Protocol):
     """Quantizer whose codebook gets no gradient in the quantize phase, but is refitted to the rows from time to time.
 
     :class:`nsvq_lightning.callbacks.CodebookRefit` does so with every quantizer that offers it.
     """
 
-    codebook: Tensor
-    """Codebook ``[K, D]`` in the raw space of the attribute."""
-
     def refit(self, x: Tensor, steps: int) -> None:
         """Fit the codebook to the rows ``x [N, D]`` by ``steps`` k-means steps from its current state; K stays."""
 
 
-class Holding(Protocol):
+class Holding(Quantizer, Protocol):
     """Quantizer whose rows can be given other codes than the nearest ones while they are trained.
 
     :class:`nsvq_lightning.callbacks.RateDistortion` uses it, and leaves other quantizers alone.
     """
 
-    codebook: Tensor
-    """Codebook ``[K, D]`` in the raw space of the attribute."""
     held: Tensor
     """Codes ``[N]`` int64 that rows have in training, or empty; they count only while the scene has N rows."""
 
@@ -85,20 +80,17 @@ class Holding(Protocol):
         """Set :attr:`held`."""
 
 
-class Limitable(Protocol):
+class Limitable(Quantizer, Protocol):
     """Quantizer whose next fit can be told to place fewer codes.
 
     :class:`nsvq_lightning.callbacks.CodebookInit` uses it for scenes with few splats.
     """
 
-    codebook: Tensor
-    """Codebook ``[K, D]`` in the raw space of the attribute."""
-
     def limit(self, codes: int) -> None:
         """Have at most ``codes`` codes, at least 1, from the next fit on."""
 
 
-class Mendable(Protocol):
+class Mendable(Quantizer, Protocol):
     """Quantizer that can repair codes that have become non-finite.
 
     :class:`nsvq_lightning.callbacks.FiniteCodes` uses it; with other quantizers it ends the run.

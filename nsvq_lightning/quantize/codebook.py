@@ -8,46 +8,29 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.graph import increment_version
 
 from nsvq_lightning.quantize.base import held_codes
-from nsvq_lightning.quantize.kmeans import count_hits, draw_far_rows, kmeans, lookup, sum_by_code
+from nsvq_lightning.quantize.kmeans import draw_far_rows, kmeans, lookup, sum_by_code
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.quantize.tracking import NearestTracker
 from nsvq_lightning.random import generator as seeded
 from nsvq_lightning.skips import is_on
 
 
-def inactive_codes(usage: Tensor, window: Tensor | int, threshold: float) -> Tensor:
-    """Mask ``[K]`` of the codes hit in fewer than ``threshold`` of the ``window`` iterations; none in an empty window.
-
-    Raises:
-        ValueError: ``threshold`` is not in [0, 1].
-    """
-    if not 0.0 <= threshold <= 1.0:
-        raise ValueError(f"threshold is a share of the iterations and must be in [0, 1], got {threshold}")
-    return usage < threshold * window
-
-
-def choose_replacements(active: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """``count`` active codes in random order; none is taken twice before all have been taken once.
-
-    Args:
-        active: Active codes, as indices ``[A]`` or vectors ``[A, D]``, A > 0.
-        count: Number of codes to replace.
-        generator: Source of the permutations.
-    """
-    rounds = -(-count // len(active))
-    order = [torch.randperm(len(active), generator=generator, device=generator.device) for _ in range(rounds)]
-    return active[torch.cat(order)[:count].to(active.device)]
+def inactive_codes(usage: Tensor, window: Tensor) -> Tensor:
+    """Mask ``[K]`` of the codes hit in fewer than 1 % of the iterations of the window; none in an empty window."""
+    return usage < 0.01 * window
 
 
 def copy_codes(active: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """New codes ``[count, D]`` by the paper's rule: random picks of the active codes ``[A, D]``, plus noise of 1e-12.
 
-    In float32 the noise rarely changes a value, so a copy gets rows only once training has moved it.
+    None is picked twice before all have been picked once. In float32 the noise rarely changes a value, so a copy gets
+    rows only once training has moved it.
     """
-    copies = choose_replacements(active, count, generator)
+    rounds = -(-count // len(active))
+    order = [torch.randperm(len(active), generator=generator, device=generator.device) for _ in range(rounds)]
+    copies = active[torch.cat(order)[:count].to(active.device)]
     noise = torch.randn(count, active.shape[1], generator=generator, device=generator.device)
     return copies + 1e-12 * noise.to(active)
 
@@ -229,8 +212,7 @@ class CodebookQuantizer(nn.Module, ABC):
     @torch.no_grad()
     def count(self, codes: Tensor) -> None:
         """Count one iteration in which ``codes [N]`` were hit."""
-        count_hits(codes, self.usage)
-        increment_version(self.usage)  # tells autograd, and anyone with a copy, that a kernel has written
+        self.usage += torch.zeros_like(self.usage).index_fill_(0, codes, 1)
         self.window += 1
 
     def reset_usage(self) -> None:
@@ -239,35 +221,25 @@ class CodebookQuantizer(nn.Module, ABC):
         self.window.zero_()
 
     @torch.no_grad()
-    def replace_unused(
-        self,
-        generator: torch.Generator,
-        rows: Tensor | None = None,
-        jitter: float = 0.5,
-        threshold: float = 0.01,
-    ) -> Tensor:
+    def replace_unused(self, generator: torch.Generator, rows: Tensor | None = None, jitter: float = 0.5) -> Tensor:
         """Replace inactive codes by active ones and start a new window (paper, section 3.1).
 
-        A code is inactive if it was hit in fewer than ``threshold`` of the window's iterations. By the paper's rule the
-        new codes are copies of randomly chosen active codes, plus noise of 1e-12. With ``rows``, the codes with the
-        largest distortion are split instead (:func:`~nsvq_lightning.quantize.codebook.split_codes`). The
-        optimiser's state is not touched.
+        A code is inactive if it was hit in fewer than 1 % of the window's iterations. By the paper's rule the new codes
+        are copies of randomly chosen active codes, plus noise of 1e-12. With ``rows``, the codes with the largest
+        distortion are split instead (:func:`~nsvq_lightning.quantize.codebook.split_codes`). The optimiser's state is
+        not touched.
 
         Args:
             generator: Source of the choice and of the noise.
             rows: Rows of the scene ``[N, D]``, or None for the paper's rule.
             jitter: With ``rows``: where a new code lies between the code that is split and one of its rows, in (0, 1].
-            threshold: Share of the iterations, in [0, 1].
 
         Returns:
             The replaced codes ``[R]`` int64; none, with a warning, where no code was active.
-
-        Raises:
-            ValueError: ``threshold`` is not in [0, 1].
         """
         # A non-finite code must not be copied; it is left to `mend`, because its moments are not finite either.
         finite = torch.isfinite(self.codebook).all(1)
-        inactive = inactive_codes(self.usage, self.window, threshold)
+        inactive = inactive_codes(self.usage, self.window)
         replaced = (inactive & finite).nonzero()[:, 0]
         active = self.codebook[~inactive & finite]
         if len(replaced) and not len(active):
@@ -366,9 +338,8 @@ class CodebookQuantizer(nn.Module, ABC):
         stored = state_dict.get(f"{prefix}codebook")
         if stored is not None and stored.dim() == 2 and stored.shape[1] == self.dim:
             self._resize(stored.shape[0])
-        held = state_dict.setdefault(f"{prefix}held", self.held.new_zeros(0))  # checkpoints of older releases have none
-        self.held = self.held.new_zeros(held.shape)
-        codes = state_dict.get(f"{prefix}codes")
-        if codes is not None:
-            self.codes = self.codes.new_zeros(codes.shape)
+        for name in ("codes", "held"):
+            rows = state_dict.get(f"{prefix}{name}")
+            if rows is not None:
+                setattr(self, name, self.codes.new_zeros(rows.shape))
         super()._load_from_state_dict(state_dict, prefix, *args)

@@ -5,7 +5,6 @@ Sums of rows by code, also the gradient of a codebook, have the same bits on any
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,8 @@ from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import kernel, thread_count
-from nsvq_lightning.compute.memory import INT64, flat_checked, outside
+from nsvq_lightning.compute.memory import INT64, flat_checked
+from nsvq_lightning.compute.rows import put_rows
 from nsvq_lightning.quantize.nearest import nearest
 
 
@@ -54,7 +54,7 @@ def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtyp
         )
     values, dtype = values.detach(), dtype or values.dtype
     if kernels_for(values) == "cuda":
-        from nsvq_lightning.quantize.cuda.sums import sum_rows
+        from nsvq_lightning.quantize.cuda.substitution import sum_rows
 
         return sum_rows(values.contiguous(), codes, num_codes, dtype)
     if values.device.type == "cpu" and values.dtype in (torch.float32, torch.float64):
@@ -72,55 +72,30 @@ def _sum_segments(values: Tensor, codes: Tensor, num_codes: int) -> Tensor:
     return torch.segment_reduce(values[order], "sum", lengths=lengths, axis=0, unsafe=True, initial=0)
 
 
-@partial(kernel, parallel=False)
-def _count_hits(codes, usage):  # type: ignore[no-untyped-def]
-    """Count the codes that were hit, unless some are out of range; returns how many are."""
-    hit, missing = np.zeros(usage.shape[0], np.uint8), 0
-    for i in range(codes.shape[0]):
-        if 0 <= codes[i] < usage.shape[0]:
-            hit[codes[i]] = 1
-        else:
-            missing += 1
-    for code in range(usage.shape[0] if missing == 0 else 0):
-        usage[code] += hit[code]
-    return missing
+def lookup(codebook: Tensor, codes: Tensor, x: Tensor | None = None, rows: Tensor | None = None) -> Tensor:
+    """Rows ``[V, D]`` of ``codebook [K, D]`` for the codes, with a gradient that is summed in a fixed order.
 
-
-def count_hits(codes: Tensor, usage: Tensor) -> None:
-    """Add 1 to ``usage [K]`` (int64, in place) for every code that is among ``codes [N]``, however often.
-
-    Raises:
-        ValueError: ``codes`` is not ``[N]``, ``usage`` is not contiguous, or a code is out of range.
-        TypeError: A dtype is wrong.
+    With ``x [N, D]`` the gradient is also that of its rows ``rows [V]``, or of all of them: it passes straight through.
     """
-    if usage.device.type == "cpu":
-        numbers = flat_checked("codes", codes.contiguous(), (codes.numel(),), INT64)
-        if _count_hits(numbers, flat_checked("usage", usage, (usage.numel(),), INT64)):
-            raise outside("codes", numbers, len(usage))
-    else:
-        hit = torch.zeros_like(usage)
-        hit[codes] = 1
-        usage += hit
-
-
-def lookup(codebook: Tensor, codes: Tensor) -> Tensor:
-    """Rows ``[N, D]`` of ``codebook [K, D]`` for the codes, with a gradient that is summed in a fixed order."""
-    result: Tensor = _Lookup.apply(codebook, codes)  # type: ignore[no-untyped-call]
+    result: Tensor = _Lookup.apply(codebook, codes, x, rows)  # type: ignore[no-untyped-call]
     return result
 
 
 class _Lookup(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, codebook: Tensor, codes: Tensor) -> Tensor:
-        ctx.save_for_backward(codes)
-        ctx.num_codes = codebook.shape[0]
+    def forward(ctx: Any, codebook: Tensor, codes: Tensor, x: Tensor | None, rows: Tensor | None) -> Tensor:
+        ctx.save_for_backward(codes, rows)
+        ctx.num_codes, ctx.count = len(codebook), 0 if x is None else len(x)
         return codebook.index_select(0, codes)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        (codes,) = ctx.saved_tensors
-        return sum_by_code(grad, codes, ctx.num_codes), None
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, Tensor | None, None]:
+        codes, rows = ctx.saved_tensors
+        by_code = sum_by_code(grad, codes, ctx.num_codes) if ctx.needs_input_grad[0] else None
+        if not ctx.needs_input_grad[2]:
+            return by_code, None, None, None
+        return by_code, None, grad if rows is None else put_rows(grad, rows, ctx.count), None
 
 
 @torch.no_grad()
@@ -154,47 +129,40 @@ def kmeans(
     Raises:
         ValueError: A shape does not fit, there is no row, a value is not finite, or a weight is negative.
     """
-    x, weight = _checked(x, k, weight)
+    x = x.detach()
+    if x.dim() != 2 or x.shape[0] == 0 or k < 1:
+        raise ValueError(f"k-means needs rows [N, D] with N > 0 and k > 0, got shape {list(x.shape)} and k = {k}")
+    if bad := int((~torch.isfinite(x).all(1)).sum()):
+        raise ValueError(f"{bad} of {x.shape[0]} rows are not finite; drop them before k-means")
+    if weight is not None:
+        if weight.shape != x.shape[:1] or not bool((weight >= 0).all()) or not bool((weight > 0).any()):
+            raise ValueError(f"weight must have shape [{x.shape[0]}], no negative and at least one positive value")
+        used = weight > 0
+        x, weight = x[used], weight.detach()[used].double()
     if start is None:
         first = distinct_rows(x)
         if len(first) <= k:
             return x[first]
-        start = rows_far_apart(x[first], k, generator) if spread else _sample(x[first], k, generator)
+        start = rows_far_apart(x[first], k, generator) if spread else x[first][_shuffled(len(first), x, generator)[:k]]
     centroids = start.detach().clone()
     for _ in range(steps):
         centroids = _lloyd_step(x, centroids, weight)
     return centroids
 
 
-def _sample(rows: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    chosen = torch.randperm(len(rows), generator=generator, device=generator.device)[:count]
-    return rows[chosen.to(rows.device)]
-
-
-def _checked(x: Tensor, k: int, weight: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    x = x.detach()
-    if x.dim() != 2 or x.shape[0] == 0 or k < 1:
-        raise ValueError(f"k-means needs rows [N, D] with N > 0 and k > 0, got shape {list(x.shape)} and k = {k}")
-    if not bool(torch.isfinite(x).all()):
-        bad = int((~torch.isfinite(x).all(1)).sum())
-        raise ValueError(f"{bad} of {x.shape[0]} rows are not finite; drop them before k-means")
-    if weight is None:
-        return x, None
-    if weight.shape != x.shape[:1] or not bool((weight >= 0).all()) or not bool((weight > 0).any()):
-        raise ValueError(f"weight must have shape [{x.shape[0]}], no negative and at least one positive value")
-    used = weight > 0
-    return x[used], weight.detach()[used].double()
+def _shuffled(count: int, like: Tensor, generator: torch.Generator) -> Tensor:
+    """The numbers below ``count`` in random order."""
+    return torch.randperm(count, generator=generator, device=generator.device).to(like.device)
 
 
 def _lloyd_step(x: Tensor, centroids: Tensor, weight: Tensor | None) -> Tensor:
     """Mean of the rows nearest to each centroid; a centroid without rows stays."""
     codes = nearest(x, centroids)
-    k = centroids.shape[0]
+    k = len(centroids)
     if weight is None:
         sums, mass = sum_by_code(x, codes, k, torch.float64), torch.bincount(codes, minlength=k).double()
     else:
-        sums = sum_by_code(x * weight[:, None], codes, k)
-        mass = sum_by_code(weight[:, None], codes, k)[:, 0]
+        sums, mass = sum_by_code(x * weight[:, None], codes, k), sum_by_code(weight[:, None], codes, k)[:, 0]
     means = sums / mass.clamp_min(torch.finfo(torch.float64).tiny)[:, None]
     return torch.where(mass[:, None] > 0, means.to(centroids.dtype), centroids)
 
@@ -231,10 +199,6 @@ def _hash_rows(bits, hashes):  # type: ignore[no-untyped-def]
         hashes[i] = value
 
 
-_ROUNDS = 3
-"""How often a spread start doubles its number of rows."""
-
-
 def draw_far_rows(rows: Tensor, codebook: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Indices ``[count]`` of distinct rows, drawn with probabilities that grow with the squared distance to their code.
 
@@ -255,11 +219,11 @@ def draw_far_rows(rows: Tensor, codebook: Tensor, count: int, generator: torch.G
 def rows_far_apart(rows: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """``[count, D]`` of the distinct rows ``[N, D]``, N ≥ count, that reach into all corners: a start for k-means.
 
-    An eighth is a random sample; then each round draws as many far rows as there already are. Rows so close to these
-    that their squared distance is 0 come last.
+    An eighth is a random sample; then each of three rounds draws as many far rows as there already are. Rows so close
+    to these that their squared distance is 0 come last.
     """
-    shuffled = torch.randperm(len(rows), generator=generator, device=generator.device).to(rows.device)
-    chosen = shuffled[: -(-count // 2**_ROUNDS)]
+    shuffled = _shuffled(len(rows), rows, generator)
+    chosen = shuffled[: -(-count // 8)]
     while len(chosen) < count:
         far = draw_far_rows(rows, rows[chosen], min(len(chosen), count - len(chosen)), generator)
         if len(far) == 0:

@@ -100,7 +100,7 @@ def nearest(x: Tensor, codebook: Tensor) -> Tensor:
         rows, codes = x.numpy(), codebook.numpy()
         return torch.from_numpy(box_search(rows, codes) if x.shape[1] <= MAX_DIM else score_search(rows, codes)[0])
     if kernels == "cuda":
-        from nsvq_lightning.quantize.cuda.nearest import nearest_codes
+        from nsvq_lightning.quantize.cuda.search import nearest_codes
 
         return nearest_codes(x, codebook)
     return nearest_reference(x, codebook)

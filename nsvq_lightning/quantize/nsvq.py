@@ -11,9 +11,9 @@ from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.rows import put_rows
+from nsvq_lightning.quantize import substitution
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize.kmeans import sum_by_code
-from nsvq_lightning.quantize.substitution import draw_seed, substitute, substitute_backward
 
 
 class NSVQ(CodebookQuantizer):
@@ -57,60 +57,51 @@ def noise_substitution(
     Returns:
         Rows ``[V, D]``, each at distance ‖x − c‖ from its row of ``x``.
     """
-    mix = draw_seed(generator), aim, spread
-    result: Tensor = _Substitution.apply(x, codebook, codes, rows, mix)  # type: ignore[no-untyped-call]
+    seed = int(torch.randint(0, 2**63 - 1, (), dtype=torch.int64, device=generator.device, generator=generator))
+    rows = torch.arange(len(x), device=x.device) if rows is None else rows
+    result: Tensor = _Substitution.apply(x, codebook, codes, rows, (seed, aim, spread))  # type: ignore[no-untyped-call]
     return result
 
 
 class _Substitution(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, x: Tensor, codebook: Tensor, codes: Tensor, rows: Tensor | None, mix: tuple[int, float, float]
+        ctx: Any, x: Tensor, codebook: Tensor, codes: Tensor, rows: Tensor, mix: tuple[int, float, float]
     ) -> Tensor:
-        ctx.mix, ctx.kernels = mix, kernels_for(x)
-        seed, aim, spread = mix
-        if ctx.kernels is not None:
-            rows = torch.arange(x.shape[0], device=x.device) if rows is None else rows
-            inputs = x, rows, codebook, codes
-        if ctx.kernels == "cpu":
-            out = torch.from_numpy(substitute(seed, *_arrays(*inputs), aim=aim, spread=spread))
-        elif ctx.kernels == "cuda":
-            from nsvq_lightning.quantize.cuda.substitution import substitute as substitute_cuda
-
-            out = substitute_cuda(seed, *_contiguous(*inputs), aim=aim, spread=spread)
-        else:
-            chosen = x if rows is None else x.index_select(0, rows)
+        ctx.mix, ctx.kernels = mix, _kernels(x)
+        if ctx.kernels is None:
+            chosen = x.index_select(0, rows)
             residual = chosen - codebook[codes]
-            out = chosen + residual.norm(dim=1, keepdim=True) * _directions(residual, *mix)
-        ctx.save_for_backward(x, codebook, codes, rows, out)
+            out: Tensor = chosen + residual.norm(dim=1, keepdim=True) * _directions(residual, *mix)
+        else:
+            seed, aim, spread = mix
+            inputs = (tensor.detach().contiguous() for tensor in (x, rows, codebook, codes))
+            out = ctx.kernels.substitute(seed, *inputs, aim=aim, spread=spread)
+        ctx.save_for_backward(x, rows, codebook, codes, out)
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None, None, None]:
-        x, codebook, codes, rows, out = ctx.saved_tensors
-        if ctx.kernels == "cpu":
-            grads = substitute_backward(*_arrays(grad, x, rows, codebook, codes, out))
-            return torch.from_numpy(grads[0]), torch.from_numpy(grads[1]), None, None, None
-        if ctx.kernels == "cuda":
-            from nsvq_lightning.quantize.cuda.substitution import substitute_backward as backward_cuda
-
-            return *backward_cuda(*_contiguous(grad, x, rows, codebook, codes, out)), None, None, None
-        chosen = x if rows is None else x.index_select(0, rows)
-        residual = chosen - codebook[codes]
-        radial = (grad * _directions(residual, *ctx.mix)).sum(1, keepdim=True) * _unit(residual)
-        grad_x = grad + radial
-        if rows is not None:
-            grad_x = put_rows(grad_x, rows, x.shape[0])
-        return grad_x, -sum_by_code(radial, codes, codebook.shape[0]), None, None, None
+        x, rows, codebook, codes, out = ctx.saved_tensors
+        if ctx.kernels is None:
+            residual = x.index_select(0, rows) - codebook[codes]
+            radial = (grad * _directions(residual, *ctx.mix)).sum(1, keepdim=True) * _unit(residual)
+            grads = put_rows(grad + radial, rows, len(x)), -sum_by_code(radial, codes, len(codebook))
+        else:
+            inputs = (tensor.detach().contiguous() for tensor in (grad, x, rows, codebook, codes, out))
+            grads = ctx.kernels.substitute_backward(*inputs)
+        return *grads, None, None, None
 
 
-def _arrays(*tensors: Tensor) -> list[Any]:
-    return [tensor.numpy() for tensor in _contiguous(*tensors)]
+def _kernels(like: Tensor) -> Any:
+    """The module whose kernels take a tensor, or None."""
+    kernels = kernels_for(like)
+    if kernels == "cuda":
+        from nsvq_lightning.quantize.cuda import substitution as on_device
 
-
-def _contiguous(*tensors: Tensor) -> list[Tensor]:
-    return [tensor.detach().contiguous() for tensor in tensors]
+        return on_device
+    return substitution if kernels == "cpu" else None
 
 
 def _directions(residual: Tensor, seed: int, aim: float, spread: float) -> Tensor:

@@ -19,32 +19,26 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import torch
 from numba import prange
-from numpy.typing import NDArray
+from torch import Tensor
 
 from nsvq_lightning.compute import lanes as simd
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
-from nsvq_lightning.compute.memory import FLOAT32, INT64, check_array, check_table, outside, recycled
+from nsvq_lightning.compute.memory import INT64, Array, flat_checked, outside, recycled
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside
-from nsvq_lightning.compute.simd import broadcast, fma, get, lane_sum, load, log2, put, select, store, vsqrt
+from nsvq_lightning.quantize.scores import squares
 
 MULTIPLIERS = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
-_GOLDEN, _FIRST, _SECOND = (np.uint64(value) for value in MULTIPLIERS)
-_S27, _S30, _S31, _S40, _LOW24 = np.uint64(27), np.uint64(30), np.uint64(31), np.uint64(40), np.uint64(0xFFFFFF)
-_UNIT = np.float32(2.0**-24)
-_MINUS_TWO_LN2 = np.float32(-2 * np.log(2))
 # cos 2πt and (sin 2πt)/t as polynomials of t² on |t| ≤ 1/2 (Chebyshev fits), highest power first; errors 1e-6.
 COS = (-21.071106, 58.790493, -85.271622, 64.928658, -19.738981, 0.99999923)
 SIN = (-12.471244, 41.342884, -76.614471, 81.599945, -41.341591, 6.283185)
-_C0, _C1, _C2, _C3, _C4, _C5 = (np.float32(value) for value in COS)
-_S0, _S1, _S2, _S3, _S4, _S5 = (np.float32(value) for value in SIN)
 
-
-def draw_seed(generator: torch.Generator) -> int:
-    """A 63-bit seed from a torch generator."""
-    device = generator.device
-    return int(torch.randint(0, 2**63 - 1, (), dtype=torch.int64, device=device, generator=generator))
+_GOLDEN, _FIRST, _SECOND = (np.uint64(value) for value in MULTIPLIERS)
+_S27, _S30, _S31, _S40, _LOW24 = np.uint64(27), np.uint64(30), np.uint64(31), np.uint64(40), np.uint64(0xFFFFFF)
+_COS, _SIN = (tuple(np.float32(value) for value in each) for each in (COS, SIN))
+_UNIT, _TINY = np.float32(2.0**-24), np.finfo(np.float32).tiny
+_MINUS_TWO_LN2 = np.float32(-2 * np.log(2))
+_ROWS = 256  # rows per unit of parallel work; the noise of a row depends only on its position
 
 
 @inline
@@ -62,17 +56,10 @@ def _uniforms(seed, pair, radius, angle):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _cosine(t):  # type: ignore[no-untyped-def]
-    value = simd.fma(simd.broadcast(_C0), t, simd.broadcast(_C1))
-    value = simd.fma(simd.fma(value, t, simd.broadcast(_C2)), t, simd.broadcast(_C3))
-    return simd.fma(simd.fma(value, t, simd.broadcast(_C4)), t, simd.broadcast(_C5))
-
-
-@inline
-def _sine(t):  # type: ignore[no-untyped-def]
-    value = simd.fma(simd.broadcast(_S0), t, simd.broadcast(_S1))
-    value = simd.fma(simd.fma(value, t, simd.broadcast(_S2)), t, simd.broadcast(_S3))
-    return simd.fma(simd.fma(value, t, simd.broadcast(_S4)), t, simd.broadcast(_S5))
+def _polynomial(c, t):  # type: ignore[no-untyped-def]
+    value = simd.fma(simd.broadcast(c[0]), t, simd.broadcast(c[1]))
+    value = simd.fma(simd.fma(value, t, simd.broadcast(c[2])), t, simd.broadcast(c[3]))
+    return simd.fma(simd.fma(value, t, simd.broadcast(c[4])), t, simd.broadcast(c[5]))
 
 
 @inline
@@ -85,42 +72,8 @@ def fill_normal(seed, first, count, out, radius, angle):  # type: ignore[no-unty
         _uniforms(seed, (first // 2 + pair) * 16, radius, angle)
         length = simd.vsqrt(simd.log2(simd.load(radius, 0)) * simd.broadcast(_MINUS_TWO_LN2))
         turn = simd.load(angle, 0)
-        simd.store(out, pair * 32, length * _cosine(turn * turn))
-        simd.store(out, pair * 32 + 16, length * (turn * _sine(turn * turn)))
-
-
-@kernel
-def _normal_kernel(seed, out):  # type: ignore[no-untyped-def]
-    vectors = out.size // 16
-    for block in prange((vectors + 63) // 64):
-        radius, angle = np.empty(16, np.float32), np.empty(16, np.float32)
-        first = block * 64
-        fill_normal(seed, first, min(64, vectors - first), out[first * 16 :], radius, angle)
-
-
-def normal_vectors(seed: int, vectors: int) -> NDArray[np.float32]:
-    """The first ``vectors`` (an even number) vectors of 16 standard normal values of a seed, ``[vectors · 16]``.
-
-    Raises:
-        ValueError: ``vectors`` is negative or odd.
-    """
-    if vectors < 0 or vectors % 2:
-        raise ValueError(f"vectors must be even and at least 0, got {vectors}")
-    out = np.empty(vectors * 16, np.float32)
-    thread_count()
-    _normal_kernel(seed, out)
-    return out
-
-
-_ROWS = 256
-"""Rows per unit of parallel work; the noise of a row depends only on its position."""
-_LEAST_PARTS, _MOST_PARTS = 4, 64
-"""Number of parts in which the rows are summed: enough for the threads, few enough that adding them up is cheap."""
-
-_TINY = np.finfo(np.float32).tiny
-
-Floats = NDArray[np.float32]
-Integers = NDArray[np.int64]
+        simd.store(out, pair * 32, length * _polynomial(_COS, turn * turn))
+        simd.store(out, pair * 32 + 16, length * (turn * _polynomial(_SIN, turn * turn)))
 
 
 @inline
@@ -133,42 +86,10 @@ def _copy_in(dim, source, rows, first, count, group):  # type: ignore[no-untyped
 
 
 @inline
-def _block(dim, x, rows, codebook, codes, block):  # type: ignore[no-untyped-def]
-    """First and last row of a block, and how many of its indices are outside the table or the codebook.
-
-    A block with such an index ends where it begins.
-    """
-    begin, stop = block * _ROWS, min(codes.shape[0], (block + 1) * _ROWS)
-    found = count_outside(rows, begin, stop, x.shape[0] // dim)
-    found += count_outside(codes, begin, stop, codebook.shape[0] // dim)
-    return begin, stop if found == 0 else begin, found
-
-
-@inline
-def _part(dim, x, rows, codebook, codes, part, parts):  # type: ignore[no-untyped-def]
-    """The same for a part; the row before its first one says where clearing begins."""
-    begin, stop = codes.shape[0] * part // parts, codes.shape[0] * (part + 1) // parts
+def _outside(dim, x, rows, codebook, codes, begin, stop):  # type: ignore[no-untyped-def]
+    """How many rows and codes are out of range, with the row before the first, which says where clearing begins."""
     found = count_outside(rows, begin - 1, stop, x.shape[0] // dim)
-    found += count_outside(codes, begin, stop, codebook.shape[0] // dim)
-    return begin, stop if found == 0 else begin, found
-
-
-@inline
-def _dots(dim, a, b):  # type: ignore[no-untyped-def]
-    """Dot products of rows with rows, one per lane."""
-    total = simd.broadcast(np.float32(0.0))
-    for j in range(dim):
-        total = simd.fma(simd.load(a, 16 * j), simd.load(b, 16 * j), total)
-    return total
-
-
-@inline
-def _residuals_squared(dim, rows, chosen):  # type: ignore[no-untyped-def]
-    total = simd.broadcast(np.float32(0.0))
-    for j in range(dim):
-        residual = simd.load(rows, 16 * j) - simd.load(chosen, 16 * j)
-        total = simd.fma(residual, residual, total)
-    return total
+    return found + count_outside(codes, begin, stop, codebook.shape[0] // dim)
 
 
 @inline
@@ -192,18 +113,6 @@ def _dot_difference(dim, g, at_g, a, at_a, b, at_b, keep):  # type: ignore[no-un
 
 
 @inline
-def _residual_squared(dim, x, at, codebook, code, keep):  # type: ignore[no-untyped-def]
-    total = simd.broadcast(np.float32(0.0))
-    for j in range(0, dim // 16 * 16, 16):
-        residual = simd.load(x, at + j) - simd.load(codebook, code + j)
-        total = simd.fma(residual, residual, total)
-    if dim % 16:
-        residual = (simd.load(x, at + dim - 16) - simd.load(codebook, code + dim - 16)) * simd.load(keep, 0)
-        total = simd.fma(residual, residual, total)
-    return simd.lane_sum(total)
-
-
-@inline
 def _inverse(squared):  # type: ignore[no-untyped-def]
     return np.float32(1.0) / squared if squared > _TINY else np.float32(0.0)
 
@@ -212,16 +121,17 @@ def _short_forward(dim: int) -> Any:
     def forward(seed, aim, spread, x, rows, codebook, codes, out):  # type: ignore[no-untyped-def]
         count, missing = codes.shape[0], 0
         for block in prange((count + _ROWS - 1) // _ROWS):
-            begin, stop, found = _block(dim, x, rows, codebook, codes, block)
+            begin, stop = block * _ROWS, min(count, (block + 1) * _ROWS)
+            found = _outside(dim, x, rows, codebook, codes, begin, stop)
             missing += found
             noise, radius, angle = np.empty(_ROWS * dim, np.float32), np.empty(16, np.float32), np.empty(16, np.float32)
             values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
-            fill_normal(seed, block * _ROWS // 16 * dim, _ROWS // 16 * dim, noise, radius, angle)
-            for first in range(begin, stop, 16):
+            fill_normal(seed, begin // 16 * dim, _ROWS // 16 * dim, noise, radius, angle)
+            for first in range(begin, stop if found == 0 else begin, 16):
                 valid = min(16, count - first)
                 _copy_in(dim, x, rows, first, valid, values)
                 _copy_in(dim, codebook, codes, first, valid, chosen)
-                at = (first - block * _ROWS) * dim
+                at = (first - begin) * dim
                 error, squared = simd.broadcast(np.float32(0.0)), simd.broadcast(np.float32(0.0))
                 for j in range(dim):
                     residual = simd.load(chosen, 16 * j) - simd.load(values, 16 * j)
@@ -249,12 +159,13 @@ def _long_forward(dim: int) -> Any:
     def forward(seed, aim, spread, x, rows, codebook, codes, out):  # type: ignore[no-untyped-def]
         count, missing = codes.shape[0], 0
         for block in prange((count + _ROWS - 1) // _ROWS):
-            begin, stop, found = _block(dim, x, rows, codebook, codes, block)
+            begin, stop = block * _ROWS, min(count, (block + 1) * _ROWS)
+            found = _outside(dim, x, rows, codebook, codes, begin, stop)
             missing += found
             radius, angle, keep = np.empty(16, np.float32), np.empty(16, np.float32), np.ones(16, np.float32)
             keep[: vectors * 16 - dim] = 0
             noise, direction = np.empty(2 * vectors * 16, np.float32), np.empty(vectors * 16, np.float32)
-            for i in range(begin, stop):
+            for i in range(begin, stop if found == 0 else begin):
                 start = i % 2 * vectors * 16
                 if start == 0:
                     fill_normal(seed, i * vectors, 2 * vectors, noise, radius, angle)
@@ -289,9 +200,10 @@ def _short_backward(dim: int) -> Any:
             moved, slope = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
             total = sums[part]
             clear(total, 0, total.shape[0])
-            begin, stop, found = _part(dim, x, rows, codebook, codes, part, parts)
+            begin, stop = count * part // parts, count * (part + 1) // parts
+            found = _outside(dim, x, rows, codebook, codes, begin, stop)
             missing += found
-            for first in range(begin, stop, 16):
+            for first in range(begin, stop if found == 0 else begin, 16):
                 valid = min(16, stop - first)
                 _copy_in(dim, x, rows, first, valid, values)
                 _copy_in(dim, codebook, codes, first, valid, chosen)
@@ -299,9 +211,13 @@ def _short_backward(dim: int) -> Any:
                     for j in range(dim):
                         simd.put(moved, j * 16 + lane, simd.get(out, (first + lane) * dim + j))
                         simd.put(slope, j * 16 + lane, simd.get(grad, (first + lane) * dim + j))
+                dots, squared = simd.broadcast(np.float32(0.0)), simd.broadcast(np.float32(0.0))
                 for j in range(dim):
-                    simd.store(moved, 16 * j, simd.load(moved, 16 * j) - simd.load(values, 16 * j))
-                scale = _dots(dim, slope, moved) * _inverses(_residuals_squared(dim, values, chosen))
+                    value = simd.load(values, 16 * j)
+                    dots = simd.fma(simd.load(slope, 16 * j), simd.load(moved, 16 * j) - value, dots)
+                    residual = value - simd.load(chosen, 16 * j)
+                    squared = simd.fma(residual, residual, squared)
+                scale = dots * _inverses(squared)
                 for j in range(dim):
                     radial = scale * (simd.load(values, 16 * j) - simd.load(chosen, 16 * j))
                     simd.store(chosen, 16 * j, radial)
@@ -330,12 +246,13 @@ def _long_backward(dim: int) -> Any:
             keep[: vectors * 16 - dim] = 0
             total = sums[part]
             clear(total, 0, total.shape[0])
-            begin, stop, found = _part(dim, x, rows, codebook, codes, part, parts)
+            begin, stop = count * part // parts, count * (part + 1) // parts
+            found = _outside(dim, x, rows, codebook, codes, begin, stop)
             missing += found
-            for i in range(begin, stop):
+            for i in range(begin, stop if found == 0 else begin):
                 at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
                 scale = _dot_difference(dim, grad, i * dim, out, i * dim, x, at, keep)
-                scale *= _inverse(_residual_squared(dim, x, at, codebook, code, keep))
+                scale *= _inverse(simd.lane_sum(squares(dim, x, at, codebook, code, keep)))
                 clear_between(rows, i, dim, grad_x)
                 # The last two vectors overlap, so the last sums are read before any are written.
                 last = simd.load(total, code + dim - 16)
@@ -358,61 +275,51 @@ def _kernels(dim: int) -> tuple[Any, Any]:
     return (_short_forward(dim), _short_backward(dim)) if dim < 16 else (_long_forward(dim), _long_backward(dim))
 
 
-@kernel
-def _add_parts(sums, total):  # type: ignore[no-untyped-def]
-    """Add the sums of the parts in order."""
-    parts, size = sums.shape
-    for block in prange((size + 1023) // 1024):
-        for i in range(block * 1024, min(size, (block + 1) * 1024)):
-            value = sums[0, i]
-            for part in range(1, parts):
-                value += sums[part, i]
-            total[i] = value
-
-
 def substitute(
-    seed: int, x: Floats, rows: Integers, codebook: Floats, codes: Integers, *, aim: float = 0.0, spread: float = 1.0
-) -> Floats:
+    seed: int, x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor, *, aim: float = 0.0, spread: float = 1.0
+) -> Tensor:
     """``x + ‖x − c‖·d/‖d‖`` with ``d = aim·(c − x) + spread·v``, v ~ N(0, I), for some rows of a table, ``[V, D]``.
 
     Args:
         seed: 63 random bits; v is a function of them and of the position in ``rows``.
-        x: Table ``[N, D]``.
-        rows: Which rows of it, ``[V]``.
+        x: Contiguous float32 table ``[N, D]`` on the CPU, as are all tensors here.
+        rows: Which rows of it, ``[V]`` int64.
         codebook: Codes ``[K, D]``.
-        codes: Code of each chosen row, ``[V]``.
+        codes: Code of each chosen row, ``[V]`` int64.
         aim: Weight of the residual c − x in the direction d.
         spread: Weight of the noise in d.
 
     Raises:
-        ValueError: The arrays do not fit together, one is not contiguous, or a row or code is out of range.
+        ValueError: The tensors do not fit together, one is not contiguous, or a row or code is out of range.
         TypeError: A dtype is wrong.
     """
-    _check(x, rows, codebook, codes)
-    out = recycled((len(rows), x.shape[1])).numpy()
+    inputs = _checked(x, rows, codebook, codes)
+    out = recycled((len(rows), x.shape[1]))
     thread_count()
-    flat = x.ravel(), rows, codebook.ravel(), codes, out.ravel()
-    if _kernels(x.shape[1])[0](seed, np.float32(aim), np.float32(spread), *flat):
+    if _kernels(x.shape[1])[0](seed, np.float32(aim), np.float32(spread), *inputs, out.numpy().reshape(-1)):
         raise _missing(x, rows, codebook, codes)
     return out
 
 
-def _check(x: Floats, rows: Integers, codebook: Floats, codes: Integers) -> None:
-    check_table("x", x)
-    check_array("rows", rows, (rows.size,), INT64)
-    check_array("codebook", codebook, (len(codebook), x.shape[1]), FLOAT32)
-    check_array("codes", codes, (len(rows),), INT64)
+def _checked(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor) -> tuple[Array, ...]:
+    """The memory of the tensors."""
+    return (
+        flat_checked("x", x, (len(x), codebook.shape[-1])),
+        flat_checked("rows", rows, (rows.numel(),), INT64),
+        flat_checked("codebook", codebook, (len(codebook), x.shape[1])),
+        flat_checked("codes", codes, (len(rows),), INT64),
+    )
 
 
-def _missing(x: Floats, rows: Integers, codebook: Floats, codes: Integers) -> ValueError:
+def _missing(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor) -> ValueError:
     """The error for a row or a code that is out of range."""
     wrong_row = bool(((rows < 0) | (rows >= len(x))).any())
-    return outside("rows", rows, len(x)) if wrong_row else outside("codes", codes, len(codebook))
+    return outside("rows", rows.numpy(), len(x)) if wrong_row else outside("codes", codes.numpy(), len(codebook))
 
 
 def substitute_backward(
-    grad: Floats, x: Floats, rows: Integers, codebook: Floats, codes: Integers, out: Floats
-) -> tuple[Floats, Floats]:
+    grad: Tensor, x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor, out: Tensor
+) -> tuple[Tensor, Tensor]:
     """Gradients of ``x [N, D]`` and ``codebook [K, D]`` from that of the result, ``grad [V, D]``.
 
     ``out [V, D]`` is the result of :func:`substitute`; ``rows [V]`` must be ascending and distinct here.
@@ -421,15 +328,16 @@ def substitute_backward(
         ValueError: As for :func:`substitute`.
         TypeError: A dtype is wrong.
     """
-    _check(x, rows, codebook, codes)
-    for name, table in (("grad", grad), ("out", out)):
-        check_array(name, table, (len(rows), x.shape[1]), FLOAT32)
-    grad_x, grad_codebook = recycled(x.shape).numpy(), recycled(codebook.shape).numpy()
-    parts = max(_LEAST_PARTS, min(_MOST_PARTS, len(rows) // (4 * len(codebook))))
-    sums = recycled((parts, codebook.size)).numpy()
+    inputs = _checked(x, rows, codebook, codes)
+    slope, moved = (
+        flat_checked(name, table, (len(rows), x.shape[1])) for name, table in (("grad", grad), ("out", out))
+    )
+    grad_x, grad_codebook = recycled(x.shape), recycled(codebook.shape)
+    # Enough parts for the threads, few enough that adding them up is cheap.
+    parts = max(4, min(64, len(rows) // (4 * len(codebook))))
+    sums = recycled((parts, codebook.numel())).numpy()
     thread_count()
-    flat = grad.ravel(), x.ravel(), rows, codebook.ravel(), codes, out.ravel()
-    if _kernels(x.shape[1])[1](*flat, grad_x.ravel(), sums):
+    if _kernels(x.shape[1])[1](slope, *inputs, moved, grad_x.numpy().reshape(-1), sums):
         raise _missing(x, rows, codebook, codes)
-    _add_parts(sums, grad_codebook.ravel())
+    np.add.reduce(sums, axis=0, out=grad_codebook.numpy().reshape(-1))
     return grad_x, grad_codebook

@@ -177,7 +177,7 @@ class NearestTracker:
         x, codebook = x.detach().contiguous(), codebook.detach().contiguous()
         chosen = torch.arange(len(x), device=x.device) if rows is None else rows.contiguous()
         if kernels == "cuda":
-            from nsvq_lightning.quantize.cuda.tracking import DeviceTracker
+            from nsvq_lightning.quantize.cuda.search import DeviceTracker
 
             if self._on_device is None or not self._on_device.fits(codebook):
                 self._on_device = DeviceTracker(len(codebook), codebook.shape[1], codebook.device)
@@ -199,8 +199,8 @@ class NearestTracker:
             self._snapshot, self._memory = codebook.copy(), Memory.empty(0, dim)
         new = count - len(self._memory.last)
         if new > 0:
-            both = zip(self._memory, Memory.empty(new, dim), strict=True)
-            self._memory = Memory(*(np.append(old, more, 0) for old, more in both))
+            tables: Any = zip(self._memory, Memory.empty(new, dim), strict=True)
+            self._memory = Memory(*map(np.concatenate, tables))
             if dim > MAX_DIM:
                 self._lists = np.append(self._lists, np.zeros((new, LIST), np.int32), 0)
                 self._limits = np.append(self._limits, np.full(new, -np.inf))

@@ -31,8 +31,7 @@ def test_against_the_oracle(cases: str) -> None:
 
 
 BINNING, BLEND, PROJECTION = (f"rendering.cuda.{name}" for name in ("binning", "blend", "projection"))
-NEAREST, TRACKING = "quantize.cuda.nearest", "quantize.cuda.tracking"
-SUMS, SUBSTITUTION = (f"quantize.cuda.{name}" for name in ("sums", "substitution"))
+SEARCH, SUBSTITUTION = (f"quantize.cuda.{name}" for name in ("search", "substitution"))
 
 
 REGISTERS = {
@@ -55,7 +54,6 @@ REGISTERS = {
     "search_kernel": 232,
     "substitute_kernel": 96,
     "radial_kernel": 96,
-    "normal_kernel": 64,
     "part_kernel": 128,
     "sum_kernel": 48,
 }
@@ -69,7 +67,7 @@ REGISTERS = {
         pytest.param(["project_0", "project_3", "project_backward_0", "project_backward_3"], marks=pytest.mark.slow),
         pytest.param(["tiles", "blend", "blend_backward_all", "loss", "loss_of_one_row"], marks=pytest.mark.slow),
         pytest.param(["nearest_3", "nearest_45", "search_3"], marks=pytest.mark.slow),
-        pytest.param(["substitute_45", "normal", "sums_3", "sums_45"], marks=pytest.mark.slow),
+        pytest.param(["substitute_45", "sums_3", "sums_45"], marks=pytest.mark.slow),
     ],
 )
 def test_kernels_compile_as_they_are_launched(cases: list[str]) -> None:
@@ -100,11 +98,9 @@ def test_no_kernel_is_left_out() -> None:
         (f"{PROJECTION}:project_backward_kernel", {"n"}),
         (f"{BLEND}:total_kernel", {"count"}),
         (f"{BINNING}:expand_kernel", {"total", "count", "halvings"}),
-        (f"{NEAREST}:nearest_kernel", {"count"}),
-        *((f"{TRACKING}:{name}_kernel", {"count"}) for name in ("check", "queue", "search", "snapshot")),
+        *((f"{SEARCH}:{name}_kernel", {"count"}) for name in ("nearest", "check", "queue", "search", "snapshot")),
         (f"{SUBSTITUTION}:substitute_kernel", {"seed", "count", "height"}),
         (f"{SUBSTITUTION}:radial_kernel", {"count", "height"}),
-        (f"{SUBSTITUTION}:normal_kernel", {"seed", "count"}),
     ],
 )
 def test_numbers_that_change_from_step_to_step_compile_once(kernel: str, changing: set[str]) -> None:

@@ -25,10 +25,8 @@ from triton.compiler import ASTSource, make_backend
 from triton.runtime.jit import JITFunction, create_function_from_signature
 
 from nsvq_lightning.quality.loss import photometric_loss
-from nsvq_lightning.quantize.cuda.nearest import nearest_codes
-from nsvq_lightning.quantize.cuda.substitution import normal_vectors
-from nsvq_lightning.quantize.cuda.sums import sum_rows
-from nsvq_lightning.quantize.cuda.tracking import SNAPSHOT_STEPS, DeviceTracker
+from nsvq_lightning.quantize.cuda.search import SNAPSHOT_STEPS, DeviceTracker, nearest_codes
+from nsvq_lightning.quantize.cuda.substitution import sum_rows
 from nsvq_lightning.quantize.nsvq import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.cuda import projection
@@ -122,7 +120,6 @@ CASES: dict[str, Callable[[], object]] = {
     "search_45": lambda: search(45),
     "substitute_3": lambda: substitute(3),
     "substitute_45": lambda: substitute(45),
-    "normal": lambda: normal_vectors(0, SEEN, torch.device("meta")),
     "sums_3": lambda: sums(3, torch.float32),
     "sums_45": lambda: sums(45, torch.float64),
 }

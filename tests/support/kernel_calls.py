@@ -80,11 +80,12 @@ def _codes(count: int = 40, codes: int = 9) -> Any:
 
 
 def _substitution(dim: int) -> dict[str, Any]:
-    return {"x": _normal(70, dim), "rows": _rows(), "codebook": _normal(9, dim, seed=1), "codes": _codes()}
+    rows, codes = torch.from_numpy(_rows()), torch.from_numpy(_codes())
+    return {"x": _tensor(70, dim), "rows": rows, "codebook": _tensor(9, dim, seed=1), "codes": codes}
 
 
 def _gradient(dim: int) -> dict[str, Any]:
-    return _substitution(dim) | {"grad": _normal(40, dim, seed=2), "out": _normal(40, dim, seed=3)}
+    return _substitution(dim) | {"grad": _tensor(40, dim, seed=2), "out": _tensor(40, dim, seed=3)}
 
 
 def _box_search() -> dict[str, Any]:
@@ -188,10 +189,6 @@ def _kept_and_back(function: Callable[..., Any], splats: RawSplats, **arguments:
     return [factors.detach(), *torch.autograd.grad(factors.sum(), leaves[:3])]
 
 
-def _tensors(arrays: dict[str, Any]) -> dict[str, Any]:
-    return {name: torch.from_numpy(array) for name, array in arrays.items()}
-
-
 _Q, _IO, _CPU = "nsvq_lightning.quantize", "nsvq_lightning.io", "nsvq_lightning.rendering.cpu"
 _ROWS, _SSIM = "nsvq_lightning.compute.rows", "nsvq_lightning.quality.ssim"
 
@@ -230,7 +227,6 @@ NUMBA: dict[str, list[Case]] = {
     ],
     f"{_Q}.nearest.cheapest": [Case(_priced, rows=("x", "prices"), types=("x", "codebook"))],
     f"{_Q}.kmeans.distinct_rows": [Case(lambda: {"x": _tensor(70, 3)}, rows=("x",), columns=("x",), types=("x",))],
-    f"{_Q}.substitution.normal_vectors": [Case(lambda: {"seed": 5, "vectors": 4})],
     f"{_Q}.scores.score_search": [
         Case(
             lambda: {"x": _normal(70, 12), "codebook": _normal(50, 12, seed=1), "with_lists": True},
@@ -243,13 +239,6 @@ NUMBA: dict[str, list[Case]] = {
     ],
     f"{_Q}.substitution.substitute_backward": [
         Case(lambda dim=dim: _gradient(dim), rows=("x", "codebook"), numbers=("rows", "codes")) for dim in (3, 20)
-    ],
-    f"{_Q}.kmeans.count_hits": [
-        Case(
-            lambda: {"codes": torch.from_numpy(_codes()), "usage": torch.zeros(9, dtype=torch.int64)},
-            rows=("codes", "usage"),
-            numbers=("codes",),
-        )
     ],
     f"{_Q}.kmeans.sum_by_code": [
         Case(
@@ -293,8 +282,7 @@ NUMBA: dict[str, list[Case]] = {
 SCALAR = [
     name
     for name in NUMBA
-    if name.startswith(_IO)
-    or name.rpartition(".")[2] in ("sort_into_leaves", "count_hits", "distinct_rows", "sum_by_code")
+    if name.startswith(_IO) or name.rpartition(".")[2] in ("sort_into_leaves", "distinct_rows", "sum_by_code")
 ]
 """Entry points whose kernels index arrays as Python does, so that Numba can check the bounds."""
 
@@ -385,7 +373,7 @@ def _pairs() -> dict[str, Any]:
 
 
 def _search_on_device(function: Callable[..., Any], **arguments: Any) -> Any:
-    from nsvq_lightning.quantize.cuda.tracking import DeviceTracker
+    from nsvq_lightning.quantize.cuda.search import DeviceTracker
 
     return function(DeviceTracker(9, 3, torch.device("cpu")), **arguments)
 
@@ -401,10 +389,10 @@ TRITON: dict[str, list[Case]] = {
     ],
     f"{_CUDA}.projection.project_radii": [Case(lambda: {"lens": _lens(), "splats": _splats()}, call=_by_attribute)],
     f"{_CUDA}.projection.project_backward": [Case(_projection_backward, call=_by_attribute)],
-    f"{_Q}.cuda.nearest.nearest_codes": [
+    f"{_Q}.cuda.search.nearest_codes": [
         Case(lambda: {"x": _tensor(20, 3), "codebook": _tensor(9, 3, seed=1)}, rows=("x", "codebook"))
     ],
-    f"{_Q}.cuda.tracking.DeviceTracker.search": [
+    f"{_Q}.cuda.search.DeviceTracker.search": [
         Case(
             lambda: {
                 "x": _tensor(20, 3), "codebook": _tensor(9, 3, seed=1), "rows": torch.tensor([0, 2, 3, 9])
@@ -413,14 +401,13 @@ TRITON: dict[str, list[Case]] = {
             call=_search_on_device,
         )
     ],
-    f"{_Q}.cuda.substitution.normal_vectors": [Case(lambda: {"seed": 5, "vectors": 4, "device": torch.device("cpu")})],
     f"{_Q}.cuda.substitution.substitute": [
-        Case(lambda dim=dim: {"seed": 5} | _tensors(_substitution(dim)), rows=("x", "codebook")) for dim in (3, 20)
+        Case(lambda dim=dim: {"seed": 5} | _substitution(dim), rows=("x", "codebook")) for dim in (3, 20)
     ],
     f"{_Q}.cuda.substitution.substitute_backward": [
-        Case(lambda dim=dim: _tensors(_gradient(dim)), rows=("x", "codebook")) for dim in (3, 20)
+        Case(lambda dim=dim: _gradient(dim), rows=("x", "codebook")) for dim in (3, 20)
     ],
-    f"{_Q}.cuda.sums.sum_rows": [
+    f"{_Q}.cuda.substitution.sum_rows": [
         Case(
             lambda: {
                 "values": _tensor(40, 5), "codes": torch.from_numpy(_codes()), "num_codes": 9, "dtype": torch.float32

@@ -1,5 +1,7 @@
 """Error substitution on a GPU: gather, residual, noise and result of a row in one pass, gradients in another.
 
+Sums of rows by code have one fixed order: rows are sorted by code, and some programs add up one code's.
+
 As on the CPU, the backward pass takes the direction from the result, not from a second draw: with x̃ - x = ‖r‖ d̂ the
 radial term (g·d̂) r/‖r‖ is (g·(x̃ - x)) r/‖r‖². The noise of a row is that of the CPU kernel:
 the integers are the same, and the arithmetic after them is the same sequence of roundings, polynomials included.
@@ -13,21 +15,26 @@ import torch
 import triton
 import triton.language as tl
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quantize import substitution
-from nsvq_lightning.quantize.cuda.sums import sum_rows
 
 GOLDEN, FIRST, SECOND = (tl.constexpr(value) for value in substitution.MULTIPLIERS)
 C0, C1, C2, C3, C4, C5 = (tl.constexpr(value) for value in substitution.COS)
 S0, S1, S2, S3, S4, S5 = (tl.constexpr(value) for value in substitution.SIN)
 UNIT = tl.constexpr(2.0**-24)
 MINUS_TWO_LN2 = tl.constexpr(-2 * math.log(2))
-SPLIT = tl.constexpr(0x3F3504F3)
-"""Bits of 1/√2: a mantissa lies in [1/√2, √2)."""
+SPLIT = tl.constexpr(0x3F3504F3)  # bits of 1/√2: a mantissa lies in [1/√2, √2)
 TWO_LOG2_E = tl.constexpr(2 / math.log(2))
 L0, L1, L2, L3, L4 = (tl.constexpr(1 / odd) for odd in (11, 9, 7, 5, 3))
+TINY = tl.constexpr(torch.finfo(torch.float32).tiny)
+BLOCK = 1024  # elements per program of a substitution
+ROWS = 16  # rows of a code that are added up side by side
+WIDTH = 64  # largest number of columns per program of a sum
+PARTS = 8  # most programs that share the rows of one code, so that one of very many is no long tail; a power of two
+PART = 256  # fewest rows of a part, but for the last one
 
 
 @triton.jit
@@ -68,27 +75,6 @@ def normal(seed, vector, lane):
     value = tl.fma(tl.fma(value, t, tl.where(even, C2, S2)), t, tl.where(even, C3, S3))
     value = tl.fma(tl.fma(value, t, tl.where(even, C4, S4)), t, tl.where(even, C5, S5))
     return length * tl.where(even, value, turn * value)
-
-
-@triton.jit(do_not_specialize=["seed", "count"])
-def normal_kernel(seed, out, count, BLOCK: tl.constexpr):
-    """The first ``count`` values of a seed."""
-    at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    tl.store(out + at, normal(seed, at // 16, (at % 16).to(tl.int32)), mask=at < count)
-
-
-def normal_vectors(seed: int, vectors: int, device: torch.device) -> Tensor:
-    """The first ``vectors`` vectors of 16 standard normal values of a seed, ``[vectors · 16]``."""
-    out = torch.empty(vectors * 16, device=device)
-    if vectors:
-        with torch.cuda.device_of(out):
-            normal_kernel[(triton.cdiv(vectors * 16, BLOCK),)](seed, out, vectors * 16, BLOCK=BLOCK, **COMPILE)
-    return out
-
-
-BLOCK = 1024
-"""Elements per program."""
-TINY = tl.constexpr(torch.finfo(torch.float32).tiny)
 
 
 @triton.jit
@@ -220,3 +206,100 @@ def substitute_backward(
                 **COMPILE,
             )  # fmt: skip
     return grad_x, sum_rows(radials, codes, len(codebook), x.dtype)
+
+
+@triton.jit
+def part_size(begin, end, PARTS: tl.constexpr, PART: tl.constexpr):
+    """Rows in a part of a code's rows ``begin`` to ``end``."""
+    return tl.maximum(tl.cdiv(end - begin, PARTS), PART)
+
+
+@triton.jit
+def part_kernel(
+    values, order, offsets, partial, dim, PARTS: tl.constexpr, PART: tl.constexpr, ROWS: tl.constexpr,
+    WIDTH: tl.constexpr,
+):  # fmt: skip
+    """Sum a part of a code's rows ``order[offsets[code]:offsets[code + 1]]`` in the dtype of ``partial``."""
+    program = tl.program_id(0).to(tl.int64)
+    code, part = program // PARTS, (program % PARTS).to(tl.int32)
+    column = tl.program_id(1) * WIDTH + tl.arange(0, WIDTH)[None, :]
+    begin, end = tl.load(offsets + code), tl.load(offsets + code + 1)
+    size = part_size(begin, end, PARTS, PART)
+    first = begin + part * size
+    last = tl.minimum(first + size, end)
+    if first < last:
+        total = tl.zeros([ROWS, WIDTH], partial.dtype.element_ty)
+        for start in range(first, last, ROWS):
+            place = start + tl.arange(0, ROWS)[:, None]
+            row = tl.load(order + place, mask=place < last, other=0)
+            value = tl.load(values + row * dim + column, mask=(place < last) & (column < dim), other=0.0)
+            total += value.to(partial.dtype.element_ty)
+        lane = tl.program_id(1) * WIDTH + tl.arange(0, WIDTH)
+        tl.store(partial + program * dim + lane, tl.sum(total, 0), mask=lane < dim)
+
+
+@triton.jit
+def sum_kernel(
+    partial, offsets, sums, dim, PARTS: tl.constexpr, PART: tl.constexpr, WIDTH: tl.constexpr
+):  # fmt: skip
+    """Sum the parts of a code; 0 for a code without rows."""
+    code = tl.program_id(0).to(tl.int64)
+    column = tl.program_id(1) * WIDTH + tl.arange(0, WIDTH)
+    begin, end = tl.load(offsets + code), tl.load(offsets + code + 1)
+    part = tl.arange(0, PARTS)[:, None]
+    there = (part * part_size(begin, end, PARTS, PART) < end - begin) & (column < dim)[None, :]
+    total = tl.load(partial + (code * PARTS + part) * dim + column[None, :], mask=there, other=0.0)
+    tl.store(sums + code * dim + column, tl.sum(total, 0), mask=column < dim)
+
+
+def sorted_by_code(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:
+    """Rows ``[N]`` int64, stably sorted by code, and where each code begins ``[K + 1]`` int32."""
+    # 16-bit keys take a quarter of the sorting passes of 64-bit ones.
+    key = torch.int16 if num_codes < 2**15 else torch.int32
+    keys, order = codes.to(key).sort(stable=True)
+    starts = torch.searchsorted(keys, torch.arange(num_codes + 1, dtype=key, device=codes.device), out_int32=True)
+    return order, starts
+
+
+_sorted = WeakTensorKeyDictionary()
+"""Rows by code of codes that still exist, after the version of these codes and how many there may be."""
+
+
+def _remembered(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:
+    """:func:`sorted_by_code`, once for codes that stay the same, as frozen ones do."""
+    version, count, *found = _sorted.get(codes, (-1, -1))
+    if (version, count) != (codes._version, num_codes):
+        found = list(sorted_by_code(codes, num_codes))
+        _sorted[codes] = codes._version, num_codes, found[0], found[1]
+    return found[0], found[1]
+
+
+def sum_rows(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype) -> Tensor:
+    """Sums ``[K, D]`` of the rows of each code, 0 for a code without rows; nothing is read back from the device.
+
+    Args:
+        values: Contiguous rows ``[N, D]`` on a CUDA device.
+        codes: Codes ``[N]`` int64 in [0, K).
+        num_codes: K.
+        dtype: Dtype of the sums and of their accumulation.
+
+    Raises:
+        ValueError: The values are not ``[N, D]`` or not contiguous, or there is not one code per row.
+        TypeError: A dtype is wrong.
+    """
+    check_tensor("values", values, (len(values), values.shape[-1]), values.device, values.dtype)
+    check_tensor("codes", codes, (len(values),), values.device, torch.int64)
+    order, offsets = _remembered(codes, num_codes)
+    dim = values.shape[1]
+    width = min(WIDTH, triton.next_power_of_2(dim))
+    columns = triton.cdiv(dim, width)
+    partial = torch.empty(num_codes * PARTS, dim, dtype=dtype, device=values.device)
+    sums = torch.empty(num_codes, dim, dtype=dtype, device=values.device)
+    with torch.cuda.device_of(values):
+        part_kernel[(num_codes * PARTS, columns)](
+            values, order, offsets, partial, dim, PARTS=PARTS, PART=PART, ROWS=ROWS, WIDTH=width, num_warps=1, **COMPILE
+        )
+        sum_kernel[(num_codes, columns)](
+            partial, offsets, sums, dim, PARTS=PARTS, PART=PART, WIDTH=width, num_warps=1, **COMPILE
+        )
+    return sums
