@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 import nsvq_lightning
 from nsvq_lightning.protocols import missing_members
-from nsvq_lightning.quantize import NSVQ, PostHoc, StraightThrough
+from nsvq_lightning.quantize import NSVQ, DiVeQ, PostHoc, StraightThrough, TrainedStraightThrough
 from nsvq_lightning.quantize.base import Quantizer, as_quantizer, is_mendable, is_refittable
 
 
@@ -55,7 +55,8 @@ def test_a_codebook_that_nothing_trains_is_refused() -> None:
 
 
 def test_what_quantizers_offer_beyond() -> None:
-    assert [is_refittable(q(4, 3)) for q in (NSVQ, StraightThrough, PostHoc)] == [False, True, False]
+    for kind in (NSVQ, DiVeQ, StraightThrough, TrainedStraightThrough, PostHoc):
+        assert is_refittable(as_quantizer(kind(4, 3))) == (kind is StraightThrough)
     assert is_mendable(NSVQ(4, 3))
     assert not is_mendable(nn.Linear(2, 2))
 

@@ -1,3 +1,5 @@
+"""Noise substitution, as NSVQ and DiVeQ use it: values, gradients in closed form, and the noise itself."""
+
 from __future__ import annotations
 
 from typing import Any
@@ -8,12 +10,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from nsvq_lightning.quantize import NSVQ, nearest, substitution
+from nsvq_lightning.quantize import NSVQ, CodebookQuantizer, DiVeQ, nearest, substitution
 from nsvq_lightning.quantize.nsvq import noise_substitution
 from nsvq_lightning.quantize.substitution import fill_normal, substitute, substitute_backward
 from nsvq_lightning.random import generator
 
 DIMS = [4, 9, 45, *(pytest.param(dim, marks=pytest.mark.slow) for dim in (1, 16))]
+KINDS = pytest.mark.parametrize(("aim", "spread"), [(0.0, 1.0), (1.0, 0.1), (1.0, 0.0)])
+DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 
 
 def problem(dim: int, dtype: torch.dtype = torch.float32, count: int = 523) -> tuple[Tensor, Tensor, Tensor]:
@@ -23,42 +27,50 @@ def problem(dim: int, dtype: torch.dtype = torch.float32, count: int = 523) -> t
     return x.requires_grad_(), codebook.requires_grad_(), nearest(x, codebook)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@KINDS
+@DTYPES
 @pytest.mark.parametrize("dim", DIMS)
-def test_error_has_the_length_of_the_quantization_error(dim: int, dtype: torch.dtype) -> None:
+def test_error_has_the_length_of_the_quantization_error(
+    dim: int, dtype: torch.dtype, aim: float, spread: float
+) -> None:
     x, codebook, codes = problem(dim, dtype)
     with torch.no_grad():
-        x_q = noise_substitution(x, codebook, codes, generator(1))
+        x_q = noise_substitution(x, codebook, codes, generator(1), aim=aim, spread=spread)
         expected = (x.double() - codebook[codes].double()).norm(dim=1)
     rounding = 4 * torch.finfo(dtype).eps
     difference = (x_q.double() - x.double()).norm(dim=1) - expected
     assert bool((difference.abs() <= rounding * (expected + x.double().norm(dim=1))).all())
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@KINDS
+@DTYPES
 @pytest.mark.parametrize("dim", DIMS)
-def test_gradients_equal_autograd_of_the_formula(dim: int, dtype: torch.dtype) -> None:
+def test_gradients_equal_autograd_of_the_formula(dim: int, dtype: torch.dtype, aim: float, spread: float) -> None:
+    """The direction is recovered from the result, or known if there is no noise in it."""
     x, codebook, codes = problem(dim, dtype)
     grad = torch.randn(x.shape, generator=generator(2), dtype=torch.float64)
-    x_q = noise_substitution(x, codebook, codes, generator(1))
+    x_q = noise_substitution(x, codebook, codes, generator(1), aim=aim, spread=spread)
     x_q.backward(grad.to(dtype))
-    x_wide = x.detach().double().requires_grad_()
-    book_wide = codebook.detach().double().requires_grad_()
-    noise = (x_q - x).detach().double()
-    length = (x_wide - book_wide[codes]).norm(dim=1, keepdim=True)
-    (x_wide + length * noise / noise.norm(dim=1, keepdim=True)).backward(grad)
-    # The direction is recovered from x_q - x, which rounding spoils where x is near its code.
+    x_wide, book_wide = (tensor.detach().double().requires_grad_() for tensor in (x, codebook))
+    residual = book_wide[codes] - x_wide
+    length = residual.norm(dim=1, keepdim=True)
+    moved = residual.detach() if spread == 0 else (x_q - x).detach().double()
+    expected = x_wide + length * moved / moved.norm(dim=1, keepdim=True)
+    torch.testing.assert_close(x_q.detach().double(), expected.detach(), rtol=1e-5, atol=1e-5)
+    expected.backward(grad)
+    # Rounding spoils the direction where x is near its code.
     tolerance = 1e-10 if dtype == torch.float64 else 2e-3 if dim == 1 else 2e-4
-    for found, expected in ((x.grad, x_wide.grad), (codebook.grad, book_wide.grad)):
+    for found, wide in ((x.grad, x_wide.grad), (codebook.grad, book_wide.grad)):
         assert found is not None
-        torch.testing.assert_close(found.double(), expected, rtol=tolerance, atol=tolerance)
+        torch.testing.assert_close(found.double(), wide, rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@KINDS
+@DTYPES
 @pytest.mark.parametrize("dim", DIMS)
 @pytest.mark.parametrize("chosen", [[0, 3, 4, 522], [7], list(range(523)), list(range(1, 500, 2)), []])
 def test_rows_of_a_table_are_those_rows_and_the_others_get_no_gradient(
-    dim: int, dtype: torch.dtype, chosen: list[int], monkeypatch: pytest.MonkeyPatch
+    dim: int, dtype: torch.dtype, chosen: list[int], aim: float, spread: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(substitution, "recycled", lambda shape: torch.full(shape, torch.nan))
     x, codebook, codes = problem(dim, dtype)
@@ -67,11 +79,10 @@ def test_rows_of_a_table_are_those_rows_and_the_others_get_no_gradient(
     results = []
     for table, which in ((x, rows), (x.detach()[rows].requires_grad_(), None)):
         codebook.grad = None
-        x_q = noise_substitution(table, codebook, codes[rows], generator(1), which)
+        x_q = noise_substitution(table, codebook, codes[rows], generator(1), which, aim=aim, spread=spread)
         x_q.backward(weight)
         results.append((x_q.detach(), table.grad, codebook.grad))
     (x_q, grad, book), (expected_q, expected_grad, expected_book) = results
-    assert grad is not None
     assert torch.equal(x_q, expected_q)
     assert torch.equal(grad, torch.zeros_like(x).index_copy_(0, rows, expected_grad))
     assert torch.equal(book, expected_book)
@@ -81,12 +92,11 @@ def test_rows_of_a_table_are_those_rows_and_the_others_get_no_gradient(
 def test_kernel_gradient_equals_the_plain_formulation(dim: int) -> None:
     """Same directions in both: the float32 kernel against the closed form in float64."""
     x, codebook, codes = (tensor.detach() for tensor in problem(dim))
-    grad = torch.randn(x.shape, generator=generator(2))
-    rows = torch.arange(len(x))
-    unit = substitute(7, torch.zeros_like(x), rows, torch.eye(dim)[:1], torch.zeros_like(rows))
+    grad, rows = torch.randn(x.shape, generator=generator(2)), torch.arange(len(x))
+    v = substitute(7, torch.zeros_like(x), rows, torch.eye(dim)[:1], torch.zeros_like(rows)).double()
     out = substitute(7, x, rows, codebook, codes)
     grad_x, grad_codebook = substitute_backward(grad, x, rows, codebook, codes, out)
-    v, r = unit.double(), x.double() - codebook[codes].double()
+    r = x.double() - codebook[codes].double()
     length = r.norm(dim=1, keepdim=True)
     radial = (grad.double() * v).sum(1, keepdim=True) * r / length
     torch.testing.assert_close(v.norm(dim=1), torch.ones(len(v)).double(), rtol=1e-6, atol=0)
@@ -96,12 +106,13 @@ def test_kernel_gradient_equals_the_plain_formulation(dim: int) -> None:
     torch.testing.assert_close(grad_codebook.double(), expected, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@KINDS
+@DTYPES
 @pytest.mark.parametrize("dim", [3, 45])
-def test_no_error_no_noise_and_no_radial_gradient(dim: int, dtype: torch.dtype) -> None:
+def test_no_error_no_move_and_no_radial_gradient(dim: int, dtype: torch.dtype, aim: float, spread: float) -> None:
     x, codebook, codes = problem(dim, dtype)
     x = codebook.detach()[codes].clone().requires_grad_()
-    x_q = noise_substitution(x, codebook, codes, generator(1))
+    x_q = noise_substitution(x, codebook, codes, generator(1), aim=aim, spread=spread)
     assert torch.equal(x_q, x)
     grad = torch.randn(x.shape, generator=generator(2), dtype=torch.float64).to(dtype)
     x_q.backward(grad)
@@ -116,26 +127,28 @@ def test_gradient_of_a_code_is_zero_on_average() -> None:
     for step in range(50):
         codebook.grad = None
         noise_substitution(x, codebook, codes, generator(0, step)).backward(torch.ones_like(x))
-        total += codebook.grad.abs().sum() * 0 + codebook.grad.sum(0)
+        total += codebook.grad.sum(0)
     assert bool((total.abs() / (50 * 4000) < 4 / (50 * 4000) ** 0.5).all())
 
 
-def test_noise_is_a_function_of_the_generator_alone() -> None:
+@KINDS
+def test_results_are_a_function_of_the_generator_whatever_the_threads(aim: float, spread: float) -> None:
     x, codebook, codes = problem(45)
     before = torch.get_num_threads()
+    results = []
     try:
-        results = []
         for threads in (1, 2):
             torch.set_num_threads(threads)
             codebook.grad = None
-            x_q = noise_substitution(x, codebook, codes, generator(1))
+            x_q = noise_substitution(x, codebook, codes, generator(1), aim=aim, spread=spread)
             x_q.backward(torch.ones_like(x_q))
             results.append(torch.cat((x_q.detach(), codebook.grad)))
     finally:
         torch.set_num_threads(before)
     assert torch.equal(*results)
-    assert not torch.equal(noise_substitution(x, codebook, codes, generator(1, 1)), x_q)
-    first_rows = noise_substitution(x[:300], codebook, codes[:300], generator(1))
+    other = noise_substitution(x, codebook, codes, generator(1, 1), aim=aim, spread=spread)
+    assert torch.equal(other, x_q) == (spread == 0)
+    first_rows = noise_substitution(x[:300], codebook, codes[:300], generator(1), aim=aim, spread=spread)
     assert torch.equal(first_rows, x_q[:300])
 
 
@@ -174,15 +187,58 @@ def test_direction_is_uniform_on_the_sphere() -> None:
         assert float(covariance.abs().max()) < 6 * 2**0.5 / (dim * 20000**0.5)
 
 
-def test_module_in_its_three_states() -> None:
-    x, _, _ = problem(3)
-    x = x.detach()
-    quantizer = NSVQ(64, 3)
+@DTYPES
+@pytest.mark.parametrize("dim", [3, 45])
+def test_direction_is_the_error_plus_noise_of_sigma(dim: int, dtype: torch.dtype) -> None:
+    """Kernel and torch draw other numbers, so moments are compared: across the error, (d/‖d‖)·w ≈ σ v·w / ‖r‖."""
+    sigma, count = 1e-3, 20_000
+    x, code = torch.zeros(count, dim, dtype=dtype), torch.zeros(1, dim, dtype=dtype)
+    code[0, 0] = 0.5
+    codes = torch.zeros(count, dtype=torch.int64)
+    x_q = noise_substitution(x, code, codes, generator(1), aim=1.0, spread=sigma)
+    across = x_q[:, 1:].double() / sigma  # length 0.5 times direction σ v / 0.5
+    assert abs(float(across.mean())) < 4 / across.numel() ** 0.5
+    assert abs(float(across.square().mean()) - 1) < 6 * (2 / across.numel()) ** 0.5
+
+
+@pytest.mark.parametrize("dim", [3, 45])
+def test_with_less_noise_the_value_comes_nearer_to_the_code_and_with_much_it_is_nsvq(dim: int) -> None:
+    x, codebook, codes = (tensor.detach() for tensor in problem(dim))
+    results = [
+        noise_substitution(x, codebook, codes, generator(1), aim=1.0, spread=sigma) for sigma in (1e-1, 1e-3, 1e-5, 1e6)
+    ]
+    distances = [float((x_q - codebook[codes]).norm(dim=1).max()) for x_q in results]
+    assert distances[0] > 50 * distances[1] > 1000 * distances[2]
+    torch.testing.assert_close(results[3], noise_substitution(x, codebook, codes, generator(1)), rtol=1e-3, atol=1e-4)
+
+
+def test_gradient_descent_moves_codes_to_what_is_wanted() -> None:
+    """Rows stand still, the loss wants the codes elsewhere; the gradient of each row is only that along its error."""
+    x = torch.randn(400, 3, generator=generator(0))
+    quantizer = DiVeQ(8, 3)
+    quantizer.fit(x, generator=generator(1))
+    codes = quantizer.encode(x)
+    wanted = quantizer.decode(codes).detach() + torch.tensor([0.3, -0.2, 0.1])
+    losses = []
+    for step in range(100):
+        loss = (quantizer.approximate(x, codes, generator(2, step), None) - wanted).square().mean()
+        (grad,) = torch.autograd.grad(loss, quantizer.codebook)
+        with torch.no_grad():
+            quantizer.codebook -= 2.0 * grad
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.01 * losses[0]
+
+
+@pytest.mark.parametrize("kind", [NSVQ, DiVeQ])
+def test_module_in_its_three_states(kind: type[CodebookQuantizer]) -> None:
+    x = problem(3)[0].detach()
+    quantizer = kind(64, 3)
     quantizer.fit(x, generator=generator(0))
     x_q, codes = quantizer(x, generator(1))
     hard = quantizer.codebook[codes]
     torch.testing.assert_close((x_q - x).norm(dim=1), (hard - x).norm(dim=1), rtol=1e-4, atol=1e-6)
     assert not torch.equal(x_q, hard)
+    assert ((x_q - hard).abs().max() < 0.02) == (kind is DiVeQ)
     quantizer.eval()
     assert torch.equal(quantizer(x)[0], hard)
     quantizer.train()
@@ -195,6 +251,9 @@ def test_module_in_its_three_states() -> None:
         quantizer(x[:5])
 
 
-def test_training_without_a_generator_is_refused() -> None:
+def test_refusals() -> None:
     with pytest.raises(ValueError, match="generator"):
         NSVQ(4, 3)(torch.zeros(2, 3))
+    for sigma in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="sigma must be finite"):
+            DiVeQ(4, 3, sigma=sigma)
