@@ -200,13 +200,11 @@ def _code_distances(dim, codes, leaf, x, row):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _visit_leaf(dim, codes, labels, leaf, x, row, limit, scratch, found):  # type: ignore[no-untyped-def]
-    """Compare the codes of a leaf that are not farther than ``limit``; of equal distances the lower code wins.
-
-    ``found`` holds the smallest distance so far, its code and the distance of the second-nearest code.
-    """
-    best, label, second = found
-    distances = _code_distances(dim, codes, leaf, x, row)
+def _visit_leaf(dim, tree, leaf, x, i, limit, state):  # type: ignore[no-untyped-def]
+    """Compare the codes of a leaf that are not farther than ``limit``; of equal distances the lower code wins."""
+    codes, labels, _, _ = tree
+    best, label, second, _, _, scratch, _ = state
+    distances = _code_distances(dim, codes, leaf, x, i * dim)
     bits = simd.mask_bits(distances <= simd.broadcast(limit))
     if bits != 0:
         simd.store(scratch, 0, distances)
@@ -214,11 +212,13 @@ def _visit_leaf(dim, codes, labels, leaf, x, row, limit, scratch, found):  # typ
             lane = simd.lowest_bit(bits)
             bits &= bits - 1
             distance, code = simd.get(scratch, lane), simd.get(labels, leaf * 16 + lane)
-            if distance < best or (distance == best and code < label):
-                best, label, second = distance, code, best
-            elif distance < second:
-                second = distance
-    return best, label, second
+            smallest = simd.get(best, i)
+            if distance < smallest or (distance == smallest and code < simd.get(label, i)):
+                simd.put(second, i, smallest)
+                simd.put(best, i, distance)
+                simd.put(label, i, code)
+            elif distance < simd.get(second, i):
+                simd.put(second, i, distance)
 
 
 @inline
@@ -256,22 +256,10 @@ def _prove(dim, codebook, x, row, code, memory, travelled):  # type: ignore[no-u
 
 
 @inline
-def _remember(dim, x, at, found, memory, row, travelled):  # type: ignore[no-untyped-def]
-    """Keep where a row was searched and the distance of its second-nearest code."""
-    last, anchors, clearance = memory
-    _, code, second = found
-    simd.put(last, row, code)
-    for j in range(dim):
-        simd.put(anchors, row * dim + j, simd.get(x, at + j))
-    # There may still be codes beyond the largest float32 number.
-    simd.put(clearance, row, np.sqrt(np.float64(min(second, _LARGEST))) / ROUNDING + travelled)
-
-
-@inline
 def _guess(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
     """For each query, find the best code of one near leaf: three passes without unpredictable branches."""
-    codes, labels, leaves, nodes = tree
-    best, label, second, guess, _, scratch, bounded = state
+    codes, _, leaves, nodes = tree
+    best, label, second, guess, _, _, bounded = state
     infinity = np.float32(np.inf)
     for i in range(count):
         simd.put(guess, i, _nearest_node(dim, nodes, x, i * dim))
@@ -286,25 +274,19 @@ def _guess(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
         limit = simd.lane_min(distances)
         if bounded:
             limit = simd.lane_min(simd.select(distances > simd.broadcast(limit), distances, simd.broadcast(infinity)))
-        found = _visit_leaf(dim, codes, labels, leaf, x, i * dim, limit, scratch, (infinity, _NO_CODE, infinity))
-        simd.put(best, i, found[0])
-        simd.put(label, i, found[1])
-        simd.put(second, i, found[2])
+        simd.put(best, i, infinity)
+        simd.put(label, i, _NO_CODE)
+        simd.put(second, i, infinity)
+        _visit_leaf(dim, tree, leaf, x, i, limit, state)
 
 
 @inline
 def _visit_leaves(dim, tree, x, state, pending):  # type: ignore[no-untyped-def]
     """Visit the pending (query, leaf) pairs."""
-    codes, labels, _, _ = tree
-    best, label, second, _, tasks, scratch, bounded = state
+    best, _, second, _, tasks, _, bounded = state
     for t in range(pending):
         i, leaf = simd.get(tasks, 2 * t), simd.get(tasks, 2 * t + 1)
-        found = simd.get(best, i), simd.get(label, i), simd.get(second, i)
-        limit = found[2] if bounded else found[0]
-        found = _visit_leaf(dim, codes, labels, leaf, x, i * dim, limit, scratch, found)
-        simd.put(best, i, found[0])
-        simd.put(label, i, found[1])
-        simd.put(second, i, found[2])
+        _visit_leaf(dim, tree, leaf, x, i, simd.get(second, i) if bounded else simd.get(best, i), state)
 
 
 @inline
@@ -338,7 +320,8 @@ def _search_kernel(dim: int) -> Any:
     """The search for one dimension, a compile-time constant, so that short loops over it are unrolled."""
 
     def search(x, rows, codebook, codes, labels, leaves, nodes, memory, travelled, result):  # type: ignore[no-untyped-def]
-        total, bounded, missing = result.shape[0], memory[0].shape[0] > 0, 0
+        last_codes, anchors, clearance = memory
+        total, bounded, missing = result.shape[0], last_codes.shape[0] > 0, 0
         for block in prange((total + _ROWS - 1) // _ROWS):
             best, label, second = np.empty(_ROWS, np.float32), np.empty(_ROWS, np.int32), np.empty(_ROWS, np.float32)
             guess, tasks = np.empty(_ROWS, np.int64), np.empty(2 * _TASKS, np.int64)
@@ -350,7 +333,7 @@ def _search_kernel(dim: int) -> Any:
             missing += found_outside
             for i in range(first, stop if found_outside == 0 else first):
                 row = simd.get(rows, i)
-                last = np.int64(simd.get(memory[0], row)) if bounded else np.int64(_UNKNOWN)
+                last = np.int64(simd.get(last_codes, row)) if bounded else np.int64(_UNKNOWN)
                 simd.put(result, i, last)
                 simd.put(places, count, i)
                 known = last >= 0 and last < codebook.shape[0] // dim
@@ -365,8 +348,12 @@ def _search_kernel(dim: int) -> Any:
                 nearest = simd.get(label, i) if simd.get(label, i) != _NO_CODE else np.int32(0)
                 simd.put(result, simd.get(places, i), np.int64(nearest))
                 if bounded:
-                    found = simd.get(best, i), nearest, simd.get(second, i)
-                    _remember(dim, queries, i * dim, found, memory, simd.get(rows, simd.get(places, i)), travelled)
+                    # Keep where the row was searched; there may still be codes beyond the largest float32 number.
+                    row, away = simd.get(rows, simd.get(places, i)), min(simd.get(second, i), _LARGEST)
+                    simd.put(last_codes, row, nearest)
+                    for j in range(dim):
+                        simd.put(anchors, row * dim + j, simd.get(queries, i * dim + j))
+                    simd.put(clearance, row, np.sqrt(np.float64(away)) / ROUNDING + travelled)
         return missing
 
     return kernel(search)

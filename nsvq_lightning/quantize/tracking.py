@@ -38,13 +38,6 @@ Floats = NDArray[np.float32]
 Integers = NDArray[np.int64]
 
 
-def _overlap(dim: int) -> Floats:
-    """1 in the lanes of a row's last vector that the one before does not cover, else 0; a single 1 for short rows."""
-    keep = np.zeros(16, np.float32)
-    keep[-(dim % 16) if dim > 16 else -1 :] = 1
-    return keep
-
-
 @inline
 def _member(dim, x, at, codebook, lists, place, keep):  # type: ignore[no-untyped-def]
     return squares(dim, x, at, codebook, np.int64(simd.get(lists, place)) * dim, keep)
@@ -83,14 +76,6 @@ def _settle(dim, x, row, codebook, lists, start, near):  # type: ignore[no-untyp
     return code
 
 
-@inline
-def _second_smallest(squared, near, scratch):  # type: ignore[no-untyped-def]
-    """Smallest lane other than the lowest one whose bit is set."""
-    simd.store(scratch, 0, squared)
-    simd.put(scratch, simd.lowest_bit(near), np.float32(np.inf))
-    return simd.lane_min(simd.load(scratch, 0))
-
-
 @cache
 def _check_kernel(dim: int) -> Any:
     """The check for one dimension, a compile-time constant."""
@@ -120,7 +105,9 @@ def _check_kernel(dim: int) -> Any:
                     code = _settle(dim, x, row, codebook, lists, start, near)
                     simd.put(result, i, code)
                     simd.put(last, row, np.int32(code))
-                    second = np.float64(np.sqrt(_second_smallest(squared, near, scratch)))
+                    simd.store(scratch, 0, squared)
+                    simd.put(scratch, simd.lowest_bit(near), np.float32(np.inf))
+                    second = np.float64(np.sqrt(simd.lane_min(simd.load(scratch, 0))))
                     if near & (near - 1) == 0 and second - distance > moved:
                         # The gap to the second code now exceeds how far the row has moved, so a new anchor pays.
                         for j in range(dim):
@@ -217,8 +204,11 @@ class NearestTracker:
         last, anchors, clearance = self._memory
         memory = last, self._lists.ravel(), anchors.ravel(), clearance, self._limits
         dim = x.shape[1]
+        # 1 in the lanes of a row's last vector that the one before does not cover; a single 1 for short rows.
+        keep = np.zeros(16, np.float32)
+        keep[-(dim % 16) if dim > 16 else -1 :] = 1
         thread_count()
-        _check_kernel(dim)(x.ravel(), rows, codebook.ravel(), memory, _overlap(dim), self._travelled, drift, result)
+        _check_kernel(dim)(x.ravel(), rows, codebook.ravel(), memory, keep, self._travelled, drift, result)
         unsure = np.flatnonzero(result < 0)
         if 2 * len(unsure) > len(rows):  # codes have jumped; a new snapshot spares the next searches the cost
             drift = self._take_snapshot(codebook, drift)

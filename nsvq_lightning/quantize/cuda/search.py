@@ -15,8 +15,6 @@ be searched is known to the GPU alone: it queues them and works the queue off, a
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 import triton
 import triton.language as tl
@@ -119,28 +117,14 @@ def by_column(codebook: Tensor) -> Tensor:
     return columns
 
 
-class Memory(NamedTuple):
-    """What is known about rows from their last search.
+def empty_memory(count: int, dim: int, device: torch.device) -> tuple[Tensor, ...]:
+    """What is known from their last search about ``count`` rows that have not been searched.
 
-    Attributes:
-        last: Code, or -1 for a row that has not been searched, ``[N]`` int32.
-        lists: The codes that were near ``[N, LIST]`` int32.
-        anchors: Where the row was ``[N, D]``.
-        clearance: Distance below which there was no code but the nearest, plus how far the codes had moved by then,
-            ``[N]`` in float64, because movements add up over a whole run.
-        limits: The same for codes outside the list.
+    Code ``[N]`` int32, here -1; the codes that were near ``[N, LIST]`` int32; where the row was ``[N, D]``; the
+    distance below which there was no code but the nearest, plus how far the codes had moved by then, ``[N]`` in
+    float64, because movements add up over a whole run; and the same for codes outside the list.
     """
-
-    last: Tensor
-    lists: Tensor
-    anchors: Tensor
-    clearance: Tensor
-    limits: Tensor
-
-
-def empty_memory(count: int, dim: int, device: torch.device) -> Memory:
-    """Memory of ``count`` rows that have not been searched."""
-    return Memory(
+    return (
         torch.full((count,), -1, dtype=torch.int32, device=device),
         torch.zeros(count, LIST, dtype=torch.int32, device=device),
         torch.zeros(count, dim, device=device),
@@ -369,7 +353,7 @@ class DeviceTracker:
 
     def _grow(self, count: int) -> None:
         """Make room for ``count`` rows."""
-        old = len(self._memory.last)
-        if count > old:
-            more = empty_memory(count - old, self.dim, self.device)
-            self._memory = Memory(*(torch.cat(both) for both in zip(self._memory, more, strict=True)))
+        more = count - len(self._memory[0])
+        if more > 0:
+            both = zip(self._memory, empty_memory(more, self.dim, self.device), strict=True)
+            self._memory = tuple(map(torch.cat, both))
