@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from nsvq_lightning.skips import SKIPS, is_on, switch, switched
-
-
-def test_all_are_on_by_default() -> None:
-    assert all(map(is_on, SKIPS))
+from nsvq_lightning.skips import is_on, switch, switched
 
 
 def test_switches_are_restored_whatever_happens_in_the_body() -> None:
@@ -29,7 +25,3 @@ def test_unknown_switches_are_refused_and_change_nothing() -> None:
     with pytest.raises(ValueError, match=r"unknown switches block; there are blocks, saturated"), switched(block=False):
         pass
     assert is_on("blocks")
-
-
-def test_the_summary_says_what_and_when() -> None:
-    assert SKIPS["blocks"].summary == "skip 4x4 blocks of pixels: a splat cannot reach them"

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from nsvq_lightning.commands.benchmark.timing import use_threads
 from nsvq_lightning.quantize import NSVQ, kmeans, nearest_reference
 from nsvq_lightning.quantize.kmeans import _sum_segments, distinct_rows, draw_far_rows, rows_far_apart, sum_by_code
 from nsvq_lightning.random import generator
@@ -134,14 +135,10 @@ def test_distinct_rows_of_signed_zeros_and_repeats() -> None:
 
 
 def test_repeatable_for_any_threads() -> None:
-    x, before = rows(3000, 3), torch.get_num_threads()
-    try:
-        results = []
-        for count in (1, 2):
-            torch.set_num_threads(count)
+    x, results = rows(3000, 3), []
+    for count in (1, 2):
+        with use_threads(count):
             results.append(kmeans(x, 64, generator(3)))
-    finally:
-        torch.set_num_threads(before)
     assert torch.equal(*results)
 
 

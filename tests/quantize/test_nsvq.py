@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from nsvq_lightning.commands.benchmark.timing import use_threads
 from nsvq_lightning.quantize import NSVQ, CodebookQuantizer, DiVeQ, nearest, substitution
 from nsvq_lightning.quantize.nsvq import noise_substitution
 from nsvq_lightning.quantize.substitution import fill_normal, substitute, substitute_backward
@@ -134,17 +135,13 @@ def test_gradient_of_a_code_is_zero_on_average() -> None:
 @KINDS
 def test_results_are_a_function_of_the_generator_whatever_the_threads(aim: float, spread: float) -> None:
     x, codebook, codes = problem(45)
-    before = torch.get_num_threads()
     results = []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
+    for threads in (1, 2):
+        with use_threads(threads):
             codebook.grad = None
             x_q = noise_substitution(x, codebook, codes, generator(1), aim=aim, spread=spread)
             x_q.backward(torch.ones_like(x_q))
             results.append(torch.cat((x_q.detach(), codebook.grad)))
-    finally:
-        torch.set_num_threads(before)
     assert torch.equal(*results)
     other = noise_substitution(x, codebook, codes, generator(1, 1), aim=aim, spread=spread)
     assert torch.equal(other, x_q) == (spread == 0)
