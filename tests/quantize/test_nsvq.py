@@ -31,22 +31,9 @@ def problem(dim: int, dtype: torch.dtype = torch.float32, count: int = 523) -> t
 @KINDS
 @DTYPES
 @pytest.mark.parametrize("dim", DIMS)
-def test_error_has_the_length_of_the_quantization_error(
+def test_values_and_gradients_equal_autograd_of_the_formula(
     dim: int, dtype: torch.dtype, aim: float, spread: float
 ) -> None:
-    x, codebook, codes = problem(dim, dtype)
-    with torch.no_grad():
-        x_q = noise_substitution(x, codebook, codes, generator(1), aim=aim, spread=spread)
-        expected = (x.double() - codebook[codes].double()).norm(dim=1)
-    rounding = 4 * torch.finfo(dtype).eps
-    difference = (x_q.double() - x.double()).norm(dim=1) - expected
-    assert bool((difference.abs() <= rounding * (expected + x.double().norm(dim=1))).all())
-
-
-@KINDS
-@DTYPES
-@pytest.mark.parametrize("dim", DIMS)
-def test_gradients_equal_autograd_of_the_formula(dim: int, dtype: torch.dtype, aim: float, spread: float) -> None:
     """The direction is recovered from the result, or known if there is no noise in it."""
     x, codebook, codes = problem(dim, dtype)
     grad = torch.randn(x.shape, generator=generator(2), dtype=torch.float64)
@@ -57,7 +44,8 @@ def test_gradients_equal_autograd_of_the_formula(dim: int, dtype: torch.dtype, a
     length = residual.norm(dim=1, keepdim=True)
     moved = residual.detach() if spread == 0 else (x_q - x).detach().double()
     expected = x_wide + length * moved / moved.norm(dim=1, keepdim=True)
-    torch.testing.assert_close(x_q.detach().double(), expected.detach(), rtol=1e-5, atol=1e-5)
+    rounding = 20 * torch.finfo(dtype).eps
+    torch.testing.assert_close(x_q.detach().double(), expected.detach(), rtol=rounding, atol=rounding)
     expected.backward(grad)
     # Rounding spoils the direction where x is near its code.
     tolerance = 1e-10 if dtype == torch.float64 else 2e-3 if dim == 1 else 2e-4

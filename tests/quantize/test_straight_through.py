@@ -99,16 +99,6 @@ def test_searches_after_a_refit_are_exact() -> None:
         assert torch.equal(codes, nearest_codes(x, quantizer.codebook))
 
 
-def test_frozen_codes_train_the_codebook() -> None:
-    quantizer, x = fitted()
-    quantizer.freeze(quantizer.encode(x))
-    x_q, codes = quantizer(x)
-    x_q.backward(torch.ones_like(x_q))
-    assert x.grad is None
-    counts = torch.bincount(codes, minlength=16).float()
-    assert torch.equal(quantizer.codebook.grad, counts[:, None].expand(-1, 3))
-
-
 # PostHoc
 
 
