@@ -20,7 +20,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from nsvq_lightning.compute import lanes as simd
+from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
 from nsvq_lightning.compute.memory import aligned_empty, check_array, check_table, outside
 from nsvq_lightning.compute.rows import count_outside

@@ -20,7 +20,7 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nsvq_lightning.compute import lanes as simd
+from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import kernel, thread_count
 from nsvq_lightning.quantize.box_search import MAX_DIM, box_search, place_of_least

@@ -17,7 +17,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from nsvq_lightning.compute import lanes as simd
+from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, aligned_empty, check_array, check_table
 

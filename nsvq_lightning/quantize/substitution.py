@@ -22,7 +22,7 @@ import numpy as np
 from numba import prange
 from torch import Tensor
 
-from nsvq_lightning.compute import lanes as simd
+from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
 from nsvq_lightning.compute.memory import INT64, Array, flat_checked, outside, recycled
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside
