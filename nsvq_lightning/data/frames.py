@@ -13,7 +13,7 @@ import PIL.ImageOps
 from cv2.typing import MatLike
 
 from nsvq_lightning.data.colmap import SceneError
-from nsvq_lightning.data.images import opened
+from nsvq_lightning.data.images import ORIENTATION, opened
 from nsvq_lightning.io.atomic import atomic_path, atomic_write
 
 __all__ = ["PHOTOS", "VIDEOS", "copy_photos", "photos_in", "sharpness", "write_frames"]
@@ -31,8 +31,6 @@ TINY = 48, 27
 STILL = 2.0
 """Mean difference, of 255, below which the camera has not moved between two frames."""
 JPEG_QUALITY = 95
-ORIENTATION = 0x0112
-"""EXIF tag: how to turn the stored pixels."""
 
 
 def photos_in(folder: Path) -> list[Path]:
@@ -69,15 +67,15 @@ def copy_photos(photos: Sequence[Path], folder: Path, done: Callable[[int], None
     for count, path in enumerate(photos, 1):
         target = folder / path.name
         try:
-            with opened(path) as image:
+            with path.open("rb") as file, opened(file) as image:
                 turned = image.getexif().get(ORIENTATION, 1) != 1
                 if not turned:
                     image.load()
                 elif not target.exists():
                     upright = PIL.ImageOps.exif_transpose(image)
-                    with atomic_write(target) as file:
+                    with atomic_write(target) as copy:
                         exif = upright.getexif().tobytes()
-                        upright.save(file, image.format, quality=JPEG_QUALITY, exif=exif)
+                        upright.save(copy, image.format, quality=JPEG_QUALITY, exif=exif)
             if not turned and not target.exists():
                 with atomic_path(target) as unfinished:
                     shutil.copyfile(path, unfinished)

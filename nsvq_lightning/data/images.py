@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,45 +24,13 @@ from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.undistort import Pinhole, Undistortion
 from nsvq_lightning.skips import is_on
 
-__all__ = [
-    "ROUNDED",
-    "ImageHead",
-    "ImageSource",
-    "ImageStore",
-    "Picture",
-    "encode_png",
-    "image_head",
-    "image_size",
-    "opened",
-    "read_image",
-    "read_mask",
-]
-
 ROUNDED = 0.01
 """Relative difference of aspect ratios that rounding explains."""
-
-# COLMAP works on the pixels as stored, so the EXIF orientation must not be applied.
-_READ = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-
-_FEW_PIXELS, _MOST_A_BYTE = 1 << 25, 32
-"""Pixels that any file may have, however short, such as a white mask; beyond, most pixels per byte of the file. 32
-leave a quarter of a bit for each. So many are decoded in less than 1 GB."""
+ORIENTATION = 274
+"""EXIF and TIFF tag: how to turn the stored pixels."""
 
 _DAMAGED = (OSError, ValueError, SyntaxError, KeyError)
 """What Pillow raises for a file that is damaged or not a picture."""
-
-_TIFF_SIZE, _TIFF_ORIENTATION = (256, 257), 274
-_LIMIT = threading.Lock()
-
-_MIRRORED = {2: (1,), 3: (0, 1), 4: (0,), 6: (0,), 7: (0, 1), 8: (1,)}
-"""By orientation, the axes to mirror; from 5 on, rows and columns are swapped first."""
-_TURNED = 5
-"""EXIF orientation from which on a photo is stored lying on its side."""
-_OPPOSITE = {6: 8, 8: 6}
-"""Orientations that do not undo themselves."""
-_ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
-_OPAQUE = 128
-"""Alpha value from which on a pixel counts."""
 
 
 def _undecodable(path: Path, reason: str) -> SceneError:
@@ -89,48 +57,47 @@ def image_head(path: Path) -> ImageHead:
         SceneError: The file is not an image, or its head declares more pixels than it can hold.
     """
     try:
-        with opened(path) as image:
+        with path.open("rb") as file, opened(file) as image:
             width, height = image.size
             # Pillow decodes a whole PNG to look for a tag that is hardly ever there.
             tags = {} if image.format == "PNG" else image.getexif()
-            orientation = int(tags.get(_TIFF_ORIENTATION, 1))
+            orientation = int(tags.get(ORIENTATION, 1))
             if image.format == "TIFF":  # Pillow applies the orientation to their size
-                width, height = (int(tags[tag]) for tag in _TIFF_SIZE)
-            has_alpha = image.mode in _ALPHA_MODES or "transparency" in image.info
+                width, height = int(tags[256]), int(tags[257])
+            has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
     except _DAMAGED as error:
         raise _undecodable(path, str(error)) from error
     return ImageHead((width, height), orientation, has_alpha)
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels as stored, read from the head of the file.
-
-    Raises:
-        SceneError: The file is not an image, or its head declares more pixels than it can hold.
-    """
-    return image_head(path).size
+_FEW_PIXELS, _MOST_A_BYTE = 1 << 25, 32
+"""Pixels that any file may have, however short, such as a white mask; beyond, most pixels per byte of the file. 32
+leave a quarter of a bit for each. So many are decoded in less than 1 GB."""
+_LIMIT = threading.Lock()
 
 
 @contextmanager
-def opened(path: Path, room: int = _FEW_PIXELS) -> Iterator[PIL.Image.Image]:
+def opened(file: BinaryIO, room: int = 0) -> Iterator[PIL.Image.Image]:
     """Open the head of a picture, past Pillow's pixel limit, which phones exceed; nothing is decoded.
 
     Args:
-        path: Image file.
+        file: The image file, opened for reading.
         room: Pixels that it may have in any case.
 
     Raises:
         OSError: It is not a picture, or its head declares more pixels than that and than the file can hold; the other
             errors of ``_DAMAGED`` mean the same.
     """
+    size = file.seek(0, io.SEEK_END)
     with _LIMIT:
         usual, PIL.Image.MAX_IMAGE_PIXELS = PIL.Image.MAX_IMAGE_PIXELS, None
         try:
-            image = PIL.Image.open(path)
+            image = PIL.Image.open(file)
+        except PIL.UnidentifiedImageError:
+            raise OSError("its head is that of no known format") from None
         finally:
             PIL.Image.MAX_IMAGE_PIXELS = usual
     with image:
-        size = path.stat().st_size
         if image.width * image.height > max(_FEW_PIXELS, room, _MOST_A_BYTE * size):
             raise OSError(
                 f"its head declares {image.width}x{image.height} pixels in {size} bytes, more than {_FEW_PIXELS} and "
@@ -145,11 +112,11 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     Raises:
         SceneError: The file is damaged or has floating-point pixels.
     """
-    return np.asarray(cv2.cvtColor(_decoded(path, _READ), cv2.COLOR_BGR2RGB), np.uint8)
+    return np.asarray(cv2.cvtColor(_decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH), cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def _decoded(path: Path, flags: int, room: int = 0) -> NDArray[np.uint8]:
-    """Decode an image as OpenCV does, to 8 bits, with the pixels as stored.
+    """Decode an image as OpenCV does, to 8 bits, with the pixels as stored: those are what COLMAP works on.
 
     Args:
         path: Image file.
@@ -167,36 +134,50 @@ def _decoded(path: Path, flags: int, room: int = 0) -> NDArray[np.uint8]:
             "there again"
         ) from error
     try:
-        with opened(path, room):
-            pass
+        with opened(io.BytesIO(data), room) as head:
+            # OpenCV applies the orientation to TIFFs even when told not to.
+            applied = int(head.getexif().get(ORIENTATION, 1)) if head.format == "TIFF" else 1
     except _DAMAGED as error:
         raise _undecodable(path, str(error)) from error
     try:
-        orientation = _orientation(data)
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except _DAMAGED:
-        image = None
-    except cv2.error as error:  # a size beyond OpenCV's limits
-        raise _undecodable(path, str(error)) from error
-    if image is None:
-        raise _undecodable(path, f"truncated, damaged or of an unknown format, {len(data)} bytes")
+        _check_whole(data)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+        if image is None:
+            raise OSError("OpenCV cannot decode it")
+    except (*_DAMAGED, cv2.error) as error:
+        reason = f"truncated, damaged, too large or of an unknown format, {len(data)} bytes: {error}"
+        raise _undecodable(path, reason) from error
     if image.dtype == np.uint16:
         image = cv2.convertScaleAbs(image, alpha=1 / 257)  # rounds; none of the 65536 is near a half
     if image.dtype != np.uint8:
         raise _undecodable(path, f"its pixels are {image.dtype}; accepted are 8 and 16 bit integers")
-    return _turned_back(image, orientation)
+    return _turned_back(image, applied)
 
 
-def _with_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """RGB ``[H, W, 3]`` and alpha ``[H, W]`` of an image that has transparent pixels; hidden colours stay.
+def _check_whole(data: bytes) -> None:
+    """Refuse truncation that OpenCV would not notice.
 
     Raises:
-        SceneError: The file is damaged.
+        OSError: The file is incomplete; the other errors of ``_DAMAGED`` mean the same.
     """
-    image = _decoded(path, cv2.IMREAD_UNCHANGED)
-    if image.ndim != 3 or image.shape[2] != 4:
-        raise _undecodable(path, f"its transparency is not understood, its pixels are {list(image.shape[2:])}")
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGB), np.uint8), image[..., 3]
+    file = io.BytesIO(data)
+    if data.startswith(b"\x89PNG"):
+        PngImageFile(file).verify()  # OpenCV allocates chunks of any declared length, up to 2 GB, before it reads them
+    elif data.startswith(b"\xff\xd8"):
+        JpegImageFile(file)  # up to the first scan
+        if b"\xff\xd9" not in data[file.tell() :]:
+            raise OSError("there is no end marker")  # OpenCV 4 would fill the missing part with grey
+
+
+_TURNED = 5
+"""EXIF orientation from which on a photo is stored lying on its side."""
+
+
+def _turned_back(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
+    """Pixels to which an EXIF orientation was applied, as they were stored."""
+    stored = pixels.swapaxes(0, 1) if orientation >= _TURNED else pixels
+    mirrored = {2: (1,), 3: (0, 1), 4: (0,), 6: (0,), 7: (0, 1), 8: (1,)}  # axes
+    return np.ascontiguousarray(np.flip(stored, mirrored.get(orientation, ())))
 
 
 def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
@@ -212,8 +193,7 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     Raises:
         SceneError: The file is damaged, or has another aspect ratio than the photo.
     """
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    grey = _decoded(path, flags, room=width * height)
+    grey = _decoded(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH, room=width * height)
     kept: NDArray[np.uint8] = (grey > int(grey.max()) / 2).astype(np.uint8)
     if abs(kept.shape[1] * height / (kept.shape[0] * width) - 1) > ROUNDED:
         raise SceneError(
@@ -236,37 +216,6 @@ def encode_png(rgb: NDArray[np.uint8]) -> bytes:
     if not encoded:
         raise OSError(f"cannot encode a picture of shape {list(rgb.shape)}")
     return bytes(data)
-
-
-def _orientation(data: bytes) -> int:
-    """The orientation that OpenCV applies to the picture; also refuses truncation that OpenCV would not notice.
-
-    Raises:
-        OSError: The file is incomplete; the other errors of ``_DAMAGED`` mean the same.
-    """
-    file = io.BytesIO(data)
-    if data.startswith(b"\x89PNG"):
-        PngImageFile(file).verify()  # OpenCV allocates chunks of any declared length, up to 2 GB, before it reads them
-    elif data.startswith(b"\xff\xd8"):
-        JpegImageFile(file)  # up to the first scan
-        if b"\xff\xd9" not in data[file.tell() :]:
-            raise OSError("there is no end marker")  # OpenCV 4 would fill the missing part with grey
-    elif data.startswith((b"II", b"MM")):
-        tags = PIL.Image.Exif()  # the tags of a TIFF, whatever its pixels are
-        tags.load(data)
-        return int(tags.get(_TIFF_ORIENTATION, 1))
-    return 1
-
-
-def _turned_back(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
-    """A TIFF's pixels as stored: OpenCV applies the orientation to TIFFs even when told not to."""
-    stored = pixels.swapaxes(0, 1) if orientation >= _TURNED else pixels
-    return np.ascontiguousarray(np.flip(stored, _MIRRORED.get(orientation, ())))
-
-
-def _upright(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
-    """Stored pixels as the orientation says they are to be shown."""
-    return _turned_back(pixels, _OPPOSITE.get(orientation, orientation))
 
 
 class Picture(NamedTuple):
@@ -350,11 +299,16 @@ class ImageSource:
 
     def _decode(self) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
         """The file's pixels, turned, and which of them are not transparent."""
+        undo = {6: 8, 8: 6}.get(self.orientation, self.orientation)  # the others undo themselves
         if not self.has_alpha:
-            return _upright(read_image(self.path), self.orientation), None
-        image, alpha = (_upright(part, self.orientation) for part in _with_alpha(self.path))
+            return _turned_back(read_image(self.path), undo), None
+        pixels = _decoded(self.path, cv2.IMREAD_UNCHANGED)
+        if pixels.ndim != 3 or pixels.shape[2] != 4:
+            raise _undecodable(self.path, f"its transparency is not understood, its pixels are {pixels.shape[2:]}")
+        pixels = _turned_back(pixels, undo)
+        image, alpha = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB), np.uint8), pixels[..., 3]
         if self.backdrop is None:
-            return image, alpha >= _OPAQUE
+            return image, alpha >= 128  # half opaque
         share = alpha.astype(np.float32) / 255
         for channel in range(3):  # one by one: as numbers of 32 bits, they take several times the memory
             image[..., channel] = np.rint(image[..., channel] * share + self.backdrop * (1 - share))

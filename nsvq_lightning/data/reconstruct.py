@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
-from nsvq_lightning.data.images import image_size
+from nsvq_lightning.data.images import image_head
 
 __all__ = ["Verdict", "reconstruct"]
 
@@ -107,7 +107,7 @@ def _find_features(
     cameras = dict(_rows(database, "select name, camera_id from images")) if database.exists() else {}
     groups: defaultdict[tuple[int, int], list[str]] = defaultdict(list)
     for name in names:
-        groups[image_size(images / name)].append(name)
+        groups[image_head(images / name).size].append(name)
     options = pycolmap.FeatureExtractionOptions(max_image_size=max_size, num_threads=threads, use_gpu=False)
     done = len(found)
     for group in groups.values():

@@ -15,16 +15,17 @@ import torch
 from numpy.typing import NDArray
 
 from nsvq_lightning.data.colmap import (
+    LARGEST,
     LARGEST_SIDE,
     ColmapImage,
     ColmapModel,
     SceneError,
     check_name,
-    has_model,
+    find_model,
     import_pycolmap,
     read_model,
 )
-from nsvq_lightning.data.images import image_size
+from nsvq_lightning.data.images import image_head
 from nsvq_lightning.data.point_cloud import read_points, share_seen
 from nsvq_lightning.rendering.camera import Camera
 
@@ -43,7 +44,6 @@ _UNROUNDED = 1e-3
 """How far the axes of a camera may be from a rotation's."""
 _CLEARLY = 1.5
 """Ratio of points in view from which ``applied_transform`` is taken to be missing from the points."""
-_LARGEST = 1e18
 
 Kind = tuple[str, int, int, tuple[float, ...]]
 """COLMAP's name of a camera model, width, height, parameters."""
@@ -85,7 +85,7 @@ def transforms_files(root: Path, model: str | None = None) -> list[Path]:
     """
     if model is not None:
         return [root / model] if model.endswith(".json") else []
-    if not has_model(root):
+    if find_model(root) is None:
         if (root / _TRANSFORMS).is_file():
             return [root / _TRANSFORMS]
         if (root / _TRAIN).is_file():
@@ -112,7 +112,7 @@ class _Frame:
             SceneError: It is something else.
         """
         value = self.values.get(key, otherwise)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _LARGEST:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
             raise self.error(f"has {key} = {value!r}, which is no finite number")
         return float(value)
 
@@ -169,7 +169,7 @@ class _Frame:
             path = self.file.parent / self.name
             if not path.is_file():
                 raise self.error(f"is of the photo {path}, which does not exist", "copy the photo there")
-            return image_size(path)
+            return image_head(path).size
         size = round(self.number("w")), round(self.number("h"))
         if not 0 < min(size) <= max(size) <= LARGEST_SIDE:
             raise self.error(f"has size {size[0]}x{size[1]}; sides go from 1 to {LARGEST_SIDE}")
@@ -201,7 +201,7 @@ class _Frame:
             matrix = np.array(self.values.get("transform_matrix"), np.float64)
         except (ValueError, TypeError):
             matrix = np.zeros(0)
-        if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) <= _LARGEST).all():
+        if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) <= LARGEST).all():
             raise self.error("has no transform_matrix of 4 by 4 finite numbers")
         # Blender's cameras may be scaled.
         axes = matrix[:3, :3] / np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-30)

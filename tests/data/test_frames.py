@@ -10,7 +10,7 @@ import pytest
 
 from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.frames import copy_photos, photos_in, sharpness, write_frames
-from nsvq_lightning.data.images import image_size, read_image
+from nsvq_lightning.data.images import image_head, read_image
 
 
 def _texture(shift: int = 0) -> np.ndarray[Any, Any]:
@@ -71,7 +71,7 @@ def test_photos_are_turned_upright(tmp_path: Path, orientation: int) -> None:
     target.mkdir()
     PIL.Image.fromarray(np.ascontiguousarray(stored)).save(source / "a.jpg", quality=95, exif=exif)
     assert copy_photos(photos_in(source), target, lambda _: None) == []
-    assert image_size(target / "a.jpg") == (64, 32)
+    assert image_head(target / "a.jpg").size == (64, 32)
     assert np.abs(read_image(target / "a.jpg").astype(int) - upright).mean() < 5
     with PIL.Image.open(target / "a.jpg") as image:
         assert image.getexif().get(0x0112, 1) == 1

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from nsvq_lightning.data.colmap import SceneError
-from nsvq_lightning.data.images import ImageSource, ImageStore, Picture, image_size, read_image, read_mask
+from nsvq_lightning.data.images import ImageSource, ImageStore, Picture, image_head, read_image, read_mask
 from nsvq_lightning.data.undistort import Pinhole
 from nsvq_lightning.skips import switched
 
@@ -26,7 +26,7 @@ def test_colour_picture_is_rgb(tmp_path: Path) -> None:
     path = tmp_path / "müller 1.png"  # a name outside ASCII
     PIL.Image.fromarray(RGB).save(path)  # oracle: Pillow
     np.testing.assert_array_equal(read_image(path), RGB)
-    assert image_size(path) == (9, 6)
+    assert image_head(path).size == (9, 6)
 
 
 def test_grey_alpha_palette_and_16_bit_pictures(tmp_path: Path) -> None:
@@ -51,7 +51,7 @@ def test_exif_orientation_is_ignored_as_colmap_does(tmp_path: Path) -> None:
     exif[0x0112] = 6  # turn by 90 degrees
     picture = PIL.Image.fromarray(cv2.resize(RGB, (64, 48)))
     picture.save(tmp_path / "turned.jpg", quality=95, exif=exif)
-    assert image_size(tmp_path / "turned.jpg") == (64, 48)
+    assert image_head(tmp_path / "turned.jpg").size == (64, 48)
     assert read_image(tmp_path / "turned.jpg").shape == (48, 64, 3)
 
 
@@ -73,14 +73,14 @@ def test_the_orientation_of_a_tiff_is_ignored_too(tmp_path: Path, orientation: i
     """OpenCV and Pillow turn TIFFs unless they are kept from it."""
     path, picture = tmp_path / "x.tif", cv2.resize(RGB, (64, 48))
     path.write_bytes(_tiff(picture, orientation, order))
-    assert image_size(path) == (64, 48)
+    assert image_head(path).size == (64, 48)
     np.testing.assert_array_equal(read_image(path), picture)
 
 
 def test_a_picture_may_be_larger_than_the_limit_of_pillow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     PIL.Image.fromarray(cv2.resize(RGB, (200, 150))).save(tmp_path / "x.jpg")
     monkeypatch.setattr(PIL.Image, "MAX_IMAGE_PIXELS", 1000)
-    assert image_size(tmp_path / "x.jpg") == (200, 150)
+    assert image_head(tmp_path / "x.jpg").size == (200, 150)
     assert PIL.Image.MAX_IMAGE_PIXELS == 1000
 
 
@@ -108,7 +108,7 @@ def test_the_end_of_a_thumbnail_is_not_that_of_the_picture(tmp_path: Path) -> No
 def test_what_is_no_picture_is_found_by_its_head(tmp_path: Path) -> None:
     (tmp_path / "text.jpg").write_text("no picture")
     with pytest.raises(SceneError, match=r"text\.jpg cannot be decoded"):
-        image_size(tmp_path / "text.jpg")
+        image_head(tmp_path / "text.jpg")
 
 
 def _png(width: int, height: int, data: bytes) -> bytes:
@@ -123,7 +123,7 @@ def _png(width: int, height: int, data: bytes) -> bytes:
 def test_a_head_that_promises_more_than_the_file_holds(tmp_path: Path, side: int) -> None:
     path = tmp_path / "bomb.png"
     path.write_bytes(_png(side, side, zlib.compress(b"\0" * 1000)))
-    for read in (image_size, read_image):
+    for read in (image_head, read_image):
         with pytest.raises(SceneError, match=r"bomb\.png cannot be decoded"):
             read(path)
 
@@ -133,11 +133,11 @@ def test_photos_and_masks_of_many_equal_pixels_are_refused_by_their_heads(tmp_pa
     side = 8200
     path = _black(tmp_path / "black.png", side)
     assert path.stat().st_size < side * side / 5000
-    for read in (image_size, read_image, lambda path: read_mask(path, 820, 820)):
+    for read in (image_head, read_image, lambda path: read_mask(path, 820, 820)):
         with pytest.raises(SceneError, match=r"black\.png cannot be decoded .*8200x8200 pixels in \d+ bytes"):
             read(path)
     assert not read_mask(path, side, side).any()
-    assert image_size(_black(tmp_path / "small.png", 5700)) == (5700, 5700)
+    assert image_head(_black(tmp_path / "small.png", 5700)).size == (5700, 5700)
 
 
 def _black(path: Path, side: int) -> Path:
@@ -152,7 +152,7 @@ def test_a_chunk_longer_than_the_file_is_not_allocated(tmp_path: Path) -> None:
     assert read_image(path).shape == (2, 3, 3)
     place = whole.index(b"IDAT") - 4
     path.write_bytes(whole[:place] + struct.pack(">I", 0x7FFFFF00) + whole[place + 4 :])
-    assert image_size(path) == (3, 2)
+    assert image_head(path).size == (3, 2)
     started = time.process_time()  # OpenCV fills 2 GB with zeros before it finds the end of the file
     with pytest.raises(SceneError, match=r"long\.png cannot be decoded \(truncated"):
         read_image(path)

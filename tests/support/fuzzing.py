@@ -374,10 +374,10 @@ def _build_photos(folder: Path) -> list[Path]:
 
 def _read_photo(path: Path) -> object:
     """Load it as the photo of a view."""
-    from nsvq_lightning.data.images import ImageSource, image_size
+    from nsvq_lightning.data.images import ImageSource, image_head
     from nsvq_lightning.data.undistort import Pinhole
 
-    size = image_size(path)
+    size = image_head(path).size
     return ImageSource(path, size, None, Pinhole(np.eye(3), *size)).load()
 
 
