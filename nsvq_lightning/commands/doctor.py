@@ -452,7 +452,7 @@ def check_exposure(photos: Mapping[str, tuple[float, float, float]]) -> Iterator
 def check_budget(scene: Scene) -> Iterator[Finding]:
     """Memory against what is available; time from renders of the scene grown as two recipes grow it."""
     from nsvq_lightning.compression.budget import splats_for_photos
-    from nsvq_lightning.data.edges import detailed_pixels
+    from nsvq_lightning.data.scene import detailed_pixels
     from nsvq_lightning.training.memory_estimate import CACHE_BYTES, available_memory, readable_bytes, run_bytes
 
     default = splats_for_photos(len(scene.train), detailed_pixels(scene))

@@ -37,7 +37,7 @@ def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:
 
     Args:
         photos: Number of train photos.
-        detail: Detailed pixels of a photo (:func:`nsvq_lightning.data.edges.detailed_pixels`).
+        detail: Detailed pixels of a photo (:func:`nsvq_lightning.data.scene.detailed_pixels`).
         quality: Factor.
     """
     return max(LEAST, round(quality * SPLATS_PER_PIXEL * math.cbrt(photos) * detail))

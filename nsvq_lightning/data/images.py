@@ -250,7 +250,7 @@ class ImageSource:
         orientation: EXIF orientation to apply; 1 leaves the pixels as stored.
         mask: Image file that says which pixels count.
         has_alpha: Whether the file has transparent pixels.
-        backdrop: Grey value behind transparent pixels, which then count; None excludes them.
+        white: Whether transparent pixels are white, and count.
     """
 
     path: Path
@@ -260,12 +260,12 @@ class ImageSource:
     orientation: int = 1
     mask: Path | None = None
     has_alpha: bool = False
-    backdrop: int | None = None
+    white: bool = False
 
     @property
     def nbytes(self) -> int:
         """Bytes of the picture in memory."""
-        masked = self.mask is not None or (self.has_alpha and self.backdrop is None)
+        masked = self.mask is not None or (self.has_alpha and not self.white)
         return (3 + masked) * self.pinhole.width * self.pinhole.height
 
     def load(self) -> Picture:
@@ -307,11 +307,11 @@ class ImageSource:
             raise _undecodable(self.path, f"its transparency is not understood, its pixels are {pixels.shape[2:]}")
         pixels = _turned_back(pixels, undo)
         image, alpha = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB), np.uint8), pixels[..., 3]
-        if self.backdrop is None:
+        if not self.white:
             return image, alpha >= 128  # half opaque
         share = alpha.astype(np.float32) / 255
         for channel in range(3):  # one by one: as numbers of 32 bits, they take several times the memory
-            image[..., channel] = np.rint(image[..., channel] * share + self.backdrop * (1 - share))
+            image[..., channel] = np.rint(image[..., channel] * share + 255 * (1 - share))
         return image, None
 
 

@@ -1,14 +1,14 @@
-"""A scene: registered views with pinhole cameras, sparse points, the split into train and test."""
+"""A scene: registered views with pinhole cameras, sparse points, the split into train and test, and photos' detail."""
 
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,32 +18,23 @@ from torch import Tensor
 from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, larger_models
 from nsvq_lightning.data.frames import PHOTOS
-from nsvq_lightning.data.images import ROUNDED, ImageHead, ImageSource, ImageStore, image_head
-from nsvq_lightning.data.masks import find_masks
+from nsvq_lightning.data.images import ROUNDED, ImageSource, ImageStore, image_head
 from nsvq_lightning.data.point_cloud import random_points
 from nsvq_lightning.data.transforms import read_poses
-from nsvq_lightning.data.undistort import Pinhole, Undistortion, rectify
+from nsvq_lightning.data.undistort import rectify
 from nsvq_lightning.rendering.camera import Camera
 
-__all__ = ["ONE_PLACE", "OTHER_SHAPE", "Factor", "Scene", "SceneError", "View", "load_scene", "same_shape"]
+__all__ = ["Factor", "Scene", "SceneError", "View", "detailed_pixels", "edge_strength", "find_masks", "load_scene"]
 
 log = logging.getLogger(__name__)
 
 Factor = Literal[1, 2, 4, 8]
 
-_FACTORS = (1, 2, 4, 8)
-_CAMERAS_WITH_KEPT_MAPS = 8
-"""With more distorted cameras than this (say, one per photo), the undistortion maps would take more than the images."""
-_FARTHEST = 1e4
-"""Distance of the cameras from the origin, in extents, beyond which rounding moves splats by much of a pixel."""
 OTHER_SHAPE = (
     "have another aspect ratio than their camera: they were cropped, rotated or mixed up after COLMAP ran; copy the "
     "photos it ran on"
 )
 ONE_PLACE = "are taken from one place: without parallax there is no depth; move while taking photos"
-_WHITE = 255
-_AT_CAMERA = 1e-6
-"""Distance from a camera's centre, in extents, within which a point is a failed triangulation, not a surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +129,7 @@ def load_scene(
     instant-ngp, Polycam) or ``transforms_train.json`` and ``transforms_test.json`` (NeRF-synthetic) take its place.
     They say where the photos are. A folder without points gets random ones.
 
-    Pixels that a mask excludes (see :func:`nsvq_lightning.data.masks.find_masks`) or that are transparent do not count:
+    Pixels that a mask excludes (see :func:`nsvq_lightning.data.scene.find_masks`) or that are transparent do not count:
     no loss and no metric depends on them. Only NeRF-synthetic scenes are shown in front of white instead.
 
     Pinhole images are used as they are; those of any other camera model are undistorted when they are decoded, like
@@ -161,29 +152,47 @@ def load_scene(
         SceneError: The folder, the model or an image is missing or damaged, or the split leaves no train view.
         ValueError: An argument is out of range.
     """
-    _check_arguments(factor, max_width, test_every)
+    if factor is not None and factor not in get_args(Factor):
+        raise ValueError(f"factor must be None, 1, 2, 4 or 8, got {factor}")
+    if max_width is not None and max_width < 1:
+        raise ValueError(f"max_width must be None or at least 1 pixel, got {max_width}")
+    if test_every < 2:
+        raise ValueError(f"test_every must be at least 2 (1 leaves no train view), got {test_every}")
     root = Path(root)
     poses = read_poses(root, model, allow_outside=allow_outside)
-    larger = larger_models(root) if model is None and poses.source == "COLMAP" else None
-    if larger is not None:
+    if model is None and poses.source == "COLMAP" and (larger := larger_models(root)) is not None:
         log.warning("%s: %s", root, larger)
-    names = [image.name for image in poses.images]
-    train, test = split_views(names, test_every) if poses.test is None else _given_split(len(names), poses)
+    views = range(len(poses.images))
+    given = poses.test is not None
+    test = tuple(views[::test_every]) if poses.test is None else poses.test
+    train = tuple(sorted(set(views) - set(test)))
+    split = f"as {poses.source} says" if given else f"every {test_every}th by name"
+    if not train or not test:
+        raise SceneError(
+            f"{len(views)} registered image(s), test views {split}, leave {len(train)} train and {len(test)} test "
+            f"views; at least 1 of each is needed: {'check what it lists' if given else 'register more photos'}"
+        )
     folder, divisor = _image_folder(root, poses.images_folder or images_folder, factor)
-    mask_files: list[Path | None] = [None] * len(names)
+    mask_files: list[Path | None] = [None] * len(views)
     if masks is not None:
         mask_files = find_masks(poses.images, root, [f"{masks}_{factor}", masks] if factor else [masks])
     files = _locate(poses.images, folder)
     sources = _image_sources(poses, files, mask_files, divisor, max_width if factor is None else None)
-    cameras = tuple(_camera(image, source.pinhole) for image, source in zip(poses.images, sources, strict=True))
-    poses = poses if len(poses.points) else _with_random_points(root, poses, [cameras[index] for index in train])
+    cameras = tuple(_camera(image, source) for image, source in zip(poses.images, sources, strict=True))
+    if not len(poses.points):
+        points = random_points([cameras[index] for index in train])
+        log.info(
+            "%s has no points: %d random ones in the volume that the cameras see take their place", root, len(points)
+        )
+        poses = replace(poses, points=points, colors=np.full((len(points), 3), 128, np.uint8))
     centres = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in poses.images])
-    extent = _extent(centres[list(train)])
-    _warn_if_far(centres[list(train)], extent)
+    middle = centres[list(train)].mean(0)
+    extent = float(1.1 * np.linalg.norm(centres[list(train)] - middle, axis=1).max())
+    _warn_if_far(float(np.linalg.norm(middle)), extent)
     usable = _away_from(centres, poses.points, _AT_CAMERA * extent)
     return Scene(
         root=root,
-        names=tuple(names),
+        names=tuple(image.name for image in poses.images),
         cameras=cameras,
         images=ImageStore(sources, cache_bytes),
         points=torch.from_numpy(poses.points[usable]).float(),
@@ -191,56 +200,9 @@ def load_scene(
         train=train,
         test=test,
         extent=extent,
-        split=f"every {test_every}th by name" if poses.test is None else f"as {poses.source} says",
+        split=split,
         white=poses.synthetic,
     )
-
-
-def split_views(names: Sequence[str], test_every: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Train and test indices of sorted names: index % ``test_every`` == 0 is test, as in the published tables.
-
-    Raises:
-        SceneError: There is no train view left.
-    """
-    train = tuple(i for i in range(len(names)) if i % test_every != 0)
-    test = tuple(range(0, len(names), test_every))
-    if not train or not test:
-        raise SceneError(
-            f"{len(names)} registered image(s) split with test_every={test_every} leave {len(train)} train and "
-            f"{len(test)} test views; at least 1 of each is needed: register more photos"
-        )
-    return train, test
-
-
-def _given_split(count: int, poses: ColmapModel) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Train and test indices as the model says.
-
-    Raises:
-        SceneError: There are none of a kind.
-    """
-    test = poses.test or ()
-    train = tuple(sorted(set(range(count)) - set(test)))
-    if not train or not test:
-        raise SceneError(
-            f"{poses.source} gives {len(train)} train and {len(test)} test views; at least 1 of each is needed: check "
-            "the photos that it lists"
-        )
-    return train, test
-
-
-def _with_random_points(root: Path, poses: ColmapModel, cameras: list[Camera]) -> ColmapModel:
-    points = random_points(cameras)
-    log.info("%s has no points: %d random ones in the volume that the cameras see take their place", root, len(points))
-    return replace(poses, points=points, colors=np.full((len(points), 3), 128, np.uint8))
-
-
-def _check_arguments(factor: int | None, max_width: int | None, test_every: int) -> None:
-    if factor is not None and factor not in _FACTORS:
-        raise ValueError(f"factor must be None, 1, 2, 4 or 8, got {factor}")
-    if max_width is not None and max_width < 1:
-        raise ValueError(f"max_width must be None or at least 1 pixel, got {max_width}")
-    if test_every < 2:
-        raise ValueError(f"test_every must be at least 2 (1 leaves no train view), got {test_every}")
 
 
 def _image_folder(root: Path, name: str, factor: int | None) -> tuple[Path, int]:
@@ -268,9 +230,7 @@ def _locate(images: Sequence[ColmapImage], folder: Path) -> list[Path]:
     found = [folder / image.name for image in images]
     absent = [i for i, path in enumerate(found) if not path.is_file()]
     if absent:
-        by_stem = {
-            path.relative_to(folder).with_suffix(""): path for path in sorted(folder.rglob("*")) if path.is_file()
-        }
+        by_stem = _by_stem(folder)
         for i in absent:
             found[i] = by_stem.get(Path(images[i].name).with_suffix(""), found[i])
         lost = [images[i].name for i in absent if not found[i].is_file()]
@@ -282,70 +242,90 @@ def _locate(images: Sequence[ColmapImage], folder: Path) -> list[Path]:
     return found
 
 
+def find_masks(images: Sequence[ColmapImage], root: Path, folders: Sequence[str]) -> list[Path | None]:
+    """The mask of each photo: the one that its model names, or the one of its name in a folder.
+
+    Of ``cam/1.jpg`` that is ``cam/1.jpg.png`` (as COLMAP has it) or ``cam/1.png`` (as nerfstudio has it), with any
+    suffix.
+
+    Args:
+        images: The photos.
+        root: Scene folder.
+        folders: Names of folders of masks in it; the first one that exists counts.
+
+    Raises:
+        SceneError: A mask that the model names does not exist.
+    """
+    folder = next((root / name for name in folders if (root / name).is_dir()), None)
+    files = {} if folder is None else _by_stem(folder)
+    found = [
+        image.mask or files.get(Path(image.name)) or files.get(Path(image.name).with_suffix("")) for image in images
+    ]
+    lost = [path for path in found if path is not None and not path.is_file()]
+    if lost:
+        raise SceneError(f"{len(lost)} masks do not exist, first {lost[0]}: copy them, or remove mask_path")
+    if folder is not None and not any(found):
+        name = Path(images[0].name)
+        usual = name.with_suffix(".png")
+        log.warning("%s has no mask of any photo: that of %s would be %s.png or %s", folder, name, name, usual)
+    return found
+
+
+def _by_stem(folder: Path) -> dict[Path, Path]:
+    """The files in a folder and the folders in it, by their path there without suffix."""
+    return {path.relative_to(folder).with_suffix(""): path for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
 def same_shape(camera: Any, width: int, height: int) -> bool:
     """Whether a picture has the aspect ratio of its ``pycolmap.Camera``, up to rounding of its size."""
     return bool(abs(width * camera.height / (height * camera.width) - 1) < ROUNDED)
+
+
+_CAMERAS_WITH_KEPT_MAPS = 8
+"""With more distorted cameras than this (say, one per photo), the undistortion maps would take more than the images."""
 
 
 def _image_sources(
     model: ColmapModel, paths: list[Path], masks: list[Path | None], divisor: int, max_width: int | None
 ) -> list[ImageSource]:
     """One source per view; views with the same camera and file size share their undistortion."""
-    heads = [image_head(path) for path in paths]
-    turned = [_is_turned(model.cameras[image.camera_id], head) for image, head in zip(model.images, heads, strict=True)]
-    if any(turned):
-        log.info("%d of %d photos are turned by their EXIF orientation, as their cameras are", sum(turned), len(turned))
-    sizes = [head.size[::-1] if turn else head.size for head, turn in zip(heads, turned, strict=True)]
-    kinds = [(image.camera_id, size) for image, size in zip(model.images, sizes, strict=True)]
-    others = sum(not same_shape(model.cameras[camera_id], *size) for camera_id, size in kinds)
-    if others:
+    kinds, orientations, transparent = [], [], []
+    for image, path in zip(model.images, paths, strict=True):
+        camera, head = model.cameras[image.camera_id], image_head(path)
+        size, on_its_side = head.size, head.size[::-1]
+        # COLMAP calibrates photos as they are stored, other programs as their EXIF orientation shows them.
+        turned = head.lies_on_its_side and not same_shape(camera, *size) and same_shape(camera, *on_its_side)
+        kinds.append((image.camera_id, on_its_side if turned else size))
+        orientations.append(head.orientation if turned else 1)
+        transparent.append(head.has_alpha)
+    if turned_count := sum(orientation != 1 for orientation in orientations):
+        log.info("%d of %d photos are turned by their EXIF orientation, as their cameras are", turned_count, len(kinds))
+    if others := sum(not same_shape(model.cameras[camera_id], *size) for camera_id, size in kinds):
         log.warning("%d of %d photos %s", others, len(kinds), OTHER_SHAPE)
-    rectified: dict[tuple[int, tuple[int, int]], tuple[Pinhole, Undistortion | None]] = {}
-    keep_maps = len(Counter(kinds)) <= _CAMERAS_WITH_KEPT_MAPS
+    keep_maps = len(set(kinds)) <= _CAMERAS_WITH_KEPT_MAPS
+    rectified = {}
     for camera_id, size in dict.fromkeys(kinds):
-        camera = model.cameras[camera_id]
-        rectified[camera_id, size] = rectify(camera, *size, keep_maps=keep_maps)
-    sources = []
-    for path, mask, kind, head, turn in zip(paths, masks, kinds, heads, turned, strict=True):
-        full, undistortion = rectified[kind]
-        source = ImageSource(
-            path,
-            kind[1],
-            undistortion,
-            full.resized(*target_size(full.width, full.height, divisor, max_width)),
-            orientation=head.orientation if turn else 1,
-            mask=mask,
-            has_alpha=head.has_alpha,
-            backdrop=_WHITE if model.synthetic else None,
-        )
-        sources.append(source)
-    return sources
+        full, undistortion = rectify(model.cameras[camera_id], *size, keep_maps=keep_maps)
+        scale = 1 / divisor if max_width is None or full.width <= max_width else max_width / full.width
+        pinhole = full.resized(max(1, round(full.width * scale)), max(1, round(full.height * scale)))
+        rectified[camera_id, size] = size, undistortion, pinhole
+    return [
+        ImageSource(path, *rectified[kind], orientation, mask, has_alpha, model.synthetic)
+        for path, kind, orientation, mask, has_alpha in zip(paths, kinds, orientations, masks, transparent, strict=True)
+    ]
 
 
-def _is_turned(camera: Any, head: ImageHead) -> bool:
-    """Whether the program that made a camera looked at its photo turned by its EXIF orientation, as COLMAP does not."""
-    width, height = head.size
-    return head.lies_on_its_side and not same_shape(camera, width, height) and same_shape(camera, height, width)
-
-
-def target_size(width: int, height: int, divisor: int, max_width: int | None) -> tuple[int, int]:
-    """Size in pixels at which an undistorted image is used."""
-    scale = 1 / divisor
-    if max_width is not None and width > max_width:
-        scale = max_width / width
-    return max(1, round(width * scale)), max(1, round(height * scale))
-
-
-def _camera(image: ColmapImage, pinhole: Pinhole) -> Camera:
-    K, viewmat = torch.from_numpy(pinhole.K).float(), torch.from_numpy(image.viewmat).float()
+def _camera(image: ColmapImage, source: ImageSource) -> Camera:
+    pinhole = source.pinhole
     try:
+        K, viewmat = torch.from_numpy(pinhole.K).float(), torch.from_numpy(image.viewmat).float()
         return Camera(K, viewmat, pinhole.width, pinhole.height)
     except ValueError as error:
         raise SceneError(f"camera {image.camera_id} of image {image.name}: {error}; run COLMAP again") from error
 
 
-def _extent(centres: NDArray[np.float64]) -> float:
-    return float(1.1 * np.linalg.norm(centres - centres.mean(0), axis=1).max())
+_AT_CAMERA = 1e-6
+"""Distance from a camera's centre, in extents, within which a point is a failed triangulation, not a surface."""
 
 
 def _away_from(centres: NDArray[np.float64], points: NDArray[np.float64], radius: float) -> NDArray[np.bool_]:
@@ -361,9 +341,12 @@ def _away_from(centres: NDArray[np.float64], points: NDArray[np.float64], radius
     return away
 
 
-def _warn_if_far(centres: NDArray[np.float64], extent: float) -> None:
+_FARTHEST = 1e4
+"""Distance of the cameras from the origin, in extents, beyond which rounding moves splats by much of a pixel."""
+
+
+def _warn_if_far(distance: float, extent: float) -> None:
     """Warn where float32 positions are too coarse for the scene, as in geographic coordinates."""
-    distance = float(np.linalg.norm(centres.mean(0)))
     if extent > 0 and distance > _FARTHEST * extent:
         log.warning(
             "the cameras are %.3g scene units from the origin, %.0f times the extent of the scene: float32 positions "
@@ -372,3 +355,47 @@ def _warn_if_far(centres: NDArray[np.float64], extent: float) -> None:
             distance / extent,
             float(np.spacing(np.float32(distance))),
         )
+
+
+def edge_strength(image: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Edge strength ``[H, W]`` of a photo, in [0, 1]: the positive part of a high-pass filter of its grey values.
+
+    The strongest edge has strength 1; a photo without any edge is 0 everywhere.
+
+    Args:
+        image: ``[H, W, 3]`` uint8 RGB.
+        mask: Which pixels count ``[H, W]`` bool; those beside one that does not have strength 0. None if all count.
+    """
+    edges = torch.from_numpy(_high_pass(image, cv2.CV_8U, mask))  # which also clips to 0..255
+    low, high = int(edges.min()), int(edges.max())
+    return ((edges.float() - low) / max(high - low, 1)).to(image.device)
+
+
+_DETAIL = 20
+"""High-pass value, of grey values up to 255, from which a pixel counts as detailed: well above the noise of a photo."""
+_SAMPLE = 32
+"""Photos that are looked at for the detail of a scene."""
+
+
+def detailed_pixels(scene: Scene) -> float:
+    """Pixels of a train photo that differ clearly from their neighbours, on average over the photos.
+
+    Args:
+        scene: At most 32 of its photos, evenly spaced, are decoded.
+
+    Raises:
+        SceneError: An image cannot be decoded.
+    """
+    pictures = (scene.images[index] for index in scene.some_train(_SAMPLE))
+    counts = [int((np.abs(_high_pass(image, cv2.CV_16S, mask)) > _DETAIL).sum()) for image, mask in pictures]
+    return sum(counts) / len(counts)
+
+
+def _high_pass(image: Tensor, depth: int, mask: Tensor | None) -> NDArray[Any]:
+    """Eight times the grey value of each pixel less those of its neighbours, 0 beside pixels that do not count."""
+    grey = cv2.cvtColor(image.cpu().numpy(), cv2.COLOR_RGB2GRAY)
+    kernel = np.array([[-1, -1, -1], [-1, 8, -1], [-1, -1, -1]], np.float32)
+    passed = np.asarray(cv2.filter2D(grey, depth, kernel))
+    if mask is not None:
+        passed *= cv2.erode(mask.cpu().numpy().view(np.uint8), np.ones((3, 3), np.uint8))
+    return passed

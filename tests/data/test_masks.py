@@ -14,8 +14,7 @@ import torch
 from lightning.pytorch import Trainer
 
 from nsvq_lightning.data.datamodule import ColmapDataModule, DevicePhotos
-from nsvq_lightning.data.edges import edge_strength
-from nsvq_lightning.data.scene import SceneError, load_scene
+from nsvq_lightning.data.scene import SceneError, edge_strength, load_scene
 from nsvq_lightning.training.module import SplatModule
 from tests.conftest import SceneFactory
 from tests.support.transforms_scenes import write_blender, write_nerfstudio

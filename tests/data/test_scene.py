@@ -15,7 +15,7 @@ from lightning.fabric.utilities import move_data_to_device
 from nsvq_lightning.data.colmap import import_pycolmap, larger_models
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.reconstruct import reconstruct
-from nsvq_lightning.data.scene import SceneError, load_scene, split_views
+from nsvq_lightning.data.scene import SceneError, load_scene
 
 SceneFactory = Callable[..., Path]
 
@@ -230,7 +230,7 @@ def test_missing_image_folder(make_scene: SceneFactory) -> None:
 def test_split_without_train_views(make_scene: SceneFactory) -> None:
     with pytest.raises(SceneError, match="leave 0 train and 1 test views"):
         load_scene(make_scene(views=1))
-    assert split_views(["a", "b"], 8) == ((1,), (0,))
+    assert load_scene(make_scene("two", views=2)).train == (1,)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -257,9 +258,9 @@ def test_trained_splats_are_rendered_with_all_their_coefficients() -> None:
     assert SplatModule(sh_degree=2).active_sh_degree == 0  # from points, the degree grows
 
 
-def test_photos_from_one_place_are_named(make_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photos_from_one_place_are_named(make_scene: Callable[..., Path]) -> None:
     module, data = SplatModule(), ColmapDataModule(str(make_scene()))
-    monkeypatch.setattr("nsvq_lightning.data.scene._extent", lambda centres: 0.0)
+    data.scene = replace(data.scene, extent=0.0)
     trainer = Trainer(max_steps=1, logger=False, enable_checkpointing=False, enable_progress_bar=False)
     with pytest.raises(ValueError, match=r"the 7 train photos of .* are taken from one place.* move while"):
         trainer.fit(module, data)
