@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -14,17 +14,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nsvq_lightning.data.colmap import (
-    LARGEST,
-    LARGEST_SIDE,
-    ColmapImage,
-    ColmapModel,
-    SceneError,
-    check_name,
-    find_model,
-    import_pycolmap,
-    read_model,
-)
+from nsvq_lightning.data import colmap
+from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, check_name
 from nsvq_lightning.data.images import image_head
 from nsvq_lightning.data.point_cloud import read_points, share_seen
 from nsvq_lightning.rendering.camera import Camera
@@ -33,20 +24,7 @@ __all__ = ["read_poses", "transforms_files"]
 
 log = logging.getLogger(__name__)
 
-_TRANSFORMS, _TRAIN = "transforms.json", "transforms_train.json"
-_TEST = ("transforms_test.json", "transforms_val.json")
-"""Where the test views of a NeRF-synthetic scene are: the first of these that there is."""
-_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
-"""What may be missing at the end of a ``file_path``."""
-_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-_FISHEYE = "OPENCV_FISHEYE"
-_UNROUNDED = 1e-3
-"""How far the axes of a camera may be from a rotation's."""
-_CLEARLY = 1.5
-"""Ratio of points in view from which ``applied_transform`` is taken to be missing from the points."""
-
-Kind = tuple[str, int, int, tuple[float, ...]]
-"""COLMAP's name of a camera model, width, height, parameters."""
+_TRAIN = "transforms_train.json"
 
 
 def read_poses(
@@ -68,7 +46,7 @@ def read_poses(
     files = transforms_files(root, model)
     if files:
         return _read_transforms(root, files, allow_outside)
-    poses = read_model(root, observations, model)
+    poses = colmap.read_model(root, observations, model)
     for image in poses.images:
         check_name(image.name, f"the COLMAP model of {root}", allow_outside)
     return poses
@@ -85,12 +63,16 @@ def transforms_files(root: Path, model: str | None = None) -> list[Path]:
     """
     if model is not None:
         return [root / model] if model.endswith(".json") else []
-    if find_model(root) is None:
-        if (root / _TRANSFORMS).is_file():
-            return [root / _TRANSFORMS]
-        if (root / _TRAIN).is_file():
-            return [root / _TRAIN, *[root / name for name in _TEST if (root / name).is_file()][:1]]
-    return []
+    if colmap.find_model(root) is not None:
+        return []
+    single, train, *tests = (root / f"transforms{part}.json" for part in ("", "_train", "_test", "_val"))
+    if single.is_file():
+        return [single]
+    return [train, *[test for test in tests if test.is_file()][:1]] if train.is_file() else []
+
+
+_Lens = tuple[str, int, int, tuple[float, ...]]
+"""COLMAP's name of a camera model, width, height, parameters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +94,7 @@ class _Frame:
             SceneError: It is something else.
         """
         value = self.values.get(key, otherwise)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= colmap.LARGEST:
             raise self.error(f"has {key} = {value!r}, which is no finite number")
         return float(value)
 
@@ -123,7 +105,8 @@ class _Frame:
         if not isinstance(given, str) or not given:
             raise self.error("has no file_path")
         name = self._named(given)
-        return next((name + suffix for suffix in _SUFFIXES if (self.file.parent / (name + suffix)).is_file()), name)
+        whole = (name + suffix for suffix in ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG"))
+        return next((path for path in whole if (self.file.parent / path).is_file()), name)
 
     @property
     def mask(self) -> Path | None:
@@ -137,7 +120,7 @@ class _Frame:
         check_name(name, f"{self.file}: frame {self.position}", self.allow_outside)
         return name
 
-    def kind(self) -> Kind:
+    def lens(self) -> _Lens:
         """Its camera.
 
         Raises:
@@ -145,24 +128,25 @@ class _Frame:
         """
         width, height = self._size()
         fx, fy = self._focal("x", width), self._focal("y", height)
-        lens = (fx, fy, self.number("cx", width / 2), self.number("cy", height / 2))
+        pinhole = (fx, fy, self.number("cx", width / 2), self.number("cy", height / 2))
         radial = tuple(self.number(f"k{i}") for i in range(1, 5))
         tangential = self.number("p1"), self.number("p2")
-        model = self.values.get("camera_model", _FISHEYE if self.values.get("is_fisheye") is True else "OPENCV")
-        if model == _FISHEYE and not any(tangential):
-            return _FISHEYE, width, height, (*lens, *radial)
-        if model not in _PERSPECTIVE or radial[3]:
-            distorted = f" and k4 = {radial[3]:g}" if model in _PERSPECTIVE else ""
+        fisheye, perspective = "OPENCV_FISHEYE", ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+        model = self.values.get("camera_model", fisheye if self.values.get("is_fisheye") is True else "OPENCV")
+        if model == fisheye and not any(tangential):
+            return fisheye, width, height, (*pinhole, *radial)
+        if model not in perspective or radial[3]:
+            distorted = f" and k4 = {radial[3]:g}" if model in perspective else ""
             raise self.error(
                 f"has camera_model {model}{distorted}, which cannot be read; PINHOLE, OPENCV (k1 to k3, p1, p2) and "
                 "OPENCV_FISHEYE (k1 to k4) can",
                 "export the photos undistorted, as PINHOLE",
             )
         if radial[2]:
-            return "FULL_OPENCV", width, height, (*lens, *radial[:2], *tangential, radial[2], 0.0, 0.0, 0.0)
+            return "FULL_OPENCV", width, height, (*pinhole, *radial[:2], *tangential, radial[2], 0.0, 0.0, 0.0)
         if any(radial) or any(tangential):
-            return "OPENCV", width, height, (*lens, *radial[:2], *tangential)
-        return "PINHOLE", width, height, lens
+            return "OPENCV", width, height, (*pinhole, *radial[:2], *tangential)
+        return "PINHOLE", width, height, pinhole
 
     def _size(self) -> tuple[int, int]:
         if "w" not in self.values or "h" not in self.values:
@@ -171,8 +155,8 @@ class _Frame:
                 raise self.error(f"is of the photo {path}, which does not exist", "copy the photo there")
             return image_head(path).size
         size = round(self.number("w")), round(self.number("h"))
-        if not 0 < min(size) <= max(size) <= LARGEST_SIDE:
-            raise self.error(f"has size {size[0]}x{size[1]}; sides go from 1 to {LARGEST_SIDE}")
+        if not 0 < min(size) <= max(size) <= colmap.LARGEST_SIDE:
+            raise self.error(f"has size {size[0]}x{size[1]}; sides go from 1 to {colmap.LARGEST_SIDE}")
         return size
 
     def _focal(self, axis: str, side: int) -> float:
@@ -201,13 +185,13 @@ class _Frame:
             matrix = np.array(self.values.get("transform_matrix"), np.float64)
         except (ValueError, TypeError):
             matrix = np.zeros(0)
-        if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) <= LARGEST).all():
+        if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) <= colmap.LARGEST).all():
             raise self.error("has no transform_matrix of 4 by 4 finite numbers")
         # Blender's cameras may be scaled.
         axes = matrix[:3, :3] / np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-30)
         left, _, right = np.linalg.svd(axes)
         rotation = left @ right
-        if np.abs(rotation - axes).max() > _UNROUNDED or np.linalg.det(rotation) < 0:
+        if np.abs(rotation - axes).max() > 1e-3 or np.linalg.det(rotation) < 0:
             raise self.error("has a transform_matrix that is no rotation: its axes are skewed or mirrored")
         viewmat = np.eye(4)
         viewmat[:3, :3] = (rotation * (1, -1, -1)).T
@@ -216,26 +200,24 @@ class _Frame:
 
 
 def _read_transforms(root: Path, files: list[Path], allow_outside: bool) -> ColmapModel:
-    heads, frames = [], []
-    for file in files:
-        head = _document(file)
-        heads.append(head)
-        frames.append({frame.name: frame for frame in _frames(file, head, allow_outside)})
-    test = _test_names(files, heads, frames)
-    chosen = dict(sorted({name: frame for part in frames for name, frame in part.items()}.items()))
-    if test is not None:
-        train_names, test_names = test
-        chosen = {name: frame for name, frame in chosen.items() if name in train_names | test_names}
-    kinds = {name: frame.kind() for name, frame in chosen.items()}
-    numbers = {kind: number for number, kind in enumerate(dict.fromkeys(kinds.values()), start=1)}
-    pycolmap = import_pycolmap()
+    heads, frames = zip(*[_frames(file, allow_outside) for file in files], strict=True)
+    chosen = {name: frame for part in frames for name, frame in part.items()}
+    train, test = map(set, frames) if len(files) == 2 else _listed(heads[0])
+    if train & test:
+        raise SceneError(f"{files[-1]}: {min(train & test)} is a train and a test photo: list it once")
+    is_split = bool(train and test)
+    chosen = {name: frame for name, frame in sorted(chosen.items()) if name in train | test or not is_split}
+    lenses = {name: frame.lens() for name, frame in chosen.items()}
+    numbers = {lens: number for number, lens in enumerate(dict.fromkeys(lenses.values()), start=1)}
+    pycolmap = colmap.import_pycolmap()
     cameras = {
         number: pycolmap.Camera(model=model, width=width, height=height, params=list(params), camera_id=number)
         for (model, width, height, params), number in numbers.items()
     }
-    folder = _common_folder(list(chosen))
+    tops = {PurePosixPath(name).parts[0] if "/" in name else "." for name in chosen}
+    folder = tops.pop() if len(tops) == 1 else "."
     images = tuple(
-        ColmapImage(name.removeprefix(f"{folder}/"), numbers[kinds[name]], frame.viewmat(), frame.mask)
+        ColmapImage(name.removeprefix(f"{folder}/"), numbers[lenses[name]], frame.viewmat(), frame.mask)
         for name, frame in chosen.items()
     )
     points, colors = _points(root, heads[0], images, cameras, allow_outside)
@@ -246,71 +228,47 @@ def _read_transforms(root: Path, files: list[Path], allow_outside: bool) -> Colm
         colors=colors,
         source=files[0].name,
         images_folder=folder,
-        test=None if test is None else tuple(i for i, name in enumerate(chosen) if name in test[1]),
+        test=tuple(i for i, name in enumerate(chosen) if name in test) if is_split else None,
         synthetic=files[0].name == _TRAIN,
     )
 
 
-def _document(file: Path) -> dict[str, Any]:
+def _frames(file: Path, allow_outside: bool) -> tuple[dict[str, Any], dict[str, _Frame]]:
+    """The values of a file, and its frames by the names of their photos.
+
+    Raises:
+        SceneError: It cannot be read or has no frames, one is no table of values, or two are of the same photo.
+    """
     try:
-        document = json.loads(file.read_text(encoding="utf-8-sig"))
+        head = json.loads(file.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise SceneError(f"{file} does not exist: choose another file (--data.model)") from error
     except (OSError, ValueError, RecursionError) as error:
         raise SceneError(f"{file} cannot be read ({error}): copy or export it again") from error
-    if not isinstance(document, dict) or not isinstance(document.get("frames"), list) or not document["frames"]:
+    if not isinstance(head, dict) or not isinstance(head.get("frames"), list) or not head["frames"]:
         raise SceneError(f"{file} has no list of frames, so it has no cameras: export it again")
-    return document
-
-
-def _frames(file: Path, head: dict[str, Any], allow_outside: bool) -> Iterator[_Frame]:
-    """The frames of a file.
-
-    Raises:
-        SceneError: One is no table of values, or two are of the same photo.
-    """
     shared = {key: value for key, value in head.items() if key not in ("frames", "file_path", "mask_path")}
-    names: set[str] = set()
-    for position, frame in enumerate(head["frames"]):
-        if not isinstance(frame, dict):
+    frames: dict[str, _Frame] = {}
+    for position, own in enumerate(head["frames"]):
+        if not isinstance(own, dict):
             raise SceneError(f"{file}: frame {position} is no table of values: export the file again")
-        values = {key: value for key, value in (shared | frame).items() if value is not None}
-        made = _Frame(file, position, values, allow_outside)
-        if made.name in names:
-            raise made.error(f"is of {made.name}, which an earlier frame is of, too", "remove one of them")
-        names.add(made.name)
-        yield made
+        values = {key: value for key, value in (shared | own).items() if value is not None}
+        frame = _Frame(file, position, values, allow_outside)
+        if (name := frame.name) in frames:
+            raise frame.error(f"is of {name}, which an earlier frame is of, too", "remove one of them")
+        frames[name] = frame
+    return head, frames
+
+
+def _listed(head: Mapping[str, Any]) -> list[set[str]]:
+    """Names of the train and test photos that a file lists; an empty set where it lists none of them."""
+    lists = [head.get(f"{part}_filenames") for part in ("train", "test", "val")]
+    train, test, val = ({_plain(str(n)) for n in names} if isinstance(names, list) else set() for names in lists)
+    return [train, test or val]
 
 
 def _plain(path: str) -> str:
     return str(PurePosixPath(path.replace("\\", "/")))
-
-
-def _common_folder(names: list[str]) -> str:
-    """The folder at the top that all files are in; ``"."`` if there is none."""
-    tops = {PurePosixPath(name).parts[0] if "/" in name else "." for name in names}
-    return tops.pop() if len(tops) == 1 else "."
-
-
-def _test_names(
-    files: list[Path], heads: list[dict[str, Any]], frames: list[dict[str, _Frame]]
-) -> tuple[set[str], set[str]] | None:
-    """Names of the train and test photos, where the files say so.
-
-    Raises:
-        SceneError: A photo is in both.
-    """
-    if len(files) == 2:
-        train, test = set(frames[0]), set(frames[1])
-    else:
-        given = [heads[0].get(f"{part}_filenames") for part in ("train", "test", "val")]
-        train, *tests = ({_plain(str(n)) for n in names} if isinstance(names, list) else set() for names in given)
-        test = tests[0] or tests[1]
-        if not (train and test):
-            return None
-    if train & test:
-        raise SceneError(f"{files[-1]}: {min(train & test)} is a train and a test photo: list it once")
-    return train, test
 
 
 def _points(
@@ -337,7 +295,7 @@ def _points(
         for lens in (cameras[image.camera_id],)
     ]
     moved = points @ applied[:, :3].T + applied[:, 3]
-    if share_seen(moved, pinholes) > _CLEARLY * share_seen(points, pinholes):
+    if share_seen(moved, pinholes) > 1.5 * share_seen(points, pinholes):
         log.info("%s: the points are not in the frame of the cameras: applied_transform moves them there", root / name)
         return moved, colors
     return points, colors
