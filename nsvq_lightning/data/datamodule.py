@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import count, pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -54,23 +55,13 @@ class ViewSampler(Sampler[int]):
     def view_at(self, draw: int) -> int:
         """View of draw ``draw`` on this rank, in ``[0, n_views)``."""
         epoch, position = divmod(draw * self.world_size + self.rank, self.n_views)
-        return int(self._permutation(epoch)[position])
-
-    def __iter__(self) -> Iterator[int]:
-        draw = self.start
-        while True:
-            yield self.view_at(draw)
-            draw += 1
-
-    def _permutation(self, epoch: int) -> Tensor:
         if epoch != self._epoch:
             self._order = torch.randperm(self.n_views, generator=generator(self.seed, epoch, "views"))
             self._epoch = epoch
-        return self._order
+        return int(self._order[position])
 
-
-_SHARE = 4
-"""Photos take at most one part in so many of a GPU's memory that is free at the first of them: splats grow."""
+    def __iter__(self) -> Iterator[int]:
+        return map(self.view_at, count(self.start))
 
 
 class DevicePhotos:
@@ -108,18 +99,12 @@ class DevicePhotos:
 
 
 def _spare(device: torch.device) -> int:
-    """Bytes of a device's memory that photos may take."""
-    return torch.cuda.mem_get_info(device)[0] // _SHARE if device.type == "cuda" else 1 << 62
+    """Bytes of a device's memory that photos may take: a quarter of a GPU's that is free, as splats grow."""
+    return torch.cuda.mem_get_info(device)[0] // 4 if device.type == "cuda" else 1 << 62
 
 
 DEMO = Path(__file__).parent / "demo"
 """Folder of the demo scene, a COLMAP scene as any other; nothing is ever written there."""
-
-T = TypeVar("T")
-
-
-def _identity(batch: T) -> T:
-    return batch
 
 
 class ColmapDataModule(LightningDataModule):
@@ -158,10 +143,10 @@ class ColmapDataModule(LightningDataModule):
         allow_outside: bool = False,
     ) -> None:
         super().__init__()
-        self.root = Path(root)
-        self.factor, self.max_width, self.test_every, self.seed = factor, max_width, test_every, seed
-        self.cache_bytes, self.images_folder, self.model, self.masks = cache_bytes, images_folder, model, masks
-        self.allow_outside = allow_outside
+        self.root, self.seed, self.cache_bytes = Path(root), seed, cache_bytes
+        self._load = partial(
+            load_scene, root, factor, max_width, test_every, cache_bytes, images_folder, model, masks, allow_outside
+        )
         self._photos = DevicePhotos(cache_bytes)
 
     @cached_property
@@ -171,17 +156,7 @@ class ColmapDataModule(LightningDataModule):
         Raises:
             SceneError: The folder cannot be used.
         """
-        scene = load_scene(
-            self.root,
-            self.factor,
-            self.max_width,
-            self.test_every,
-            self.cache_bytes,
-            self.images_folder,
-            self.model,
-            self.masks,
-            self.allow_outside,
-        )
+        scene = self._load()
         rank_zero_info(_summary(scene))
         return scene
 
@@ -197,16 +172,16 @@ class ColmapDataModule(LightningDataModule):
         """Load the scene; further calls do nothing.
 
         Raises:
-            SceneError: The folder cannot be used, or there are fewer test views than processes, which would otherwise
-                fail only at the first evaluation.
+            SceneError: The folder cannot be used, or there are fewer views to test on, or predict, than processes,
+                which would otherwise fail only at the first evaluation.
         """
-        count = len(self.scene.test)
-        if stage != "predict":
-            self._check_share(count, "test views")
+        number, views = (len(self.scene), "views") if stage == "predict" else (len(self.scene.test), "test views")
+        if number < self.process[1]:
+            raise SceneError(f"{number} {views} cannot be shared by {self.process[1]} processes: use fewer devices")
 
     def train_dataloader(self) -> DataLoader[View]:
         """Endless train views from the trainer's step on; limit the run with ``max_steps``."""
-        return DataLoader(_TrainViews(self), batch_size=None, collate_fn=_identity)
+        return DataLoader(_TrainViews(self), batch_size=None)
 
     def val_dataloader(self) -> DataLoader[View]:
         """This process's share of the test views, in the order of their names."""
@@ -222,9 +197,7 @@ class ColmapDataModule(LightningDataModule):
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
         """Move a view to the device of the splats; on a GPU its photo stays there while the memory for photos lasts."""
-        if isinstance(batch, View):
-            return self._photos.move(batch, device)
-        return super().transfer_batch_to_device(batch, device, dataloader_idx)
+        return self._photos.move(batch, device)
 
     @property
     def process(self) -> tuple[int, int]:
@@ -239,17 +212,12 @@ class ColmapDataModule(LightningDataModule):
         total = self.trainer.fit_loop.epoch_loop.batch_progress.total
         return int(total.processed)  # type: ignore[attr-defined]  # Lightning types the base of its counters
 
-    def _check_share(self, count: int, views: str) -> None:
-        if count < self.process[1]:
-            raise SceneError(f"{count} {views} cannot be shared by {self.process[1]} processes: use fewer devices")
-
     def _ordered(self, indices: Sequence[int]) -> DataLoader[View]:
         rank, world_size = self.process
-        self._check_share(len(indices), "views")
         views = _OrderedViews(self.scene, indices, stride=world_size)
         # Lightning leaves a DistributedSampler alone, whatever use_distributed_sampler says; this one pads nothing.
         sampler = UnrepeatedDistributedSampler(views, num_replicas=world_size, rank=rank, shuffle=False)
-        return DataLoader(views, batch_size=None, sampler=sampler, collate_fn=_identity)
+        return DataLoader(views, batch_size=None, sampler=sampler)
 
 
 class DemoDataModule(ColmapDataModule):
@@ -271,15 +239,11 @@ class _TrainViews(IterableDataset[View]):
         self._data = data
 
     def __iter__(self) -> Iterator[View]:
-        data, (rank, world_size) = self._data, self._data.process
-        scene = data.scene
-        order = iter(ViewSampler(len(scene.train), data.seed, rank, world_size, start=data.draw))
-        current = scene.train[next(order)]
-        for position in order:
-            following = scene.train[position]
-            scene.images.prefetch(following)
-            yield scene.view(current)
-            current = following
+        scene, (rank, world_size) = self._data.scene, self._data.process
+        order = ViewSampler(len(scene.train), self._data.seed, rank, world_size, start=self._data.draw)
+        for current, following in pairwise(order):
+            scene.images.prefetch(scene.train[following])
+            yield scene.view(scene.train[current])
 
 
 class _OrderedViews(Dataset[View]):
@@ -298,25 +262,17 @@ class _OrderedViews(Dataset[View]):
 
 
 def _summary(scene: Scene) -> str:
+    """Size and split of a scene, and what of its photos does not count."""
     sizes = sorted({(camera.width, camera.height) for camera in scene.cameras})
     size = f"{sizes[0][0]}x{sizes[0][1]}" + (f" to {sizes[-1][0]}x{sizes[-1][1]}" if len(sizes) > 1 else "")
     names = [scene.names[i] for i in scene.test]
     shown = ", ".join(names) if len(names) <= 8 else f"{', '.join(names[:3])}, …, {names[-1]}"
-    return (
+    text = (
         f"{scene.root}: {len(scene)} views of {size}, {len(scene.points)} points, extent {scene.extent:.3g}; "
-        f"{len(scene.train)} train views, {len(scene.test)} test views ({scene.split}: {shown}){_left_out(scene)}"
+        f"{len(scene.train)} train views, {len(scene.test)} test views ({scene.split}: {shown})"
     )
-
-
-def _left_out(scene: Scene) -> str:
-    """What of the photos does not count, in words."""
-    masked = sum(source.mask is not None for source in scene.images.sources)
-    transparent = sum(source.has_alpha for source in scene.images.sources)
-    return "".join(
-        (
-            f"; {masked} views have a mask" if masked else "",
-            f"; {transparent} may be transparent, which {'is white' if scene.white else 'does not count'}"
-            if transparent
-            else "",
-        )
-    )
+    if masked := sum(source.mask is not None for source in scene.images.sources):
+        text += f"; {masked} views have a mask"
+    if transparent := sum(source.has_alpha for source in scene.images.sources):
+        text += f"; {transparent} may be transparent, which {'is white' if scene.white else 'does not count'}"
+    return text
