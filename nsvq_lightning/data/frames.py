@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,20 +16,10 @@ from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.images import ORIENTATION, opened
 from nsvq_lightning.io.atomic import atomic_path, atomic_write
 
-__all__ = ["PHOTOS", "VIDEOS", "copy_photos", "photos_in", "sharpness", "write_frames"]
-
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 """Suffixes of photos that both COLMAP and this package read."""
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 """Suffixes of videos."""
-CLOSED = (".heic", ".heif", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".dng")
-"""Suffixes of photos that must be converted first."""
-SMALL = 480
-"""Width in pixels at which sharpness is measured: noise is no sharpness."""
-TINY = 48, 27
-"""Pixels at which two frames are compared."""
-STILL = 2.0
-"""Mean difference, of 255, below which the camera has not moved between two frames."""
 JPEG_QUALITY = 95
 
 
@@ -40,7 +30,8 @@ def photos_in(folder: Path) -> list[Path]:
         SceneError: There are none, or some in a format that must be converted first.
     """
     files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-    closed = [path.name for path in files if path.suffix.lower() in CLOSED]
+    must_convert = (".heic", ".heif", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".dng")
+    closed = [path.name for path in files if path.suffix.lower() in must_convert]
     if closed:
         raise SceneError(
             f"{folder}: {closed[0]} and {len(closed) - 1} more cannot be read: convert them to JPEG first, for example "
@@ -88,15 +79,13 @@ def copy_photos(photos: Sequence[Path], folder: Path, done: Callable[[int], None
 def sharpness(picture: MatLike) -> float:
     """Variance of the Laplacian of a picture, reduced to the same width whatever its size: more is sharper."""
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.ndim == 3 else picture
-    factor = min(1.0, SMALL / grey.shape[1])
+    factor = min(1.0, 480 / grey.shape[1])  # noise is no sharpness
     small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(small, cv2.CV_64F).var())
 
 
-class _Frame(NamedTuple):
-    number: int
-    sharpness: float
-    picture: MatLike
+STILL = 2.0
+"""Mean difference, of 255, below which the camera has not moved between two frames."""
 
 
 def write_frames(video: Path, folder: Path, count: int, done: Callable[[int], None]) -> list[Path]:
@@ -117,18 +106,17 @@ def write_frames(video: Path, folder: Path, count: int, done: Callable[[int], No
     total = frame_count(video)
     parts = min(count, total)
     written: list[Path] = []
-    best: _Frame | None = None
     last: MatLike | None = None
-    part = 0
-    for index, picture in _frames(video):
-        if index * parts // total != part:
-            last = _keep(best, folder, last, written)
-            best, part = None, index * parts // total
-        found = sharpness(picture)
-        if best is None or found > best.sharpness:
-            best = _Frame(index, found, picture)
-        done(index + 1)
-    _keep(best, folder, last, written)
+    for _, part in itertools.groupby(_frames(video, done), key=lambda frame: frame[0] * parts // total):
+        number, picture = max(part, key=lambda frame: sharpness(frame[1]))
+        tiny = cv2.resize(picture, (48, 27), interpolation=cv2.INTER_AREA).astype(np.float32)
+        if last is not None and float(np.abs(tiny - last).mean()) < STILL:
+            continue
+        path = folder / f"frame_{number:06d}.jpg"
+        with atomic_write(path) as file:
+            file.write(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())
+        written.append(path)
+        last = tiny
     return written
 
 
@@ -140,38 +128,23 @@ def frame_count(video: Path) -> int:
     """
     reader = cv2.VideoCapture(str(video))
     total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
-    if total <= 0 and reader.isOpened():  # some containers do not say
-        total = 0
-        while reader.grab():
-            total += 1
     reader.release()
-    if total <= 0:
+    if total <= 0:  # some containers do not say
+        total = sum(1 for _ in _frames(video, lambda _: None))
+    if not total:
         raise SceneError(f"{video}: no frame can be read; convert it with 'ffmpeg -i {video.name} converted.mp4'")
     return total
 
 
-def _frames(video: Path) -> Iterator[tuple[int, MatLike]]:
-    reader, index = cv2.VideoCapture(str(video)), 0
+def _frames(video: Path, done: Callable[[int], None]) -> Iterator[tuple[int, MatLike]]:
+    """The frames with their numbers; ``done`` is called with how many have been used."""
+    reader = cv2.VideoCapture(str(video))
     try:
-        while True:
+        for index in itertools.count():
             found, picture = reader.read()
             if not found:
                 return
             yield index, picture
-            index += 1
+            done(index + 1)
     finally:
         reader.release()
-
-
-def _keep(best: _Frame | None, folder: Path, last: MatLike | None, written: list[Path]) -> MatLike | None:
-    """Write a frame unless it shows what the last one did; returns the last one kept, tiny."""
-    if best is None:
-        return last
-    tiny = cv2.resize(best.picture, TINY, interpolation=cv2.INTER_AREA).astype(np.float32)
-    if last is not None and float(np.abs(tiny - last).mean()) < STILL:
-        return last
-    path = folder / f"frame_{best.number:06d}.jpg"
-    with atomic_write(path) as file:
-        file.write(cv2.imencode(".jpg", best.picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())
-    written.append(path)
-    return tiny

@@ -14,15 +14,6 @@ from nsvq_lightning.io.ply import read_ply_columns, read_ply_size
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 
-__all__ = ["RANDOM_POINTS", "random_points", "read_points", "share_seen"]
-
-RANDOM_POINTS = 20_000
-"""Points of a scene that comes without."""
-_CANDIDATES = 8
-"""Random points that are drawn for each that is kept."""
-_GREY = 128
-_COLORS = ("red", "green", "blue")
-
 
 def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Positions ``[P, 3]`` and RGB colours ``[P, 3]`` of a ``.ply`` point cloud; points without a colour are grey.
@@ -36,14 +27,15 @@ def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         header, _ = read_ply_size(path)
         if missing := [axis for axis in "xyz" if axis not in header.properties]:
             raise FormatError(f"{path}: its vertices have no {', '.join(missing)}")
-        colored = set(_COLORS) <= set(header.properties)
-        names = ("x", "y", "z", *(_COLORS if colored else ()))
+        rgb = ("red", "green", "blue")
+        colored = set(rgb) <= set(header.properties)
+        names = ("x", "y", "z", *(rgb if colored else ()))
         table = np.concatenate([np.zeros((0, len(names)), np.float32), *read_ply_columns(path, header, names)])
     except FormatError as error:
         raise SceneError(f"points {error}") from error
     xyz = table[:, :3].astype(np.float64)
     if not colored:
-        return xyz, np.full((len(xyz), 3), _GREY, np.uint8)
+        return xyz, np.full((len(xyz), 3), 128, np.uint8)
     # Some programs write them in [0, 1].
     scale = 255 if header.dtype["red"].kind == "f" else 1
     return xyz, (np.nan_to_num(table[:, 3:]) * scale).clip(0, 255).round().astype(np.uint8)
@@ -52,6 +44,10 @@ def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
 def share_seen(points: NDArray[np.float64], cameras: list[Camera]) -> float:
     """Mean share of the cameras that have a point in their picture, walls disregarded."""
     return float(_sightings(points, cameras).mean() / len(cameras)) if len(points) else 0.0
+
+
+RANDOM_POINTS = 20_000
+"""Points of a scene that comes without."""
 
 
 def random_points(cameras: list[Camera]) -> NDArray[np.float64]:
@@ -64,7 +60,7 @@ def random_points(cameras: list[Camera]) -> NDArray[np.float64]:
         cameras: At least one.
     """
     draws = generator(0, 0, "random points")
-    count = _CANDIDATES * RANDOM_POINTS
+    count = 8 * RANDOM_POINTS
     views = np.stack([camera.viewmat.double().numpy() for camera in cameras])
     rotations = views[:, :3, :3]
     centres = -np.einsum("vji,vj->vi", rotations, views[:, :3, 3])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import shutil
 import sqlite3
 import threading
@@ -14,19 +15,6 @@ from typing import Any
 
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
 from nsvq_lightning.data.images import image_head
-
-__all__ = ["Verdict", "reconstruct"]
-
-EXHAUSTIVE = 120
-"""Photos up to which every pair is compared; frames of a video are compared with those near them from half of it on."""
-OVERLAP = 12
-"""Frames after each with which it is compared, and as many farther ones at distances that double."""
-SHARED = 8
-"""Photos of one size from which on their camera has a lens model of four numbers, not one."""
-BATCH = 4
-"""Photos whose features are found between two reports."""
-POLLED = 1.0
-"""Seconds between two looks at how many pairs are compared."""
 
 Report = Callable[[str, int, int], None]
 """Called with a step, how much of it is done, and how much there is."""
@@ -78,9 +66,9 @@ def reconstruct(
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     pycolmap.set_random_seed(0)
     database, images = scene / "database.db", scene / "images"
-    _find_features(pycolmap, database, images, names, report, max_size, threads)
-    _compare(pycolmap, database, len(names), report, is_video, threads)
-    models = _map(pycolmap, database, scene, len(names), report, threads)
+    _find_features(database, images, names, report, max_size, threads)
+    _compare(database, len(names), report, is_video, threads)
+    models = _map(database, scene, len(names), report, threads)
     common = _partners(database)
     if not models:
         raise SceneError(
@@ -99,12 +87,16 @@ def reconstruct(
     )
 
 
+SHARED = 8
+"""Photos of one size from which on their camera has a lens model of four numbers, not one."""
+
+
 def _find_features(
-    pycolmap: Any, database: Path, images: Path, names: Sequence[str], report: Report, max_size: int, threads: int
+    database: Path, images: Path, names: Sequence[str], report: Report, max_size: int, threads: int
 ) -> None:
-    known = _rows(database, "select name from images join keypoints using (image_id)") if database.exists() else []
-    found = {name for (name,) in known}
-    cameras = dict(_rows(database, "select name, camera_id from images")) if database.exists() else {}
+    pycolmap = import_pycolmap()
+    found = {name for (name,) in _rows(database, "select name from images join keypoints using (image_id)")}
+    cameras = dict(_rows(database, "select name, camera_id from images"))
     groups: defaultdict[tuple[int, int], list[str]] = defaultdict(list)
     for name in names:
         groups[image_head(images / name).size].append(name)
@@ -116,7 +108,7 @@ def _find_features(
         todo = [name for name in group if name not in found]
         while todo:
             # The first one alone makes the camera of its group.
-            size = BATCH if reader.existing_camera_id >= 0 else 1
+            size = 4 if reader.existing_camera_id >= 0 else 1
             batch, todo = todo[:size], todo[size:]
             pycolmap.extract_features(
                 database,
@@ -134,7 +126,14 @@ def _find_features(
             report("finding features", done, len(names))
 
 
-def _compare(pycolmap: Any, database: Path, count: int, report: Report, is_video: bool, threads: int) -> None:
+EXHAUSTIVE = 120
+"""Photos up to which every pair is compared; frames of a video are compared with those near them from half of it on."""
+OVERLAP = 12
+"""Frames after each with which it is compared, and as many farther ones at distances that double."""
+
+
+def _compare(database: Path, count: int, report: Report, is_video: bool, threads: int) -> None:
+    pycolmap = import_pycolmap()
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
     exhaustive = count <= (EXHAUSTIVE // 2 if is_video else EXHAUSTIVE)
     pairs = count * (count - 1) // 2 if exhaustive else 2 * OVERLAP * count
@@ -149,22 +148,21 @@ def _compare(pycolmap: Any, database: Path, count: int, report: Report, is_video
     report("comparing photos", pairs, pairs)
 
 
-def _map(pycolmap: Any, database: Path, scene: Path, count: int, report: Report, threads: int) -> list[Any]:
+def _map(database: Path, scene: Path, count: int, report: Report, threads: int) -> list[Any]:
     """The models, the largest first, which are then in ``scene/sparse``."""
+    pycolmap = import_pycolmap()
     work, sparse = scene / "mapping", scene / "sparse"
     if not (sparse / "0").is_dir():
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir()
-        placed = 0
-
-        def count_image() -> None:
-            nonlocal placed
-            placed += 1
-            report("placing cameras", min(placed, count), count)
-
+        placed = itertools.count(1)
         options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=0, min_model_size=3)
         found = pycolmap.incremental_mapping(
-            database, scene / "images", work, options=options, next_image_callback=count_image
+            database,
+            scene / "images",
+            work,
+            options=options,
+            next_image_callback=lambda: report("placing cameras", min(next(placed), count), count),
         )
         ordered = _adding(found.values())
         shutil.rmtree(work)
@@ -211,7 +209,7 @@ def _polled(database: Path, show: Callable[[int], None]) -> Iterator[None]:
     ended = threading.Event()
 
     def poll() -> None:
-        while not ended.wait(POLLED):
+        while not ended.wait(timeout=1.0):
             with contextlib.suppress(sqlite3.Error):
                 show(_rows(database, "select count(*) from two_view_geometries")[0][0])
 
@@ -225,5 +223,8 @@ def _polled(database: Path, show: Callable[[int], None]) -> Iterator[None]:
 
 
 def _rows(database: Path, query: str, *values: Any) -> list[tuple[Any, ...]]:
+    """What a query finds in a database; nothing where there is none."""
+    if not database.exists():
+        return []
     with contextlib.closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)) as connection:
         return connection.execute(query, values).fetchall()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,14 +13,7 @@ from numpy.typing import NDArray
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap
 from nsvq_lightning.skips import is_on
 
-__all__ = ["Pinhole", "Undistortion", "rectify"]
-
-_LOG = logging.getLogger(__name__)
-
-_PINHOLE = ("SIMPLE_PINHOLE", "PINHOLE")
-# With all distortion parameters 0 these are pinholes; fisheye models are not, whatever their parameters.
-_POLYNOMIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-_ROWS_AT_ONCE = 256
+log = logging.getLogger(__name__)
 
 
 class Maps(NamedTuple):
@@ -122,36 +114,36 @@ class Undistortion:
         """Where each pixel of the pinhole image comes from."""
         if self._maps is not None:
             return self._maps
-        pixels = np.concatenate(list(self._source_pixels())).reshape(self.pinhole.height, self.pinhole.width, 2)
+        pixels = self._source_pixels()
         # more than a pixel outside, or NaN where the ray leaves the domain of the camera model
         blank: NDArray[np.bool_] = np.any((pixels <= -1) | (pixels >= self._size) | np.isnan(pixels), axis=-1)
         columns, rows = (np.nan_to_num(pixels[..., i], nan=-1.0) for i in (0, 1))
         maps = Maps(columns, rows, blank if blank.any() else None)
-        if maps.blank is not None:
-            self._warn_of(maps.blank)
-        if self._keep_maps:
-            self._maps = maps
-        return maps
-
-    def _source_pixels(self) -> Iterator[NDArray[np.float32]]:
-        """Blocks ``[B, 2]`` of source pixels: a whole image in float64 would take gigabytes."""
-        K, width, height = self.pinhole.K, self.pinhole.width, self.pinhole.height
-        x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
-        y = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
-        for top in range(0, height, _ROWS_AT_ONCE):
-            grid = np.meshgrid(x, y[top : top + _ROWS_AT_ONCE])
-            rays = np.stack([*grid, np.ones_like(grid[0])], axis=-1).reshape(-1, 3)
-            yield (np.asarray(self._camera.img_from_cam(rays)) * self._scale - 0.5).astype(np.float32)
-
-    def _warn_of(self, blank: NDArray[np.bool_]) -> None:
-        if not self._warned:
+        if maps.blank is not None and not self._warned:
             self._warned = True
-            _LOG.warning(
+            log.warning(
                 "camera %s (%s): %.1f %% of the pinhole image is left out: its field of view is too wide for a pinhole",
                 self._camera.camera_id,
                 self._camera.model_name,
                 100 * blank.mean(),
             )
+        if self._keep_maps:
+            self._maps = maps
+        return maps
+
+    def _source_pixels(self) -> NDArray[np.float32]:
+        """Where each pixel of the pinhole image comes from ``[H, W, 2]``."""
+        K, width, height = self.pinhole.K, self.pinhole.width, self.pinhole.height
+        x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
+        y = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
+        pixels = np.empty((height, width, 2), np.float32)
+        at_once = 256  # rows: a whole image in float64 would take gigabytes
+        for top in range(0, height, at_once):
+            grid = np.meshgrid(x, y[top : top + at_once])
+            rays = np.stack([*grid, np.ones_like(grid[0])], axis=-1).reshape(-1, 3)
+            block = np.asarray(self._camera.img_from_cam(rays)) * self._scale - 0.5
+            pixels[top : top + at_once] = block.reshape(-1, width, 2)
+        return pixels
 
 
 def rectify(camera: Any, width: int, height: int, keep_maps: bool = True) -> tuple[Pinhole, Undistortion | None]:
@@ -167,8 +159,10 @@ def rectify(camera: Any, width: int, height: int, keep_maps: bool = True) -> tup
         SceneError: The camera cannot be turned into a pinhole camera.
     """
     # An all-zero polynomial is a pinhole too, but COLMAP's undistorter would crop its picture by a pixel.
-    skip = camera.model_name in _POLYNOMIAL and camera.is_undistorted()
-    if skip or (camera.model_name in _PINHOLE and is_on("undistortion")):
+    # Fisheye models without distortion are none.
+    polynomial = camera.model_name in ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+    is_pinhole = camera.model_name in ("SIMPLE_PINHOLE", "PINHOLE")
+    if (polynomial and camera.is_undistorted()) or (is_pinhole and is_on("undistortion")):
         pinhole = Pinhole(camera.calibration_matrix(), camera.width, camera.height)
         return pinhole.resized(width, height), None
     undistortion = Undistortion(camera, width, height, keep_maps)
