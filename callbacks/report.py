@@ -25,7 +25,8 @@ from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_bit, psnr
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.report.evaluation import ViewScore, evaluate
-from nsvq_lightning.report.files import paper_level, summarize, write_curve, write_curve_csv, write_metrics, write_views
+from nsvq_lightning.report.figures import write_csv
+from nsvq_lightning.report.files import paper_level, summarize, write_curve, write_metrics
 from nsvq_lightning.report.page import RunPage
 from nsvq_lightning.report.pictures import comparison, file_stem, log_pictures, write_png
 from nsvq_lightning.splats.splats import RawSplats
@@ -129,10 +130,10 @@ class MetricReport(WritingCallback):
         """Evaluate the end of the run if no epoch has ended, and draw the curve."""
         self._evaluate_once(trainer, module, trainer.global_step)
         folder = run_folder(trainer)
-        if trainer.is_global_zero and module.history and not is_trial(trainer):
-            with module.stopwatch.paused(module.device):
-                write_curve_csv(folder / "curve.csv", module.history)
-                write_curve(folder / "curve.png", module.history, module.schedule)
+        if trainer.is_global_zero and host.history and not is_trial(trainer):
+            with host.stopwatch.paused(host.device):
+                write_csv(folder / "curve.csv", host.history)
+                write_curve(folder / "curve.png", host.history, host.schedule)
 
     def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Catch up for a run that was stopped after its last iteration: when continued, it trains no further."""
@@ -172,8 +173,8 @@ class MetricReport(WritingCallback):
         }
         module.history.append(entry)
         if trainer.is_global_zero:
-            write_curve_csv(folder / "curve.csv", module.history)
-            self._page(folder, module).write()
+            write_csv(folder / "curve.csv", host.history)
+            self._page(folder, host).write()
         values = {f"report/{name}": float(entry[name]) for name in ("psnr", "ssim", "splats")}
         trainer.callback_metrics.update({name: torch.tensor(value) for name, value in values.items()})
         for logger in trainer.loggers:
@@ -256,7 +257,7 @@ class MetricReport(WritingCallback):
                 lpips = fmean(score.lpips for score in scores if score.lpips is not None), None
             metrics = summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper_level)
             write_metrics(folder / "metrics.json", metrics)
-            write_views(folder / "views.csv", scores)
+            write_csv(folder / "views.csv", [asdict(score) for score in scores])
             pictures = [self._picture(trainer, score.name) for score in scores]
             views = [asdict(score) | {"picture": path.name} for score, path in zip(scores, pictures, strict=True)]
             log.info("report: %s", replace(self._page(folder, module), metrics=metrics, views=views).write())

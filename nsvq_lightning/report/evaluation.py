@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,8 +13,6 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import image_metrics
 from nsvq_lightning.rendering.camera import Camera
-
-__all__ = ["Quality", "ViewScore", "evaluate"]
 
 
 @dataclass(frozen=True)
@@ -31,13 +30,11 @@ class ViewScore:
     cc_ssim: float | None = None
 
 
-@dataclass(frozen=True)
-class Quality:
-    """Mean quality over the views of all processes; ``views`` are those of this process."""
+class Quality(NamedTuple):
+    """Mean quality over the views of all processes."""
 
     psnr: float
     ssim: float
-    views: list[ViewScore] = field(default_factory=list)
 
 
 @torch.no_grad()
@@ -58,16 +55,15 @@ def evaluate(
     Raises:
         ValueError: There are no views.
     """
-    metrics = image_metrics().to(device)
-    scores: list[ViewScore] = []
+    metrics, shown = image_metrics().to(device), False
     for view in views:
-        on_device = view.to(device)
-        image = apply_mask(render_image(on_device.camera), on_device.mask)
-        if show is not None and not scores:
-            show(image, on_device.image)
-        values = metrics(image, on_device.image, on_device.mask)
-        scores.append(ViewScore(view.name, float(values["psnr"]), float(values["ssim"])))
-    if not scores:
+        photo = view.to(device)
+        image = kept(render_image(photo.camera), photo.mask)
+        if show is not None and not shown:
+            show(image, photo.image)
+        shown = True
+        metrics.update(image, photo.image, photo.mask)
+    if not shown:
         raise ValueError("there are no views to evaluate; the scene needs at least one test view")
     mean = metrics.compute()
-    return Quality(float(mean["psnr"]), float(mean["ssim"]), scores)
+    return Quality(float(mean["psnr"]), float(mean["ssim"]))

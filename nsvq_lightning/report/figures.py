@@ -4,26 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from nsvq_lightning.io.atomic import atomic_write, write_text
-
-__all__ = [
-    "colours_of",
-    "draw_keys",
-    "markdown_table",
-    "markers_of",
-    "new_figure",
-    "panels",
-    "write_csv",
-    "write_figure",
-]
-
-
-MARKERS = "os^Dvph*X<>"
-"""Matplotlib markers that are distinguishable in print."""
 
 
 def new_figure(width: float, height: float) -> Any:
@@ -35,10 +21,8 @@ def new_figure(width: float, height: float) -> Any:
 
 def write_figure(path: Path, figure: Any) -> None:
     """Write a figure as PNG, cropped to its content, atomically."""
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", bbox_inches="tight")
     with atomic_write(path) as file:
-        file.write(picture.getvalue())
+        figure.savefig(file, format="png", bbox_inches="tight")
 
 
 def colours_of(names: Sequence[str]) -> dict[str, Any]:
@@ -51,7 +35,7 @@ def colours_of(names: Sequence[str]) -> dict[str, Any]:
 
 def markers_of(names: Sequence[str]) -> dict[str, str]:
     """A marker for each name."""
-    return {name: MARKERS[index % len(MARKERS)] for index, name in enumerate(names)}
+    return dict(zip(names, itertools.cycle("os^Dvph*X<>"), strict=False))  # distinguishable in print
 
 
 def draw_keys(figure: Any, colours: Mapping[str, Any], markers: Mapping[str, str], hollow: str | None = None) -> None:
@@ -91,13 +75,6 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: Co
     return "\n".join(f"| {' | '.join(line)} |" for line in [padded[0], rule, *padded[1:]])
 
 
-COLUMNS = 2
-WIDTH = 6.4
-"""Inches of a panel."""
-KEY_LINE = 0.19
-"""Inches of a line of the keys below the panels."""
-
-
 def panels(count: int, height: float, keys: int = 0) -> tuple[Any, list[Any]]:
     """A figure and its axes.
 
@@ -106,9 +83,9 @@ def panels(count: int, height: float, keys: int = 0) -> tuple[Any, list[Any]]:
         height: Of a panel, inches.
         keys: Lines of the keys that :func:`~nsvq_lightning.report.figures.draw_keys` will draw below.
     """
-    across = min(COLUMNS, count)
+    across = min(2, count)
     down = -(-count // across)
-    figure = new_figure(WIDTH * across, height * down + KEY_LINE * keys)
+    figure = new_figure(6.4 * across, height * down + 0.19 * keys)  # inches of a panel, and of a line of the keys
     axes = list(figure.subplots(down, across, squeeze=False).ravel())
     for axis in axes[count:]:
         axis.set_axis_off()

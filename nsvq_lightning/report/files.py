@@ -1,11 +1,10 @@
-"""The files of a report: ``metrics.json``, ``views.csv``, ``curve.csv``, ``curve.png``."""
+"""The numbers of a report, ``metrics.json``, and its curve, ``curve.png``."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +17,9 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import read_header
 from nsvq_lightning.io.nsvq.paper import paper_header
 from nsvq_lightning.report.evaluation import ViewScore
-from nsvq_lightning.report.figures import new_figure, write_csv, write_figure
-from nsvq_lightning.training.resume import ResumedModule
+from nsvq_lightning.report.figures import new_figure, write_figure
+from nsvq_lightning.training.host import SplatHost
 from nsvq_lightning.training.schedule import Phase, Schedule
-
-__all__ = ["paper_level", "summarize", "write_curve", "write_curve_csv", "write_metrics", "write_views"]
 
 PHASE_COLOURS = {Phase.WARMUP: "#dfe8f5", Phase.PRUNE: "#f8e6d0", Phase.QUANTIZE: "#dcefdc", Phase.FINETUNE: "#efe0f0"}
 
@@ -45,13 +42,18 @@ def summarize(
         module: The module, for its history and schedule.
         paper: :func:`paper_level` of the scene that was stored.
     """
+
+    def mean(name: str) -> float:
+        return float(sum(getattr(score, name) for score in scores)) / len(scores)
+
     file_bytes, header = path.stat().st_size, read_header(path)
-    ends = _phase_ends(module.history)
-    pruned = next((end for end in ends if end["phase"] == Phase.PRUNE.name.lower()), None)
+    last = {str(entry["phase"]): dict(entry) for entry in host.history}  # the last evaluation of each phase
+    ends = [last[phase.name.lower()] for phase in Phase if phase.name.lower() in last]
     return {
-        "psnr": _mean([score.psnr for score in scores]),
-        "ssim": _mean([score.ssim for score in scores]),
-        **{name: _mean([getattr(score, name) for score in scores]) for name in ("cc_psnr", "cc_ssim")},
+        "psnr": mean("psnr"),
+        "ssim": mean("ssim"),
+        "cc_psnr": mean("cc_psnr"),
+        "cc_ssim": mean("cc_ssim"),
         "lpips": lpips[0],
         "lpips_reason": lpips[1],
         "views": len(scores),
@@ -63,8 +65,8 @@ def summarize(
         "streams": {"header": header.size, **{stream.name: stream.length for stream in header.streams}},
         "codes": {name: _codes_in_use(codes, len(scene.codebooks[name])) for name, codes in scene.codes.items()},
         "paper_level": dict(paper),
-        "train_seconds": module.stopwatch.seconds,
-        "before_quantization": pruned if scene.codebooks else None,
+        "train_seconds": host.train_seconds,
+        "before_quantization": last.get(Phase.PRUNE.name.lower()) if scene.codebooks else None,
         "phases": ends,
     }
 
@@ -82,18 +84,7 @@ def paper_level(scene: CompressedScene) -> dict[str, Any]:
 
 def write_metrics(path: Path, metrics: Mapping[str, Any]) -> None:
     """Write the numbers as JSON, atomically; an infinite PSNR (no error at all) becomes null."""
-    text = json.dumps(_json_value(metrics), indent=2, allow_nan=False) + "\n"
-    write_text(path, text)
-
-
-def write_views(path: Path, scores: Sequence[ViewScore]) -> None:
-    """Write one row per test view, atomically."""
-    write_csv(path, [asdict(score) for score in scores])
-
-
-def write_curve_csv(path: Path, history: Sequence[Mapping[str, Any]]) -> None:
-    """Write one row per evaluation, atomically."""
-    write_csv(path, history)
+    write_text(path, json.dumps(_json_value(metrics), indent=2, allow_nan=False) + "\n")
 
 
 def write_curve(path: Path, history: Sequence[Mapping[str, Any]], schedule: Schedule) -> None:
@@ -122,16 +113,6 @@ def _codes_in_use(codes: NDArray[np.integer], size: int) -> dict[str, Any]:
     counts = np.bincount(codes, minlength=size)
     shares = counts[counts > 0] / max(1, len(codes))
     return {"codebook": size, "used": len(shares), "entropy": float(-(shares * np.log2(shares)).sum()) + 0.0}
-
-
-def _phase_ends(history: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The last evaluation of each phase."""
-    last = {str(entry["phase"]): dict(entry) for entry in history}
-    return [last[phase.name.lower()] for phase in Phase if phase.name.lower() in last]
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)
 
 
 def _json_value(value: Any) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import math
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib.metadata import version
@@ -24,15 +24,6 @@ from nsvq_lightning.version import __version__
 
 from .files import PHASE_COLOURS
 
-__all__ = ["RunPage", "curve_svg"]
-
-
-WIDTH, HEIGHT = 800, 340
-LEFT, RIGHT, TOP, BOTTOM = 48, 84, 28, 52
-"""Pixels around the axes."""
-TICKS = 5
-"""About how many ticks an axis has."""
-
 
 def curve_svg(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> str:
     """PSNR and number of splats over the iterations, with phases shaded.
@@ -41,16 +32,18 @@ def curve_svg(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> str:
         history: The evaluations, at least one.
         schedule: Phases of the run.
     """
+    width, height = 800, 340
+    left, right, top, bottom = 48, 84, 28, 52  # pixels around the axes
     last = max(schedule.total, int(history[-1]["iteration"]))
     finite = [entry["psnr"] for entry in history if math.isfinite(entry["psnr"])] or [0.0]
     low, high = math.floor(min(finite)), math.ceil(max(finite) + 0.1)
     most = 1.05 * max(entry["splats"] for entry in history)
 
     def x(iteration: float) -> float:
-        return LEFT + (WIDTH - LEFT - RIGHT) * iteration / last
+        return left + (width - left - right) * iteration / last
 
     def y(share: float) -> float:
-        return HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * share
+        return height - bottom - (height - top - bottom) * share
 
     def line(points: Sequence[tuple[float, float]], colour: str) -> str:
         listed = " ".join(f"{x(iteration):.1f},{y(share):.1f}" for iteration, share in points)
@@ -63,42 +56,35 @@ def curve_svg(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> str:
     parts, start = [], 0
     for phase, end in zip(Phase, schedule.ends, strict=True):
         if end > start:
-            box = f'x="{x(start):.1f}" y="{TOP}" width="{x(end) - x(start):.1f}" height="{HEIGHT - TOP - BOTTOM}"'
+            box = f'x="{x(start):.1f}" y="{top}" width="{x(end) - x(start):.1f}" height="{height - top - bottom}"'
             parts.append(f'<rect {box} fill="{PHASE_COLOURS[phase]}" fill-opacity="0.6"/>')
-            parts.append(label(((x(start) + x(end)) / 2, TOP - 8), phase.name.lower(), "middle"))
+            parts.append(label(((x(start) + x(end)) / 2, top - 8), phase.name.lower(), "middle"))
         start = end
     for value in _ticks(0, last):
-        parts.append(label((x(value), HEIGHT - BOTTOM + 20), f"{value:,.0f}", "middle"))
+        parts.append(label((x(value), height - bottom + 20), f"{value:,.0f}", "middle"))
     for value in _ticks(low, high):
         at = y((value - low) / (high - low))
-        parts.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{at:.1f}" y2="{at:.1f}" stroke="#8884"/>')
-        parts.append(label((LEFT - 6, at + 4), f"{value:g}", "end", "blue"))
+        parts.append(f'<line x1="{left}" x2="{width - right}" y1="{at:.1f}" y2="{at:.1f}" stroke="#8884"/>')
+        parts.append(label((left - 6, at + 4), f"{value:g}", "end", "blue"))
     for value in _ticks(0, most):
-        parts.append(label((WIDTH - RIGHT + 6, y(value / most) + 4), f"{value:,.0f}", "start", "brown"))
-    parts.append(label((LEFT, HEIGHT - 4), "test PSNR, dB", "start", "blue"))
-    parts.append(label((WIDTH / 2, HEIGHT - 4), "iteration", "middle"))
-    parts.append(label((WIDTH - RIGHT, HEIGHT - 4), "splats", "end", "brown"))
+        parts.append(label((width - right + 6, y(value / most) + 4), f"{value:,.0f}", "start", "brown"))
+    parts.append(label((left, height - 4), "test PSNR, dB", "start", "blue"))
+    parts.append(label((width / 2, height - 4), "iteration", "middle"))
+    parts.append(label((width - right, height - 4), "splats", "end", "brown"))
     parts.append(line([(entry["iteration"], entry["splats"] / most) for entry in history], "brown"))
     quality = [(entry["iteration"], (entry["psnr"] - low) / (high - low)) for entry in history]
     quality = [(iteration, share) for iteration, share in quality if math.isfinite(share)]
     parts.append(line(quality, "blue"))
     parts += [f'<circle cx="{x(at):.1f}" cy="{y(share):.1f}" r="3" fill="var(--blue)"/>' for at, share in quality]
-    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{"".join(parts)}</svg>'
+    return f'<svg viewBox="0 0 {width} {height}" role="img">{"".join(parts)}</svg>'
 
 
 def _ticks(low: float, high: float) -> list[float]:
     """Round numbers from ``low`` to ``high``, a step of 1, 2 or 5 times a power of ten apart."""
-    rough = (high - low) / TICKS
+    rough = (high - low) / 5
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough)
     return [index * step for index in range(math.ceil(low / step), math.floor(high / step) + 1)]
-
-
-REFRESH_SECONDS = 5
-"""Seconds after which a browser reads the page of a run that is not finished again."""
-LONGEST_SIDE = 1000
-"""Pixels to which larger views are reduced."""
-JPEG_QUALITY = 88
 
 
 @dataclass(frozen=True)
@@ -130,10 +116,24 @@ class RunPage:
             The file.
         """
         title = escape(f"{self.folder.resolve().parent.name} / {self.folder.resolve().name}")
-        refresh = "" if self.metrics else f'<meta http-equiv="refresh" content="{REFRESH_SECONDS}">'
+        refresh = "" if self.metrics else '<meta http-equiv="refresh" content="5">'
         template = Template(files("nsvq_lightning.report").joinpath("web", "report.html").read_text(encoding="utf-8"))
-        sections = (self._summary(), self._preview(), self._curve(), self._views(), self._streams(), self._codes())
-        body = "\n".join([f"<h1>{title}</h1>", *sections, self._time(), self._settings(), self._footer()])
+        preview, config = self.folder / "preview.png", self.folder / "config.yaml"
+        sections: dict[str, str] = {}
+        if self.metrics is None and preview.exists():
+            sections["Photo and render"] = f'<img class="preview" alt="photo and render" src="{_jpeg(_read(preview))}">'
+        if self.history:
+            sections["While it trained"] = curve_svg(self.history, self.schedule)
+        sections["Test views"] = self._views()
+        sections |= {heading: _table(*table) for heading, table in self._tables().items()}
+        if config.exists():
+            text = escape(config.read_text(encoding="utf-8"))
+            sections["Settings"] = f"<details><summary>config.yaml</summary><pre>{text}</pre></details>"
+        shown = [f"<h2>{heading}</h2>{content}" for heading, content in sections.items() if content]
+        packages = ", ".join(f"{name} {version(name)}" for name in ("torch", "lightning", "numba"))
+        machine = f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads"
+        versions = f"nsvq-lightning {__version__}, Python {platform.python_version()}, {packages}; {machine}"
+        body = "\n".join([f"<h1>{title}</h1>", self._summary(), *shown, f"<footer>{escape(versions)}</footer>"])
         path = self.folder / "report.html"
         write_text(path, template.substitute(title=title, refresh=refresh, body=body))
         return path
@@ -166,72 +166,43 @@ class RunPage:
         scene = ' <a href="viewer.html">viewer.html</a> beside this page shows the scene.' if viewer else ""
         return f'<div class="figures">{shown}</div><p>Quality on test views, {how}.{scene}</p>'
 
-    def _preview(self) -> str:
-        picture = self.folder / "preview.png"
-        if self.metrics is not None or not picture.exists():
-            return ""
-        return (
-            f'{_heading("Photo and render")}<img class="preview" alt="photo and render" src="{_jpeg(_read(picture))}">'
-        )
-
-    def _curve(self) -> str:
-        return _heading("While it trained") + curve_svg(self.history, self.schedule) if self.history else ""
-
     def _views(self) -> str:
         worst = min((row["psnr"] for row in self.views), default=0.0)
-        shown = []
+        figures = []
         for row in self.views:
             path = self.folder / "renders" / row["picture"]
             if path.exists():
                 remark = ", the lowest" if row["psnr"] == worst and len(self.views) > 1 else ""
                 caption = f"{escape(row['name'])}: {_decibels(row['psnr'])}, SSIM {row['ssim']:.4f}{remark}"
-                shown.append(_figure(_read(path), caption))
-        return f'{_heading("Test views")}<div class="views">{"".join(shown)}</div>' if shown else ""
+                figures.append(_figure(_read(path), caption))
+        return f'<div class="views">{"".join(figures)}</div>' if figures else ""
 
-    def _streams(self) -> str:
-        if self.metrics is None:
-            return ""
-        splats, whole = max(1, self.metrics["num_splats"]), self.metrics["file_bytes"]
-        rows = [
-            (name, f"{size:,}", f"{8 * size / splats:.2f}", f'<i style="width:{12 * size / whole:.2f}rem"></i>')
-            for name, size in self.metrics["streams"].items()
-            if size
-        ]
-        rows.append(("whole file", f"{whole:,}", f"{8 * whole / splats:.2f}", ""))
-        return _heading("Bytes") + _table(("stream", "bytes", "bits a splat", ""), rows)
-
-    def _codes(self) -> str:
-        if self.metrics is None or not self.metrics["codes"]:
-            return ""
-        rows = [
-            (name, f"{codes['codebook']:,}", f"{codes['used']:,}", f"{codes['entropy']:.2f}")
-            for name, codes in self.metrics["codes"].items()
-        ]
-        return _heading("Codes") + _table(("attribute", "codebook", "in use", "entropy, bits"), rows)
-
-    def _time(self) -> str:
-        rows, before, since = [], 0, 0.0
+    def _tables(self) -> dict[str, tuple[Sequence[str], list[Sequence[str]]]]:
+        """Head and rows of each table by its heading."""
+        streams: list[Sequence[str]] = []
+        codes: list[Sequence[str]] = []
+        if self.metrics is not None:
+            splats, whole = max(1, self.metrics["num_splats"]), self.metrics["file_bytes"]
+            for name, size in self.metrics["streams"].items():
+                bar = f'<i style="width:{12 * size / whole:.2f}rem"></i>'
+                streams += [(name, f"{size:,}", f"{8 * size / splats:.2f}", bar)] if size else []
+            streams.append(("whole file", f"{whole:,}", f"{8 * whole / splats:.2f}", ""))
+            for name, book in self.metrics["codes"].items():
+                codes.append((name, f"{book['codebook']:,}", f"{book['used']:,}", f"{book['entropy']:.2f}"))
+        times: list[Sequence[str]] = []
+        before, since = 0, 0.0
         for phase in Phase:
             entries = [entry for entry in self.history if entry["phase"] == phase.name.lower()]
             if entries:
                 steps, seconds = entries[-1]["iteration"] - before, entries[-1]["seconds"] - since
-                rows.append((phase.name.lower(), f"{steps:,}", _duration(seconds), f"{1000 * seconds / steps:.1f}"))
+                times.append((phase.name.lower(), f"{steps:,}", _duration(seconds), f"{1000 * seconds / steps:.1f}"))
                 before, since = entries[-1]["iteration"], entries[-1]["seconds"]
-        rows += [(name, "", _duration(seconds), "") for name, seconds in self.seconds.items() if seconds]
-        return _heading("Time") + _table(("part", "iterations", "time", "ms an iteration"), rows) if rows else ""
-
-    def _settings(self) -> str:
-        config = self.folder / "config.yaml"
-        if not config.exists():
-            return ""
-        text = escape(config.read_text(encoding="utf-8"))
-        return f"{_heading('Settings')}<details><summary>config.yaml</summary><pre>{text}</pre></details>"
-
-    def _footer(self) -> str:
-        packages = ", ".join(f"{name} {version(name)}" for name in ("torch", "lightning", "numba"))
-        machine = f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads"
-        versions = f"nsvq-lightning {__version__}, Python {platform.python_version()}, {packages}; {machine}"
-        return f"<footer>{escape(versions)}</footer>"
+        times += [(name, "", _duration(seconds), "") for name, seconds in self.seconds.items() if seconds]
+        return {
+            "Bytes": (("stream", "bytes", "bits a splat", ""), streams),
+            "Codes": (("attribute", "codebook", "in use", "entropy, bits"), codes),
+            "Time": (("part", "iterations", "time", "ms an iteration"), times),
+        }
 
 
 def _figure(comparison: MatLike, caption: str) -> str:
@@ -246,11 +217,10 @@ def _figure(comparison: MatLike, caption: str) -> str:
     )
 
 
-def _heading(text: str) -> str:
-    return f"<h2>{text}</h2>"
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table; nothing without rows."""
+    if not rows:
+        return ""
     lines = ["".join(f"<th>{cell}</th>" for cell in head)]
     lines += ["".join(f"<td>{cell}</td>" for cell in row) for row in rows]
     return f'<div class="scroll"><table>{"".join(f"<tr>{line}</tr>" for line in lines)}</table></div>'
@@ -265,10 +235,10 @@ def _read(path: Path) -> MatLike:
 
 def _jpeg(picture: MatLike) -> str:
     """A picture as an address that holds it."""
-    factor = min(1.0, LONGEST_SIDE / max(picture.shape[:2]))
+    factor = min(1.0, 1000 / max(picture.shape[:2]))
     if factor < 1.0:
         picture = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes()
     return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
 
 

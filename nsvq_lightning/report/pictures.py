@@ -18,9 +18,6 @@ from torch import Tensor
 from nsvq_lightning.data.images import encode_png
 from nsvq_lightning.io.atomic import atomic_write
 
-__all__ = ["comparison", "file_stem", "log_pictures", "write_png"]
-
-
 LONGEST = 120
 """Bytes of a file name without suffix; file systems take 143 to 255 with it."""
 
@@ -39,27 +36,22 @@ def file_stem(name: str, names: tuple[str, ...] = ()) -> str:
 
 @lru_cache(maxsize=8)
 def _file_stems(names: tuple[str, ...]) -> dict[str, str]:
+    """A file name without suffix for each name; those that are too long or used twice end in a digest."""
     plain = {name: str(Path(name).with_suffix("")).replace("/", "_").replace("\\", "_") for name in names}
-    uses = Counter(_folded(stem) for stem in plain.values())
-    return {
-        name: stem if uses[_folded(stem)] == 1 and _is_plain(stem) else _digested(name, stem)
-        for name, stem in plain.items()
-    }
+    uses = Counter(map(_folded, plain.values()))
+    stems = {}
+    for name, stem in plain.items():
+        data = stem.encode(errors="surrogateescape")
+        if uses[_folded(stem)] > 1 or len(data) > LONGEST or re.search("~[0-9a-f]{12}$", _folded(stem)):
+            ending = f"~{sha256(name.encode(errors='surrogateescape')).hexdigest()[:12]}"
+            stem = data[: LONGEST - len(ending)].decode(errors="ignore") + ending
+        stems[name] = stem
+    return stems
 
 
 def _folded(stem: str) -> str:
     """What file systems that do not tell case or composed characters apart make of a name."""
     return normalize("NFKC", normalize("NFKC", stem).casefold())
-
-
-def _is_plain(stem: str) -> bool:
-    return len(stem.encode(errors="surrogateescape")) <= LONGEST and not re.search("~[0-9a-f]{12}$", _folded(stem))
-
-
-def _digested(name: str, stem: str) -> str:
-    digest = sha256(name.encode(errors="surrogateescape")).hexdigest()[:12]
-    start = stem.encode(errors="surrogateescape")[: LONGEST - len(digest) - 1].decode(errors="ignore")
-    return f"{start}~{digest}"
 
 
 def comparison(image: Tensor, photo: Tensor, gain: float = 4.0) -> Tensor:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,18 +20,18 @@ __all__ = ["SUFFIX", "VideoWriter", "video_writer"]
 
 SUFFIX = ".mp4"
 """Suffix of videos."""
-X264_QUALITY = 17
-"""Constant rate factor of H.264: nearly without visible loss."""
 
 
-class VideoWriter(Protocol):
-    """Takes the pictures of a video."""
+class VideoWriter(NamedTuple):
+    """Takes the pictures of a video.
+
+    Attributes:
+        codec: Name of the video's codec.
+        write: Adds a picture ``[H, W, 3]``, RGB.
+    """
 
     codec: str
-    """Name of the video's codec."""
-
-    def write(self, rgb: NDArray[np.uint8]) -> None:
-        """Add a picture ``[H, W, 3]``, RGB."""
+    write: Callable[[NDArray[np.uint8]], object]
 
 
 @contextmanager
@@ -60,52 +60,38 @@ def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Vi
         # Both tell the container by the suffix, which the unfinished file does not have.
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
             file = Path(folder) / f"video{SUFFIX}"
-            writer = _X264(program, file, width, height, fps) if program else _VP9(file, width, height, fps)
-            try:
+            with _h264(program, file, width, height, fps) if program else _vp9(file, width, height, fps) as writer:
                 yield writer
-            except BaseException:
-                writer.close(given_up=True)
-                raise
-            writer.close()
             file.replace(unfinished)
 
 
-class _VP9:
-    codec = "VP9"
-
-    def __init__(self, path: Path, width: int, height: int, fps: float) -> None:
-        code = cv2.VideoWriter.fourcc(*"vp09")
-        self._writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, fps, (width, height))
-        if not self._writer.isOpened():
-            raise OSError("OpenCV cannot write VP9 here: install ffmpeg, or write PNGs into a folder")
-
-    def write(self, rgb: NDArray[np.uint8]) -> None:
-        self._writer.write(np.ascontiguousarray(rgb[:, :, ::-1]))
-
-    def close(self, given_up: bool = False) -> None:
-        self._writer.release()
+@contextmanager
+def _vp9(path: Path, width: int, height: int, fps: float) -> Iterator[VideoWriter]:
+    video = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"vp09"), fps, (width, height))
+    if not video.isOpened():
+        raise OSError("OpenCV cannot write VP9 here: install ffmpeg, or write PNGs into a folder")
+    try:
+        yield VideoWriter("VP9", lambda rgb: video.write(np.ascontiguousarray(rgb[:, :, ::-1])))
+    finally:
+        video.release()
 
 
-class _X264:
-    codec = "H.264"
-
-    def __init__(self, program: str, path: Path, width: int, height: int, fps: float) -> None:
-        command = [program, "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
-        command += ["-r", str(fps), "-i", "-", "-c:v", "libx264", "-crf", str(X264_QUALITY), "-pix_fmt", "yuv420p"]
-        command += ["-movflags", "+faststart", str(path)]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
-
-    def write(self, rgb: NDArray[np.uint8]) -> None:
-        assert self._process.stdin is not None
+@contextmanager
+def _h264(program: str, path: Path, width: int, height: int, fps: float) -> Iterator[VideoWriter]:
+    command = [program, "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
+    command += ["-r", str(fps), "-i", "-", "-c:v", "libx264", "-crf", "17", "-pix_fmt", "yuv420p"]  # 17: nearly no loss
+    command += ["-movflags", "+faststart", str(path)]
+    broken = False
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        pipe = process.stdin
+        assert pipe is not None
         try:
-            self._process.stdin.write(np.ascontiguousarray(rgb).data)
-        except BrokenPipeError:
-            self.close()
+            yield VideoWriter("H.264", lambda rgb: pipe.write(np.ascontiguousarray(rgb).data))
+        except BrokenPipeError:  # what ffmpeg says is the cause
+            broken = True
+        except BaseException:
+            process.kill()
             raise
-
-    def close(self, given_up: bool = False) -> None:
-        if given_up:
-            self._process.kill()
-        _, said = self._process.communicate()
-        if self._process.returncode and not given_up:
-            raise OSError(f"ffmpeg could not write the video: {said.decode(errors='replace').strip()}")
+        _, said = process.communicate()
+    if broken or process.returncode:
+        raise OSError(f"ffmpeg could not write the video: {said.decode(errors='replace').strip()}")

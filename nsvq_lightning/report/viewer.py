@@ -25,13 +25,11 @@ __all__ = ["BACKGROUNDS", "camera_entry", "page_cameras", "some_cameras", "viewe
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 """RGB of the backgrounds that have names."""
-MOST_CAMERAS = 300
-"""Cameras that a page lists."""
 
 
 def some_cameras(scene: Scene) -> dict[str, Camera]:
-    """Cameras of photos by name, evenly spaced where there are many."""
-    return dict(list(zip(scene.names, scene.cameras, strict=True))[:: -(-len(scene) // MOST_CAMERAS)])
+    """Cameras of at most 300 photos by name, evenly spaced."""
+    return dict(list(zip(scene.names, scene.cameras, strict=True))[:: -(-len(scene) // 300)])
 
 
 def write_viewer(
@@ -87,7 +85,9 @@ def viewer_page(
         raise ValueError("a page needs at least one camera to start from, got none")
     if len(background) != 3 or not all(0 <= value <= 1 for value in background):
         raise ValueError(f"background must be three numbers from 0 to 1, got {list(background)}")
-    up = _mean_up(list(cameras.values())) if up is None else up
+    if up is None:  # the mean of where their upper edges point, or that of the first where they point everywhere
+        edges = -torch.tensor([camera.packed_view[3:6] for camera in cameras.values()], dtype=torch.float64)
+        up = (edges.mean(0) if edges.mean(0).norm() > 0.1 else edges[0]).tolist()
     if len(up) != 3 or not 0 < math.hypot(*up) < math.inf:
         raise ValueError(f"up must be a direction, three finite numbers that are not all 0, got {list(up)}")
     scene = {
@@ -135,31 +135,20 @@ def page_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
         ValueError: They are damaged.
         OSError: It cannot be read.
     """
-    found = re.search(
-        r'<script id="scene" type="application/json">(.*)</script>', Path(path).read_text(encoding="utf-8")
-    )
-    if found is None:
-        return {}
+    text = Path(path).read_text(encoding="utf-8")
+    found = re.search(r'<script id="scene" type="application/json">(.*)</script>', text)
+    cameras = {}
+    opengl = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
     try:
-        return {str(entry["name"]): _entry_camera(entry) for entry in json.loads(found[1])["cameras"]}
+        for entry in json.loads(found[1])["cameras"] if found else ():
+            name, width, height = str(entry["name"]), int(entry["width"]), int(entry["height"])
+            pose = torch.tensor(entry["camera_to_world"], dtype=torch.float64).view(4, 4)
+            fx, fy, cx, cy = (float(entry[key]) for key in ("fx", "fy", "cx", "cy"))
+            K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+            cameras[name] = Camera(K, (pose @ opengl).inverse().float(), width, height)
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"the cameras in {path} are damaged ({error}): name the photos with --data.root") from error
-
-
-def _entry_camera(entry: Mapping[str, Any]) -> Camera:
-    """The camera of a :func:`camera_entry`."""
-    pose = torch.tensor(entry["camera_to_world"], dtype=torch.float64).view(4, 4)
-    viewmat = (pose @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))).inverse()
-    fx, fy, cx, cy = (float(entry[name]) for name in ("fx", "fy", "cx", "cy"))
-    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    return Camera(K, viewmat.float(), int(entry["width"]), int(entry["height"]))
-
-
-def _mean_up(cameras: Sequence[Camera]) -> list[float]:
-    """Mean of where the cameras' upper edges point; that of the first where they point everywhere."""
-    directions = -torch.tensor([camera.packed_view[3:6] for camera in cameras], dtype=torch.float64)
-    mean = directions.mean(0)
-    return [float(value) for value in (mean if mean.norm() > 0.1 else directions[0])]
+    return cameras
 
 
 def _source(name: str) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nsvq_lightning.commands.sweep.results import Row, as_markdown, draw_sweep, grouped, moments, series_of
-from nsvq_lightning.report.files import write_curve_csv
+from nsvq_lightning.report.figures import write_csv
 
 
 def row(seed: int = 0, psnr: float | None = 30.0, **other: object) -> Row:
@@ -71,7 +71,7 @@ def test_the_picture_shows_every_point(tmp_path: Path) -> None:
     assert drawn([row(0), row(0, 36.0, codebooks="4k", bytes=3_000_000), plain], orange) > 2 * one
     assert drawn([row(0), row(0, scene="horns")]) > one
     assert drawn([plain]) > 0  # nothing else to compare it with: a point
-    write_curve_csv(tmp_path / "curve.csv", [{"seconds": 10.0 * k, "psnr": 25.0 + k} for k in range(5)])
+    write_csv(tmp_path / "curve.csv", [{"seconds": 10.0 * k, "psnr": 25.0 + k} for k in range(5)])
     assert drawn([row(0, folder=tmp_path)]) > 1.5 * one  # and a line over the time
     draw_sweep(tmp_path / "none.png", [row(psnr=None)])
     assert not (tmp_path / "none.png").exists()
