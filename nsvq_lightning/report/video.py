@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -31,7 +31,7 @@ class VideoWriter(NamedTuple):
     """
 
     codec: str
-    write: Callable[[NDArray[np.uint8]], object]
+    write: Callable[[NDArray[np.uint8]], Any]
 
 
 @contextmanager

@@ -8,18 +8,11 @@ import numpy as np
 import pytest
 import torch
 from demo_room import Lens, demo_poses, demo_room, render_view, surface_points
-from raytrace import Lamp, Quad, Room, Sphere
 from skimage.metrics import peak_signal_noise_ratio
 
 from nsvq_lightning.data.colmap import import_pycolmap, read_model
 from nsvq_lightning.data.datamodule import DEMO, DemoDataModule
 from nsvq_lightning.data.scene import load_scene
-
-GREY = np.full((2, 2, 3), 0.5, np.float32)
-
-
-def _vector(*xyz: float) -> np.ndarray:
-    return np.array(xyz, np.float32)
 
 
 def test_the_package_contains_what_its_maker_makes() -> None:
@@ -60,45 +53,3 @@ def test_pictures_show_the_points_in_their_colours(demo_scene: Path) -> None:
         rows = torch.tensor([p.point3D_id - 1 for p in seen])
         differences.append((scene.view(i).image[y, x].float() / 255 - scene.colors[rows]).abs().mean(1))
     assert torch.cat(differences).median() < 0.05
-
-
-def test_pictures_are_neither_dark_nor_burnt_nor_flat() -> None:
-    scene = DemoDataModule().scene
-    pixels = torch.stack([scene.view(i).image for i in range(len(scene))]).float()
-    assert 60 < pixels.mean() < 170
-    assert (pixels >= 255).all(-1).float().mean() < 0.05
-    assert pixels.std() > 35
-
-
-def test_surfaces_know_their_coordinates() -> None:
-    rng = np.random.default_rng(0)
-    quad = Quad(_vector(1, 2, 3), _vector(2, 0, 0), _vector(0, 0, -3), GREY)
-    sphere = Sphere(_vector(0, -1, 2), 0.7, GREY)
-    uv = rng.uniform(0.05, 0.95, (50, 2)).astype(np.float32)
-    for surface in (quad, sphere):
-        points = surface.points(uv)
-        np.testing.assert_allclose(surface.coordinates(points), uv, atol=1e-5)
-        normals = surface.normals(points)
-        np.testing.assert_allclose(surface.intersect(points + normals, -normals), 1, atol=1e-4)
-    assert quad.normals(points)[0].tolist() == [0, -1, 0]  # right is x, down is -z: it faces up, to -y
-
-
-def test_sphere_is_hit_where_the_quadratic_says() -> None:
-    sphere = Sphere(_vector(0, 0, 5), 2.0, GREY)
-    rays = np.array([[0, 0, 1], [0, 0.5, 1], [0, 0, -1]], np.float32)
-    t = sphere.intersect(_vector(0, 0, 0), rays)
-    # |t (0, 1/2, 1) - (0, 0, 5)|² = 4  =>  5/4 t² - 10 t + 21 = 0 has no real root
-    assert t.tolist() == [3.0, np.inf, np.inf]
-    assert sphere.intersect(_vector(0, 0, 5), rays[:1]).tolist() == [2.0]
-
-
-def test_lamp_light_follows_the_inverse_square_law_and_casts_shadows() -> None:
-    floor = Quad(_vector(-5, 0, 5), _vector(10, 0, 0), _vector(0, 0, -10), np.ones((2, 2, 3), np.float32))
-    lamp = Lamp(_vector(0, -2, 0), side=0.01, power=4.0, ambient=0.0)
-    centre = np.array([[0.5, 0.5], [0.9, 0.5]], np.float32)
-    bare = Room([floor], lamp).diffuse(0, centre)[:, 0]
-    # straight below: power / 2²; four metres aside: cosines at the lamp and at the floor, power · (2²/20) / 20
-    np.testing.assert_allclose(bare, [1.0, 4 * (4 / 20) / 20], rtol=0.01)
-    shaded = Room([floor, Sphere(_vector(0, -1, 0), 0.3, GREY)], lamp).diffuse(0, centre)[:, 0]
-    assert shaded[0] == 0
-    assert shaded[1] == pytest.approx(bare[1])

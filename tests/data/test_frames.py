@@ -35,20 +35,16 @@ def test_the_sharpest_frame_of_each_part_is_taken(tmp_path: Path) -> None:
     assert [path.name for path in found] == [f"frame_{k:06d}.jpg" for k in sorted(sharp)]
     assert seen == list(range(1, 25))
     for path, index in zip(found, sorted(sharp), strict=True):
-        assert (
-            np.abs(read_image(path)[:, :, ::-1].astype(int) - pictures[index]).mean() < 30
-        )  # chroma has half the resolution
+        difference = read_image(path)[:, :, ::-1].astype(int) - pictures[index]
+        assert np.abs(difference).mean() < 30  # chroma has half the resolution
 
 
-def test_parts_in_which_the_camera_stands_still_are_left_out(tmp_path: Path) -> None:
-    pictures = [_texture(0)] * 12 + [_texture(40)] * 6 + [_texture(80)] * 6
-    found = write_frames(_video(tmp_path / "a.mp4", pictures), tmp_path, 8, lambda _: None)
-    assert len(found) == 3
-
-
-def test_a_short_video_gives_what_it_has(tmp_path: Path) -> None:
-    video = _video(tmp_path / "a.mp4", [_texture(30 * k) for k in range(3)])
-    assert len(write_frames(video, tmp_path, 100, lambda _: None)) == 3
+@pytest.mark.parametrize(("shifts", "parts", "frames"), [([0] * 12 + [40] * 6 + [80] * 6, 8, 3), ([0, 30, 60], 100, 3)])
+def test_still_parts_are_left_out_and_short_videos_give_what_they_have(
+    tmp_path: Path, shifts: list[int], parts: int, frames: int
+) -> None:
+    video = _video(tmp_path / "a.mp4", [_texture(shift) for shift in shifts])
+    assert len(write_frames(video, tmp_path, parts, lambda _: None)) == frames
 
 
 def test_what_is_no_video_is_told(tmp_path: Path) -> None:
@@ -57,8 +53,15 @@ def test_what_is_no_video_is_told(tmp_path: Path) -> None:
         write_frames(tmp_path / "a.mp4", tmp_path, 10, lambda _: None)
 
 
+@pytest.fixture
+def folders(tmp_path: Path) -> tuple[Path, Path]:
+    (tmp_path / "from").mkdir()
+    (tmp_path / "to").mkdir()
+    return tmp_path / "from", tmp_path / "to"
+
+
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
-def test_photos_are_turned_upright(tmp_path: Path, orientation: int) -> None:
+def test_photos_are_turned_upright(folders: tuple[Path, Path], orientation: int) -> None:
     upright = np.zeros((32, 64, 3), np.uint8)
     upright[:, :32, 0] = 255  # red on the left
     turns = {1: 0, 3: 2, 6: 1, 8: 3}[orientation]
@@ -66,9 +69,7 @@ def test_photos_are_turned_upright(tmp_path: Path, orientation: int) -> None:
     exif = PIL.Image.Exif()
     exif[0x0112] = orientation
     exif[0x010F] = "maker"
-    source, target = tmp_path / "from", tmp_path / "to"
-    source.mkdir()
-    target.mkdir()
+    source, target = folders
     PIL.Image.fromarray(np.ascontiguousarray(stored)).save(source / "a.jpg", quality=95, exif=exif)
     assert copy_photos(photos_in(source), target, lambda _: None) == []
     assert image_head(target / "a.jpg").size == (64, 32)
@@ -79,10 +80,8 @@ def test_photos_are_turned_upright(tmp_path: Path, orientation: int) -> None:
     assert (orientation == 1) == ((target / "a.jpg").read_bytes() == (source / "a.jpg").read_bytes())
 
 
-def test_damaged_photos_are_named_and_left_out(tmp_path: Path) -> None:
-    source, target = tmp_path / "from", tmp_path / "to"
-    source.mkdir()
-    target.mkdir()
+def test_damaged_photos_are_named_and_left_out(folders: tuple[Path, Path]) -> None:
+    source, target = folders
     PIL.Image.fromarray(_texture()).save(source / "a.png")
     (source / "b.jpg").write_bytes((source / "a.png").read_bytes()[:200])
     (source / "notes.txt").write_text("no photo")

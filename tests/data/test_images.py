@@ -84,7 +84,7 @@ def test_a_picture_may_be_larger_than_the_limit_of_pillow(tmp_path: Path, monkey
     assert PIL.Image.MAX_IMAGE_PIXELS == 1000
 
 
-@pytest.mark.parametrize("kept", [0.0, 0.02, 0.5, 0.9])
+@pytest.mark.parametrize("kept", [0.0, 0.02, 0.9])
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 def test_damaged_pictures_are_named(tmp_path: Path, suffix: str, kept: float) -> None:
     path = tmp_path / f"broken{suffix}"
@@ -103,12 +103,6 @@ def test_the_end_of_a_thumbnail_is_not_that_of_the_picture(tmp_path: Path) -> No
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(SceneError, match=r"broken\.jpg cannot be decoded \(truncated"):
         read_image(path)
-
-
-def test_what_is_no_picture_is_found_by_its_head(tmp_path: Path) -> None:
-    (tmp_path / "text.jpg").write_text("no picture")
-    with pytest.raises(SceneError, match=r"text\.jpg cannot be decoded"):
-        image_head(tmp_path / "text.jpg")
 
 
 def _png(width: int, height: int, data: bytes) -> bytes:
@@ -130,19 +124,14 @@ def test_a_head_that_promises_more_than_the_file_holds(tmp_path: Path, side: int
 
 def test_photos_and_masks_of_many_equal_pixels_are_refused_by_their_heads(tmp_path: Path) -> None:
     """A mask may be as large as its photo, which has been decoded."""
-    side = 8200
-    path = _black(tmp_path / "black.png", side)
-    assert path.stat().st_size < side * side / 5000
+    side, path, small = 8200, tmp_path / "black.png", tmp_path / "small.png"
+    PIL.Image.new("1", (side, side)).save(path)
     for read in (image_head, read_image, lambda path: read_mask(path, 820, 820)):
         with pytest.raises(SceneError, match=r"black\.png cannot be decoded .*8200x8200 pixels in \d+ bytes"):
             read(path)
     assert not read_mask(path, side, side).any()
-    assert image_head(_black(tmp_path / "small.png", 5700)).size == (5700, 5700)
-
-
-def _black(path: Path, side: int) -> Path:
-    PIL.Image.new("1", (side, side)).save(path)
-    return path
+    PIL.Image.new("1", (5700, 5700)).save(small)
+    assert image_head(small).size == (5700, 5700)
 
 
 def test_a_chunk_longer_than_the_file_is_not_allocated(tmp_path: Path) -> None:
@@ -174,16 +163,12 @@ def test_downscaling_averages_areas(tmp_path: Path) -> None:
     assert source.nbytes == source.load().nbytes
 
 
-def test_resizing_a_picture_to_its_own_size_would_change_no_bit(tmp_path: Path) -> None:
+def test_pictures_of_their_own_size_and_of_another_than_when_they_were_loaded(tmp_path: Path) -> None:
     PIL.Image.fromarray(RGB).save(tmp_path / "a.png")
     source = ImageSource(tmp_path / "a.png", (9, 6), None, Pinhole(np.eye(3), 9, 6))
     with switched(resizing=False):
         resized = source.load()
     assert torch.equal(resized.image, source.load().image)
-
-
-def test_picture_that_changed_its_size_since_loading(tmp_path: Path) -> None:
-    PIL.Image.fromarray(RGB).save(tmp_path / "a.png")
     with pytest.raises(SceneError, match="decoded to 9x6, its head says 10x6"):
         ImageSource(tmp_path / "a.png", (10, 6), None, Pinhole(np.eye(3), 10, 6)).load()
 
@@ -210,10 +195,6 @@ def sources(tmp_path: Path) -> list[_Counting]:
     return made
 
 
-def _decodings(sources: list[_Counting]) -> list[int]:
-    return [len(source.threads) for source in sources]
-
-
 @pytest.mark.parametrize(
     ("budget", "decodings"),
     [(0, [3, 3, 3, 3]), (17, [3, 3, 3, 3]), (36, [1, 1, 3, 3]), (71, [1, 1, 1, 3]), (72, [1, 1, 1, 1])],
@@ -223,7 +204,7 @@ def test_budget_keeps_what_fits(sources: list[_Counting], budget: int, decodings
     for _ in range(3):
         for i in range(4):
             assert set(store[i].image.flatten().tolist()) == {i}
-    assert _decodings(sources) == decodings
+    assert [len(source.threads) for source in sources] == decodings
 
 
 def test_prefetched_pictures_are_decoded_once_and_elsewhere(sources: list[_Counting]) -> None:
@@ -237,7 +218,9 @@ def test_prefetched_pictures_are_decoded_once_and_elsewhere(sources: list[_Count
     assert len(store._coming) <= 2
 
 
-def test_errors_of_prefetched_pictures_surface_when_asked_for(sources: list[_Counting]) -> None:
+def test_errors_surface_when_a_picture_is_asked_for(sources: list[_Counting]) -> None:
+    with pytest.raises(ValueError, match="cache_bytes must be at least 0, got -1"):
+        ImageStore(sources, cache_bytes=-1)
     store = ImageStore(sources)
     sources[1].path.write_bytes(b"gone")
     store.prefetch(1)
@@ -249,8 +232,3 @@ def test_store_survives_pickling_with_a_prefetch_under_way(sources: list[_Counti
     store = ImageStore([ImageSource(s.path, s.size, None, s.pinhole) for s in sources])
     store.prefetch(1)
     torch.testing.assert_close(pickle.loads(pickle.dumps(store))[1].image, store[1].image)
-
-
-def test_negative_budget(sources: list[_Counting]) -> None:
-    with pytest.raises(ValueError, match="cache_bytes must be at least 0, got -1"):
-        ImageStore(sources, cache_bytes=-1)
