@@ -117,17 +117,14 @@ def test_setup_is_idempotent_and_prints_the_split_once(
 
 
 def test_order_does_not_depend_on_the_cache(make_scene: SceneFactory) -> None:
+    alone = ColmapDataModule(str(make_scene("alone", views=2)), cache_bytes=0)
+    assert [view.name for view in islice(alone.train_dataloader(), 3)] == ["001.png"] * 3
     root = str(make_scene())
     for cache_bytes in (0, 10_000):
         views = list(islice(ColmapDataModule(root, cache_bytes=cache_bytes).train_dataloader(), 30))
         expected = list(islice(ColmapDataModule(root).train_dataloader(), 30))
         assert [view.name for view in views] == [view.name for view in expected]
         assert all(torch.equal(a.image, b.image) for a, b in zip(views, expected, strict=True))
-
-
-def test_scene_with_a_single_train_view(make_scene: SceneFactory) -> None:
-    data = ColmapDataModule(str(make_scene(views=2)), cache_bytes=0)
-    assert [view.name for view in islice(data.train_dataloader(), 3)] == ["001.png"] * 3
 
 
 def test_demo_is_read_where_it_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,33 +178,32 @@ def test_rejects_numbers_out_of_range(arguments: dict[str, int], named: str) -> 
 
 
 ELSEWHERE = torch.device("meta")
-BYTES = 3 * 4 * 5
+BYTES = 4 * 4 * 5
 
 
 def _view(index: int) -> View:
     camera = Camera(torch.eye(3), torch.eye(4), 5, 4)
-    return View(f"{index}.png", index, camera, torch.zeros(4, 5, 3, dtype=torch.uint8))
-
-
-def test_on_a_cpu_nothing_is_moved_or_kept() -> None:
-    photos, first = DevicePhotos(10 * BYTES), _view(0)
-    assert photos.move(first, torch.device("cpu")) is first
+    image, mask = torch.zeros(4, 5, 3, dtype=torch.uint8), torch.ones(4, 5, dtype=torch.bool)
+    return View(f"{index}.png", index, camera, image, mask)
 
 
 def test_the_first_photos_stay_while_the_budget_lasts() -> None:
+    assert DevicePhotos(10 * BYTES).move(first := _view(0), torch.device("cpu")) is first
     photos, views = DevicePhotos(2 * BYTES + 1), [_view(i) for i in range(3)]
-    first = [photos.move(each, ELSEWHERE) for each in views]
-    again = [photos.move(each, ELSEWHERE) for each in views]
-    assert [a.image is b.image for a, b in zip(first, again, strict=True)] == [True, True, False]
-    assert all(moved.image.is_meta and moved.camera is each.camera for moved, each in zip(again, views, strict=True))
-    assert all(moved.name == each.name for moved, each in zip(again, views, strict=True))
+    moved, again = ([photos.move(each, ELSEWHERE) for each in views] for _ in range(2))
+    assert [a.image is b.image for a, b in zip(moved, again, strict=True)] == [True, True, False]
+    for there, here in zip(again, views, strict=True):
+        assert (there.image.is_meta, there.mask is not None and there.mask.is_meta) == (True, True)
+        assert (there.name, there.camera) == (here.name, here.camera)
 
 
-def test_a_photo_that_has_been_exchanged_is_moved_anew() -> None:
-    photos, original, masked = DevicePhotos(10 * BYTES), _view(0), _view(0)
+def test_a_photo_that_has_been_exchanged_is_moved_anew_and_none_is_pickled() -> None:
+    photos, original, exchanged = DevicePhotos(10 * BYTES), _view(0), _view(0)
     kept = photos.move(original, ELSEWHERE)
-    assert photos.move(masked, ELSEWHERE).image is not kept.image
+    assert photos.move(exchanged, ELSEWHERE).image is not kept.image
     assert photos.move(original, ELSEWHERE).image is kept.image
+    copy = pickle.loads(pickle.dumps(photos))
+    assert copy.move(original, ELSEWHERE).image is not kept.image
 
 
 def test_a_gpu_gives_a_part_of_what_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -216,10 +212,3 @@ def test_a_gpu_gives_a_part_of_what_is_free(monkeypatch: pytest.MonkeyPatch) -> 
     first = [photos.move(each, ELSEWHERE) for each in views]
     assert photos.move(views[0], ELSEWHERE).image is first[0].image
     assert photos.move(views[1], ELSEWHERE).image is not first[1].image
-
-
-def test_photos_of_a_device_are_not_pickled() -> None:
-    photos, first = DevicePhotos(10 * BYTES), _view(0)
-    kept = photos.move(first, ELSEWHERE)
-    copy = pickle.loads(pickle.dumps(photos))
-    assert copy.move(first, ELSEWHERE).image is not kept.image

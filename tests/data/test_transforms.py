@@ -26,7 +26,7 @@ SceneFactory = Callable[..., Path]
 def change(path: Path, frame: dict[str, Any] | None = None, **head: Any) -> None:
     """Change values of a transforms file, and of its first frame; None removes one."""
     document = json.loads(path.read_text())
-    for values, changes in ((document, head), (document["frames"][0], frame or {})):
+    for values, changes in ((document["frames"][0], frame or {}), (document, head)):
         values.update(changes)
         for key in [key for key, value in changes.items() if value is None]:
             del values[key]
@@ -137,6 +137,11 @@ def test_blender_scenes_have_their_own_split_and_random_points(
     assert torch.equal(scene.points, load_scene(root).points)
     (root / "transforms_test.json").rename(root / "transforms_val.json")
     assert len(load_scene(root).test) == 3
+    train = root / "transforms_train.json"
+    shutil.copy(train, root / "transforms_test.json")
+    with pytest.raises(SceneError, match=r"transforms_test\.json: train/r_0\.png is a train and a test photo"):
+        load_scene(root)
+    (root / "transforms_test.json").unlink()
     (root / "transforms_val.json").unlink()
     assert load_scene(root).split == "every 8th by name"
 
@@ -179,51 +184,43 @@ def test_a_colmap_model_comes_first_and_any_can_be_chosen(make_scene: SceneFacto
         load_scene(root, model="other.json")
 
 
-def mirrored(root: Path) -> None:
-    matrix = np.diag([-1.0, 1, 1, 1]).tolist()
-    change(root / "transforms.json", {"transform_matrix": matrix})
-
-
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    ("frame", "head", "message"),
     [
-        (lambda root: change(root / "transforms.json", camera_model="EQUIRECTANGULAR"), "RECTANGULAR, which cannot"),
-        (lambda root: change(root / "transforms.json", k4=0.1), "OPENCV and k4 = 0.1, which cannot"),
-        (lambda root: change(root / "transforms.json", fl_x=None, fl_y=None), "frame 0 has no focal length"),
-        (lambda root: change(root / "transforms.json", fl_x=-3), "focal length -3"),
-        (lambda root: change(root / "transforms.json", {"cx": "wide"}), "frame 0 has cx = 'wide'"),
-        (lambda root: change(root / "transforms.json", {"cx": float("nan")}), "frame 0 has cx = nan"),
-        (lambda root: change(root / "transforms.json", w=0), "size 0x32"),
-        (lambda root: change(root / "transforms.json", {"transform_matrix": [[1, 2], [3]]}), "no transform_matrix"),
-        (lambda root: change(root / "transforms.json", {"transform_matrix": None}), "no transform_matrix"),
-        (mirrored, "skewed or mirrored"),
-        (lambda root: change(root / "transforms.json", {"file_path": None}), "no file_path"),
-        (lambda root: change(root / "transforms.json", {"file_path": "images/001.png"}), "an earlier frame is of"),
-        (lambda root: change(root / "transforms.json", {"file_path": "images/gone.png"}), r"first gone\.png"),
-        (lambda root: change(root / "transforms.json", frames=[]), "no list of frames"),
-        (lambda root: change(root / "transforms.json", frames=[3]), "frame 0 is no table"),
-        (lambda root: change(root / "transforms.json", ply_file_path="gone.ply"), r"gone\.ply do not exist"),
-        (lambda root: change(root / "transforms.json", {"file_path": "../a.png"}), r"names \.\./a\.png, which is"),
-        (lambda root: change(root / "transforms.json", {"file_path": "/etc/a.png"}), r"names /etc/a\.png, which is"),
-        (lambda root: change(root / "transforms.json", {"file_path": "..\\a.png"}), r"names \.\./a\.png, which is"),
-        (lambda root: change(root / "transforms.json", {"mask_path": "../m.png"}), r"names \.\./m\.png, which is"),
-        (lambda root: change(root / "transforms.json", {"file_path": "\udcff.png"}), "which is not UTF-8"),
-        (lambda root: change(root / "transforms.json", ply_file_path="../a.ply"), r"path in .* names \.\./a\.ply"),
-        (lambda root: (root / "transforms.json").write_text("{"), r"transforms\.json cannot be read"),
+        ({}, {"camera_model": "EQUIRECTANGULAR"}, "RECTANGULAR, which cannot"),
+        ({}, {"k4": 0.1}, "OPENCV and k4 = 0.1, which cannot"),
+        ({}, {"fl_x": None, "fl_y": None}, "frame 0 has no focal length"),
+        ({}, {"fl_x": -3}, "focal length -3"),
+        ({"cx": "wide"}, {}, "frame 0 has cx = 'wide'"),
+        ({"cx": float("nan")}, {}, "frame 0 has cx = nan"),
+        ({}, {"w": 0}, "size 0x32"),
+        ({"transform_matrix": [[1, 2], [3]]}, {}, "no transform_matrix"),
+        ({"transform_matrix": None}, {}, "no transform_matrix"),
+        ({"transform_matrix": np.diag([-1.0, 1, 1, 1]).tolist()}, {}, "skewed or mirrored"),
+        ({"file_path": None}, {}, "no file_path"),
+        ({"file_path": "images/001.png"}, {}, "an earlier frame is of"),
+        ({"file_path": "images/gone.png"}, {}, r"first gone\.png"),
+        ({}, {"frames": []}, "no list of frames"),
+        ({}, {"frames": [3]}, "frame 0 is no table"),
+        ({}, {"ply_file_path": "gone.ply"}, r"gone\.ply do not exist"),
+        ({"file_path": "../a.png"}, {}, r"names \.\./a\.png, which is"),
+        ({"file_path": "/etc/a.png"}, {}, r"names /etc/a\.png, which is"),
+        ({"file_path": "..\\a.png"}, {}, r"names \.\./a\.png, which is"),
+        ({"mask_path": "../m.png"}, {}, r"names \.\./m\.png, which is"),
+        ({"file_path": "\udcff.png"}, {}, "which is not UTF-8"),
+        ({}, {"ply_file_path": "../a.ply"}, r"path in .* names \.\./a\.ply"),
     ],
-)  # fmt: skip
+)
 def test_damage_is_named(
-    make_scene: SceneFactory, tmp_path: Path, damage: Callable[[Path], None], message: str
+    make_scene: SceneFactory, tmp_path: Path, frame: dict[str, Any], head: dict[str, Any], message: str
 ) -> None:
-    root = write_pinhole(make_scene(), tmp_path / "json")
-    if message == "no list of frames" or "table" in message:
-        document = json.loads((root / "transforms.json").read_text())
-        document["frames"] = [] if "list" in message else [3]
-        (root / "transforms.json").write_text(json.dumps(document))
-    else:
-        damage(root)
+    path = write_pinhole(make_scene(views=3), tmp_path / "json") / "transforms.json"
+    change(path, frame, **head)
     with pytest.raises(SceneError, match=message):
-        load_scene(root)
+        load_scene(path.parent)
+    path.write_text("{")
+    with pytest.raises(SceneError, match=r"transforms\.json cannot be read"):
+        load_scene(path.parent)
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -250,7 +247,8 @@ def test_binary_point_clouds(tmp_path: Path, order: str) -> None:
 
 def test_points_without_colours_are_grey_and_short_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "points.ply"
-    head = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    properties = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat ascii 1.0\nelement vertex 2\n{properties}end_header\n"
     path.write_text(f"{head}1 2 3\n4 5 6\n")
     xyz, rgb = read_points(path)
     np.testing.assert_array_equal(xyz, [[1, 2, 3], [4, 5, 6]])
