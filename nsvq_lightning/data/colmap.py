@@ -233,7 +233,12 @@ def _read(files: Mapping[str, Path]) -> Any:
     reconstruction = pycolmap.Reconstruction()
     folder, suffix = files["cameras"].parent, files["cameras"].suffix
     if suffix == ".bin":
-        check_binary_files(files, pycolmap)
+        models = [model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"]
+        params = {int(m.value): len(pycolmap.Camera.create_from_model_id(1, m, 1.0, 1, 1).params) for m in models}
+        for table in (*TABLES, "rigs", "frames"):  # the last two are COLMAP 4's
+            path = folder / f"{table}.bin"
+            if table in TABLES or path.is_file():
+                _check_table(table, path, params)
     try:
         (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))
     # pycolmap's own checks give ValueError, its C++ library the others.
@@ -248,32 +253,24 @@ def _read(files: Mapping[str, Path]) -> Any:
     return reconstruction
 
 
-def check_binary_files(files: Mapping[str, Path], pycolmap: Any) -> None:
-    """Walk every record of a binary model, so that a damaged file gives an error instead of an endless allocation.
-
-    COLMAP's reader trusts the counts in the files: an empty ``points3D.bin`` makes it allocate without end, and a
-    truncated ``cameras.bin`` loads as garbage.
-
-    Args:
-        files: The tables; ``rigs.bin`` and ``frames.bin`` (COLMAP 4) beside them are checked too where they exist.
-        pycolmap: The module, which knows the camera models.
-
-    Raises:
-        SceneError: A file is empty, truncated, longer than its records, or not a COLMAP table.
-    """
-    models = [model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"]
-    params = {int(m.value): len(pycolmap.Camera.create_from_model_id(1, m, 1.0, 1, 1).params) for m in models}
-    beside = {table: files["cameras"].with_name(f"{table}.bin") for table in ("rigs", "frames")}
-    for table, path in {**files, **beside}.items():
-        if table in TABLES or path.is_file():
-            _check_table(table, path, params)
-
-
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height
 
 
 def _check_table(table: str, path: Path, params: Mapping[int, int]) -> None:
+    """Walk every record of a binary table, so that a damaged file gives an error instead of an endless allocation.
+
+    COLMAP's reader trusts the counts in the files: an empty ``points3D.bin`` makes it allocate without end, and a
+    truncated ``cameras.bin`` loads as garbage.
+
+    Args:
+        table: Its name.
+        path: Its file.
+        params: Number of parameters of each camera model by its id.
+
+    Raises:
+        SceneError: The file is empty, truncated, longer than its records, or not a COLMAP table.
+    """
     remedy = "copy the model again or export it anew with `colmap model_converter`"
     size = path.stat().st_size
     if size < _U64.size:

@@ -215,31 +215,28 @@ def _image_folder(root: Path, name: str, factor: int | None) -> tuple[Path, int]
         photos = sorted(path for path in root.glob("*/*") if path.suffix.lower() in PHOTOS)
         folders = list(dict.fromkeys(path.parent.name for path in photos))
         scaled_copies = [other for other in folders if other.startswith(f"{name}_")]
+        hint = ": copy the photos there"
+        if folders:
+            hint += f", or set images_folder to one of {', '.join(folders)}"
         if scaled_copies:
             hint = f"; there is {', '.join(scaled_copies)}: set factor"
-        elif folders:
-            hint = f": copy the photos there, or set images_folder to one of {', '.join(folders)}"
-        else:
-            hint = ": copy the photos there"
         raise SceneError(f"image folder {folder} does not exist{hint}")
     return folder, factor or 1
 
 
 def _locate(images: Sequence[ColmapImage], folder: Path) -> list[Path]:
     """Path of each image; in a downscaled copy of the folder, the suffix may differ."""
-    found = [folder / image.name for image in images]
-    absent = [i for i, path in enumerate(found) if not path.is_file()]
-    if absent:
+    paths = [folder / image.name for image in images]
+    if not all(path.is_file() for path in paths):
         by_stem = _by_stem(folder)
-        for i in absent:
-            found[i] = by_stem.get(Path(images[i].name).with_suffix(""), found[i])
-        lost = [images[i].name for i in absent if not found[i].is_file()]
-        if lost:
-            raise SceneError(
-                f"{len(lost)} of {len(images)} images of the model are not in {folder}, first {lost[0]}: "
-                "copy the photos that COLMAP was run on into that folder, under the same names"
-            )
-    return found
+        paths = [path if path.is_file() else by_stem.get(path.with_suffix(""), path) for path in paths]
+    lost = [image.name for image, path in zip(images, paths, strict=True) if not path.is_file()]
+    if lost:
+        raise SceneError(
+            f"{len(lost)} of {len(images)} images of the model are not in {folder}, first {lost[0]}: "
+            "copy the photos that COLMAP was run on into that folder, under the same names"
+        )
+    return paths
 
 
 def find_masks(images: Sequence[ColmapImage], root: Path, folders: Sequence[str]) -> list[Path | None]:
@@ -258,8 +255,10 @@ def find_masks(images: Sequence[ColmapImage], root: Path, folders: Sequence[str]
     """
     folder = next((root / name for name in folders if (root / name).is_dir()), None)
     files = {} if folder is None else _by_stem(folder)
+    names = [Path(folder or "", image.name) for image in images]
     found = [
-        image.mask or files.get(Path(image.name)) or files.get(Path(image.name).with_suffix("")) for image in images
+        image.mask or files.get(name) or files.get(name.with_suffix(""))
+        for image, name in zip(images, names, strict=True)
     ]
     lost = [path for path in found if path is not None and not path.is_file()]
     if lost:
@@ -272,8 +271,8 @@ def find_masks(images: Sequence[ColmapImage], root: Path, folders: Sequence[str]
 
 
 def _by_stem(folder: Path) -> dict[Path, Path]:
-    """The files in a folder and the folders in it, by their path there without suffix."""
-    return {path.relative_to(folder).with_suffix(""): path for path in sorted(folder.rglob("*")) if path.is_file()}
+    """The files in a folder and the folders in it, by their path without suffix."""
+    return {path.with_suffix(""): path for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def same_shape(camera: Any, width: int, height: int) -> bool:

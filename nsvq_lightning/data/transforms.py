@@ -20,8 +20,6 @@ from nsvq_lightning.data.images import image_head
 from nsvq_lightning.data.point_cloud import read_points, share_seen
 from nsvq_lightning.rendering.camera import Camera
 
-__all__ = ["read_poses", "transforms_files"]
-
 log = logging.getLogger(__name__)
 
 _TRAIN = "transforms_train.json"
@@ -43,8 +41,7 @@ def read_poses(
         SceneError: There is no such model, it is damaged, or has cameras or names that cannot be used.
     """
     check_name(str(root.resolve()), "--data.root", allow_outside=True)
-    files = transforms_files(root, model)
-    if files:
+    if files := _transforms_files(root, model):
         return _read_transforms(root, files, allow_outside)
     poses = colmap.read_model(root, observations, model)
     for image in poses.images:
@@ -52,15 +49,8 @@ def read_poses(
     return poses
 
 
-def transforms_files(root: Path, model: str | None = None) -> list[Path]:
-    """The transforms files with the cameras of a scene folder; empty if these are in a COLMAP model.
-
-    Of two files, the second has the test views.
-
-    Args:
-        root: Scene folder.
-        model: See :func:`read_poses`.
-    """
+def _transforms_files(root: Path, model: str | None) -> list[Path]:
+    """The files with the cameras, of two the second has the test views; none if the cameras are in a COLMAP model."""
     if model is not None:
         return [root / model] if model.endswith(".json") else []
     if colmap.find_model(root) is not None:
