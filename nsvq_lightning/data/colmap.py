@@ -170,7 +170,14 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
     if broken:
         raise SceneError(f"{files['images']}: {len(broken)} poses are not finite, first {broken[0]}: run COLMAP again")
     for number in dict.fromkeys(image.camera_id for image in registered):
-        _check_camera(files["cameras"], reconstruction.cameras[number])
+        camera = reconstruction.cameras[number]  # of a text table, which no check has seen before, it may be anything
+        size = camera.width, camera.height
+        if not 0 < min(size) <= max(size) <= LARGEST_SIDE or not _is_finite(camera.params):
+            raise SceneError(
+                f"{files['cameras']}: camera {number} has size {size[0]}x{size[1]} and parameters "
+                f"{camera.params_to_string()}; needed are sizes from 1 to {LARGEST_SIDE} and finite numbers: copy the "
+                "model again or run COLMAP again"
+            )
     return ColmapModel(
         images=tuple(ColmapImage(i.name, i.camera_id, pose) for i, pose in zip(registered, viewmats, strict=True)),
         cameras=dict(reconstruction.cameras.items()),
@@ -337,17 +344,6 @@ def _check_rows(path: Path, rows: int) -> None:
     if announced and int(announced[1]) > rows:
         raise SceneError(
             f"{path} announces {announced[1]} rows but has {rows}: it is truncated; copy it again or export it anew"
-        )
-
-
-def _check_camera(path: Path, camera: Any) -> None:
-    """Check size and parameters: text tables, which no check has seen before, may hold any number."""
-    size = camera.width, camera.height
-    if not 0 < min(size) <= max(size) <= LARGEST_SIDE or not _is_finite(camera.params):
-        raise SceneError(
-            f"{path}: camera {camera.camera_id} has size {size[0]}x{size[1]} and parameters "
-            f"{camera.params_to_string()}; needed are sizes from 1 to {LARGEST_SIDE} and finite numbers: copy the "
-            "model again or run COLMAP again"
         )
 
 

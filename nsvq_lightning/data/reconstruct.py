@@ -8,7 +8,7 @@ import shutil
 import sqlite3
 import threading
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -133,11 +133,22 @@ OVERLAP = 12
 
 
 def _compare(database: Path, count: int, report: Report, is_video: bool, threads: int) -> None:
+    """Compare photos, and say now and then how many pairs are done."""
     pycolmap = import_pycolmap()
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
     exhaustive = count <= (EXHAUSTIVE // 2 if is_video else EXHAUSTIVE)
     pairs = count * (count - 1) // 2 if exhaustive else 2 * OVERLAP * count
-    with _polled(database, lambda done: report("comparing photos", min(done, pairs), pairs)):
+    ended = threading.Event()
+
+    def poll() -> None:
+        while not ended.wait(timeout=1.0):
+            with contextlib.suppress(sqlite3.Error):
+                done = _rows(database, "select count(*) from two_view_geometries")[0][0]
+                report("comparing photos", min(done, pairs), pairs)
+
+    polling = threading.Thread(target=poll, daemon=True)
+    polling.start()
+    try:
         if exhaustive:
             pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
         else:
@@ -145,6 +156,9 @@ def _compare(database: Path, count: int, report: Report, is_video: bool, threads
             pycolmap.match_sequential(
                 database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu
             )
+    finally:
+        ended.set()
+        polling.join()
     report("comparing photos", pairs, pairs)
 
 
@@ -201,25 +215,6 @@ def _partners(database: Path) -> dict[str, int]:
             if image in names:
                 counts[names[image]] += 1
     return counts
-
-
-@contextlib.contextmanager
-def _polled(database: Path, show: Callable[[int], None]) -> Iterator[None]:
-    """Say now and then how many pairs are compared while the block compares them."""
-    ended = threading.Event()
-
-    def poll() -> None:
-        while not ended.wait(timeout=1.0):
-            with contextlib.suppress(sqlite3.Error):
-                show(_rows(database, "select count(*) from two_view_geometries")[0][0])
-
-    thread = threading.Thread(target=poll, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
 
 
 def _rows(database: Path, query: str, *values: Any) -> list[tuple[Any, ...]]:

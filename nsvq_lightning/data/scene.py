@@ -112,6 +112,10 @@ class Scene:
         return View(self.names[index], index, self.cameras[index], *self.images[index])
 
 
+_FARTHEST = 1e4
+"""Distance of the cameras from the origin, in extents, from which float32 positions are too coarse: as on a map."""
+
+
 def load_scene(
     root: str | Path,
     factor: Factor | None = None,
@@ -188,7 +192,15 @@ def load_scene(
     centres = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in poses.images])
     middle = centres[list(train)].mean(0)
     extent = float(1.1 * np.linalg.norm(centres[list(train)] - middle, axis=1).max())
-    _warn_if_far(float(np.linalg.norm(middle)), extent)
+    distance = float(np.linalg.norm(middle))
+    if extent > 0 and distance > _FARTHEST * extent:
+        log.warning(
+            "the cameras are %.3g scene units from the origin, %.0f times the extent of the scene: float32 positions "
+            "there are %.1g apart; move the origin near the cameras (colmap model_transformer)",
+            distance,
+            distance / extent,
+            float(np.spacing(np.float32(distance))),
+        )
     usable = _away_from(centres, poses.points, _AT_CAMERA * extent)
     return Scene(
         root=root,
@@ -338,22 +350,6 @@ def _away_from(centres: NDArray[np.float64], points: NDArray[np.float64], radius
     if not away.all():
         log.warning("left out %d of %d points: they are at the centre of a camera", len(away) - away.sum(), len(away))
     return away
-
-
-_FARTHEST = 1e4
-"""Distance of the cameras from the origin, in extents, beyond which rounding moves splats by much of a pixel."""
-
-
-def _warn_if_far(distance: float, extent: float) -> None:
-    """Warn where float32 positions are too coarse for the scene, as in geographic coordinates."""
-    if extent > 0 and distance > _FARTHEST * extent:
-        log.warning(
-            "the cameras are %.3g scene units from the origin, %.0f times the extent of the scene: float32 positions "
-            "there are %.1g apart; move the origin near the cameras (colmap model_transformer)",
-            distance,
-            distance / extent,
-            float(np.spacing(np.float32(distance))),
-        )
 
 
 def edge_strength(image: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -41,24 +41,19 @@ def read_poses(
         SceneError: There is no such model, it is damaged, or has cameras or names that cannot be used.
     """
     check_name(str(root.resolve()), "--data.root", allow_outside=True)
-    if files := _transforms_files(root, model):
+    files = [root / model] if model is not None and model.endswith(".json") else []
+    if model is None and colmap.find_model(root) is None:
+        single, train, *tests = (root / f"transforms{part}.json" for part in ("", "_train", "_test", "_val"))
+        if single.is_file():
+            files = [single]
+        elif train.is_file():
+            files = [train, *[test for test in tests if test.is_file()][:1]]  # the second one has the test views
+    if files:
         return _read_transforms(root, files, allow_outside)
     poses = colmap.read_model(root, observations, model)
     for image in poses.images:
         check_name(image.name, f"the COLMAP model of {root}", allow_outside)
     return poses
-
-
-def _transforms_files(root: Path, model: str | None) -> list[Path]:
-    """The files with the cameras, of two the second has the test views; none if the cameras are in a COLMAP model."""
-    if model is not None:
-        return [root / model] if model.endswith(".json") else []
-    if colmap.find_model(root) is not None:
-        return []
-    single, train, *tests = (root / f"transforms{part}.json" for part in ("", "_train", "_test", "_val"))
-    if single.is_file():
-        return [single]
-    return [train, *[test for test in tests if test.is_file()][:1]] if train.is_file() else []
 
 
 _Lens = tuple[str, int, int, tuple[float, ...]]
