@@ -38,14 +38,7 @@ VIEWS = [
 
 
 def _entry(iteration: int, phase: str, psnr: float, seconds: float) -> dict[str, Any]:
-    return {
-        "iteration": iteration,
-        "phase": phase,
-        "splats": 1000,
-        "psnr": psnr,
-        "ssim": 0.5,
-        "seconds": seconds,
-    }
+    return {"iteration": iteration, "phase": phase, "splats": 1000, "psnr": psnr, "ssim": 0.5, "seconds": seconds}
 
 
 HISTORY = [_entry(100, "warmup", 20.0, 5.0), _entry(150, "warmup", 21.0, 7.5), _entry(450, "finetune", 31.0, 67.5)]
@@ -109,15 +102,12 @@ def test_page_of_a_finished_run_needs_no_other_file(run: Path) -> None:
     assert same[2].max() < 8
     for words in ("a & <i> / version_0", "31.25 dB", "0.004 MB", "41.5 x", "a.jpg: 30.00 dB, SSIM 0.8000, the lowest"):
         assert words in page.words
-    assert "sub/<b>.jpg: 32.50 dB" in page.words
-    assert "model: {note: '</pre><script>'}" in page.words
-    assert re.search(r"means +3,500 +28\.00", page.words)
-    assert "means.far" not in page.words
-    assert re.search(r"quats +64 +40 +5\.12", page.words)
-    assert re.search(r"warmup +150 +7\.5 s +50\.0", page.words)
+    for words in ("sub/<b>.jpg: 32.50 dB", "model: {note: '</pre><script>'}", "evaluations"):
+        assert words in page.words
+    for row in (r"means +3,500 +28\.00", r"quats +64 +40 +5\.12", r"warmup +150 +7\.5 s +50\.0"):
+        assert re.search(row, page.words)
     assert re.search(r"finetune +300 +1 min 0 s +200\.0", page.words)
-    assert "evaluations" in page.words
-    assert "kernels compiled" not in page.words
+    assert not re.search(r"means\.far|kernels compiled", page.words)
 
 
 def test_page_of_a_running_fit_shows_a_view_and_is_read_again(run: Path) -> None:
@@ -147,14 +137,11 @@ def test_curve_stays_within_its_axes(psnr: list[float]) -> None:
     text = curve_svg(history, SCHEDULE)
     dots = [(float(x), float(y)) for x, y in re.findall(r'<circle cx="([\d.]+)" cy="([\d.]+)"', text)]
     assert len(dots) == sum(map(math.isfinite, psnr))
-    xs = [x for x, _ in dots]
+    xs, heights = ([dot[axis] for dot in dots] for axis in (0, 1))
     assert xs == sorted(set(xs))
     assert all(48 <= x <= 716 and 28 <= y <= 288 for x, y in dots)
-    heights = [y for _, y in dots]
     finite = [value for value in psnr if math.isfinite(value)]
-    assert [heights.index(y) for y in sorted(heights, reverse=True)] == [
-        finite.index(value) for value in sorted(finite)
-    ]
+    assert np.argsort(heights, stable=True).tolist() == np.argsort(np.negative(finite), stable=True).tolist()
     assert "nan" not in text
     assert "inf" not in text
 
@@ -167,13 +154,10 @@ def test_curve_shades_the_phases_where_they_are() -> None:
     assert re.findall(r"(warmup|prune|quantize|finetune)</text>", text) == ["warmup", "prune", "quantize", "finetune"]
 
 
-def test_ordinary_names_stay_as_they_are() -> None:
-    names = ("view_000.png", "IMG 1.2.JPG", "left/é.jpg", "right/é.jpg")
-    assert [file_stem(name, names) for name in names] == ["view_000", "IMG 1.2", "left_é", "right_é"]
-    assert file_stem("a/b.png") == "a_b"  # of views that nobody has listed
-
-
 def test_files_of_different_views_differ_and_fit_any_file_system(tmp_path: Path) -> None:
+    ordinary = ("view_000.png", "IMG 1.2.JPG", "left/é.jpg", "right/é.jpg")
+    assert [file_stem(name, ordinary) for name in ordinary] == ["view_000", "IMG 1.2", "left_é", "right_é"]
+    assert file_stem("a/b.png") == "a_b"  # of views that nobody has listed
     same = ("a/b.png", "a_b.png", "x.png", "x.jpg", "X.jpeg", "é.png", "e\u0301.png", "a/b.jpg~0123456789ab.png")
     deep = tuple("/".join(["ö" * 100] * 2 + [last]) for last in ("1.png", "2.png"))
     names = (*same, *deep, "y~0123456789ab.png", "z\udcff.png")

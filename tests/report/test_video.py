@@ -64,13 +64,11 @@ def test_an_error_leaves_the_old_video(tmp_path: Path, codec: str) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
 
 
-def test_impossible_videos_are_refused(tmp_path: Path) -> None:
-    with (
-        pytest.raises(ValueError, match=r"a\.avi: a video ends in \.mp4"),
-        video_writer(tmp_path / "a.avi", 64, 48, 12),
-    ):
-        pass
-    with pytest.raises(ValueError, match="must be even, got 63x48"), video_writer(tmp_path / "a.mp4", 63, 48, 12):
+@pytest.mark.parametrize(
+    ("name", "width", "message"), [("a.avi", 64, r"a\.avi: a video ends in \.mp4"), ("a.mp4", 63, "even, got 63x48")]
+)
+def test_impossible_videos_are_refused(tmp_path: Path, name: str, width: int, message: str) -> None:
+    with pytest.raises(ValueError, match=message), video_writer(tmp_path / name, width, 48, 12):
         pass
     assert not list(tmp_path.iterdir())
 
