@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nsvq_lightning.compression.budget import splats_for_bytes, splats_for_photos
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.data.scene import detailed_pixels, edge_strength
+from nsvq_lightning.data.scene import View, detailed_pixels, edge_strength
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors

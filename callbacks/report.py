@@ -130,10 +130,10 @@ class MetricReport(WritingCallback):
         """Evaluate the end of the run if no epoch has ended, and draw the curve."""
         self._evaluate_once(trainer, module, trainer.global_step)
         folder = run_folder(trainer)
-        if trainer.is_global_zero and host.history and not is_trial(trainer):
-            with host.stopwatch.paused(host.device):
-                write_csv(folder / "curve.csv", host.history)
-                write_curve(folder / "curve.png", host.history, host.schedule)
+        if trainer.is_global_zero and module.history and not is_trial(trainer):
+            with module.stopwatch.paused(module.device):
+                write_csv(folder / "curve.csv", module.history)
+                write_curve(folder / "curve.png", module.history, module.schedule)
 
     def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Catch up for a run that was stopped after its last iteration: when continued, it trains no further."""
@@ -173,8 +173,8 @@ class MetricReport(WritingCallback):
         }
         module.history.append(entry)
         if trainer.is_global_zero:
-            write_csv(folder / "curve.csv", host.history)
-            self._page(folder, host).write()
+            write_csv(folder / "curve.csv", module.history)
+            self._page(folder, module).write()
         values = {f"report/{name}": float(entry[name]) for name in ("psnr", "ssim", "splats")}
         trainer.callback_metrics.update({name: torch.tensor(value) for name, value in values.items()})
         for logger in trainer.loggers:

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import image_metrics
 from nsvq_lightning.rendering.camera import Camera
 

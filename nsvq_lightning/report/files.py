@@ -18,7 +18,6 @@ from nsvq_lightning.io.nsvq.file import read_header
 from nsvq_lightning.io.nsvq.paper import paper_header
 from nsvq_lightning.report.evaluation import ViewScore
 from nsvq_lightning.report.figures import new_figure, write_figure
-from nsvq_lightning.training.host import SplatHost
 from nsvq_lightning.training.schedule import Phase, Schedule
 
 PHASE_COLOURS = {Phase.WARMUP: "#dfe8f5", Phase.PRUNE: "#f8e6d0", Phase.QUANTIZE: "#dcefdc", Phase.FINETUNE: "#efe0f0"}
@@ -47,7 +46,7 @@ def summarize(
         return float(sum(getattr(score, name) for score in scores)) / len(scores)
 
     file_bytes, header = path.stat().st_size, read_header(path)
-    last = {str(entry["phase"]): dict(entry) for entry in host.history}  # the last evaluation of each phase
+    last = {str(entry["phase"]): dict(entry) for entry in module.history}  # the last evaluation of each phase
     ends = [last[phase.name.lower()] for phase in Phase if phase.name.lower() in last]
     return {
         "psnr": mean("psnr"),
@@ -65,7 +64,7 @@ def summarize(
         "streams": {"header": header.size, **{stream.name: stream.length for stream in header.streams}},
         "codes": {name: _codes_in_use(codes, len(scene.codebooks[name])) for name, codes in scene.codes.items()},
         "paper_level": dict(paper),
-        "train_seconds": host.train_seconds,
+        "train_seconds": module.stopwatch.seconds,
         "before_quantization": last.get(Phase.PRUNE.name.lower()) if scene.codebooks else None,
         "phases": ends,
     }
