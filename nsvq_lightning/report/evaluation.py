@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.data.scene import View
+from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import image_metrics
 from nsvq_lightning.rendering.camera import Camera
 
@@ -57,7 +58,7 @@ def evaluate(
     metrics, shown = image_metrics().to(device), False
     for view in views:
         photo = view.to(device)
-        image = kept(render_image(photo.camera), photo.mask)
+        image = apply_mask(render_image(photo.camera), photo.mask)
         if show is not None and not shown:
             show(image, photo.image)
         shown = True

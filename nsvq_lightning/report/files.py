@@ -18,6 +18,7 @@ from nsvq_lightning.io.nsvq.file import read_header
 from nsvq_lightning.io.nsvq.paper import paper_header
 from nsvq_lightning.report.evaluation import ViewScore
 from nsvq_lightning.report.figures import new_figure, write_figure
+from nsvq_lightning.training.resume import ResumedModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 
 PHASE_COLOURS = {Phase.WARMUP: "#dfe8f5", Phase.PRUNE: "#f8e6d0", Phase.QUANTIZE: "#dcefdc", Phase.FINETUNE: "#efe0f0"}
