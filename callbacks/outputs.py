@@ -17,7 +17,6 @@ from nsvq_lightning.io.nsvq.file import as_stored
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.report.pictures import file_stem, write_png
 from nsvq_lightning.report.viewer import BACKGROUNDS, some_cameras, write_viewer
-from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.training import live_preview
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_trial, run_folder
@@ -178,14 +177,14 @@ class LiveScene(WritingCallback):
         asked = live_preview.asked(folder)
         if asked == self._answered:
             return
-        module, began = module, time.monotonic()
-        with module.stopwatch.paused(module.device):
-            splats = type(module.splats).from_tensors(*module.hard_splats(module.phase)).to("cpu")
-            state = {"iteration": trainer.global_step, "of": trainer.max_steps, "phase": module.phase.name.lower()}
-            if module.history:
-                state["psnr"] = f"{module.history[-1]['psnr']:.2f}"
-            config = {"antialiased": module.antialiased, "live": state}
-            scene = CompressedScene.from_arrays(SplatArrays.from_splats(splats), config=config)
+        host, began = as_host(pl_module), time.monotonic()
+        with host.stopwatch.paused(host.device):
+            splats = type(host.splats).from_tensors(*host.hard_splats(host.phase)).to("cpu")
+            state = {"iteration": trainer.global_step, "of": trainer.max_steps, "phase": host.phase.name.lower()}
+            if host.history:
+                state["psnr"] = f"{host.history[-1]['psnr']:.2f}"
+            config = {"antialiased": getattr(pl_module, "antialiased", False), "live": state}
+            scene = CompressedScene.from_splats(splats, config=config)
             save(scene, folder / live_preview.LIVE_SCENE, Storage("paper"))
         self._answered, ended = asked, time.monotonic()
         self._next = ended + (ended - began) / SHARE

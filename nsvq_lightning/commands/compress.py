@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from nsvq_lightning.compression.ladder import Candidate
     from nsvq_lightning.io.compressed import CompressedScene
     from nsvq_lightning.rendering.camera import Camera
-    from nsvq_lightning.splats.arrays import SplatArrays
 
 __all__ = ["main"]
 
@@ -98,12 +97,11 @@ def _compress(options: argparse.Namespace) -> int:
     from nsvq_lightning.training.run_folder import claim_version
 
     source: Path = options.input
-    scene = read_scene(source)
-    arrays = scene.finite().arrays()
-    if len(arrays) == 0:
+    scene = read_scene(source).finite()
+    if len(scene) == 0:
         raise ValueError(f"{source} holds no finite splat; there is nothing to compress")
-    cameras = views_of(arrays.to_splats(), options.root, VIEWS)
-    candidate, pictures = _candidate(options, arrays, cameras, scene)
+    cameras = views_of(scene.decode(), options.root, VIEWS)
+    candidate, pictures = _candidate(options, scene, cameras)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     result = Result(candidate.rung.name, candidate.data, candidate.error)
     if options.root is not None and options.max_steps != 0:
@@ -117,13 +115,13 @@ def _compress(options: argparse.Namespace) -> int:
             path = folder / "scene.nsvq"
             data = with_origin(path.read_bytes(), scene.origin)
             # A new one: keeping the pictures of the original would fill the memory during training.
-            error = Compressor(arrays, cameras, candidate.storage, antialiased=scene.antialiased).error(data)
+            error = Compressor(scene, cameras, candidate.storage).error(data)
             result = _within_aim(options, result, Result(f"{result.settings}, trained with photos", data, error), path)
     with atomic_write(options.output) as file:
         file.write(result.data)
     before, after = source.stat().st_size, len(result.data)
     sys.stdout.write(
-        f"{options.output}: {len(arrays):,} splats in {after:,} bytes, {before / after:.1f} times smaller than "
+        f"{options.output}: {len(scene):,} splats in {after:,} bytes, {before / after:.1f} times smaller than "
         f"{source.name}\n  {result.settings}, error {result.error:.4g} ({decibels(result.error):.2f} dB against the "
         f"original in {pictures} pictures)\n"
     )
@@ -145,15 +143,11 @@ def _within_aim(options: argparse.Namespace, untrained: Result, trained: Result,
     return replace(untrained, settings=f"{untrained.settings}, without training")
 
 
-def _candidate(
-    options: argparse.Namespace, arrays: SplatArrays, cameras: list[Camera], scene: CompressedScene
-) -> tuple[Candidate, int]:
+def _candidate(options: argparse.Namespace, scene: CompressedScene, cameras: list[Camera]) -> tuple[Candidate, int]:
     """The scene as the options ask for it, and the number of pictures in which its error was measured."""
     from nsvq_lightning.compression.ladder import LADDER, PLAIN, Compressor, finest_within, smallest_within
 
-    compressor = Compressor(
-        arrays, cameras, Storage(options.level), options.seed, scene.origin, options.tune, scene.antialiased
-    )
+    compressor = Compressor(scene, cameras, Storage(options.level), options.seed, options.tune)
     if options.max_error is not None:
         candidate = smallest_within(compressor, options.max_error)
     elif options.target_bytes is not None:

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.commands.arguments import Parser
 from nsvq_lightning.commands.progress import progress
-from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, cropped, rotated, turn_up
 from nsvq_lightning.io.describe import attribute_errors
 from nsvq_lightning.io.formats import FORMATS, read_scene, save
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
-from nsvq_lightning.io.placing import UP_AXES, cropped, rotated, turn_up
 from nsvq_lightning.io.sog import PALETTE_LIMIT
 from nsvq_lightning.io.spz import DEFAULT_AXES, DEFAULT_VERSION, SPZ_AXES, SPZ_VERSIONS
 
@@ -163,7 +162,7 @@ def _errors(scene: CompressedScene, output: Path) -> str:
     in_order = FORMATS[output.suffix.lower()].in_order
     if in_order is None:
         return ""
-    errors = attribute_errors(read_scene(output).arrays(), in_order(scene).arrays())
+    errors = attribute_errors(read_scene(output), in_order(scene))
     listed = ", ".join(f"{name} {error:.2g}{'°' * (name == 'rotation')}" for name, error in errors.items())
     return f"  root mean square errors: {listed}\n"
 

@@ -6,9 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from nsvq_lightning.io.nsvq.precision import Precision
-from nsvq_lightning.splats.conventions import sh_coefficients
-
-__all__ = ["splats_for_bytes", "splats_for_photos"]
+from nsvq_lightning.splats.attributes import ATTRIBUTES, QUANTIZABLE, attribute_dims
 
 SPLATS_PER_PIXEL = 0.165
 """Splats for each detailed pixel of a photo, times the cube root of the number of photos."""
@@ -18,10 +16,6 @@ LEAST = 1000
 
 GEOMETRY_BITS = 23.5
 """Bits of a splat's position and opacity at the precision of level ``compact``, 22 to 25 on the measured scenes."""
-ROW_BITS = {"scales": 0.0, "quats": 0.3, "sh0": -1.3, "shN": -1.4}
-"""Bits of a code beyond log2 of the number of codes: colours of neighbours are alike."""
-CODE_BITS = {"scales": 6.0, "quats": 5.7, "sh0": 5.9, "shN": 5.5}
-"""Bits of a number in a codebook at level ``compact``."""
 RATE_DISTORTION = 0.28
 """Codes and codebooks take 1 / (1 + this · strength) of their bits where codes are chosen by rate and distortion."""
 HEADER = 2048
@@ -65,15 +59,14 @@ def splats_for_bytes(
     usual, precision = Precision(), precision or Precision()
     position, opacity = precision.position / usual.position, precision.opacity / usual.opacity
     fixed, bits = 8.0 * HEADER, GEOMETRY_BITS - 3 * math.log2(position) - math.log2(opacity)
-    numbers = {"scales": 3, "quats": 4, "sh0": 3, "shN": 3 * sh_coefficients(sh_degree)}
     coded = 1 / (1 + RATE_DISTORTION * strength)
-    for name, count in numbers.items():
+    for name in QUANTIZABLE:
         if name in codebooks:
             codes, dim = codebooks[name]
-            fixed += coded * codes * dim * CODE_BITS[name]
-            bits += coded * (math.log2(codes) + ROW_BITS[name])
+            fixed += coded * codes * dim * ATTRIBUTES[name].code_bits
+            bits += coded * (math.log2(codes) + ATTRIBUTES[name].row_bits)
         else:
-            bits += FULL_BITS * count
+            bits += FULL_BITS * attribute_dims(sh_degree)[name]
     splats = int((8 * size - fixed) / bits)
     if splats < LEAST:
         raise ValueError(

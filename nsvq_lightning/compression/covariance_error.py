@@ -14,8 +14,6 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.canonical_covariance import FORMS, Form, canonical
 
-__all__ = ["covariance_error", "covariances", "form_errors"]
-
 SAMPLE = 1 << 15
 """Size of a sample of splats that is enough to rank the forms."""
 

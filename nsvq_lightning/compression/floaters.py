@@ -15,7 +15,7 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import ALPHA_MAX
 from nsvq_lightning.rendering.rasterize import Render
-from nsvq_lightning.splats.splats import RawSplats, SplatTensors
+from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 
 __all__ = ["floaters", "removal_effects"]
 
@@ -47,7 +47,7 @@ def floaters(
         views: Gives the train views, all of them: what only photos that are left out support would go.
         render: The rasterizer.
     """
-    raw = RawSplats(*(getattr(splats, name).detach() for name in RawSplats._fields))
+    raw = detached(splats)
     left = torch.arange(len(raw.means), device=raw.means.device)
     threshold = torch.inf
     for number in range(MOST_ROUNDS):
@@ -94,7 +94,7 @@ def removal_effects(
     # No opacity reaches the rasterizer's cap, which has no gradient.
     cap = torch.logit(torch.tensor(ALPHA_MAX - 0.01)).item()
     opacities = splats.opacities.detach().clamp_max(cap).requires_grad_()
-    raw = RawSplats(*(getattr(splats, name).detach() for name in RawSplats._fields))._replace(opacities=opacities)
+    raw = detached(splats)._replace(opacities=opacities)
     # α ∂/∂α of a pixel's opacity α = σ(x) · G, from ∂/∂x.
     scale = -1 / torch.sigmoid(-opacities.detach())
     slope, curvature, error = torch.zeros_like(scale), torch.zeros_like(scale), 0.0

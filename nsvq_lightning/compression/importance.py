@@ -12,18 +12,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.sh import C0
-from nsvq_lightning.splats.splats import RawSplats, SplatTensors
-
-__all__ = [
-    "INVISIBLE",
-    "contributions",
-    "least_contributing",
-    "most_contributing",
-    "pixel_sizes",
-    "row_weights",
-    "scale_floor",
-    "sensitivity",
-]
+from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 
 
 def contributions(
@@ -40,7 +29,7 @@ def contributions(
         cameras: The views; they may be divided among processes, and the results added.
         render: The rasterizer.
     """
-    base = RawSplats(*(getattr(splats, name).detach() for name in RawSplats._fields))
+    base = detached(splats)
     # Any colour above 0, where it is not clamped, will do: sh0 = 0 is grey.
     sh0 = torch.zeros_like(base.sh0).requires_grad_()
     grey = base._replace(sh0=sh0, shN=base.shN[:, :0])
@@ -107,7 +96,7 @@ def sensitivity(
         The estimate, shaped as the raw attributes, in squared channel values over squared units of the attribute; and
         the picture ``[H, W, 3]``, detached.
     """
-    raw = RawSplats(*(getattr(splats, name).detach().requires_grad_() for name in RawSplats._fields))
+    raw = RawSplats(*(tensor.requires_grad_() for tensor in detached(splats)))
     with torch.enable_grad():
         image = render(raw, camera).image
     draws = torch.randint(0, 2, image.shape, generator=signs, dtype=torch.int8).to(image) * 2 - 1

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nsvq_lightning.compression.covariance_error import form_errors
 from nsvq_lightning.compression.importance import contributions, row_weights, scale_floor
-from nsvq_lightning.compression.stored import compress
+from nsvq_lightning.compression.stored import to_compressed
 from nsvq_lightning.compression.viewpoints import decibels, picture_error, pictures
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import decode, encode
@@ -26,9 +26,9 @@ from nsvq_lightning.quantize.kmeans import lookup
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.arrays import SplatArrays
+from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.canonical_covariance import canonical
-from nsvq_lightning.splats.splats import RawSplats
+from nsvq_lightning.splats.splats import RawSplats, detached
 
 __all__ = [
     "LADDER",
@@ -44,10 +44,6 @@ __all__ = [
 ]
 
 
-RATES = {"scales": 0.01, "quats": 0.002, "sh0": 0.0025, "shN": 0.0005, "opacities": 0.025}
-"""Learning rates at the start, of codebooks and of the opacities."""
-POSITION_RATE = 3e-5
-"""Learning rate of the positions at the start, in root mean square distances of the splats from their middle."""
 FINAL = 0.05
 """Learning rates at the end, as a share of those at the start."""
 
@@ -74,11 +70,12 @@ def tuned(
     free = {name: torch.from_numpy(rows.copy()).requires_grad_() for name, rows in scene.codebooks.items()}
     free["opacities"] = original.opacities.clone().requires_grad_()
     free["means"] = original.means.clone().requires_grad_()
-    rates = RATES | {"means": POSITION_RATE * float(original.means.std(0).norm())}
+    rates = {name: ATTRIBUTES[name].tuning_rate for name in free}
+    rates["means"] *= float(original.means.std(0).norm())
     groups = [{"params": [tensor], "lr": rates[name]} for name, tensor in free.items()]
     adam = torch.optim.Adam(groups, eps=1e-15)
     decay = torch.optim.lr_scheduler.ExponentialLR(adam, FINAL ** (1 / steps))
-    fixed = RawSplats(*(tensor.detach() for tensor in scene.decode().raw()))
+    fixed = detached(scene.decode())
     draws, order = generator(seed, 0, "views"), list[int]()
     for _ in range(steps):
         if not order:
@@ -168,11 +165,10 @@ class Compressor:
     it, the scene is tuned until its pictures resemble those of the original.
 
     Args:
-        splats: The scene, finite.
+        scene: The scene, finite.
         cameras: Views in which the scene is tuned; in some of them errors and contributions are measured.
         storage: Level, and the precision, which rungs make coarser or finer.
         seed: Seed of k-means.
-        origin: World coordinates of the point (0, 0, 0) of the positions, stored in files.
         tuning: Steps of tuning, 0 for none.
 
     Raises:
@@ -181,21 +177,18 @@ class Compressor:
 
     def __init__(
         self,
-        splats: SplatArrays,
+        scene: CompressedScene,
         cameras: Sequence[Camera],
         storage: Storage,
         seed: int = 0,
-        origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
         tuning: int = 0,
-        antialiased: bool = False,
     ) -> None:
-        if len(splats) == 0 or not cameras:
-            raise ValueError(f"cannot compress {len(splats)} splats seen by {len(cameras)} cameras")
-        self._splats = RawSplats(*(tensor.detach() for tensor in splats.to_splats().raw()))
-        self._views, self._cameras = cameras, cameras[:: -(-len(cameras) // MEASURED) or 1]
-        self._storage, self._seed, self._origin, self._tuning = storage, seed, origin, tuning
-        self._antialiased = antialiased
-        self._pictures = pictures(self._splats, self._cameras, antialiased)
+        if len(scene) == 0 or not cameras:
+            raise ValueError(f"cannot compress {len(scene)} splats seen by {len(cameras)} cameras")
+        self._splats, self._origin, self._antialiased = detached(scene.decode()), scene.origin, scene.antialiased
+        self._views, self._cameras = cameras, cameras[:: -(-len(cameras) // MEASURED)]
+        self._storage, self._seed, self._tuning = storage, seed, tuning
+        self._pictures = pictures(self._splats, self._cameras, self._antialiased)
         if not any(bool(picture.any()) for picture in self._pictures):
             raise ValueError(
                 f"all {len(self._cameras)} pictures of the scene are black, so no error can be measured: photos "
@@ -228,8 +221,7 @@ class Compressor:
 
     def error(self, data: bytes) -> float:
         """Root mean square difference between the pictures of a ``.nsvq`` file and those of the scene."""
-        splats = RawSplats(*(tensor.detach() for tensor in decode(*unframe(data)).decode().raw()))
-        return picture_error(splats, self._cameras, self._pictures, self._antialiased)
+        return picture_error(decode(*unframe(data)).decode(), self._cameras, self._pictures, self._antialiased)
 
     def _compressed(self, rung: Rung) -> Candidate:
         scene = self._quantized(rung.codebooks)
@@ -256,7 +248,7 @@ class Compressor:
         config: dict[str, object] = {"codebooks": {name: len(q.codebook) for name, q in quantizers.items()}}
         if self._antialiased:
             config["antialiased"] = True
-        scene = replace(compress(splats, quantizers), config=config, origin=self._origin)
+        scene = replace(to_compressed(splats, quantizers), config=config, origin=self._origin)
         return tuned(scene, splats, self._views, self._tuning, self._seed) if quantizers else scene
 
     def _canonical(self, codebooks: Mapping[str, int]) -> RawSplats:

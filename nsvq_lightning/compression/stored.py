@@ -10,19 +10,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nsvq_lightning.io.compressed import QUANTIZABLE, CompressedScene
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.quantize.attributes import attribute_rows, codes_of
 from nsvq_lightning.quantize.base import Quantizer
-from nsvq_lightning.splats.arrays import dropped, finite_rows
+from nsvq_lightning.splats.attributes import QUANTIZABLE, dropped, finite_rows
 from nsvq_lightning.splats.splats import RawSplats, sh_degree_of
-
-__all__ = ["compress", "formula_bytes"]
 
 log = logging.getLogger(__name__)
 
 
 @torch.no_grad()
-def compress(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> CompressedScene:
+def to_compressed(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> CompressedScene:
     """The scene as it is stored: codes and codebooks where there are quantizers, plain float32 elsewhere.
 
     Splats with non-finite values are left out with a warning.

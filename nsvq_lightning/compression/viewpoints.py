@@ -16,8 +16,6 @@ from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import SplatTensors
 
-__all__ = ["decibels", "likely_cameras", "look_at", "middle_of", "picture_error", "pictures", "views_of"]
-
 
 def look_at(target: NDArray[np.float64], eye: NDArray[np.float64], width: int, height: int, angle: float) -> Camera:
     """A camera at ``eye [3]`` that has ``target [3]`` in its centre, y down.

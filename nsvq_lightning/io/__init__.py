@@ -8,14 +8,12 @@ from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.formats import FORMATS, Format, load, read_scene, save
 from nsvq_lightning.io.nsvq.file import CompressedScene, read_header, read_nsvq, write_nsvq
 from nsvq_lightning.io.ply import plain_ply_bytes, read_ply, write_ply
-from nsvq_lightning.splats.arrays import SplatArrays
 
 __all__ = [
     "FORMATS",
     "CompressedScene",
     "Format",
     "FormatError",
-    "SplatArrays",
     "atomic_path",
     "atomic_write",
     "load",

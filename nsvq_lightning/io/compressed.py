@@ -1,4 +1,4 @@
-"""A vector-quantized scene: what a ``.nsvq`` file holds."""
+"""A scene as files hold it, some of whose attributes are codes; it is turned and cropped without decoding these."""
 
 from __future__ import annotations
 
@@ -10,33 +10,22 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.ply import plain_ply_bytes
-from nsvq_lightning.splats.arrays import SplatArrays, check_floats, dropped, finite_rows
-from nsvq_lightning.splats.conventions import sh_coefficients
+from nsvq_lightning.splats import attributes as splat
+from nsvq_lightning.splats.conventions import shN_degree, turned
 
 if TYPE_CHECKING:
-    from nsvq_lightning.splats.splats import Splats
+    from nsvq_lightning.splats.splats import Splats, SplatTensors
 
 log = logging.getLogger(__name__)
 
 _T = TypeVar("_T", bound=np.generic)
-
-__all__ = ["QUANTIZABLE", "CompressedScene", "attribute_dims"]
-
-QUANTIZABLE = ("quats", "scales", "sh0", "shN")
-"""Attributes that may be stored as codes, in file order; positions and opacities never are (paper, section 3)."""
-
-
-def attribute_dims(sh_degree: int) -> dict[str, int]:
-    """Values per splat, D, of each attribute in :data:`QUANTIZABLE`; ``shN`` is the flattened ``[coefficients, 3]``."""
-    return {"quats": 4, "scales": 3, "sh0": 3, "shN": 3 * sh_coefficients(sh_degree)}
 
 
 @dataclass(frozen=True, eq=False)
 class CompressedScene:
     """N splats, some of whose attributes are codes into codebooks.
 
-    Every attribute of :data:`QUANTIZABLE` is either in ``codes`` and ``codebooks`` or in ``raw``; spaces are those of
+    Every attribute that may have a codebook is either in ``codes`` and ``codebooks`` or in ``raw``; spaces are those of
     :meth:`nsvq_lightning.Splats.from_tensors` (log-scales, quaternions wxyz, SH coefficients).
 
     Attributes:
@@ -69,38 +58,83 @@ class CompressedScene:
     stored_bytes: int | None = None
 
     def __post_init__(self) -> None:
-        n, dims = len(self.means), attribute_dims(self.sh_degree)
-        check_floats("means", self.means, (n, 3))
-        check_floats("opacities", self.opacities, (n,))
+        n, dims = len(self.means), splat.attribute_dims(self.sh_degree)
+        _check_floats("means", self.means, (n, 3))
+        _check_floats("opacities", self.opacities, (n,))
         if len(self.origin) != 3 or not np.isfinite(self.origin).all():
             raise ValueError(f"origin must be three finite numbers, got {self.origin}")
         if self.codes.keys() != self.codebooks.keys():
             raise ValueError(f"codes of {sorted(self.codes)} but codebooks of {sorted(self.codebooks)}")
-        if sorted([*self.codes, *self.raw]) != sorted(QUANTIZABLE):
+        if sorted([*self.codes, *self.raw]) != sorted(splat.QUANTIZABLE):
             raise ValueError(
-                f"each of {', '.join(QUANTIZABLE)} must be either in codes and codebooks or in raw; "
+                f"each of {', '.join(splat.QUANTIZABLE)} must be either in codes and codebooks or in raw; "
                 f"got codes of {sorted(self.codes)} and raw {sorted(self.raw)}"
             )
         for name, values in self.raw.items():
-            check_floats(f"raw[{name!r}]", values, (n, dims[name]))
+            _check_floats(f"raw[{name!r}]", values, (n, dims[name]))
         for name, codes in self.codes.items():
             _check_codes(name, codes, self.codebooks[name], n, dims[name])
 
     @classmethod
-    def from_arrays(cls, arrays: SplatArrays, **header: Any) -> CompressedScene:
-        """A scene without any codebook: valid, but not compressed.
+    def from_splats(cls, splats: SplatTensors, **header: Any) -> CompressedScene:
+        """A copy of splats, on any device, without any codebook: valid, but not compressed.
 
         Args:
-            arrays: The scene.
+            splats: The splats.
             header: ``config``, ``metrics`` and ``origin``.
+
+        Raises:
+            ValueError: The shape of an attribute does not fit the others.
         """
-        dims = attribute_dims(arrays.sh_degree)
-        # Not -1, which NumPy cannot infer where an axis is empty.
-        raw = {name: getattr(arrays, name).reshape(len(arrays), dims[name]) for name in QUANTIZABLE}
-        return cls(arrays.means, arrays.opacities, raw=raw, sh_degree=arrays.sh_degree, **header)
+        from nsvq_lightning.splats.splats import check_shapes
+
+        tensors = {name: getattr(splats, name).detach() for name in splat.ATTRIBUTES}
+        check_shapes(tensors)
+        rows = {name: tensor.cpu().numpy().astype(np.float32) for name, tensor in tensors.items()}
+        dims = splat.attribute_dims(shN_degree(rows["shN"].shape[1]))
+        return cls(
+            rows["means"],
+            rows["opacities"],
+            raw={name: rows[name].reshape(len(rows[name]), dims[name]) for name in splat.QUANTIZABLE},
+            sh_degree=shN_degree(rows["shN"].shape[1]),
+            **header,
+        )
 
     def __len__(self) -> int:
         return len(self.means)
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether it is to be rendered with anti-aliasing, as it was trained (``antialiased`` of :attr:`config`)."""
+        return self.config.get("antialiased") is True
+
+    def values(self, name: str, rows: slice = slice(None)) -> NDArray[np.float32]:
+        """An attribute ``[N, ...]`` of all splats or some, bit for bit the rows of its codebook if it has one.
+
+        Args:
+            name: Attribute; positions are relative to ``origin``.
+            rows: Which splats.
+        """
+        values: NDArray[np.float32]
+        if name in self.codes:
+            values = self.codebooks[name][self.codes[name][rows]]
+        else:
+            values = (self.raw[name] if name in self.raw else getattr(self, name))[rows]
+        return values.reshape(len(values), *splat.attribute_shapes(self.sh_degree)[name])
+
+    def decode(self) -> Splats:
+        """The decoded scene as :class:`nsvq_lightning.Splats`.
+
+        Positions stay relative to ``origin``: adding a large origin in float32 would lose the detail that
+        subtracting it preserved.
+        """
+        import torch
+
+        from nsvq_lightning.splats.splats import Splats
+
+        return Splats.from_tensors(
+            *(torch.from_numpy(np.ascontiguousarray(self.values(name))) for name in splat.ATTRIBUTES)
+        )
 
     def table(self, name: str) -> tuple[NDArray[np.float32], NDArray[np.integer] | None]:
         """Distinct rows ``[K, D]`` of an attribute and the row of each splat ``[N]``; None where row i is splat i's."""
@@ -147,49 +181,26 @@ class CompressedScene:
             codebooks={name: self.codebooks[name][used if len(used) else [0]] for name, (used, _) in rows.items()},
         )
 
-    def finite(self) -> CompressedScene:
-        """The splats without NaN or infinite values; a warning counts the others by attribute."""
+    def finite_rows(self) -> tuple[NDArray[np.bool_], dict[str, int]]:
+        """Which splats ``[N]`` have neither NaN nor infinite values, and how many do, by attribute."""
         bad = {name: np.where(np.isfinite(rows).all(1), 0, np.nan) for name, rows in self.codebooks.items()}
         flags = {name: flags.astype(np.float32)[self.codes[name]] for name, flags in bad.items()}
-        keep, culprits = finite_rows({"means": self.means, "opacities": self.opacities, **self.raw, **flags})
+        return splat.finite_rows({"means": self.means, "opacities": self.opacities, **self.raw, **flags})
+
+    def finite(self) -> CompressedScene:
+        """The splats without NaN or infinite values; a warning counts the others by attribute."""
+        keep, culprits = self.finite_rows()
         if not culprits:
             return self
-        log.warning(dropped(keep, culprits))
+        log.warning(splat.dropped(keep, culprits))
         return self.take(keep)
 
-    def arrays(self) -> SplatArrays:
-        """The decoded scene, bit for bit the rows of the codebooks; positions stay relative to ``origin``."""
-        rows = {name: self.raw[name] if name in self.raw else self._look_up(name) for name in QUANTIZABLE}
-        return SplatArrays(
-            means=self.means,
-            quats=rows["quats"],
-            scales=rows["scales"],
-            opacities=self.opacities,
-            sh0=rows["sh0"].reshape(len(self), 1, 3),
-            shN=rows["shN"].reshape(len(self), sh_coefficients(self.sh_degree), 3),
-        )
 
-    def decode(self) -> Splats:
-        """The decoded scene as :class:`nsvq_lightning.Splats`.
-
-        Positions stay relative to ``origin``: adding a large origin in float32 would lose the detail that
-        subtracting it preserved.
-        """
-        return self.arrays().to_splats()
-
-    @property
-    def antialiased(self) -> bool:
-        """Whether it is to be rendered with anti-aliasing, as it was trained (``antialiased`` of :attr:`config`)."""
-        return self.config.get("antialiased") is True
-
-    @property
-    def plain_bytes(self) -> int:
-        """Bytes of the plain ``.ply`` of the same scene."""
-        return plain_ply_bytes(len(self), self.sh_degree)
-
-    def _look_up(self, name: str) -> NDArray[np.float32]:
-        rows: NDArray[np.float32] = self.codebooks[name][self.codes[name]]
-        return rows
+def _check_floats(name: str, array: NDArray[np.float32], shape: tuple[int, ...]) -> None:
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {list(shape)}, got {list(array.shape)}")
+    if array.dtype != np.float32:  # nothing is rounded silently
+        raise TypeError(f"{name} must be float32, got {array.dtype}; convert it with .astype(np.float32)")
 
 
 def _check_codes(name: str, codes: NDArray[np.integer], codebook: NDArray[np.float32], n: int, dim: int) -> None:
@@ -198,7 +209,7 @@ def _check_codes(name: str, codes: NDArray[np.integer], codebook: NDArray[np.flo
             f"{name} has no coefficients at SH degree 0, so no codebook; give it in raw with shape [{n}, 0]"
         )
     rows = len(codebook)
-    check_floats(f"codebooks[{name!r}]", codebook, (rows, dim))
+    _check_floats(f"codebooks[{name!r}]", codebook, (rows, dim))
     if codes.shape != (n,):
         raise ValueError(f"codes[{name!r}] must have shape [{n}], got {list(codes.shape)}")
     if not np.issubdtype(codes.dtype, np.integer):
@@ -207,3 +218,76 @@ def _check_codes(name: str, codes: NDArray[np.integer], codebook: NDArray[np.flo
         raise ValueError(f"codebooks[{name!r}] is empty; a codebook needs at least one row")
     if n and not (int(codes.min()) >= 0 and int(codes.max()) < rows):
         raise ValueError(f"codes[{name!r}] must be in 0..{rows - 1}, got {codes.min()}..{codes.max()}")
+
+
+UP_AXES = {
+    "y": np.diag([1.0, -1.0, -1.0]),
+    "minus-y": np.eye(3),
+    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "minus-z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+}
+"""Rotations that turn COLMAP's up, -y, to an axis; x stays."""
+
+
+def turn_up(up: NDArray[np.float64], axis: str) -> NDArray[np.float64]:
+    """The rotation ``[3, 3]`` that turns a direction to an axis: the shortest way to -y, then around x.
+
+    Args:
+        up: Direction ``[3]`` of length 1.
+        axis: One of :data:`UP_AXES`.
+    """
+    goal = np.array([0.0, -1.0, 0.0])
+    # Two reflections: one that swaps opposite directions needs another mirror than the one between them.
+    between = up + goal
+    if between @ between < 1e-12:
+        return np.asarray(UP_AXES[axis] @ UP_AXES["y"])
+    first, second = (np.eye(3) - 2 * np.outer(v, v) / (v @ v) for v in (goal, between))
+    return np.asarray(UP_AXES[axis] @ first @ second)
+
+
+def rotated(scene: CompressedScene, rotation: NDArray[np.float64]) -> CompressedScene:
+    """The scene turned about the world's origin.
+
+    Positions, rotations and spherical harmonics turn, the last two by the rows of their codebooks; numbers are rounded
+    once, to float32.
+
+    Args:
+        scene: The scene.
+        rotation: ``[3, 3]``, of determinant 1.
+    """
+    import torch
+
+    from nsvq_lightning.rendering.sh import sh_rotation
+
+    matrix = sh_rotation(torch.from_numpy(rotation), scene.sh_degree).numpy()
+
+    def rows(tables: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
+        found = dict(tables)
+        if "quats" in found:
+            found["quats"] = turned(found["quats"], rotation)
+        if "shN" in found:
+            wide = found["shN"].reshape(len(found["shN"]), len(matrix), 3).astype(np.float64)
+            found["shN"] = (matrix @ wide).reshape(found["shN"].shape).astype(np.float32)
+        return found
+
+    x, y, z = (rotation @ np.array(scene.origin)).tolist()
+    return replace(
+        scene,
+        means=(scene.means.astype(np.float64) @ rotation.T).astype(np.float32),
+        codebooks=rows(scene.codebooks),
+        raw=rows(scene.raw),
+        origin=(x, y, z),
+        stored_bytes=None,
+    )
+
+
+def cropped(scene: CompressedScene, low: NDArray[np.float64], high: NDArray[np.float64]) -> CompressedScene:
+    """The splats whose centres are in a box, its sides included; codebooks stay as they are.
+
+    Args:
+        scene: The scene.
+        low: Smallest world coordinates ``[3]``.
+        high: Largest ``[3]``.
+    """
+    positions = scene.means.astype(np.float64) + np.array(scene.origin)
+    return scene.take(((positions >= low) & (positions <= high)).all(1))

@@ -9,23 +9,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.formats import FORMATS
 from nsvq_lightning.io.nsvq.header import MAGIC, read_header
 from nsvq_lightning.io.numbers import opacity_of
-from nsvq_lightning.io.ply import PLY_MAGIC, attribute_of, plain_ply_bytes, read_ply_size, splat_degree
+from nsvq_lightning.io.ply import PLY_MAGIC, attribute_bytes, plain_ply_bytes, read_ply_size, splat_degree
 from nsvq_lightning.io.sog import META, ZIP_MAGIC, read_sog_header
 from nsvq_lightning.io.splat import SPLAT_LAYOUT, count_splats
 from nsvq_lightning.io.spz import DEFAULT_AXES, SPZ_MAGICS, read_spz_header
-from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.splats.conventions import unit
 
 __all__ = ["attribute_errors", "describe"]
 
 
-def attribute_errors(read: SplatArrays, written: SplatArrays) -> dict[str, float]:
+def attribute_errors(read: CompressedScene, written: CompressedScene) -> dict[str, float]:
     """Root mean square errors over the splats, by quantity.
 
     Args:
@@ -37,23 +36,19 @@ def attribute_errors(read: SplatArrays, written: SplatArrays) -> dict[str, float
         ``position`` in scene units, ``rotation`` in degrees, ``log-scale``, ``opacity`` in [0, 1], and the coefficients
         ``sh0`` and ``shN``; 0 where there is nothing to compare.
     """
-    units, others = unit(read.quats), unit(written.quats)
+    units, others = (unit(scene.values("quats")) for scene in (read, written))
     nearer = np.minimum(np.linalg.norm(units - others, axis=1), np.linalg.norm(units + others, axis=1))
-    kept = read.shN.shape[1]
-    return {
-        "position": _root_mean_square(read.means - written.means.astype(np.float64)),
-        "rotation": _root_mean_square(np.degrees(4 * np.arcsin(np.minimum(nearer / 2, 1)))),
-        "log-scale": _root_mean_square(read.scales - written.scales.astype(np.float64)),
-        "opacity": _root_mean_square(opacity_of(read.opacities) - opacity_of(written.opacities)),
-        "sh0": _root_mean_square(read.sh0 - written.sh0.astype(np.float64)),
-        "shN": _root_mean_square(
-            np.concatenate([read.shN - written.shN[:, :kept], written.shN[:, kept:]], axis=1, dtype=np.float64)
-        ),
+    shN, written_shN = (scene.values("shN").astype(np.float64) for scene in (read, written))
+    missing = written_shN.shape[1] - shN.shape[1]
+    errors = {
+        "position": read.means - written.means.astype(np.float64),
+        "rotation": np.degrees(4 * np.arcsin(np.minimum(nearer / 2, 1))),
+        "log-scale": read.values("scales") - written.values("scales").astype(np.float64),
+        "opacity": opacity_of(read.opacities) - opacity_of(written.opacities),
+        "sh0": read.values("sh0") - written.values("sh0").astype(np.float64),
+        "shN": np.pad(shN, ((0, 0), (0, missing), (0, 0))) - written_shN,
     }
-
-
-def _root_mean_square(errors: NDArray[np.floating[Any]]) -> float:
-    return float(np.sqrt(np.mean(np.square(errors)))) if errors.size else 0.0
+    return {name: float(np.sqrt(np.mean(np.square(error)))) if error.size else 0.0 for name, error in errors.items()}
 
 
 def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -100,11 +95,7 @@ def _describe_ply(path: Path) -> dict[str, Any]:
     header, total = read_ply_size(path)
     with naming_file(path):
         sh_degree = splat_degree(header)
-    sizes: dict[str, int] = {}
-    for table in [header, *(header.others[name] for name in ("sh",) if header.packed and name in header.others)]:
-        for name in table.properties:
-            attribute = attribute_of(name)
-            sizes[attribute] = sizes.get(attribute, 0) + table.count * table.dtype[name].itemsize
+    sizes = attribute_bytes(header)
     # The lengths of ascii numbers vary, so only the total is known.
     streams = {"header": total - sum(sizes.values()), **sizes} if header.encoding != "ascii" else {"text": total}
     name = "compressed" if header.packed else header.encoding

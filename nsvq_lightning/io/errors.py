@@ -11,8 +11,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike, fspath
 
-__all__ = ["FEW_ROWS", "FEW_SPLATS", "FormatError", "check_room", "naming_file"]
-
 
 class FormatError(ValueError):
     """A file is truncated, altered, or not of the format it was opened as; the message names file, defect and remedy.

@@ -10,18 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_nsvq
+from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_finite
 from nsvq_lightning.io.nsvq.precision import Storage
-from nsvq_lightning.io.ply import read_ply, read_ply_header, write_ply
+from nsvq_lightning.io.ply import read_ply, write_ply
 from nsvq_lightning.io.sog import in_sog_order, read_sog, write_sog
 from nsvq_lightning.io.splat import read_splat, write_splat
 from nsvq_lightning.io.spz import in_spz_order, read_spz, write_spz
-from nsvq_lightning.splats.arrays import SplatArrays
 
 if TYPE_CHECKING:
     from nsvq_lightning.splats.splats import Splats, SplatTensors
-
-__all__ = ["FORMATS", "Format", "load", "read_scene", "save"]
 
 logger = logging.getLogger(__name__)
 
@@ -103,7 +100,7 @@ def save(
         raise ValueError(f"cannot write {path}: compressed .ply files are only read; .sog and .spz are smaller")
     entry = _format_of(path, "write")
     if not isinstance(scene, CompressedScene):
-        scene = CompressedScene.from_arrays(SplatArrays.from_splats(scene))
+        scene = CompressedScene.from_splats(scene)
     scene = scene.finite()
     if any(scene.origin) and not entry.keeps_origin:
         logger.warning("%s: the origin %s of the positions is not stored; add it in the viewer", path, scene.origin)
@@ -122,24 +119,9 @@ def _format_of(path: Path, action: str) -> Format:
         raise ValueError(f"cannot {action} {path}: unknown suffix {path.suffix!r}; supported are {supported}") from None
 
 
-def _read_ply(path: Path) -> CompressedScene:
-    splats = read_ply(path)
-    return CompressedScene.from_arrays(
-        splats, config={"antialiased": True} if read_ply_header(path).antialiased else {}
-    )
-
-
-def _write_ply(path: Path, scene: CompressedScene) -> int:
-    return write_ply(path, scene.arrays(), scene.antialiased)
-
-
-def _write_nsvq(path: Path, scene: CompressedScene, *, storage: Storage) -> int:
-    return write_nsvq(path, scene, storage.level, storage.precision)
-
-
 FORMATS: dict[str, Format] = {
-    ".ply": Format("3D Gaussian Splatting", _read_ply, _write_ply),
-    ".nsvq": Format("compressed scene of this package", read_nsvq, _write_nsvq, keeps_origin=True, takes_storage=True),
+    ".ply": Format("3D Gaussian Splatting", read_ply, write_ply),
+    ".nsvq": Format("compressed scene of this package", read_nsvq, write_finite, keeps_origin=True, takes_storage=True),
     ".sog": Format("PlayCanvas, SuperSplat", read_sog, write_sog, in_order=in_sog_order),
     ".spz": Format("Niantic", read_spz, write_spz, in_order=in_spz_order),
     ".splat": Format(

@@ -13,8 +13,6 @@ from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import INT64, UINT64, check_array, outside
 from nsvq_lightning.io.numbers import power_above, power_below
 
-__all__ = ["AXIS_BITS", "Grid", "morton_keys", "nearest_before", "spatial_order", "unmorton"]
-
 AXIS_BITS = 21
 """Bits per coordinate: three coordinates make a key of 63 bits."""
 

@@ -10,18 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "Clamped",
-    "coarsest_power",
-    "finite_logits",
-    "logits_of_bytes",
-    "nearest_power",
-    "opacity_of",
-    "power_above",
-    "power_below",
-]
-
-
 _OPAQUE = 20.0
 """Magnitude of the logit that replaces ±inf: its sigmoid is 1 in float32, and training can still move it."""
 

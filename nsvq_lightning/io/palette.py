@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from nsvq_lightning.compute.jit import kernel
 from nsvq_lightning.compute.memory import check_array, check_table
 
-__all__ = ["find_palette", "in_order_of_use"]
-
 _ITERATIONS = 4
 """Power-iteration steps for the direction of a cut, which need not be exact."""
 

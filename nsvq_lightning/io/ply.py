@@ -15,45 +15,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.numbers import finite_logits, logits_of_bytes
-from nsvq_lightning.splats.arrays import SplatArrays
-from nsvq_lightning.splats.conventions import from_smallest_three, sh_coefficients, shN_degree
-
-__all__ = [
-    "MIP_COMMENTS",
-    "PLY_MAGIC",
-    "PlyHeader",
-    "attribute_of",
-    "plain_ply_bytes",
-    "read_ply",
-    "read_ply_columns",
-    "read_ply_header",
-    "read_ply_size",
-    "splat_degree",
-    "splat_properties",
-    "write_ply",
-]
-
+from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
+from nsvq_lightning.splats.conventions import SH_C0, from_smallest_three, shN_degree
 
 PLY_MAGIC = b"ply"
 
-MIP_COMMENTS = {"SplatRenderMode:": "mip", "antialiased": "1"}
+_MIP_COMMENTS = {"SplatRenderMode:": "mip", "antialiased": "1"}
 """Comments of Brush and of Postshot, and the word after each that says: trained with anti-aliasing."""
-
-_HEADER_LIMIT = 1 << 20
 _BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
-_REQUIRED = (
-    *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
-)
-_PACKED = {f"packed_{name}": "u4" for name in ("position", "rotation", "scale", "color")}
-_BOUNDS = {f"{end}_{part}{axis}": "f4" for part in ("", "scale_") for end in ("min", "max") for axis in "xyz"}
+_PACKED = {"packed_position": "means", "packed_rotation": "quats", "packed_scale": "scales", "packed_color": "sh0"}
+"""Properties of a compressed ``.ply``, and the attributes in them; the opacity is in the colour."""
+_ROWS = 1 << 12
+"""Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene."""
 
 
 @dataclass(frozen=True)
@@ -94,21 +75,6 @@ class PlyHeader:
         return self.dtype.names or ()
 
 
-@dataclass
-class _Element:
-    name: str
-    count: int
-    fields: list[tuple[str, str]]
-    has_list: bool = False
-
-    def dtype(self) -> np.dtype[np.void]:
-        names = [name for name, _ in self.fields]
-        doubled = sorted(a for a, b in pairwise(sorted(names)) if a == b)
-        if doubled:
-            raise FormatError(f"element {self.name} has the property {doubled[0]!r} twice")
-        return np.dtype(self.fields)
-
-
 def read_ply_header(path: str | os.PathLike[str]) -> PlyHeader:
     """Parse only the header; the size of the data is not checked.
 
@@ -116,15 +82,83 @@ def read_ply_header(path: str | os.PathLike[str]) -> PlyHeader:
         FormatError: The header is truncated or malformed, or has no vertices.
     """
     with open(path, "rb") as file:
-        start = file.read(_HEADER_LIMIT)
+        start = file.read(1 << 20)
     end = re.search(rb"\nend_header[ \t]*\r?\n", start)
     if not re.match(rb"ply[ \t]*\r?\n", start):
         raise FormatError("not a .ply file: it does not start with the line 'ply'")
     if end is None:
         raise FormatError("truncated or damaged: the header has no end_header line")
     lines = [line.split() for line in start[: end.start()].decode("latin-1").split("\n")[1:]]
-    encoding = _encoding(lines)
-    return replace(_locate(encoding, _elements(lines, _BYTE_ORDER[encoding]), end.end()), antialiased=_mip(lines))
+    formats = [line[1] for line in lines if line and line[0] == "format" and len(line) > 1]
+    if len(formats) != 1 or formats[0] not in _BYTE_ORDER:
+        raise FormatError(f"the header needs one format line with {', '.join(_BYTE_ORDER)}; got {formats}")
+    elements = _elements(lines, formats[0], end.end())
+    if "vertex" not in elements:
+        raise FormatError("the header has no element vertex")
+    # The last comment that says how the splats were trained counts.
+    meaning = {key.lower(): value for key, value in _MIP_COMMENTS.items()}
+    said = [line[1:] for line in lines if len(line) == 3 and line[0] == "comment" and line[1].lower() in meaning]
+    antialiased = bool(said) and meaning[said[-1][0].lower()] == said[-1][1].lower()
+    return replace(elements.pop("vertex"), antialiased=antialiased, others=elements)
+
+
+def _elements(lines: list[list[str]], encoding: str, offset: int) -> dict[str, PlyHeader]:
+    """The elements by name up to the first list after the vertices, whose length varies."""
+    fields: list[tuple[str, int, list[tuple[str, str]]]] = []
+    for line in lines:
+        match line:
+            case [] | ["comment" | "obj_info" | "format", *_]:
+                pass
+            case ["element", name, number] if re.fullmatch(r"[0-9]{1,15}", number):
+                fields.append((name, int(number), []))
+            case ["property", "list", _, _, name] if fields:
+                fields[-1][2].append((name, "list"))
+            case ["property", kind, name] if fields and kind in _TYPES:
+                fields[-1][2].append((name, _BYTE_ORDER[encoding] + _TYPES[kind]))
+            case _:
+                raise FormatError(f"bad header line {' '.join(line)[:80]!r}")
+    found: dict[str, PlyHeader] = {}
+    before = 0
+    for name, count, properties in fields:
+        if any(kind == "list" for _, kind in properties):
+            if "vertex" in found:
+                break
+            raise FormatError(f"element {name} holds lists; points and splats have plain numbers only")
+        if doubled := sorted(a for a, b in pairwise(sorted(name for name, _ in properties)) if a == b):
+            raise FormatError(f"element {name} has the property {doubled[0]!r} twice")
+        found[name] = PlyHeader(encoding, count, np.dtype(properties), offset, before)
+        if encoding == "ascii":
+            before += count
+        else:
+            offset = found[name].end
+    return found
+
+
+def read_ply_size(path: str | os.PathLike[str]) -> tuple[PlyHeader, int]:
+    """Header and size in bytes of a ``.ply`` file that is long enough for its vertices.
+
+    Raises:
+        FormatError: The file is truncated, or no ``.ply``.
+    """
+    with naming_file(path):
+        header, file_bytes = read_ply_header(path), Path(path).stat().st_size
+        # An ascii value takes at least one digit and one separator; the last separator may be missing.
+        row_bytes = 2 * len(header.properties) if header.encoding == "ascii" else header.dtype.itemsize
+        needed = header.offset + header.count * row_bytes - (header.encoding == "ascii" and header.count > 0)
+        if header.packed:
+            needed = max(needed, *(header.others[name].end for name in ("chunk", "sh") if name in header.others))
+        if needed > file_bytes:
+            raise FormatError(f"truncated: {header.count} vertices need {needed} bytes, the file has {file_bytes}")
+    return header, file_bytes
+
+
+def splat_columns(sh_degree: int) -> dict[str, list[str]]:
+    """Properties of each attribute; of the colours, all of red come first."""
+    stems = {name: attribute.ply for name, attribute in ATTRIBUTES.items()}
+    return {
+        name: [f"{stems[name]}{i}" for i in range(dim)] if stems[name].endswith("_") else stems[name].split()
+        for name, dim in attribute_dims(sh_degree).items()
+    }
 
 
 def splat_degree(header: PlyHeader) -> int:
@@ -138,7 +172,7 @@ def splat_degree(header: PlyHeader) -> int:
         names = header.others["sh"].properties if "sh" in header.others else ()
     else:
         names = header.properties
-        missing = [name for name in _REQUIRED if name not in names]
+        missing = [name for columns in splat_columns(0).values() for name in columns if name not in names]
         if missing:
             raise FormatError(f"not a .ply of Gaussian splats: it has no property {', '.join(missing)}")
     rest = [name for name in names if name.startswith("f_rest_")]
@@ -151,7 +185,8 @@ def splat_degree(header: PlyHeader) -> int:
 
 def _check_packed(header: PlyHeader) -> None:
     chunk, sh = header.others["chunk"], header.others.get("sh")
-    expected = [(header, _PACKED), (chunk, _BOUNDS)]
+    bounds = [f"{end}_{part}{axis}" for part in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
+    expected = [(header, dict.fromkeys(_PACKED, "u4")), (chunk, dict.fromkeys(bounds, "f4"))]
     if sh:
         expected.append((sh, dict.fromkeys(sh.properties, "u1")))
     for table, kinds in expected:
@@ -165,74 +200,18 @@ def _check_packed(header: PlyHeader) -> None:
         )
 
 
-def splat_properties(sh_degree: int) -> tuple[str, ...]:
-    """Names of the properties that make up splats."""
-    return (*_REQUIRED, *(f"f_rest_{i}" for i in range(3 * sh_coefficients(sh_degree))))
+def attribute_bytes(header: PlyHeader) -> dict[str, int]:
+    """Bytes of each attribute of the splats in a file that is not ascii; ``other`` for all other properties."""
+    names = {column: name for name, columns in splat_columns(3).items() for column in columns} | _PACKED
+    sizes: dict[str, int] = {}
+    for table in [header, *([header.others["sh"]] if header.packed and "sh" in header.others else [])]:
+        for column in table.properties:
+            name = names.get(column, "other")
+            sizes[name] = sizes.get(name, 0) + table.count * table.dtype[column].itemsize
+    return sizes
 
 
-def attribute_of(name: str) -> str:
-    """Attribute that a property belongs to; ``other`` for all other properties."""
-    families = {"f_dc": "sh0", "f_rest": "shN", "scale": "scales", "rot": "quats"}
-    singles = {"x": "means", "y": "means", "z": "means", "opacity": "opacities"}
-    singles |= dict(zip(_PACKED, ("means", "quats", "scales", "sh0"), strict=True))
-    return singles.get(name) or families.get(re.sub(r"_[0-9]+$", "", name), "other")
-
-
-def _encoding(lines: list[list[str]]) -> str:
-    formats = [line[1] for line in lines if line and line[0] == "format" and len(line) > 1]
-    if len(formats) != 1 or formats[0] not in _BYTE_ORDER:
-        raise FormatError(f"the header needs one format line with {', '.join(_BYTE_ORDER)}; got {formats}")
-    return formats[0]
-
-
-def _mip(lines: list[list[str]]) -> bool:
-    """Whether the last comment that says how the splats were trained says: with anti-aliasing."""
-    meaning = {key.lower(): value for key, value in MIP_COMMENTS.items()}
-    said = [line[1:] for line in lines if len(line) == 3 and line[0] == "comment" and line[1].lower() in meaning]
-    return bool(said) and meaning[said[-1][0].lower()] == said[-1][1].lower()
-
-
-def _elements(lines: list[list[str]], byte_order: str) -> list[_Element]:
-    elements: list[_Element] = []
-    for line in lines:
-        match line:
-            case [] | ["comment" | "obj_info" | "format", *_]:
-                pass
-            case ["element", name, count] if re.fullmatch(r"[0-9]{1,15}", count):
-                elements.append(_Element(name, int(count), []))
-            case ["property", "list", _, _, _] if elements:
-                elements[-1].has_list = True
-            case ["property", kind, name] if elements and kind in _TYPES:
-                elements[-1].fields.append((name, byte_order + _TYPES[kind]))
-            case _:
-                raise FormatError(f"bad header line {' '.join(line)[:80]!r}")
-    return elements
-
-
-def _locate(encoding: str, elements: list[_Element], offset: int) -> PlyHeader:
-    found: dict[str, PlyHeader] = {}
-    lines = 0
-    for element in elements:
-        if element.has_list and "vertex" in found:
-            break
-        if element.has_list:
-            raise FormatError(f"element {element.name} holds lists; points and splats have plain numbers only")
-        found[element.name] = PlyHeader(encoding, element.count, element.dtype(), offset, lines)
-        if encoding == "ascii":
-            lines += element.count
-        else:
-            offset = found[element.name].end
-    if "vertex" not in found:
-        raise FormatError("the header has no element vertex")
-    return replace(found.pop("vertex"), others=found)
-
-
-_ROWS = 1 << 12
-"""Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene."""
-_SH_C0 = 0.5 / math.sqrt(math.pi)
-
-
-def read_ply(path: str | os.PathLike[str]) -> SplatArrays:
+def read_ply(path: str | os.PathLike[str]) -> CompressedScene:
     """Read the splats of a ``.ply`` file.
 
     Properties may come in any order and any number type, binary (either byte order) or ascii; with or without normals.
@@ -245,14 +224,30 @@ def read_ply(path: str | os.PathLike[str]) -> SplatArrays:
     header, _ = read_ply_size(path)
     with naming_file(path):
         sh_degree = splat_degree(header)
-        if header.packed:
-            return _read_packed(path, header, sh_degree)
-    splats = _empty(header.count, sh_degree)
+    read = _read_packed if header.packed else _read_plain
+    raw = read(path, header, sh_degree)
+    means, opacities = raw.pop("means"), raw.pop("opacities")[:, 0]
+    config = {"antialiased": True} if header.antialiased else {}
+    return CompressedScene(means, opacities, raw=raw, sh_degree=sh_degree, config=config)
+
+
+def _read_plain(path: str | os.PathLike[str], header: PlyHeader, sh_degree: int) -> dict[str, NDArray[np.float32]]:
+    """Rows ``[N, D]`` of each attribute."""
+    columns = splat_columns(sh_degree)
+    raw = {name: np.empty((header.count, len(names)), np.float32) for name, names in columns.items()}
+    ends = np.cumsum([len(names) for names in columns.values()])
     start = 0
-    for table in read_ply_columns(path, header, splat_properties(sh_degree)):
-        _store(table, splats, slice(start, start + len(table)))
+    for table in read_ply_columns(path, header, [name for names in columns.values() for name in names]):
+        for name, part in zip(raw, np.split(table, ends[:-1], axis=1), strict=True):
+            raw[name][start : start + len(table)] = _by_coefficient(part) if name == "shN" else part
         start += len(table)
-    return splats
+    # Writers that store opacity as a byte make 0 and 255 infinite logits.
+    return raw | {"opacities": finite_logits(raw["opacities"])}
+
+
+def _by_coefficient(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Higher coefficients ``[N, D]``, all of red first, in our order: the three colours of each coefficient."""
+    return rows.reshape(len(rows), 3, rows.shape[1] // 3).swapaxes(1, 2).reshape(rows.shape)
 
 
 def read_ply_columns(
@@ -268,120 +263,33 @@ def read_ply_columns(
     # A double beyond float32's range becomes inf, which is what a float file would hold.
     with naming_file(path), open(path, "rb") as file, np.errstate(over="ignore"):
         file.seek(header.offset)
-        yield from (_read_ascii if header.encoding == "ascii" else _read_binary)(file, header, columns)
+        if header.encoding == "ascii":
+            yield _read_ascii(file, header)[:, columns].astype(np.float32)
+            return
+        for start in range(0, header.count, _ROWS):
+            rows = min(_ROWS, header.count - start)
+            data = file.read(rows * header.dtype.itemsize)
+            if len(data) < rows * header.dtype.itemsize:
+                raise FormatError("truncated while it was read")
+            table = np.frombuffer(data, header.dtype)
+            yield np.stack([table[name] for name in names], axis=1, dtype=np.float32, casting="unsafe")
 
 
-def read_ply_size(path: str | os.PathLike[str]) -> tuple[PlyHeader, int]:
-    """Header and size in bytes of a ``.ply`` file that is long enough for its vertices.
-
-    Raises:
-        FormatError: The file is truncated, or no ``.ply``.
-    """
-    with naming_file(path):
-        header, file_bytes = read_ply_header(path), Path(path).stat().st_size
-        _check_room(header, file_bytes)
-    return header, file_bytes
-
-
-def write_ply(path: str | os.PathLike[str], splats: SplatArrays, antialiased: bool = False) -> int:
-    """Write splats as little-endian ``.ply``, 62 float32 per splat at SH degree 3.
-
-    Args:
-        path: File to write, replaced atomically.
-        splats: The scene; :func:`nsvq_lightning.save` leaves out non-finite splats, on which viewers fail.
-        antialiased: Say in comments that they were trained with anti-aliasing.
-
-    Returns:
-        Bytes of the file.
-    """
-    header = _header_text(len(splats), splats.sh_degree, antialiased)
-    with atomic_write(path) as file:
-        file.write(header)
-        for start in range(0, len(splats), _ROWS):
-            file.write(_rows(splats, slice(start, start + _ROWS)).tobytes())
-        return file.tell()
-
-
-def plain_ply_bytes(splats: int, sh_degree: int) -> int:
-    """Size in bytes of the file that :func:`write_ply` makes: the reference for a compressed scene."""
-    return len(_header_text(splats, sh_degree)) + 4 * splats * len(_property_names(sh_degree))
-
-
-def _property_names(sh_degree: int) -> list[str]:
-    return [
-        *"xyz",
-        "nx",
-        "ny",
-        "nz",
-        *(f"f_dc_{i}" for i in range(3)),
-        *(f"f_rest_{i}" for i in range(3 * sh_coefficients(sh_degree))),
-        "opacity",
-        *(f"scale_{i}" for i in range(3)),
-        *(f"rot_{i}" for i in range(4)),
-    ]
-
-
-def _header_text(count: int, sh_degree: int, antialiased: bool = False) -> bytes:
-    comments = "".join(f"comment {key} {value}\n" for key, value in MIP_COMMENTS.items()) if antialiased else ""
-    properties = "".join(f"property float {name}\n" for name in _property_names(sh_degree))
-    return f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {count}\n{properties}end_header\n".encode(
-        "ascii"
-    )
-
-
-def _rows(splats: SplatArrays, rows: slice) -> NDArray[np.float32]:
-    means = splats.means[rows]
-    # Channel-major: all red coefficients first; ours are [coefficient, channel].
-    rest = splats.shN[rows].transpose(0, 2, 1).reshape(len(means), -1)
-    columns = [
-        means,
-        np.zeros_like(means),
-        splats.sh0[rows, 0],
-        rest,
-        splats.opacities[rows, None],
-        splats.scales[rows],
-        splats.quats[rows],
-    ]
-    return np.concatenate(columns, axis=1).astype("<f4", copy=False)
-
-
-def _check_room(header: PlyHeader, file_bytes: int) -> None:
-    # An ascii value takes at least one digit and one separator; the last separator may be missing.
-    row_bytes = 2 * len(header.properties) if header.encoding == "ascii" else header.dtype.itemsize
-    needed = header.offset + header.count * row_bytes - (header.encoding == "ascii" and header.count > 0)
-    if header.packed:
-        needed = max(needed, *(header.others[name].end for name in ("chunk", "sh") if name in header.others))
-    if needed > file_bytes:
-        raise FormatError(f"truncated: {header.count} vertices need {needed} bytes, the file has {file_bytes}")
-
-
-def _read_binary(file: BinaryIO, header: PlyHeader, columns: list[int]) -> Iterator[NDArray[np.float32]]:
-    names = [header.properties[column] for column in columns]
-    for start in range(0, header.count, _ROWS):
-        rows = min(_ROWS, header.count - start)
-        data = file.read(rows * header.dtype.itemsize)
-        if len(data) < rows * header.dtype.itemsize:
-            raise FormatError("truncated while it was read")
-        table = np.frombuffer(data, header.dtype)
-        yield np.stack([table[name] for name in names], axis=1, dtype=np.float32, casting="unsafe")
-
-
-def _read_ascii(file: BinaryIO, header: PlyHeader, columns: list[int]) -> Iterator[NDArray[np.float32]]:
+def _read_ascii(file: BinaryIO, header: PlyHeader) -> NDArray[np.float64]:
+    shape = header.count, len(header.properties)
     if header.count == 0:
-        return
+        return np.empty(shape)
     try:
         table = np.loadtxt(file, np.float64, comments=None, skiprows=header.lines, max_rows=header.count, ndmin=2)
     except ValueError as error:
         raise FormatError(f"bad ascii data: {error}") from None
-    if table.shape != (header.count, len(header.properties)):
-        raise FormatError(
-            f"expected {header.count} lines of {len(header.properties)} values, got {' x '.join(map(str, table.shape))}"
-        )
-    yield table[:, columns].astype(np.float32)
+    if table.shape != shape:
+        raise FormatError(f"expected {shape[0]} lines of {shape[1]} values, got {' x '.join(map(str, table.shape))}")
+    return table
 
 
-def _read_packed(path: str | os.PathLike[str], header: PlyHeader, sh_degree: int) -> SplatArrays:
-    """The splats of a compressed ``.ply``; 256 that follow each other share a row of bounds."""
+def _read_packed(path: str | os.PathLike[str], header: PlyHeader, sh_degree: int) -> dict[str, NDArray[np.float32]]:
+    """Rows ``[N, D]`` of each attribute of a compressed ``.ply``; 256 that follow each other share a row of bounds."""
     chunks, vertices = (
         np.fromfile(path, table.dtype, table.count, offset=table.offset) for table in (header.others["chunk"], header)
     )
@@ -395,24 +303,22 @@ def _read_packed(path: str | os.PathLike[str], header: PlyHeader, sh_degree: int
     rotations, colors = vertices["packed_rotation"], _parts(vertices["packed_color"], 8, 8, 8, 8)
     rgb = within(colors[:, :3], "rgb") if "min_r" in header.others["chunk"].properties else colors[:, :3]
     others = (_parts(rotations, 10, 10, 10) - 0.5) * math.sqrt(2)
-    shN = np.zeros((header.count, 0, 3), np.float32)
+    shN = np.zeros((header.count, 0), np.float32)
     if sh_degree:
         sh = header.others["sh"]
         rows = np.fromfile(path, sh.dtype, sh.count, offset=sh.offset)
         # Bytes stand for the middles of 256ths, the first and the last for the ends.
         values = (8 * (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1] - 0.5)).astype(np.float32)
-        columns = [values[rows[f"f_rest_{i}"]] for i in range(3 * sh_coefficients(sh_degree))]
-        shN = np.stack(columns, axis=1).reshape(header.count, 3, -1).transpose(0, 2, 1)
-    return SplatArrays(
-        means=within(_parts(vertices["packed_position"], 11, 10, 11), "xyz").astype(np.float32),
-        quats=from_smallest_three((rotations >> 30).astype(np.intp), others),
-        scales=within(
-            _parts(vertices["packed_scale"], 11, 10, 11), [f"scale_{axis}" for axis in "xyz"]
-        ).astype(np.float32),
-        opacities=logits_of_bytes((vertices["packed_color"] & 255).astype(np.uint8)),
-        sh0=((rgb[:, None] - 0.5) / _SH_C0).astype(np.float32),
-        shN=np.ascontiguousarray(shN),
-    )  # fmt: skip
+        shN = _by_coefficient(np.stack([values[rows[name]] for name in splat_columns(sh_degree)["shN"]], axis=1))
+    positions, sizes = _parts(vertices["packed_position"], 11, 10, 11), _parts(vertices["packed_scale"], 11, 10, 11)
+    return {
+        "means": within(positions, "xyz").astype(np.float32),
+        "quats": from_smallest_three((rotations >> 30).astype(np.intp), others),
+        "scales": within(sizes, ["scale_x", "scale_y", "scale_z"]).astype(np.float32),
+        "opacities": logits_of_bytes((vertices["packed_color"] & 255).astype(np.uint8))[:, None],
+        "sh0": ((rgb - 0.5) / SH_C0).astype(np.float32),
+        "shN": shN,
+    }
 
 
 def _parts(words: NDArray[np.uint32], *bits: int) -> NDArray[np.float64]:
@@ -422,18 +328,42 @@ def _parts(words: NDArray[np.uint32], *bits: int) -> NDArray[np.float64]:
     return np.stack(shares, axis=1)
 
 
-def _empty(count: int, sh_degree: int) -> SplatArrays:
-    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 1, 3), (count, sh_coefficients(sh_degree), 3))
-    return SplatArrays(*(np.empty(shape, np.float32) for shape in shapes))
+_ORDER = tuple(dict.fromkeys(("means", "normals", "sh0", "shN", "opacities", "scales", "quats", *ATTRIBUTES)))
+"""Order of the columns; the normals, which splats do not have, are 0."""
 
 
-def _store(table: NDArray[np.float32], splats: SplatArrays, rows: slice) -> None:
-    """Distribute a table in the order of :func:`~nsvq_lightning.io.ply.splat_properties`."""
-    means, sh0, opacities, scales, quats, rest = np.split(table, np.cumsum([3, 3, 1, 3, 4]), axis=1)
-    splats.means[rows] = means
-    splats.sh0[rows, 0] = sh0
-    # Writers that store opacity as a byte make 0 and 255 infinite logits.
-    splats.opacities[rows] = finite_logits(opacities[:, 0])
-    splats.scales[rows] = scales
-    splats.quats[rows] = quats
-    splats.shN[rows] = rest.reshape(len(table), 3, -1 if rest.size else 0).transpose(0, 2, 1)
+def write_ply(path: str | os.PathLike[str], scene: CompressedScene) -> int:
+    """Write splats as little-endian ``.ply``, 62 float32 per splat at SH degree 3.
+
+    Args:
+        path: File to write, replaced atomically.
+        scene: The scene; :func:`nsvq_lightning.save` leaves out non-finite splats, on which viewers fail.
+
+    Returns:
+        Bytes of the file.
+    """
+    dims = attribute_dims(scene.sh_degree)
+    with atomic_write(path) as file:
+        file.write(_header_text(len(scene), scene.sh_degree, scene.antialiased))
+        for start in range(0, len(scene), _ROWS):
+            rows = slice(start, start + _ROWS)
+            # All red coefficients first; ours are [coefficient, channel].
+            values = {name: scene.values(name, rows).swapaxes(1 if name == "shN" else -1, -1) for name in dims}
+            columns = {name: values[name].reshape(len(values[name]), dim) for name, dim in dims.items()}
+            columns["normals"] = np.zeros_like(columns["means"])
+            file.write(np.concatenate([columns[name] for name in _ORDER], axis=1).astype("<f4", copy=False).tobytes())
+        return file.tell()
+
+
+def plain_ply_bytes(splats: int, sh_degree: int) -> int:
+    """Size in bytes of the file that :func:`write_ply` makes: the reference for a compressed scene."""
+    header = _header_text(splats, sh_degree)
+    return len(header) + 4 * splats * header.count(b"property")
+
+
+def _header_text(count: int, sh_degree: int, antialiased: bool = False) -> bytes:
+    comments = "".join(f"comment {key} {value}\n" for key, value in _MIP_COMMENTS.items()) if antialiased else ""
+    columns = splat_columns(sh_degree) | {"normals": ["nx", "ny", "nz"]}
+    properties = "".join(f"property float {column}\n" for name in _ORDER for column in columns[name])
+    head = f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {count}\n{properties}end_header\n"
+    return head.encode("ascii")

@@ -7,9 +7,6 @@ import heapq
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["best_levels", "nearest_level"]
-
-
 _STEPS = 500
 """Largest number of Lloyd steps; each costs one search of 256 borders, whatever the number of values."""
 

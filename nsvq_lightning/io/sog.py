@@ -41,20 +41,6 @@ from nsvq_lightning.io.numbers import logits_of_bytes, opacity_of
 from nsvq_lightning.io.scalar_kmeans import best_levels, nearest_level
 from nsvq_lightning.splats.conventions import from_smallest_three, sh_coefficients, smallest_three, unit
 
-__all__ = [
-    "META",
-    "PALETTE_LIMIT",
-    "ZIP_MAGIC",
-    "SogArchive",
-    "in_sog_order",
-    "picture_shape",
-    "read_sog",
-    "read_sog_header",
-    "write_archive",
-    "write_sog",
-]
-
-
 META = "meta.json"
 ZIP_MAGIC = b"PK\x03\x04"
 _EPOCH = (1980, 1, 1, 0, 0, 0)

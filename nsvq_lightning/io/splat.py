@@ -13,7 +13,6 @@ offset     bytes  content
 from __future__ import annotations
 
 import logging
-import math
 import os
 from pathlib import Path
 
@@ -24,17 +23,13 @@ from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, opacity_of
-from nsvq_lightning.splats.arrays import SplatArrays
-from nsvq_lightning.splats.conventions import unit
-
-__all__ = ["SPLAT_LAYOUT", "count_splats", "read_splat", "write_splat"]
+from nsvq_lightning.splats.conventions import SH_C0, unit
 
 logger = logging.getLogger(__name__)
 
 _RECORD = np.dtype([("means", "<f4", 3), ("lengths", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
 SPLAT_LAYOUT = {name: _RECORD[name].itemsize for name in _RECORD.names or ()}
 """Bytes of each part of a splat."""
-_SH_C0 = 0.5 / math.sqrt(math.pi)
 _SMALLEST, _LARGEST = -87.0, 88.0
 """Logarithms of the smallest and largest length that float32 holds with full precision."""
 
@@ -58,9 +53,11 @@ def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:
     clamped = Clamped()
     records = np.empty(len(scene), _RECORD)
     records["means"] = scene.means
-    records["lengths"] = scene.spread("scales", lambda rows, uses: _lengths(rows, uses, clamped))
+    records["lengths"] = scene.spread(
+        "scales", lambda rows, uses: np.exp(clamped.within("scales", rows, _SMALLEST, _LARGEST, uses))
+    )
     records["colors"][:, :3] = scene.spread(
-        "sh0", lambda rows, uses: clamped.nearest("sh0", 255 * (0.5 + _SH_C0 * rows), (0, 255), uses=uses)
+        "sh0", lambda rows, uses: clamped.nearest("sh0", 255 * (0.5 + SH_C0 * rows), (0, 255), uses=uses)
     )
     records["colors"][:, 3] = np.rint(255 * opacity_of(scene.opacities))
     records["quats"] = scene.spread("quats", lambda rows, _: _packed_quats(rows))
@@ -68,10 +65,6 @@ def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:
     with atomic_write(path) as file:
         file.write(records.tobytes())
     return records.nbytes
-
-
-def _lengths(scales: NDArray[np.float32], uses: NDArray[np.int64] | None, clamped: Clamped) -> NDArray[np.float32]:
-    return np.exp(clamped.within("scales", scales, _SMALLEST, _LARGEST, uses))
 
 
 def _packed_quats(quats: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -90,18 +83,14 @@ def read_splat(path: str | os.PathLike[str]) -> CompressedScene:
     """
     count_splats(path)
     records = np.frombuffer(Path(path).read_bytes(), _RECORD)
-    lengths = np.maximum(records["lengths"], np.finfo(np.float32).tiny)
     colors = records["colors"]
-    return CompressedScene.from_arrays(
-        SplatArrays(
-            means=records["means"].astype(np.float32),
-            quats=((records["quats"].astype(np.float32) - 128) / 128).astype(np.float32),
-            scales=np.log(lengths).astype(np.float32),
-            opacities=logits_of_bytes(colors[:, 3]),
-            sh0=((colors[:, None, :3] / 255 - 0.5) / _SH_C0).astype(np.float32),
-            shN=np.zeros((len(records), 0, 3), np.float32),
-        )
-    )
+    raw = {
+        "quats": ((records["quats"].astype(np.float32) - 128) / 128).astype(np.float32),
+        "scales": np.log(np.maximum(records["lengths"], np.finfo(np.float32).tiny)).astype(np.float32),
+        "sh0": ((colors[:, :3] / 255 - 0.5) / SH_C0).astype(np.float32),
+        "shN": np.zeros((len(records), 0), np.float32),
+    }
+    return CompressedScene(records["means"].astype(np.float32), logits_of_bytes(colors[:, 3]), raw=raw, sh_degree=0)
 
 
 def count_splats(path: str | os.PathLike[str]) -> int:

@@ -47,39 +47,20 @@ import os
 import struct
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io import zstd
 from nsvq_lightning.io.atomic import atomic_write
-from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, rotated
 from nsvq_lightning.io.errors import FormatError, check_room, naming_file
 from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, opacity_of
-from nsvq_lightning.io.placing import UP_AXES, rotated
-from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.splats.conventions import from_smallest_three, sh_coefficients, smallest_three, unit
-
-__all__ = [
-    "ANTIALIASED",
-    "DEFAULT_AXES",
-    "DEFAULT_VERSION",
-    "MOST_FRACTION",
-    "SPZ_AXES",
-    "SPZ_MAGICS",
-    "SPZ_VERSIONS",
-    "SpzHeader",
-    "in_spz_order",
-    "read_frame",
-    "read_spz",
-    "read_spz_header",
-    "write_frame",
-    "write_spz",
-]
-
 
 _MAGIC = b"NGSP"
 SPZ_MAGICS = (b"\x1f\x8b", _MAGIC)
@@ -93,6 +74,9 @@ _HEADER = struct.Struct("<4sIIBBBB")
 _TABLE_OFFSET = struct.Struct("<I12x")
 _HEAD = _HEADER.size + _TABLE_OFFSET.size
 _ENTRY = struct.Struct("<QQ")
+_MOST_A_BYTE = 1 << 15
+"""Most bytes that one byte of Zstandard can expand to: a block of 128 KiB of equal bytes takes four."""
+_LEVEL = 19
 _MOST_EXTENDED = 1 << 20
 """Bytes of extensions that are read; those in use have less than a hundred."""
 ANTIALIASED = 1
@@ -168,7 +152,7 @@ def write_frame(path: str | os.PathLike[str], header: SpzHeader, arrays: Mapping
     with atomic_write(path) as file:
         if header.version == 4:
             with naming_file(path):
-                streams = [zstd.compress(content) for content in contents]
+                streams = [zstd_compress(content) for content in contents]
             table = (_ENTRY.pack(len(s), len(c)) for s, c in zip(streams, contents, strict=True))
             file.writelines([header.pack(), _TABLE_OFFSET.pack(_HEAD + len(axes)), axes, *table, *streams])
         else:
@@ -222,7 +206,7 @@ def _unpack(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
     start = offset + _ENTRY.size * len(header.streams)
     contents = {}
     for name, length in _lengths(header, data[offset:start], len(data) - offset).items():
-        contents[name] = zstd.decompress(memoryview(data)[start : start + length], header.streams[name])
+        contents[name] = zstd_decompress(memoryview(data)[start : start + length], header.streams[name])
         start += length
     return header, contents
 
@@ -245,12 +229,45 @@ def _lengths(header: SpzHeader, table: bytes, rest: int) -> dict[str, int]:
     """Compressed bytes of each stream; table and streams must fill the ``rest`` of the file."""
     entries = dict(zip(header.streams, _ENTRY.iter_unpack(table), strict=True))
     for name, (length, size) in entries.items():
-        if size != header.streams[name] or size > length * zstd.MOST_A_BYTE:
+        if size != header.streams[name] or size > length * _MOST_A_BYTE:
             raise FormatError(f"damaged: {name} of {header.count} splats cannot be {size} bytes in {length}")
     lengths = {name: length for name, (length, _) in entries.items()}
     if len(table) + sum(lengths.values()) != rest:
         raise FormatError(f"truncated or damaged: streams of {sum(lengths.values())} bytes in {rest - len(table)}")
     return lengths
+
+
+def zstd_compress(data: memoryview) -> bytes:
+    """A Zstandard frame with its length and a checksum; the same data give the same bytes with the same release."""
+    zstd = _zstd()
+    options = {zstd.CompressionParameter.compression_level: _LEVEL, zstd.CompressionParameter.checksum_flag: 1}
+    frame: bytes = zstd.compress(data, options=options)
+    return frame
+
+
+def zstd_decompress(data: memoryview, size: int) -> bytes:
+    """Content of a Zstandard frame that must have ``size`` bytes; no more than that is ever held in memory."""
+    zstd = _zstd()
+    stream = zstd.ZstdDecompressor()
+    try:
+        content: bytes = stream.decompress(data, size)
+        beyond = b"" if stream.eof else stream.decompress(b"", 1)
+    except zstd.ZstdError as error:
+        raise FormatError(f"damaged: no valid Zstandard stream ({error})") from None
+    if len(content) < size or beyond or not stream.eof or stream.unused_data:
+        raise FormatError(f"damaged: a Zstandard stream does not hold the {size} bytes that it should")
+    return content
+
+
+def _zstd() -> Any:
+    """Zstandard: Python's own from 3.14 on, a package before that."""
+    for name in ("compression.zstd", "backports.zstd"):
+        with suppress(ImportError):
+            return import_module(name)
+    raise FormatError(
+        "version 4 of .spz needs Zstandard, which this Python does not have",
+        "run pip install 'nsvq-lightning[spz]', or save the file as version 3",
+    )
 
 
 def _with_axes(header: SpzHeader, extensions: bytes) -> SpzHeader:
@@ -469,7 +486,6 @@ def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
             Zstandard, and it is not installed.
     """
     header, arrays = read_frame(path)
-    config = {"antialiased": True} if header.flags & ANTIALIASED else {}
     if not header.axes:
         logger.info(
             "%s: the file does not say where its axes point; taken as right, down, front, as in .ply. If it is upside "
@@ -479,21 +495,21 @@ def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
     turn = axes[1] in "FB"
     if turn:  # z is up or down: signs first, then a quarter turn, as Niantic's library does it, which writes such files
         axes = axes[0] + axes[2] + {"F": "B", "B": "F"}[axes[1]]
-    scene = CompressedScene.from_arrays(_unpacked(header, arrays, _Signs.of(axes)), config=config)
-    return rotated(scene, UP_AXES["z"]) if turn else scene
-
-
-def _unpacked(header: SpzHeader, arrays: dict[str, NDArray[np.uint8]], signs: _Signs) -> SplatArrays:
-    harmonics = signs.harmonics(header.sh_degree)
-    sh = (arrays["shN"].reshape(header.count, len(harmonics), 3).astype(np.float32) - 128) / 128
-    return SplatArrays(
+    signs = _Signs.of(axes)
+    sh = (arrays["shN"].astype(np.float32) - 128) / 128
+    scene = CompressedScene(
         means=(_unpacked_means(header, arrays["means"]) * signs.axes).astype(np.float32),
-        quats=_unpacked_quats(header, arrays["quats"]) * signs.quats,
-        scales=(arrays["scales"] / 16 - 10).astype(np.float32),
         opacities=logits_of_bytes(arrays["opacities"][:, 0]),
-        sh0=((arrays["sh0"][:, None] / 255 - 0.5) / _COLOR).astype(np.float32),
-        shN=(sh * harmonics).astype(np.float32),
+        raw={
+            "quats": _unpacked_quats(header, arrays["quats"]) * signs.quats,
+            "scales": (arrays["scales"] / 16 - 10).astype(np.float32),
+            "sh0": ((arrays["sh0"] / 255 - 0.5) / _COLOR).astype(np.float32),
+            "shN": (sh * signs.harmonics(header.sh_degree).repeat(3, 1).ravel()).astype(np.float32),
+        },
+        sh_degree=header.sh_degree,
+        config={"antialiased": True} if header.flags & ANTIALIASED else {},
     )
+    return rotated(scene, UP_AXES["z"]) if turn else scene
 
 
 def _unpacked_means(header: SpzHeader, data: NDArray[np.uint8]) -> NDArray[np.floating[Any]]:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.quantize.base import Quantizer, as_quantizer, held_codes
 from nsvq_lightning.skips import is_on
+from nsvq_lightning.splats.attributes import ATTRIBUTES, QUANTIZABLE, attribute_dims
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
 
@@ -45,16 +46,12 @@ class QuantizedAttribute:
         return rows.reshape(rows.shape[0], *like.shape[1:])
 
 
+_DIMS = attribute_dims(sh_degree=3)
 QUANTIZED = {
-    attribute.name: attribute
-    for attribute in (
-        QuantizedAttribute("scales", 1.0),
-        QuantizedAttribute("quats", 1.0),
-        QuantizedAttribute("sh0", 0.25),
-        QuantizedAttribute("shN", 0.25),
-    )
+    name: QuantizedAttribute(name, ATTRIBUTES[name].code_share)
+    for name in sorted(QUANTIZABLE, key=lambda name: (-ATTRIBUTES[name].code_share, _DIMS[name]))
 }
-"""The quantized attributes by name. Positions and opacities are not vector quantized."""
+"""The quantized attributes by name, those with most codes first. Positions and opacities are not vector quantized."""
 
 
 def check_attributes(name: str, attributes: Iterable[str]) -> None:

@@ -16,6 +16,7 @@ from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import read_header
 from nsvq_lightning.io.nsvq.paper import paper_header
+from nsvq_lightning.io.ply import plain_ply_bytes
 from nsvq_lightning.report.evaluation import ViewScore
 from nsvq_lightning.report.figures import new_figure, write_figure
 from nsvq_lightning.training.resume import ResumedModule
@@ -47,8 +48,8 @@ def summarize(
         return float(sum(getattr(score, name) for score in scores)) / len(scores)
 
     file_bytes, header = path.stat().st_size, read_header(path)
-    last = {str(entry["phase"]): dict(entry) for entry in module.history}  # the last evaluation of each phase
-    ends = [last[phase.name.lower()] for phase in Phase if phase.name.lower() in last]
+    plain_bytes, ends = plain_ply_bytes(len(scene), scene.sh_degree), _phase_ends(host.history)
+    pruned = next((end for end in ends if end["phase"] == Phase.PRUNE.name.lower()), None)
     return {
         "psnr": mean("psnr"),
         "ssim": mean("ssim"),
@@ -59,8 +60,8 @@ def summarize(
         "views": len(scores),
         "num_splats": len(scene),
         "file_bytes": file_bytes,
-        "plain_bytes": scene.plain_bytes,
-        "ratio": scene.plain_bytes / file_bytes,
+        "plain_bytes": plain_bytes,
+        "ratio": plain_bytes / file_bytes,
         "level": header.level,
         "streams": {"header": header.size, **{stream.name: stream.length for stream in header.streams}},
         "codes": {name: _codes_in_use(codes, len(scene.codebooks[name])) for name, codes in scene.codes.items()},

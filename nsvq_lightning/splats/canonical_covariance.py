@@ -15,9 +15,6 @@ from torch import Tensor
 
 from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM
 
-__all__ = ["FORMS", "Canonical", "Form", "canonical"]
-
-
 Form = Literal["none", "sign", "full"]
 FORMS: tuple[Form, ...] = ("none", "sign", "full")
 """How much of the redundancy is removed, in ascending order."""

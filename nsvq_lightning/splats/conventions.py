@@ -8,15 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-__all__ = [
-    "MIN_SQUARED_NORM",
-    "from_smallest_three",
-    "shN_degree",
-    "sh_coefficients",
-    "smallest_three",
-    "turned",
-    "unit",
-]
+SH_C0 = 0.5 / math.sqrt(math.pi)
+"""Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh0."""
 
 
 def sh_coefficients(degree: int) -> int:
@@ -60,6 +53,10 @@ def turned(quats: NDArray[np.float32], rotation: NDArray[np.float64]) -> NDArray
     return np.asarray(quats.astype(np.float64) @ product.T, np.float32)
 
 
+_OTHERS = np.array([[j for j in range(4) if j != i] for i in range(4)])
+"""``[4, 3]``: the components other than each one, ascending."""
+
+
 def smallest_three(units: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Index of the largest component ``[N]``, and the other three ``[N, 3]`` in order, each in ±1/√2.
 
@@ -71,20 +68,14 @@ def smallest_three(units: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArra
     """
     largest = np.abs(units).argmax(1)
     negative = np.take_along_axis(units, largest[:, None], 1) < 0
-    others = np.take_along_axis(units, _others(largest), 1)
+    others = np.take_along_axis(units, _OTHERS[largest], 1)
     return largest, np.where(negative, -others, others)
 
 
 def from_smallest_three(largest: NDArray[np.intp], others: NDArray[np.float64]) -> NDArray[np.float32]:
     """Unit quaternions ``[N, 4]`` from the two results of :func:`smallest_three`; the second may be rounded."""
     quats = np.empty((len(largest), 4))
-    np.put_along_axis(quats, _others(largest), others, 1)
+    np.put_along_axis(quats, _OTHERS[largest], others, 1)
     rest = np.sqrt(np.maximum(0, 1 - np.square(others).sum(1)))
     np.put_along_axis(quats, largest[:, None], rest[:, None], 1)
     return quats.astype(np.float32)
-
-
-def _others(largest: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The three components ``[N, 3]`` other than ``largest [N]``, ascending."""
-    table = np.array([[j for j in range(4) if j != i] for i in range(4)])
-    return table[largest]

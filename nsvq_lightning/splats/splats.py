@@ -4,54 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from nsvq_lightning.splats.conventions import sh_coefficients, shN_degree
+from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_shapes
+from nsvq_lightning.splats.conventions import SH_C0, sh_coefficients, shN_degree
 
-__all__ = ["ATTRIBUTES", "RawSplats", "SplatTensors", "Splats", "check_shapes", "sh_degree_of"]
-
-ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
-"""Names of the raw attributes, in the order of :meth:`Splats.from_tensors`."""
-
-SH_C0 = 0.28209479177387814
-"""Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh0."""
-
-
-class SplatTensors(Protocol):
-    """Anything with the six raw attributes; :func:`nsvq_lightning.render` takes it."""
-
-    @property
-    def means(self) -> Tensor:
-        """World positions ``[N, 3]``."""
-
-    @property
-    def quats(self) -> Tensor:
-        """Rotations ``[N, 4]``, wxyz, any norm."""
-
-    @property
-    def scales(self) -> Tensor:
-        """Logarithms of the axis lengths ``[N, 3]``, scene units."""
-
-    @property
-    def opacities(self) -> Tensor:
-        """Opacity logits ``[N]``."""
-
-    @property
-    def sh0(self) -> Tensor:
-        """Constant colour coefficients ``[N, 1, 3]``."""
-
-    @property
-    def shN(self) -> Tensor:
-        """Higher colour coefficients ``[N, (degree + 1)² - 1, 3]``."""
+__all__ = ["ATTRIBUTES", "RawSplats", "SplatTensors", "Splats", "check_shapes", "detached", "sh_degree_of"]
 
 
 class RawSplats(NamedTuple):
-    """The six raw attributes as plain tensors, see :class:`SplatTensors` for shapes and spaces."""
+    """The six raw attributes of N splats as plain tensors.
+
+    Attributes:
+        means: World positions ``[N, 3]``.
+        quats: Rotations ``[N, 4]``, wxyz, any norm.
+        scales: Logarithms of the axis lengths ``[N, 3]``, scene units.
+        opacities: Opacity logits ``[N]``.
+        sh0: Constant colour coefficients ``[N, 1, 3]``.
+        shN: Higher colour coefficients ``[N, (degree + 1)² - 1, 3]``.
+    """
 
     means: Tensor
     quats: Tensor
@@ -76,15 +52,13 @@ def check_shapes(tensors: Mapping[str, Tensor]) -> None:
     Raises:
         ValueError: One does not fit.
     """
-    n = tensors["means"].shape[0]
-    expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3)}
-    for name, shape in expected.items():
-        if tuple(tensors[name].shape) != shape:
-            raise ValueError(f"{name} must have shape {list(shape)}, got {list(tensors[name].shape)}")
     shN = tensors["shN"]
-    if shN.dim() != 3 or shN.shape[0] != n or shN.shape[2] != 3:
-        raise ValueError(f"shN must have shape [{n}, (degree + 1)^2 - 1, 3], got {list(shN.shape)}")
-    sh_degree_of(shN)
+    if shN.dim() != 3 or shN.shape[2] != 3:
+        raise ValueError(f"shN must have shape [N, (degree + 1)^2 - 1, 3], got {list(shN.shape)}")
+    for name, shape in attribute_shapes(sh_degree_of(shN)).items():
+        expected = [tensors["means"].shape[0], *shape]
+        if list(tensors[name].shape) != expected:
+            raise ValueError(f"{name} must have shape {expected}, got {list(tensors[name].shape)}")
 
 
 class Splats(nn.Module):
@@ -114,11 +88,8 @@ class Splats(nn.Module):
 
     def __init__(self, sh_degree: int = 3) -> None:
         super().__init__()
-        coefficients = sh_coefficients(sh_degree)
-        empty = {"means": (0, 3), "quats": (0, 4), "scales": (0, 3), "opacities": (0,), "sh0": (0, 1, 3)}
-        for name, shape in empty.items():
-            self.register_parameter(name, nn.Parameter(torch.zeros(shape)))
-        self.register_parameter("shN", nn.Parameter(torch.zeros(0, coefficients, 3)))
+        for name, shape in attribute_shapes(sh_degree).items():
+            self.register_parameter(name, nn.Parameter(torch.zeros(0, *shape)))
         self._tables: list[str] = []
         self.edits = 0
 
@@ -224,6 +195,15 @@ class Splats(nn.Module):
             elif getattr(self, name).shape != stored.shape:
                 setattr(self, name, getattr(self, name).new_zeros(stored.shape))
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+SplatTensors = Splats | RawSplats
+"""What has the six raw attributes as tensors; :func:`nsvq_lightning.render` takes it."""
+
+
+def detached(splats: SplatTensors) -> RawSplats:
+    """The raw attributes outside the graph; they share the memory of ``splats``."""
+    return RawSplats(*(getattr(splats, name).detach() for name in ATTRIBUTES))
 
 
 def _mean_squared_neighbour_distance(points: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from nsvq_lightning.splats.arrays import dropped, finite_rows, listed
+from nsvq_lightning.splats.attributes import dropped, finite_rows, listed
 from nsvq_lightning.splats.splats import ATTRIBUTES, Splats
 from nsvq_lightning.training.optim import find_group
 

@@ -59,13 +59,13 @@ class LearningRates:
         ValueError: A rate is negative or not finite, or a rate of the position is 0.
     """
 
-    means: float = 3.2e-4
-    means_final: float = 4e-6
-    scales: float = 0.01
-    quats: float = 2e-3
-    opacities: float = 0.025
-    sh0: float = 2.5e-3
-    shN: float = 5e-4
+    means: float = ATTRIBUTES["means"].rate
+    means_final: float = 1.6e-6
+    scales: float = ATTRIBUTES["scales"].rate
+    quats: float = ATTRIBUTES["quats"].rate
+    opacities: float = ATTRIBUTES["opacities"].rate
+    sh0: float = ATTRIBUTES["sh0"].rate
+    shN: float = ATTRIBUTES["shN"].rate
     codebook_factor: float = 1.0
     scale_with_views: bool = False
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from compressed_scenes import arrays_of
 from viewer_scenes import coded_scene, nearest_in, needs_zstd, plain_scene
 
 from nsvq_lightning.commands.convert import main
@@ -32,7 +33,7 @@ def test_every_readable_format_becomes_every_writable_one(tmp_path: Path, capsys
             output = tmp_path / "new" / f"b{target}"
             assert main([str(tmp_path / f"a{source}"), str(output)]) == 0
             assert f"30 splats in {output.stat().st_size:,} bytes" in capsys.readouterr().out
-            nearest_in(read_scene(output).arrays(), scene.arrays())
+            nearest_in(arrays_of(read_scene(output)), arrays_of(scene))
     assert COMMANDS["convert"].module == main.__module__
 
 
@@ -51,7 +52,7 @@ def test_a_run_exports_its_codes_as_labels(tmp_path: Path) -> None:
     scene = coded_scene(50, 1)
     paths = exported(scene, tmp_path, Storage("paper"), "nsvq", "sog", "spz")
     sog, plain = read_scene(paths["sog"]), read_scene(paths["nsvq"])
-    order = nearest_in(sog.arrays(), plain.arrays())
+    order = nearest_in(arrays_of(sog), arrays_of(plain))
     pairs = set(zip(sog.codes["shN"].tolist(), plain.codes["shN"][order].tolist(), strict=True))
     assert len(pairs) == len(np.unique(scene.codes["shN"]))
 
@@ -73,8 +74,8 @@ def test_exports_and_conversions_of_a_scene_are_the_same_file(tmp_path: Path, su
 def test_a_plain_scene_is_exported_as_it_is(tmp_path: Path) -> None:
     scene = plain_scene(40, 1)
     paths = exported(scene, tmp_path, Storage(), "nsvq", "ply", "sog")
-    for name, values in vars(scene.arrays()).items():
-        np.testing.assert_array_equal(getattr(read_scene(paths["ply"]).arrays(), name), values, err_msg=name)
+    for name, values in vars(arrays_of(scene)).items():
+        np.testing.assert_array_equal(getattr(arrays_of(read_scene(paths["ply"])), name), values, err_msg=name)
     assert main([str(paths["ply"]), str(tmp_path / "converted.sog")]) == 0
     assert (tmp_path / "converted.sog").read_bytes() == paths["sog"].read_bytes()
 
@@ -168,14 +169,14 @@ def test_results_are_cropped_and_turned(tmp_path: Path, capsys: pytest.CaptureFi
     box = ["--crop", "-0.5", "-99", "-99", "99", "99", "99"]
     assert main([str(tmp_path / "a.nsvq"), str(tmp_path / "b.nsvq"), "--level", "paper", *box]) == 0
     kept = read_scene(tmp_path / "b.nsvq")
-    means = read_scene(tmp_path / "a.nsvq").arrays().means
+    means = arrays_of(read_scene(tmp_path / "a.nsvq")).means
     inside = int((means[:, 0] >= -0.5).sum())
     assert 0 < len(kept) == inside < 300
     assert f"crop: {300 - inside} of 300 splats are outside" in capsys.readouterr().out
     assert set(kept.codes) == set(scene.codes)
     assert main([str(tmp_path / "b.nsvq"), str(tmp_path / "c.ply"), "--up", "z", "--up-from", "0", "-1", "0"]) == 0
-    x, y, z = kept.arrays().means.T
-    turned = read_scene(tmp_path / "c.ply").arrays()
+    x, y, z = arrays_of(kept).means.T
+    turned = arrays_of(read_scene(tmp_path / "c.ply"))
     order, others = np.lexsort(turned.means.T), np.lexsort(np.stack([x, z, -y]))
     np.testing.assert_allclose(turned.means[order], np.stack([x, z, -y], 1)[others], atol=1e-5)
 

@@ -5,30 +5,27 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from splat_scenes import random_splats
 
 from nsvq_lightning.commands import main as cli
 from nsvq_lightning.commands.info import main
-from nsvq_lightning.io import CompressedScene, SplatArrays, write_nsvq, write_ply
+from nsvq_lightning.io import CompressedScene, write_nsvq, write_ply
 
 
-def _arrays(n: int) -> SplatArrays:
-    rng = np.random.default_rng(n)
-    shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, 15, 3))
-    return SplatArrays(*(rng.standard_normal(shape, np.float32) for shape in shapes))
+def _plain(n: int) -> CompressedScene:
+    return CompressedScene.from_splats(random_splats(n))
 
 
 def _scene(n: int) -> CompressedScene:
-    plain = CompressedScene.from_arrays(_arrays(n), config={"seed": 42}, metrics={"psnr": 25.5})
-    codebook = np.ones((16384, 45), np.float32)
+    plain = _plain(n)
     raw = {name: values for name, values in plain.raw.items() if name != "shN"}
-    codes = {"shN": np.arange(n) % 16384}
-    return CompressedScene(
-        plain.means, plain.opacities, codes, {"shN": codebook}, raw, config=plain.config, metrics=plain.metrics
-    )
+    codes, codebooks = {"shN": np.arange(n) % 16384}, {"shN": np.ones((16384, 45), np.float32)}
+    return replace(plain, codes=codes, codebooks=codebooks, raw=raw, config={"seed": 42}, metrics={"psnr": 25.5})
 
 
 def test_text_for_a_compressed_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -45,7 +42,7 @@ def test_text_for_a_compressed_scene(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 def test_names_that_the_output_cannot_show_are_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_ply(tmp_path / "höhle.ply", _arrays(3))
+    write_ply(tmp_path / "höhle.ply", _plain(3))
     printed = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(printed, encoding="ascii"))
     assert cli.main(["info", str(tmp_path / "höhle.ply")]) == 0
@@ -55,7 +52,7 @@ def test_names_that_the_output_cannot_show_are_no_error(tmp_path: Path, monkeypa
 
 def test_streams_add_up_to_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_nsvq(tmp_path / "x.nsvq", _scene(1000))
-    write_ply(tmp_path / "x.ply", _arrays(1000))
+    write_ply(tmp_path / "x.ply", _plain(1000))
     for name in ("x.nsvq", "x.ply"):
         assert main([str(tmp_path / name), "--json"]) == 0
         facts = json.loads(capsys.readouterr().out)

@@ -21,7 +21,6 @@ from nsvq_lightning.io import read_nsvq, save
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.report.viewer import some_cameras, viewer_page
-from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.training import live_preview
 
 
@@ -150,11 +149,9 @@ def test_the_page_shows_each_version(run: Path, address: str, tmp_path: Path) ->
         first = tab.run("nsvqViewer.picture()")
         assert "40 splats" in tab.run("document.getElementById('facts').textContent")
         camera = tab.run("nsvqViewer.camera()")
-        arrays = SplatArrays.from_splats(random_splats(55, seed=2))
         state = {"iteration": 40, "of": 90, "phase": "quantize", "psnr": "21.50"}
-        save(
-            CompressedScene.from_arrays(arrays, config={"live": state}), run / live_preview.LIVE_SCENE, Storage("paper")
-        )
+        scene = CompressedScene.from_splats(random_splats(55, seed=2), config={"live": state})
+        save(scene, run / live_preview.LIVE_SCENE, Storage("paper"))
         wait = """new Promise((resolve, reject) => {
             const seen = () => document.getElementById("facts").textContent.startsWith("55 splats");
             setInterval(() => seen() && nsvqViewer.camera(nsvqViewer.camera()).then(resolve), 50);

@@ -9,7 +9,7 @@ from nsvq_lightning.compression.floaters import floaters
 from nsvq_lightning.compression.viewpoints import look_at
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.splats import RawSplats
+from nsvq_lightning.splats.splats import RawSplats, detached
 from tests.support.splat_scenes import ball
 
 
@@ -18,7 +18,7 @@ def joined(*parts: RawSplats) -> RawSplats:
 
 
 def test_planted_floaters_go_and_splats_that_photos_show_stay() -> None:
-    own = RawSplats(*(tensor.detach() for tensor in ball(600).to_splats().raw()))
+    own = detached(ball(600).decode())
     directions = np.random.default_rng(0).standard_normal((24, 3))
     eyes = 6 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     cameras = [look_at(np.zeros(3), eye, 64, 48, 0.9) for eye in eyes]
@@ -46,7 +46,7 @@ def test_planted_floaters_go_and_splats_that_photos_show_stay() -> None:
 
 def test_a_mask_hides_what_it_excludes() -> None:
     """A splat that contradicts only excluded pixels is not seen by any photo that counts."""
-    own = RawSplats(*(tensor.detach() for tensor in ball(50, 0).to_splats().raw()))
+    own = detached(ball(50, 0).decode())
     camera = look_at(np.zeros(3), np.array([0.0, 0.0, -6.0]), 64, 48, 0.9)
     with torch.no_grad():
         photo = (255 * render(own, camera).image.clamp(0, 1)).byte()

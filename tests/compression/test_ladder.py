@@ -19,9 +19,9 @@ from nsvq_lightning.io import CompressedScene, read_header, read_nsvq, write_ply
 from nsvq_lightning.io.formats import load, save
 from nsvq_lightning.io.nsvq.precision import Precision, Storage
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.splats import RawSplats
+from nsvq_lightning.splats.splats import detached
 
-ORIGINAL = RawSplats(*(tensor.detach() for tensor in ball(600).to_splats().raw()))
+ORIGINAL = detached(ball(600).decode())
 VIEWS = cameras_around(ball(600).means, 12, 80, 60)
 
 
@@ -85,7 +85,7 @@ def test_a_candidate_is_what_its_bytes_hold(compressor: Compressor, tmp_path: Pa
     """Oracle: the file, read and rendered here."""
     candidate = compressor.at(LADDER[-3])
     (tmp_path / "x.nsvq").write_bytes(candidate.data)
-    decoded, original = load(tmp_path / "x.nsvq"), ball().to_splats()
+    decoded, original = load(tmp_path / "x.nsvq"), ball().decode()
     squares = []
     for camera in cameras_around(ball().means, 2, 96, 64):
         with torch.no_grad():
@@ -121,8 +121,8 @@ def test_the_smallest_file_within_an_error_and_the_best_within_bytes(compressor:
 def test_an_error_does_not_depend_on_the_unit_of_the_scene(scale: float) -> None:
     scene, errors = ball(300), []
     for factor in (1.0, scale):
-        means, scales = scene.means * np.float32(factor), scene.scales + np.float32(math.log(factor))
-        scaled = replace(scene, means=means, scales=scales)
+        means, scales = scene.means * np.float32(factor), scene.raw["scales"] + np.float32(math.log(factor))
+        scaled = replace(scene, means=means, raw={**scene.raw, "scales": scales})
         errors.append(Compressor(scaled, cameras_around(means, 2, 96, 64), Storage()).at(LADDER[-1]).error)
     assert errors[0] > 0.01
     assert errors[1] == pytest.approx(errors[0], rel=0.2)
@@ -147,7 +147,7 @@ def test_scenes_that_cannot_be_seen_are_refused() -> None:
 def test_the_command_compresses_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, output = tmp_path / "scene.ply", tmp_path / "new" / "scene.nsvq"
     scene = ball(700)
-    scene.sh0[3] = np.nan
+    scene.raw["sh0"][3] = np.nan
     write_ply(source, scene)
     assert main(["compress", str(source), str(output), "--codebooks", "0.5k", "--tune=2"]) == 0
     assert f"699 splats in {output.stat().st_size:,} bytes" in capsys.readouterr().out
@@ -218,7 +218,7 @@ def test_photos_train_the_codebooks(tmp_path: Path, demo_scene: Path, capsys: py
 @pytest.mark.parametrize("steps", ["0", "4"])
 def test_the_origin_of_the_positions_stays(steps: str, tmp_path: Path, demo_scene: Path) -> None:
     source, output, origin = tmp_path / "scene.nsvq", tmp_path / "out.nsvq", (500_000.0, 4.5e6, 30.0)
-    save(CompressedScene.from_arrays(ball(300, degree=0), origin=origin), source)
+    save(replace(ball(300, degree=0), origin=origin), source)
     options = ["--codebooks=0.5k", f"--data.root={demo_scene}", "--tune=2", f"--max-steps={steps}"]
     assert main(["compress", str(source), str(output), *options]) == 0
     assert read_nsvq(output).origin == origin

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nsvq_lightning import Splats, load, save
-from nsvq_lightning.io import CompressedScene, FormatError, SplatArrays
+from nsvq_lightning.io import CompressedScene, FormatError
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.random import generator
 
@@ -73,8 +73,7 @@ def test_non_finite_rows_are_dropped_and_the_scene_itself_is_left_alone(
 
 
 def test_an_origin_is_not_lost_silently(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    arrays = SplatArrays.from_splats(scene(5, 1))
-    save(CompressedScene.from_arrays(arrays, origin=(4e6, 0.0, 0.0)), tmp_path / "x.nsvq")
+    save(CompressedScene.from_splats(scene(5, 1), origin=(4e6, 0.0, 0.0)), tmp_path / "x.nsvq")
     with caplog.at_level(logging.WARNING):
         load(tmp_path / "x.nsvq")
     assert "4000000.0" in caplog.text

@@ -16,7 +16,7 @@ from viewer_scenes import needs_zstd
 from nsvq_lightning.io import FormatError, read_scene
 from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.errors import FEW_SPLATS, check_room
-from nsvq_lightning.io.zstd import compress
+from nsvq_lightning.io.spz import zstd_compress
 
 
 def spz3(path: Path, count: int, extensions: int = 0) -> None:
@@ -26,7 +26,7 @@ def spz3(path: Path, count: int, extensions: int = 0) -> None:
 
 def spz4(path: Path, count: int) -> None:
     sizes = [size * count for size in (9, 1, 3, 3, 4)]
-    streams = [compress(bytes(size)) for size in sizes]
+    streams = [zstd_compress(bytes(size)) for size in sizes]
     table = b"".join(struct.pack("<QQ", len(s), size) for s, size in zip(streams, sizes, strict=True))
     head = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, 0, 12, 0, 5, 32)
     path.write_bytes(head + table + b"".join(streams))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.compression.viewpoints import look_at
-from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.placing import UP_AXES, cropped, rotated, turn_up
+from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, cropped, rotated, turn_up
 from nsvq_lightning.rendering.camera import Camera, up_of
 from nsvq_lightning.rendering.rasterize import render
 from tests.support.splat_scenes import ball
@@ -27,7 +28,7 @@ def picture(scene: CompressedScene, camera: Camera) -> torch.Tensor:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("kind", ["codebooks", "plain"])
 def test_a_turned_scene_is_the_same_scene(degree: int, kind: str) -> None:
-    plain = CompressedScene.from_arrays(ball(200, degree), origin=(0.5, -1.0, 2.0))
+    plain = replace(ball(200, degree), origin=(0.5, -1.0, 2.0))
     sizes = {"scales": 9, "quats": 7, "sh0": 8} | ({"shN": 6} if degree else {})
     scene = coded(200, sizes, degree, origin=(0.5, -1.0, 2.0)) if kind == "codebooks" else plain
     rotation = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()

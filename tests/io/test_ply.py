@@ -5,21 +5,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from compressed_scenes import arrays_of, scene_of
 
-from nsvq_lightning.io import FormatError, SplatArrays, plain_ply_bytes, read_ply, write_ply
+from nsvq_lightning.io import CompressedScene, FormatError, plain_ply_bytes, read_ply, write_ply
+from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_shapes
 
-ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
-
-def scene(n: int, degree: int = 3) -> SplatArrays:
+def scene(n: int, degree: int = 3) -> CompressedScene:
     rng = np.random.default_rng([n, degree])
-    shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, (degree + 1) ** 2 - 1, 3))
-    return SplatArrays(*(rng.standard_normal(shape, np.float32) for shape in shapes))
+    shapes = attribute_shapes(degree).items()
+    return scene_of(**{name: rng.standard_normal((n, *shape), np.float32) for name, shape in shapes})
 
 
-def assert_same(a: SplatArrays, b: SplatArrays) -> None:
+def assert_same(a: CompressedScene, b: CompressedScene) -> None:
     for name in ATTRIBUTES:
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+        np.testing.assert_array_equal(a.values(name), b.values(name), err_msg=name)
 
 
 def _names(degree: int) -> list[str]:
@@ -31,8 +31,9 @@ def _names(degree: int) -> list[str]:
     ]
 
 
-def _values(splats: SplatArrays, row: int) -> dict[str, float]:
+def _values(scene: CompressedScene, row: int) -> dict[str, float]:
     """Oracle: what each property of one splat must be, number by number from the description of the layout."""
+    splats = arrays_of(scene)
     coefficients = splats.shN.shape[1]
     rest = {f"f_rest_{c * coefficients + k}": splats.shN[row, k, c] for c in range(3) for k in range(coefficients)}
     values = {
@@ -186,7 +187,7 @@ def _packed(**counts: int) -> bytes:
 def test_a_compressed_ply_is_known_by_its_header(tmp_path: Path) -> None:
     path = tmp_path / "x.ply"
     path.write_bytes(_packed())
-    read = read_ply(path)
+    read = arrays_of(read_ply(path))
     np.testing.assert_array_equal(read.means, [[0, 1, 2]] * 2)
     np.testing.assert_array_equal(read.scales, [[6, 7, 8]] * 2)
     np.testing.assert_allclose(read.quats, [[0, *[-(0.5**0.5)] * 3]] * 2, atol=1e-6)  # of no unit length: damaged

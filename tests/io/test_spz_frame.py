@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
+from compressed_scenes import arrays_of
 from viewer_scenes import assert_same, coded_scene, needs_zstd, plain_scene
 
 from nsvq_lightning.io import FormatError, read_scene, save
 from nsvq_lightning.io.describe import describe
-from nsvq_lightning.io.spz import read_spz_header
+from nsvq_lightning.io.spz import read_spz_header, zstd_compress, zstd_decompress
 
 HEAD = struct.Struct("<4sIIBBBBI12x")
 ENTRY = struct.Struct("<QQ")
@@ -19,7 +21,7 @@ THEIRS = Path(__file__).with_name("splat_transform_v4.spz")
 
 
 def test_what_a_file_holds_is_said_without_zstandard(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nsvq_lightning.io.zstd.import_module", None)
+    monkeypatch.setattr("nsvq_lightning.io.spz.import_module", None)
     facts = describe(THEIRS)
     assert (facts["format"], facts["splats"], facts["sh_degree"]) == (
         "spz, version 4, axes not stated, taken as RDF",
@@ -43,7 +45,7 @@ def test_extensions_that_say_nothing_of_the_axes_are_passed_over(tmp_path: Path)
 
     data = THEIRS.read_bytes()
     for kind, content in ((0xADBE0002, bytes(12)), (0xADBE0003, bytes(4)), (0xADBE0003, bytes(3)), (7, b"")):
-        assert_same(read_scene(extended(kind, content)).arrays(), read_scene(THEIRS).arrays())
+        assert_same(arrays_of(read_scene(extended(kind, content))), arrays_of(read_scene(THEIRS)))
     with pytest.raises(FormatError, match=r"x\.spz: .*newer than this release: coordinate system 17, not 0 to 16"):
         read_scene(extended(0xADBE0003, struct.pack("<I", 17)))
 
@@ -52,7 +54,7 @@ def test_extensions_that_say_nothing_of_the_axes_are_passed_over(tmp_path: Path)
 def test_truncated_and_altered_streams_are_refused_or_read_as_they_were(tmp_path: Path) -> None:
     path = tmp_path / "bad.spz"
     save(coded_scene(12, 1), path, version=4)
-    data, expected = path.read_bytes(), vars(read_scene(path).arrays())
+    data, expected = path.read_bytes(), vars(arrays_of(read_scene(path)))
     for length in range(1, len(data)):
         path.write_bytes(data[:length])
         with pytest.raises(FormatError, match=r"bad\.spz: "):
@@ -61,7 +63,7 @@ def test_truncated_and_altered_streams_are_refused_or_read_as_they_were(tmp_path
     for position in rng.integers(start, len(data), 200):
         path.write_bytes(data[:position] + bytes([data[position] ^ (1 << rng.integers(8))]) + data[position + 1 :])
         try:
-            read = vars(read_scene(path).arrays())  # a Zstandard frame has a bit without a meaning
+            read = vars(arrays_of(read_scene(path)))  # a Zstandard frame has a bit without a meaning
         except FormatError:
             refused += 1
         else:
@@ -109,7 +111,7 @@ def test_both_versions_hold_the_same_splats_and_the_same_scene_gives_the_same_by
     paths = [tmp_path / name for name in ("a.spz", "b.spz", "c.spz")]
     for path, version in zip(paths, (3, 4, 4), strict=True):
         save(coded_scene(80), path, version=version)
-    old, new = (vars(read_scene(path).arrays()) for path in paths[:2])
+    old, new = (vars(arrays_of(read_scene(path))) for path in paths[:2])
     for name, values in old.items():
         np.testing.assert_array_equal(new[name], values, err_msg=name)
     assert paths[1].read_bytes() == paths[2].read_bytes()
@@ -118,3 +120,30 @@ def test_both_versions_hold_the_same_splats_and_the_same_scene_gives_the_same_by
 def test_only_known_versions_are_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"version of \.spz must be 3 or 4, got 2"):
         save(plain_scene(3), tmp_path / "x.spz", version=2)
+
+
+DATA = b"many equal bytes " * 100
+
+
+@needs_zstd
+def test_zstandard_refuses_damage_wherever_it_is_and_another_size() -> None:
+    frame = zstd_compress(DATA)
+    assert len(frame) < len(DATA) / 10
+    assert zstd_decompress(frame, len(DATA)) == DATA
+    assert zstd_decompress(zstd_compress(b""), 0) == b""
+    for size in (0, len(DATA) - 1, len(DATA) + 1):
+        with pytest.raises(FormatError, match=f"does not hold the {size} bytes"):
+            zstd_decompress(frame, size)
+    altered = [frame[:i] + bytes([frame[i] ^ 1]) + frame[i + 1 :] for i in range(len(frame))]
+    for damaged in (*(frame[:i] for i in range(len(frame))), *altered, frame + b"more"):
+        with pytest.raises(FormatError, match="damaged"):
+            zstd_decompress(damaged, len(DATA))
+
+
+def test_without_zstandard_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> ModuleType:
+        raise ImportError(name)
+
+    monkeypatch.setattr("nsvq_lightning.io.spz.import_module", missing)
+    with pytest.raises(FormatError, match=r"needs Zstandard.* pip install 'nsvq-lightning\[spz\]'"):
+        zstd_compress(DATA)

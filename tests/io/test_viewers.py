@@ -11,9 +11,11 @@ import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from compressed_scenes import arrays_of
 from gaussforge import GaussForge
 from viewer_scenes import (
     angles,
@@ -26,7 +28,7 @@ from viewer_scenes import (
     sigmoid,
 )
 
-from nsvq_lightning.io import SplatArrays, read_scene, save
+from nsvq_lightning.io import read_scene, save
 from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.spz import read_spz_header
 
@@ -55,10 +57,10 @@ def convert(program: str, source: Path, target: Path, version: int = 3) -> Path:
     return target
 
 
-def as_read(program: str, path: Path) -> SplatArrays:
+def as_read(program: str, path: Path) -> SimpleNamespace:
     """The scene that another program finds in a file; gaussforge's own arrays lack infinite opacities and degree 0."""
     if program == "gaussforge":
-        return read_scene(convert(program, path, path.with_name("read.ply"))).arrays()
+        return arrays_of(read_scene(convert(program, path, path.with_name("read.ply"))))
     return read_table(convert(program, path, path.with_name("read.csv")))
 
 
@@ -79,8 +81,8 @@ def test_others_read_what_was_meant(
 ) -> None:
     path, scene = tmp_path / f"x{suffix}", make(COUNT)
     save(scene, path, **options)
-    theirs, ours, written = as_read(program, path), read_scene(path).arrays(), scene.arrays()
-    assert len(theirs) == COUNT
+    theirs, ours, written = as_read(program, path), arrays_of(read_scene(path)), arrays_of(scene)
+    assert len(theirs.means) == COUNT
 
     # Exactly what our own reader finds, row for row: the files mean the same to both.
     # splat-transform takes the bytes of .splat for 255ths of [-1, 1], of which none is 0; the authors for 128ths.
@@ -109,7 +111,7 @@ def test_others_read_the_ply_of_a_compressed_scene(tmp_path: Path, program: str)
     save(coded_scene(COUNT), tmp_path / "x.nsvq")
     scene = read_scene(tmp_path / "x.nsvq")
     save(scene, tmp_path / "x.ply")
-    theirs, ours = as_read(program, tmp_path / "x.ply"), scene.arrays()
+    theirs, ours = as_read(program, tmp_path / "x.ply"), arrays_of(scene)
     for name, values in vars(ours).items():
         np.testing.assert_array_equal(getattr(theirs, name), values, err_msg=name)
 
@@ -123,11 +125,11 @@ def test_spz_of_others_is_read_as_they_read_it(tmp_path: Path, version: int, deg
     path = convert(program, tmp_path / "x.ply", tmp_path / "x.spz", version)
     header, _ = read_spz_header(path)
     assert (header.version, header.count, header.sh_degree, header.axes) == (version, COUNT, degree, "")
-    ours = read_scene(path).arrays()
+    ours = arrays_of(read_scene(path))
     assert_same(as_read(program, path), ours)
 
     # And what was written, up to the bits of the format; SH are rounded to 5 and 4 bits.
-    order, written = nearest_in(ours, scene.arrays()), scene.arrays()
+    order, written = nearest_in(ours, arrays_of(scene)), arrays_of(scene)
     assert np.abs(ours.means - written.means[order]).max() <= 0.5 / (1 << header.fraction_bits) + 2e-6
     assert np.abs(ours.scales - written.scales[order]).max() <= 1 / 32 + 2e-6
     assert np.abs(sigmoid(ours.opacities) - sigmoid(written.opacities[order])).max() <= 0.5 / 255 + 2e-6
@@ -142,12 +144,12 @@ def test_compressed_ply_of_others_is_read_as_they_read_it(tmp_path: Path, degree
     scene = plain_scene(COUNT + 256, degree)
     save(scene, tmp_path / "x.ply")
     path = convert(program, tmp_path / "x.ply", tmp_path / "x.compressed.ply")
-    ours = read_scene(path).arrays()
+    ours = arrays_of(read_scene(path))
     assert_same(as_read(program, path), ours, opacity=1.1e-3)  # gaussforge keeps that far from 0 and 1
     facts = describe(path)
     assert (facts["format"], facts["splats"], facts["sh_degree"]) == ("ply, compressed", COUNT + 256, degree)
     assert sum(stream["bytes"] for stream in facts["streams"]) == path.stat().st_size
-    order, written = nearest_in(ours, scene.arrays()), scene.arrays()
+    order, written = nearest_in(ours, arrays_of(scene)), arrays_of(scene)
     assert np.abs(ours.scales - written.scales[order]).max() <= 0.005
     assert np.degrees(angles(ours.quats, written.quats[order])).max() <= 0.3
     if program != "gaussforge":  # which writes the coefficients in another order than it reads them
@@ -158,7 +160,7 @@ def test_compressed_ply_of_others_is_read_as_they_read_it(tmp_path: Path, degree
 def test_sog_of_gaussforge_is_read_as_it_reads_it(tmp_path: Path, degree: int) -> None:
     save(plain_scene(COUNT, degree), tmp_path / "x.ply")
     path = convert("gaussforge", tmp_path / "x.ply", tmp_path / "x.sog")
-    assert_same(as_read("gaussforge", path), read_scene(path).arrays())
+    assert_same(as_read("gaussforge", path), arrays_of(read_scene(path)))
 
 
 @pytest.mark.viewers

@@ -25,7 +25,6 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.report import viewer
 from nsvq_lightning.report.viewer import write_viewer
-from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.splats.splats import RawSplats
 
 WEB = Path(viewer.__file__).parent / "web"
@@ -191,7 +190,7 @@ def _shown(tab: Page, page: str, width: int, height: int, script: str = "") -> N
 def test_anti_aliasing_is_what_the_file_says(tab: Page, tmp_path: Path) -> None:
     small = _splats()._replace(scales=_splats().scales - 2)
     for antialiased in (False, True):
-        scene = CompressedScene.from_arrays(SplatArrays.from_splats(small), config={"antialiased": antialiased})
+        scene = CompressedScene.from_splats(small, config={"antialiased": antialiased})
         save(scene, tmp_path / f"{antialiased}.nsvq")
         write_viewer(tmp_path / "viewer.html", tmp_path / f"{antialiased}.nsvq", _cameras(), "t", BACKGROUND)
         camera = _cameras()["front"]

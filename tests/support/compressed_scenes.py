@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io import CompressedScene
-from nsvq_lightning.io.compressed import attribute_dims
+from nsvq_lightning.splats.attributes import ATTRIBUTES, QUANTIZABLE, attribute_dims
 
 SIZES = {"quats": 64, "scales": 100, "sh0": 33, "shN": 16}
 
@@ -16,7 +18,7 @@ SIZES = {"quats": 64, "scales": 100, "sh0": 33, "shN": 16}
 def scene(n: int, sizes: dict[str, int] = SIZES, degree: int = 3, **header: Any) -> CompressedScene:
     """A scene whose attributes have realistic sizes."""
     rng = np.random.default_rng([n, degree, *sizes.values()])
-    dims = attribute_dims(degree)
+    dims = {name: attribute_dims(degree)[name] for name in QUANTIZABLE}
     centre = {"quats": 0.0, "scales": -4.0, "sh0": 0.0, "shN": 0.0}
     spread = {"quats": 1.0, "scales": 1.0, "sh0": 1.0, "shN": 0.1}
 
@@ -32,3 +34,19 @@ def scene(n: int, sizes: dict[str, int] = SIZES, degree: int = 3, **header: Any)
         sh_degree=degree,
         **header,
     )
+
+
+def scene_of(**arrays: NDArray[np.float32]) -> CompressedScene:
+    """A scene without codebooks from the six attributes, in the shapes of ``Splats``."""
+    rows = {name: values.reshape(len(values), math.prod(values.shape[1:])) for name, values in arrays.items()}
+    return CompressedScene(
+        arrays["means"],
+        arrays["opacities"],
+        raw={name: rows[name] for name in QUANTIZABLE},
+        sh_degree=math.isqrt(arrays["shN"].shape[1] + 1) - 1,
+    )
+
+
+def arrays_of(scene: CompressedScene) -> SimpleNamespace:
+    """The decoded attributes by name, in the shapes of ``Splats``."""
+    return SimpleNamespace(**{name: scene.values(name) for name in ATTRIBUTES})

@@ -150,7 +150,8 @@ def _limit_memory() -> None:
 
 
 def _scene(n: int) -> object:
-    from nsvq_lightning.io.compressed import CompressedScene, attribute_dims
+    from nsvq_lightning.io.compressed import CompressedScene
+    from nsvq_lightning.splats.attributes import attribute_dims
 
     rng = np.random.default_rng(0)
     sizes, dims = {"quats": 8, "scales": 5, "shN": 3}, attribute_dims(1)
@@ -169,11 +170,11 @@ def _build_ply(folder: Path) -> list[Path]:
     from nsvq_lightning.io.ply import write_ply
 
     binary, ascii_ = folder / "binary.ply", folder / "ascii.ply"
-    arrays = _scene(5).arrays()  # type: ignore[attr-defined]
-    write_ply(binary, arrays)
+    scene = _scene(5)
+    write_ply(binary, scene)  # type: ignore[arg-type]
     data = binary.read_bytes()
     head, body = data.split(b"end_header\n", 1)
-    rows = np.frombuffer(body, "<f4").reshape(len(arrays), -1)
+    rows = np.frombuffer(body, "<f4").reshape(len(scene), -1)
     text = "".join(" ".join(f"{value:.6g}" for value in row) + "\n" for row in rows)
     ascii_.write_bytes(head.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + text.encode())
     return [binary, ascii_]
@@ -197,7 +198,7 @@ def _build_nsvq(folder: Path) -> list[Path]:
 def _read_nsvq(path: Path) -> object:
     from nsvq_lightning.io.nsvq.file import read_nsvq
 
-    return read_nsvq(path).arrays()
+    return {name: read_nsvq(path).values(name) for name in ("means", "quats", "scales", "sh0", "shN")}
 
 
 def _mend_nsvq(data: bytes) -> bytes:
@@ -235,10 +236,10 @@ def _read_viewer(path: Path) -> object:
 
     with suppress(FormatError):
         describe(path)
-    arrays = read_scene(path).arrays()
+    scene = read_scene(path)
     for name in ("quats", "scales", "opacities", "sh0", "shN") if path.suffix != ".splat" else ("opacities", "sh0"):
-        assert np.isfinite(getattr(arrays, name)).all(), name
-    return arrays
+        assert np.isfinite(scene.values(name)).all(), name
+    return scene
 
 
 def _mend_spz(data: bytes) -> bytes:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from compressed_scenes import scene_of
 
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.splats.splats import RawSplats
 
 
@@ -59,11 +60,11 @@ def pixel_map(camera: Camera) -> torch.Tensor:
     return torch.randn(camera.height, camera.width, generator=torch.Generator().manual_seed(1))
 
 
-def ball(count: int = 1500, degree: int = 1) -> SplatArrays:
+def ball(count: int = 1500, degree: int = 1) -> CompressedScene:
     """A ball of splats."""
     rng = np.random.default_rng(count)
     coefficients = (degree + 1) ** 2 - 1
-    return SplatArrays(
+    return scene_of(
         means=rng.standard_normal((count, 3), np.float32),
         quats=rng.standard_normal((count, 4), np.float32),
         scales=(-2.5 + 0.5 * rng.standard_normal((count, 3))).astype(np.float32),

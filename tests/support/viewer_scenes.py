@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from compressed_scenes import scene_of
 from numpy.typing import NDArray
 
-from nsvq_lightning.io import CompressedScene, SplatArrays
+from nsvq_lightning.io import CompressedScene
 
 HAS_ZSTD = any(find_spec(parent) and find_spec(f"{parent}.zstd") for parent in ("compression", "backports"))
 needs_zstd = pytest.mark.skipif(not HAS_ZSTD, reason="no Zstandard: pip install 'nsvq-lightning[spz]'")
@@ -18,15 +20,13 @@ needs_zstd = pytest.mark.skipif(not HAS_ZSTD, reason="no Zstandard: pip install 
 def plain_scene(n: int, degree: int = 3, seed: int = 0) -> CompressedScene:
     """Splats within the range of every format, all numbers different."""
     rng = np.random.default_rng([n, degree, seed])
-    return CompressedScene.from_arrays(
-        SplatArrays(
-            means=rng.normal(0, 5, (n, 3)).astype(np.float32),
-            quats=rng.normal(0, 3, (n, 4)).astype(np.float32),
-            scales=rng.uniform(-7, 1, (n, 3)).astype(np.float32),
-            opacities=rng.normal(0, 2, n).astype(np.float32),
-            sh0=rng.uniform(-1.7, 1.7, (n, 1, 3)).astype(np.float32),
-            shN=rng.uniform(-0.9, 0.9, (n, (degree + 1) ** 2 - 1, 3)).astype(np.float32),
-        )
+    return scene_of(
+        means=rng.normal(0, 5, (n, 3)).astype(np.float32),
+        quats=rng.normal(0, 3, (n, 4)).astype(np.float32),
+        scales=rng.uniform(-7, 1, (n, 3)).astype(np.float32),
+        opacities=rng.normal(0, 2, n).astype(np.float32),
+        sh0=rng.uniform(-1.7, 1.7, (n, 1, 3)).astype(np.float32),
+        shN=rng.uniform(-0.9, 0.9, (n, (degree + 1) ** 2 - 1, 3)).astype(np.float32),
     )
 
 
@@ -46,11 +46,11 @@ def coded_scene(n: int, degree: int = 3, rows: int = 20) -> CompressedScene:
     )
 
 
-def nearest_in(read: SplatArrays, written: SplatArrays) -> NDArray[np.intp]:
+def nearest_in(read: SimpleNamespace, written: SimpleNamespace) -> NDArray[np.intp]:
     """For each splat that was read the one that was written, by position: formats may reorder."""
     distance = np.abs(read.means[:, None].astype(np.float64) - written.means[None]).max(2)
     order = distance.argmin(1)
-    assert len(set(order.tolist())) == len(written)
+    assert len(set(order.tolist())) == len(written.means)
     return order
 
 
@@ -65,7 +65,7 @@ def sigmoid(logits: NDArray[np.float32]) -> NDArray[np.float64]:
     return 1 / (1 + np.exp(-logits.astype(np.float64)))
 
 
-def read_table(path: Path) -> SplatArrays:
+def read_table(path: Path) -> SimpleNamespace:
     """The scene of a .csv file of splat-transform, by the names of its columns."""
     names = path.read_text().partition("\n")[0].split(",")
     values = np.genfromtxt(path, np.float64, delimiter=",", skip_header=1, ndmin=2)
@@ -76,7 +76,7 @@ def read_table(path: Path) -> SplatArrays:
 
     rest = sum(name.startswith("f_rest_") for name in names)
     sh = stacked(*(f"f_rest_{i}" for i in range(rest))) if rest else np.zeros((len(values), 0), np.float32)
-    arrays = SplatArrays(
+    arrays = SimpleNamespace(
         means=stacked("x", "y", "z"),
         quats=stacked("rot_0", "rot_1", "rot_2", "rot_3"),
         scales=stacked("scale_0", "scale_1", "scale_2"),
@@ -88,7 +88,7 @@ def read_table(path: Path) -> SplatArrays:
     return arrays
 
 
-def assert_same(theirs: SplatArrays, ours: SplatArrays, rotation: float = 2e-6, opacity: float = 2e-6) -> None:
+def assert_same(theirs: SimpleNamespace, ours: SimpleNamespace, rotation: float = 2e-6, opacity: float = 2e-6) -> None:
     """Two readers found the same numbers, row for row, up to their floating-point arithmetic."""
     np.testing.assert_allclose(theirs.means, ours.means, rtol=2e-6, atol=2e-6)
     np.testing.assert_allclose(theirs.scales, ours.scales, rtol=0, atol=2e-6)
@@ -96,16 +96,3 @@ def assert_same(theirs: SplatArrays, ours: SplatArrays, rotation: float = 2e-6, 
     np.testing.assert_allclose(sigmoid(theirs.opacities), sigmoid(ours.opacities), rtol=0, atol=opacity)
     np.testing.assert_allclose(theirs.shN, ours.shN, rtol=0, atol=1e-6)
     assert angles(theirs.quats, ours.quats).max() <= rotation
-
-
-__all__ = [
-    "HAS_ZSTD",
-    "angles",
-    "assert_same",
-    "coded_scene",
-    "nearest_in",
-    "needs_zstd",
-    "plain_scene",
-    "read_table",
-    "sigmoid",
-]

@@ -28,16 +28,16 @@ from nsvq_lightning.commands.benchmark.timing import (
 from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.commands.compress import DEFAULT_TUNING, VIEWS
 from nsvq_lightning.compression.ladder import LADDER, PLAIN, Compressor, Rung
-from nsvq_lightning.compression.stored import compress
+from nsvq_lightning.compression.stored import to_compressed
 from nsvq_lightning.compression.viewpoints import decibels, pictures, views_of
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import load, save
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.quantize.base import as_quantizer
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.arrays import SplatArrays
 from nsvq_lightning.splats.splats import SplatTensors
 
 __all__ = ["PANELS", "run"]
@@ -69,7 +69,7 @@ def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[Measu
     with use_threads(max(scope.threads)):
         # Codebooks of one step of k-means: sizes and times do not depend on how good they are.
         quantizers = {name: as_quantizer(a.quantizer) for name, a in prepare(workload.splats, scope.codebooks).items()}
-        scene = compress(workload.splats, quantizers)
+        scene = to_compressed(workload.splats, quantizers)
         writers: dict[str, Callable[[Path], int]] = {".ply": partial(save, workload.splats)}
         writers |= {f".nsvq {level}": partial(save, scene, storage=Storage(level)) for level in LEVELS}
         images = {".ply": _image(workload, workload.splats), ".nsvq": _image(workload, scene.decode())}
@@ -95,7 +95,7 @@ def _image(workload: Workload, splats: SplatTensors) -> Tensor:
 
 
 def _small_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[Measurement]:
-    splats, cameras = SplatArrays.from_splats(workload.splats), [workload.camera]
+    plain, cameras = CompressedScene.from_splats(workload.splats), [workload.camera]
     images = pictures(workload.splats, cameras)
     if scope.photos is not None:
         scene = load_scene(scope.photos, masks=None)
@@ -108,36 +108,35 @@ def _small_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[Meas
         return fmean(decibels(float((a - b).double().square().mean().sqrt())) for a, b in pairs)
 
     original, product = psnr(workload.splats), sgemm()
-    for method, (suffix, write) in _ways(splats, scope).items():
+    for method, (suffix, write) in _ways(plain, scope).items():
         path = folder / f"small{suffix}"
         timing = Timing((milliseconds(Case(method, partial(write, path))),), (milliseconds(product),))
         size = path.stat().st_size
-        values = {"PSNR dB": psnr(load(path)), "bytes": float(size), "bits a splat": 8 * size / len(splats)}
+        values = {"PSNR dB": psnr(load(path)), "bytes": float(size), "bits a splat": 8 * size / len(plain)}
         if isfinite(original):
             values["dB lost"] = original - values["PSNR dB"]
-        described = f"{workload.name}, {len(splats):,} splats"
+        described = f"{workload.name}, {len(plain):,} splats"
         yield Measurement("codec", described, method, SMALL, max(scope.threads), timing, values)
 
 
-def _ways(splats: SplatArrays, scope: Scope) -> dict[str, tuple[str, Callable[[Path], object]]]:
+def _ways(plain: CompressedScene, scope: Scope) -> dict[str, tuple[str, Callable[[Path], object]]]:
     """Ways to a file: its suffix, and what writes it; from the most exact to the smallest in each curve."""
-    plain = splats.to_splats()
     views, tuning = (2, 2) if scope.quick else (VIEWS, DEFAULT_TUNING)
     rungs = [PLAIN, *(rung for rung in LADDER if rung.name in (RUNGS[-1:] if scope.quick else RUNGS))]
     palettes = PALETTES[-1:] if scope.quick else PALETTES
     others = {f"{path.suffix} of another program: {path.name}": path for path in scope.beside}
     return {
-        **{f"nsvq compress: {r.name}": (".nsvq", partial(_compress, splats, r, views, tuning)) for r in rungs},
+        **{f"nsvq compress: {r.name}": (".nsvq", partial(_compress, plain, r, views, tuning)) for r in rungs},
         **{f".sog: palette {rows}": (".sog", partial(save, plain, palette=rows)) for rows in palettes},
         ".spz: version 3": (".spz", partial(save, plain)),
         **{name: (path.suffix, partial(_put, path.read_bytes())) for name, path in others.items()},
     }
 
 
-def _compress(splats: SplatArrays, rung: Rung, views: int, tuning: int, path: Path) -> None:
+def _compress(plain: CompressedScene, rung: Rung, views: int, tuning: int, path: Path) -> None:
     """What ``nsvq compress`` does without photos, the search for views included."""
-    cameras = views_of(splats.to_splats(), None, views)
-    _put(Compressor(splats, cameras, Storage(), tuning=tuning).at(rung).data, path)
+    cameras = views_of(plain.decode(), None, views)
+    _put(Compressor(plain, cameras, Storage(), tuning=tuning).at(rung).data, path)
 
 
 def _put(data: bytes, path: Path) -> None:

@@ -16,7 +16,7 @@ from nsvq_lightning.compression.viewpoints import look_at, middle_of
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.splats.arrays import finite_rows
+from nsvq_lightning.splats.attributes import finite_rows
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
 __all__ = ["Workload", "relative_l2", "scene_workload", "single_workload", "synthetic_workload", "workloads"]

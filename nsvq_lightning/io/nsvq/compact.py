@@ -32,29 +32,22 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.compressed import QUANTIZABLE, CompressedScene, attribute_dims
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FEW_ROWS, FormatError, check_room
 from nsvq_lightning.io.morton import AXIS_BITS, Grid, morton_keys, nearest_before, unmorton
+from nsvq_lightning.io.nsvq import entropy
 from nsvq_lightning.io.nsvq.codebook_order import leaf_paths
-from nsvq_lightning.io.nsvq.entropy import (
-    decode_integers,
-    decode_keys,
-    decode_paths,
-    encode_integers,
-    encode_keys,
-    encode_paths,
-)
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
 from nsvq_lightning.io.nsvq.precision import MOST_OPACITY_LEVELS, Precision
 from nsvq_lightning.io.nsvq.rounding import Stored, doublings_of, logits_of_levels, position_grid, rounded
-from nsvq_lightning.io.nsvq.tasks import workers
-
-__all__ = ["decode_compact", "encode_compact"]
+from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims
 
 _GRID = struct.Struct("<qqqd")
 
@@ -63,7 +56,7 @@ _STREAMS = {"grid": _POSITIONS, "cells": _POSITIONS, "codes": ("{}.codebook", "{
 _ENCODINGS = {"means.grid": "grid", "means": "keys", "means.far": "float32"}
 _BEFORE_POSITIONS = {"cells": ("opacities", "scales"), "grid": ("scales",)}
 """Attributes whose streams come before those of the positions, by the storage of these."""
-_LARGEST_FIRST = ("shN", "quats", "sh0")
+_LARGEST_FIRST = sorted((name for name in QUANTIZABLE if name != "scales"), key=lambda name: -attribute_dims(3)[name])
 """The other attributes, by the time they take: the longest task should not begin last."""
 _FAR_BYTES = 12
 """Three float32."""
@@ -93,24 +86,24 @@ def encode_compact(scene: CompressedScene, precision: Precision | None = None) -
         precision: The largest errors.
 
     Raises:
-        ValueError: A value is not finite, or too large for its step.
+        ValueError: A value is too large for its step.
     """
     precision = precision or Precision()
     early = _BEFORE_POSITIONS["cells"]
-    with workers() as pool:
+    with _workers() as pool:
         # Positions follow two attributes. They give the order of the splats, in which all others are written.
         rounding = {name: pool.submit(rounded, scene, name, precision) for name in (*early, _LARGEST_FIRST[0])}
         placing = pool.submit(_places, scene.means, {name: rounding[name].result() for name in early}, precision)
         rounding |= {name: pool.submit(rounded, scene, name, precision) for name in _LARGEST_FIRST[1:]}
         places, order = placing.result()
         before, near = _before(len(order)), pool.submit(_neighbours, places, len(order))
-        tasks = {"means": pool.submit(encode_keys, places.keys, 3 * places.depths)}
+        tasks = {"means": pool.submit(entropy.encode_keys, places.keys, 3 * places.depths)}
         for name in (*early, *_LARGEST_FIRST):
             neighbours = before if name in early else near.result()
             attribute = rounding[name].result()
             tasks[name] = pool.submit(_encode_values, attribute, order, neighbours)
             if attribute.codebook is not None:
-                tasks[f"{name}.codebook"] = pool.submit(encode_integers, attribute.codebook)
+                tasks[f"{name}.codebook"] = pool.submit(entropy.encode_integers, attribute.codebook)
     streams = {name: task.result() for name, task in tasks.items()}
     streams["means.grid"] = _GRID.pack(*places.grid.base, places.doublings)
     streams["means.far"] = scene.means[order[len(places.keys) :]].astype("<f4", copy=False).tobytes()
@@ -139,7 +132,7 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
     entries = _checked_tables(header)
     early = _BEFORE_POSITIONS[entries["means"].storage]
     late = [name for name in (*_LARGEST_FIRST, "opacities") if name not in early]
-    with workers() as pool:
+    with _workers() as pool:
         before = _before(header.splats)
         values = {name: pool.submit(_decode_values, entries[name], streams, before) for name in early}
         codebooks = {name: pool.submit(_decode_codebook, entries[name], streams) for name in (*early, *late)}
@@ -165,6 +158,14 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
 
 
 # Streams
+
+
+def _workers() -> ThreadPoolExecutor:
+    """As many threads as torch uses; they run side by side because the kernels release the GIL.
+
+    Tasks begin in the order in which they were submitted.
+    """
+    return ThreadPoolExecutor(max_workers=torch.get_num_threads())
 
 
 def _places(
@@ -196,18 +197,18 @@ def _neighbours(places: _Places, count: int) -> NDArray[np.int32]:
 def _encode_values(attribute: Stored, order: NDArray[np.int64], neighbours: NDArray[np.int32]) -> bytes:
     entry, values = attribute.entry, attribute.values[order]
     if entry.storage == "steps":
-        return encode_integers(values)
-    return encode_paths(leaf_paths(entry.codes)[values], entry.bits, neighbours)
+        return entropy.encode_integers(values)
+    return entropy.encode_paths(leaf_paths(entry.codes)[values], entry.bits, neighbours)
 
 
 def _decode_values(
     entry: AttributeEntry, streams: Mapping[str, memoryview], neighbours: NDArray[np.int32]
 ) -> NDArray[np.int64]:
     if entry.storage == "steps":
-        return decode_integers(streams[entry.name], len(neighbours), entry.dim)
+        return entropy.decode_integers(streams[entry.name], len(neighbours), entry.dim)
     leaf_of = np.full(1 << entry.bits, -1)
     leaf_of[leaf_paths(entry.codes)] = np.arange(entry.codes)
-    values = leaf_of[decode_paths(streams[entry.name], entry.bits, neighbours)]
+    values = leaf_of[entropy.decode_paths(streams[entry.name], entry.bits, neighbours)]
     if (values < 0).any():
         raise FormatError(f"damaged: a code of {entry.name} is not one of {entry.codes}")
     return values
@@ -216,7 +217,7 @@ def _decode_values(
 def _decode_codebook(entry: AttributeEntry, streams: Mapping[str, memoryview]) -> NDArray[np.int64] | None:
     if entry.storage != "codes":
         return None
-    return decode_integers(streams[f"{entry.name}.codebook"], entry.codes, entry.dim)
+    return entropy.decode_integers(streams[f"{entry.name}.codebook"], entry.codes, entry.dim)
 
 
 def _decode_places(step: float, stored: Mapping[str, Stored], streams: Mapping[str, memoryview]) -> _Places:
@@ -226,7 +227,7 @@ def _decode_places(step: float, stored: Mapping[str, Stored], streams: Mapping[s
     grid, far = Grid(step, (base[0], base[1], base[2])), len(streams["means.far"]) // _FAR_BYTES
     depths = grid.depths(doublings_of(stored, doublings))
     depths = depths[: len(depths) - far]
-    return _Places(grid, doublings, decode_keys(streams["means"], 3 * depths), depths)
+    return _Places(grid, doublings, entropy.decode_keys(streams["means"], 3 * depths), depths)
 
 
 def _decode_means(places: _Places, far: memoryview) -> NDArray[np.float32]:
@@ -237,7 +238,7 @@ def _decode_means(places: _Places, far: memoryview) -> NDArray[np.float32]:
 def _order(storage: str) -> tuple[str, ...]:
     """Attributes in the order of their streams, by the storage of the positions."""
     first = _BEFORE_POSITIONS[storage]
-    return (*first, "means", *(name for name in ("opacities", "quats", "sh0", "shN") if name not in first))
+    return (*first, "means", *(name for name in ("opacities", *QUANTIZABLE) if name not in first))
 
 
 def _stream_names(attributes: tuple[AttributeEntry, ...]) -> list[tuple[str, str]]:
@@ -253,7 +254,7 @@ def _stream_names(attributes: tuple[AttributeEntry, ...]) -> list[tuple[str, str
 
 def _checked_tables(header: Header) -> dict[str, AttributeEntry]:
     """Compare with the tables this release would write, before anything is allocated from their sizes."""
-    dims = {"means": 3, "opacities": 1, **attribute_dims(header.sh_degree)}
+    dims = attribute_dims(header.sh_degree)
     orders = [[(name, dims[name]) for name in _order(storage)] for storage in _BEFORE_POSITIONS]
     entries = {entry.name: entry for entry in header.attributes}
     if [(entry.name, entry.dim) for entry in header.attributes] not in orders:

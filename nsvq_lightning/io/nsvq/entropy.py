@@ -25,16 +25,6 @@ from nsvq_lightning.io.nsvq.range_coder import (
     new_contexts,
 )
 
-__all__ = [
-    "KEY_BITS",
-    "decode_integers",
-    "decode_keys",
-    "decode_paths",
-    "encode_integers",
-    "encode_keys",
-    "encode_paths",
-]
-
 KEY_BITS = 63
 """Bits of a key; the highest is bit 62."""
 

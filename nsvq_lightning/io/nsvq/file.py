@@ -11,18 +11,9 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.nsvq.header import Header, frame, read_frame, read_header
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Precision, Storage, check_level
+from nsvq_lightning.splats.attributes import listed
 
-__all__ = [
-    "DEFAULT_LEVEL",
-    "LEVELS",
-    "CompressedScene",
-    "as_stored",
-    "decode",
-    "encode",
-    "read_header",
-    "read_nsvq",
-    "write_nsvq",
-]
+__all__ = ["CompressedScene", "as_stored", "decode", "encode", "read_header", "read_nsvq", "write_finite", "write_nsvq"]
 
 
 def encode(
@@ -60,7 +51,17 @@ def write_nsvq(
     Returns:
         Bytes of the file.
     """
-    parts = frame(*encode(scene, level, precision))
+    if level == "compact" and (culprits := scene.finite_rows()[1]):
+        raise ValueError(
+            f"numbers that are not finite ({listed(culprits)}): drop those splats, or use level 'paper', which stores "
+            "float32 as it is"
+        )
+    return write_finite(path, scene, Storage(level, precision or Precision()))
+
+
+def write_finite(path: str | os.PathLike[str], scene: CompressedScene, storage: Storage) -> int:
+    """:func:`write_nsvq` for a scene whose values are known to be finite."""
+    parts = frame(*encode(scene, storage.level, storage.precision))
     with atomic_write(path) as file:
         file.writelines(parts)
     return sum(map(len, parts))

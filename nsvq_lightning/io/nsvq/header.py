@@ -30,21 +30,6 @@ from typing import Any, TypeVar
 
 from nsvq_lightning.io.errors import FormatError, naming_file
 
-__all__ = [
-    "MAGIC",
-    "PREFIX_BYTES",
-    "VERSION",
-    "AttributeEntry",
-    "Header",
-    "StreamEntry",
-    "frame",
-    "read_frame",
-    "read_header",
-    "unframe",
-    "with_origin",
-]
-
-
 PREFIX_BYTES = 32
 """Bytes before the JSON, see :mod:`nsvq_lightning.io.nsvq.header`."""
 

@@ -17,28 +17,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.compressed import QUANTIZABLE, CompressedScene, attribute_dims
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
-
-__all__ = ["code_bits", "decode_paper", "encode_paper", "pack_fields", "packed_bytes", "paper_header", "unpack_fields"]
-
+from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims
 
 _CHUNK = 1 << 14
 """Rows per chunk: a multiple of 8, so that every chunk ends on a whole byte, and small enough for the cache."""
 
 _MAX_BITS = 32
-
-
-def code_bits(codes: int) -> int:
-    """Bits that distinguish ``codes`` values: ⌈log2 codes⌉, and 0 for a single one.
-
-    Raises:
-        ValueError: ``codes`` is not in 1..2³².
-    """
-    if not 1 <= codes <= 1 << _MAX_BITS:
-        raise ValueError(f"a codebook must have 1 to 2^{_MAX_BITS} rows, got {codes}")
-    return (codes - 1).bit_length()
 
 
 def packed_bytes(rows: int, widths: Sequence[int]) -> int:
@@ -136,10 +123,10 @@ _BITS = "bits"
 
 def paper_header(scene: CompressedScene) -> Header:
     """Header of the scene's file; cheap, since it depends only on counts."""
-    attributes = (
-        AttributeEntry("means", 3, "raw"),
-        AttributeEntry("opacities", 1, "raw"),
-        *(_attribute(scene, name, dim) for name, dim in attribute_dims(scene.sh_degree).items()),
+    rows = {name: len(codebook) for name, codebook in scene.codebooks.items()}
+    attributes = tuple(
+        AttributeEntry(name, dim, "codes", rows[name]) if name in rows else AttributeEntry(name, dim, "raw")
+        for name, dim in _dims(scene.sh_degree).items()
     )
     return Header(
         level="paper",
@@ -194,10 +181,10 @@ def decode_paper(header: Header, streams: Mapping[str, memoryview]) -> Compresse
         raise FormatError(f"damaged: {error}") from None
 
 
-def _attribute(scene: CompressedScene, name: str, dim: int) -> AttributeEntry:
-    if name in scene.raw:
-        return AttributeEntry(name, dim, "raw")
-    return AttributeEntry(name, dim, "codes", len(scene.codebooks[name]))
+def _dims(sh_degree: int) -> dict[str, int]:
+    """Values per splat of each attribute, in file order."""
+    dims = attribute_dims(sh_degree)
+    return {name: dims[name] for name in ("means", "opacities", *QUANTIZABLE)}
 
 
 def _layout(n: int, attributes: tuple[AttributeEntry, ...]) -> tuple[StreamEntry, ...]:
@@ -212,7 +199,7 @@ def _layout(n: int, attributes: tuple[AttributeEntry, ...]) -> tuple[StreamEntry
 
 def _check_tables(header: Header) -> None:
     """Compare with the tables this release would write, before anything is allocated from their sizes."""
-    dims = {"means": 3, "opacities": 1, **attribute_dims(header.sh_degree)}
+    dims = _dims(header.sh_degree)
     if [(entry.name, entry.dim) for entry in header.attributes] != list(dims.items()):
         raise FormatError(f"damaged: the attribute table must list {dims}, got {header.attributes}")
     for entry in header.attributes:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-__all__ = ["DEFAULT_LEVEL", "LEVELS", "MOST_OPACITY_LEVELS", "OPACITY_ERRORS", "Precision", "Storage", "check_level"]
+from nsvq_lightning.splats.attributes import ATTRIBUTES
 
 LEVELS = ("compact", "paper")
 """Compression levels: ``compact`` is small; ``paper`` stores float32 values and whole bits, as the paper counts."""
@@ -43,10 +43,10 @@ class Precision:
     position: float = 0.05
     opacity: float = 1 / 128
     codebook: float = 0.0625
-    scales: float = 0.02
-    quats: float = 0.005
-    sh0: float = 0.01
-    shN: float = 0.01
+    scales: float = ATTRIBUTES["scales"].error
+    quats: float = ATTRIBUTES["quats"].error
+    sh0: float = ATTRIBUTES["sh0"].error
+    shN: float = ATTRIBUTES["shN"].error
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -56,6 +56,11 @@ class Precision:
         least, most = OPACITY_ERRORS
         if not least <= self.opacity <= most:
             raise ValueError(f"precision: opacity must be from {least:.3g} to {most:g}, got {self.opacity}")
+
+    def of(self, name: str) -> float:
+        """Largest error of an attribute without a codebook; one that has no option has the error that it declares."""
+        error: float = getattr(self, name, ATTRIBUTES[name].error)
+        return error
 
     @property
     def opacity_levels(self) -> int:

@@ -15,17 +15,6 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline
 
-__all__ = [
-    "COUNT_LIMIT",
-    "decode_bit",
-    "decode_plain",
-    "decode_start",
-    "encode_bit",
-    "encode_end",
-    "encode_plain",
-    "new_contexts",
-]
-
 COUNT_LIMIT = 126
 """Number of bits after which the probability of a context moves at its slowest."""
 

@@ -13,21 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.compressed import CompressedScene, attribute_dims
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.morton import Grid
 from nsvq_lightning.io.nsvq.codebook_order import sibling_distance, tree_order
 from nsvq_lightning.io.nsvq.header import AttributeEntry
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.io.numbers import coarsest_power, nearest_power, opacity_of
-
-__all__ = [
-    "Stored",
-    "check_finite",
-    "doublings_of",
-    "logits_of_levels",
-    "position_grid",
-    "rounded",
-]
 
 _MOST_DOUBLINGS = 500.0
 """Largest base-2 logarithm of a width in scene units whose multiples float64 still holds."""
@@ -71,36 +62,19 @@ def rounded(scene: CompressedScene, name: str, precision: Precision) -> Stored:
     """An attribute, but not the positions, as integers.
 
     Raises:
-        ValueError: A value is not finite, or too large for its step.
+        ValueError: A value is too large for its step.
     """
     if name == "opacities":
-        check_finite(name, scene.opacities)
         return _levels(scene.opacities, precision.opacity_levels)
-    dim = attribute_dims(scene.sh_degree)[name]
     if name in scene.raw:
-        check_finite(name, scene.raw[name])
-        step = 2 * getattr(precision, name)
-        return Stored(AttributeEntry(name, dim, "steps", step=step), _integers(name, scene.raw[name], step))
+        rows, step = scene.raw[name], 2 * precision.of(name)
+        return Stored(AttributeEntry(name, rows.shape[1], "steps", step=step), _integers(name, rows, step))
     return _coded(name, scene.codes[name], scene.codebooks[name], precision.codebook)
-
-
-def check_finite(name: str, array: NDArray[np.float32]) -> None:
-    """Refuse NaN and infinity.
-
-    Raises:
-        ValueError: A value is not finite.
-    """
-    if not np.isfinite(array).all():
-        raise ValueError(
-            f"{name}: {int((~np.isfinite(array)).sum())} numbers are not finite; drop those splats, or use level "
-            "'paper', which stores float32 as it is"
-        )
 
 
 def _coded(name: str, codes: NDArray[np.integer], codebook: NDArray[np.float32], error: float) -> Stored:
     used = np.bincount(codes, minlength=len(codebook)) > 0
     rows = codebook[used] if len(codes) else np.zeros_like(codebook[:1])
-    check_finite(f"codebook of {name}", rows)
     step = _codebook_step(name, rows, error)
     integers, merged = np.unique(_integers(name, rows, step), axis=0, return_inverse=True)
     order = tree_order((integers * step).astype(np.float32))
@@ -171,11 +145,7 @@ def position_grid(
         means: The positions.
         stored: The log-scales and the opacities of their splats.
         precision: The largest errors.
-
-    Raises:
-        ValueError: A position is not finite.
     """
-    check_finite("means", means)
     widest = np.minimum(doublings_of(stored, math.log2(2 * precision.position)), _MOST_DOUBLINGS)
     grid = Grid.around(means, np.exp2(widest))
     for_size_one = math.log2(2 * precision.position / grid.step)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.nsvq.paper import code_bits, pack_fields, packed_bytes, unpack_fields
+from nsvq_lightning.io.nsvq.paper import pack_fields, packed_bytes, unpack_fields
 
 
 def _big_integer(fields: Sequence[NDArray[np.int64]], widths: Sequence[int]) -> bytes:
@@ -52,11 +52,6 @@ def test_known_bytes() -> None:
     assert pack_fields([np.array([5, 2]), np.array([17, 30])], [3, 5]) == bytes([0x8D, 0xF2])
 
 
-@pytest.mark.parametrize(("codes", "bits"), [(1, 0), (2, 1), (3, 2), (4096, 12), (4097, 13), (16384, 14)])
-def test_bits_of_a_codebook(codes: int, bits: int) -> None:
-    assert code_bits(codes) == bits
-
-
 def test_wrong_values_are_refused() -> None:
     with pytest.raises(ValueError, match="do not fit into 3 bits"):
         pack_fields([np.array([8])], [3])
@@ -68,8 +63,6 @@ def test_wrong_values_are_refused() -> None:
         unpack_fields(b"ab", 2, [3])
     with pytest.raises(ValueError, match="0 to 32"):
         unpack_fields(b"", 0, [33])
-    with pytest.raises(ValueError, match="1 to 2"):
-        code_bits(0)
 
 
 def test_half_a_million_splats_take_a_blink() -> None:

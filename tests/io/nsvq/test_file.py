@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from compressed_scenes import arrays_of
 
 from nsvq_lightning import io
 from nsvq_lightning.io import CompressedScene, FormatError, read_header, read_nsvq
@@ -292,7 +293,7 @@ def test_files_of_version_1_still_open(level: str) -> None:
     folder = Path(__file__).parent / "version_1"
     read = read_nsvq(folder / f"{level}.nsvq")
     assert (read.config, read.metrics, read.origin) == ({"seed": 1}, {"psnr": 30.0}, (1.0, 2.0, 3.0))
-    arrays = read.arrays()
+    arrays = arrays_of(read)
     with np.load(folder / f"{level}.npz") as expected:
         for name, values in expected.items():
             np.testing.assert_array_equal(getattr(arrays, name), values, err_msg=name)

@@ -8,7 +8,7 @@ from pathlib import Path
 import nsvq_reader
 import numpy as np
 import pytest
-from compressed_scenes import SIZES, scene
+from compressed_scenes import SIZES, arrays_of, scene
 
 from nsvq_lightning.io import CompressedScene, read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.precision import LEVELS, Precision
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 def compare(path: Path) -> None:
     """Both readers find the same bits."""
-    arrays, found = read_nsvq(path).arrays(), nsvq_reader.read_nsvq(path)
+    arrays, found = arrays_of(read_nsvq(path)), nsvq_reader.read_nsvq(path)
     assert len(found) == 6
     for name, values in found.items():
         expected = getattr(arrays, name)

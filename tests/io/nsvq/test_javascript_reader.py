@@ -8,17 +8,17 @@ import shutil
 import struct
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import nsvq_reader
 import numpy as np
 import pytest
-from compressed_scenes import SIZES, scene
+from compressed_scenes import SIZES, arrays_of, scene
 
 from nsvq_lightning.io import CompressedScene, FormatError, read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.header import read_frame
 from nsvq_lightning.io.nsvq.precision import LEVELS, Precision
-from nsvq_lightning.splats.arrays import SplatArrays
 
 ROOT = Path(__file__).resolve().parents[3]
 READER = ROOT / "nsvq_lightning/report/web/nsvq.js"
@@ -40,12 +40,12 @@ def refusal(path: Path) -> str:
     return done.stderr.decode()
 
 
-def content(arrays: SplatArrays) -> bytes:
+def content(arrays: SimpleNamespace) -> bytes:
     return b"".join(getattr(arrays, name).tobytes() for name in ORDER)
 
 
 def compare(*paths: Path) -> None:
-    assert dumped(*paths) == b"".join(content(read_nsvq(path).arrays()) for path in paths)
+    assert dumped(*paths) == b"".join(content(arrays_of(read_nsvq(path))) for path in paths)
 
 
 def with_far_splats() -> CompressedScene:

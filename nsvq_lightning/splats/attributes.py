@@ -1,0 +1,102 @@
+"""The attributes of a splat, declared once, and which rows of them are finite. Without torch: files open fast."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from nsvq_lightning.splats.conventions import sh_coefficients
+
+_Array = TypeVar("_Array")
+"""NumPy arrays, or torch tensors on any device; torch is not imported for the former."""
+
+
+@dataclass(frozen=True)
+class Attribute:
+    """What the rooms above know of one raw attribute.
+
+    Attributes:
+        shape: Of the values of one splat; -1 stands for the number of higher SH coefficients.
+        ply: Its properties in ``.ply``: their names, or what precedes their numbers.
+        rate: Learning rate at the start (3D Gaussian Splatting); that of the positions is times the extent of the
+            scene.
+        code_share: Number of codes relative to that for scales (paper, section 4: Ks = Kr = 4·Kc = 4·Ksh); 0 if the
+            attribute never has a codebook.
+        error: Largest error in files of level ``compact``, where it has no codebook.
+        row_bits: Bits of a code there beyond log2 of the number of codes: colours of neighbours are alike.
+        code_bits: Bits there of each number of the codebook.
+        tuning_rate: Learning rate at the start when a compressed scene is tuned, of its codebook if it has one; that of
+            the positions is times the root mean square distance of the splats from their middle.
+    """
+
+    shape: tuple[int, ...]
+    ply: str
+    rate: float
+    code_share: float = 0.0
+    error: float = 0.0
+    row_bits: float = 0.0
+    code_bits: float = 0.0
+    tuning_rate: float = 0.0
+
+
+ATTRIBUTES = {
+    "means": Attribute((3,), "x y z", 1.6e-4, tuning_rate=3e-5),
+    "quats": Attribute((4,), "rot_", 1e-3, 1.0, error=0.005, row_bits=0.3, code_bits=5.7, tuning_rate=0.002),
+    "scales": Attribute((3,), "scale_", 5e-3, 1.0, error=0.02, row_bits=0.0, code_bits=6.0, tuning_rate=0.01),
+    "opacities": Attribute((), "opacity", 0.05, tuning_rate=0.025),
+    "sh0": Attribute((1, 3), "f_dc_", 2.5e-3, 0.25, error=0.01, row_bits=-1.3, code_bits=5.9, tuning_rate=0.0025),
+    "shN": Attribute((-1, 3), "f_rest_", 1.25e-4, 0.25, error=0.01, row_bits=-1.4, code_bits=5.5, tuning_rate=0.0005),
+}
+"""The raw attributes by name, in the order of :meth:`nsvq_lightning.Splats.from_tensors`."""
+
+QUANTIZABLE = tuple(name for name, attribute in ATTRIBUTES.items() if attribute.code_share)
+"""Attributes that may have a codebook, in file order; positions and opacities never have (paper, section 3)."""
+
+
+def attribute_shapes(sh_degree: int) -> dict[str, tuple[int, ...]]:
+    """Shape of one splat's values by attribute."""
+    coefficients = sh_coefficients(sh_degree)
+    return {
+        name: tuple(coefficients if size < 0 else size for size in attribute.shape)
+        for name, attribute in ATTRIBUTES.items()
+    }
+
+
+def attribute_dims(sh_degree: int) -> dict[str, int]:
+    """Values per splat, D, by attribute; ``shN`` is the flattened ``[coefficients, 3]``."""
+    return {name: math.prod(shape) for name, shape in attribute_shapes(sh_degree).items()}
+
+
+def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int]]:
+    """Which rows are finite in all attributes.
+
+    Args:
+        attributes: Arrays or tensors ``[N, ...]`` by name, at least one.
+
+    Returns:
+        A boolean mask ``[N]`` and, for each attribute with non-finite rows, how many it has.
+    """
+    mask: Any = None
+    culprits: dict[str, int] = {}
+    for name, values in attributes.items():
+        array: Any = values
+        flags = np.isfinite(array) if isinstance(array, np.ndarray) else array.isfinite()
+        good = flags.reshape(len(array), math.prod(array.shape[1:])).all(1)
+        mask = good if mask is None else mask & good
+        if bad := len(array) - int(good.sum()):
+            culprits[name] = bad
+    return mask, culprits
+
+
+def listed(culprits: Mapping[str, int]) -> str:
+    """The attributes with non-finite rows, for a message."""
+    return ", ".join(f"{name} in {count} rows" for name, count in culprits.items())
+
+
+def dropped(mask: Any, culprits: Mapping[str, int]) -> str:
+    """The warning about rows that are left out, from both results of :func:`finite_rows`."""
+    return f"dropped {int((~mask).sum())} of {len(mask)} splats with non-finite values: {listed(culprits)}"
