@@ -328,8 +328,8 @@ def _parts(words: NDArray[np.uint32], *bits: int) -> NDArray[np.float64]:
     return np.stack(shares, axis=1)
 
 
-_ORDER = tuple(dict.fromkeys(("means", "normals", "sh0", "shN", "opacities", "scales", "quats", *ATTRIBUTES)))
-"""Order of the columns; the normals, which splats do not have, are 0."""
+_ORDER = tuple(dict.fromkeys(("means", "unused", "sh0", "shN", "opacities", "scales", "quats", *ATTRIBUTES)))
+"""Order of the columns; the normals of points, which splats do not have, are 0."""
 
 
 def write_ply(path: str | os.PathLike[str], scene: CompressedScene) -> int:
@@ -350,7 +350,7 @@ def write_ply(path: str | os.PathLike[str], scene: CompressedScene) -> int:
             # All red coefficients first; ours are [coefficient, channel].
             values = {name: scene.values(name, rows).swapaxes(1 if name == "shN" else -1, -1) for name in dims}
             columns = {name: values[name].reshape(len(values[name]), dim) for name, dim in dims.items()}
-            columns["normals"] = np.zeros_like(columns["means"])
+            columns["unused"] = np.zeros_like(columns["means"])
             file.write(np.concatenate([columns[name] for name in _ORDER], axis=1).astype("<f4", copy=False).tobytes())
         return file.tell()
 
@@ -363,7 +363,7 @@ def plain_ply_bytes(splats: int, sh_degree: int) -> int:
 
 def _header_text(count: int, sh_degree: int, antialiased: bool = False) -> bytes:
     comments = "".join(f"comment {key} {value}\n" for key, value in _MIP_COMMENTS.items()) if antialiased else ""
-    columns = splat_columns(sh_degree) | {"normals": ["nx", "ny", "nz"]}
+    columns = splat_columns(sh_degree) | {"unused": ["nx", "ny", "nz"]}
     properties = "".join(f"property float {column}\n" for name in _ORDER for column in columns[name])
     head = f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {count}\n{properties}end_header\n"
     return head.encode("ascii")
