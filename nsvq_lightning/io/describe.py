@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +83,7 @@ def _describe_nsvq(path: Path) -> dict[str, Any]:
         "sh_degree": header.sh_degree,
         "origin": list(header.origin),
         "bytes": total,
-        "attributes": [{**asdict(entry), "bits": entry.bits} for entry in header.attributes],
+        "attributes": [{**entry._asdict(), "bits": entry.bits} for entry in header.attributes],
         "streams": [{"name": "header", "encoding": "json", "bytes": header_bytes}, *streams],
         "config": header.config,
         "metrics": header.metrics,

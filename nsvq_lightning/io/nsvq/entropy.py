@@ -15,15 +15,7 @@ from numpy.typing import NDArray
 from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import INT32, INT64, UINT64, check_array, outside
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.io.nsvq.range_coder import (
-    decode_bit,
-    decode_plain,
-    decode_start,
-    encode_bit,
-    encode_end,
-    encode_plain,
-    new_contexts,
-)
+from nsvq_lightning.io.nsvq import range_coder as rc
 
 KEY_BITS = 63
 """Bits of a key; the highest is bit 62."""
@@ -62,7 +54,7 @@ def encode_paths(paths: NDArray[np.int64], bits: int, neighbours: NDArray[np.int
     check_array("paths", paths, (len(neighbours),), INT64)
     _check_paths(bits, neighbours)
     words = _room(len(paths) * bits)
-    used = _write_paths(paths, bits, neighbours, words, new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
+    used = _write_paths(paths, bits, neighbours, words, rc.new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
     return _bytes(words, used)
 
 
@@ -84,7 +76,7 @@ def decode_paths(data: bytes | memoryview, bits: int, neighbours: NDArray[np.int
     """
     _check_paths(bits, neighbours)
     paths, words = np.empty(len(neighbours), np.int64), _words(data)
-    used = _read_paths(words, bits, neighbours, paths, new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
+    used = _read_paths(words, bits, neighbours, paths, rc.new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
     _check_used(words, used)
     return paths
 
@@ -105,7 +97,7 @@ def encode_keys(keys: NDArray[np.uint64], depths: NDArray[np.int64]) -> bytes:
     if bool((keys[1:] < keys[:-1]).any()) or (len(keys) and keys[-1] > _KEY_MASK):
         raise ValueError(f"keys must ascend and be below 2^{KEY_BITS}, got {keys}; sort them")
     words = _room(int(depths.sum()) + 8 * len(keys))
-    return _bytes(words, _write_keys(keys, depths, words, new_contexts(_KEY_CONTEXTS)))
+    return _bytes(words, _write_keys(keys, depths, words, rc.new_contexts(_KEY_CONTEXTS)))
 
 
 def _check_depths(depths: NDArray[np.int64]) -> None:
@@ -124,7 +116,7 @@ def decode_keys(data: bytes | memoryview, depths: NDArray[np.int64]) -> NDArray[
     """
     _check_depths(depths)
     keys, words = np.empty(len(depths), np.uint64), _words(data)
-    used = _read_keys(words, depths, keys, new_contexts(_KEY_CONTEXTS))
+    used = _read_keys(words, depths, keys, rc.new_contexts(_KEY_CONTEXTS))
     if used == _OUTSIDE:
         raise FormatError("damaged: a position is outside its grid")
     _check_used(words, used)
@@ -149,7 +141,7 @@ def encode_integers(values: NDArray[np.int64]) -> bytes:
     by_steps = _size(steps) < _size(values)
     chosen = np.where(by_steps, steps, values)
     words = _room(int(_bit_lengths(chosen).sum()) + 8 * chosen.size)
-    used = _write_integers(chosen, words, new_contexts(_INTEGER_CONTEXTS * values.shape[1]))
+    used = _write_integers(chosen, words, rc.new_contexts(_INTEGER_CONTEXTS * values.shape[1]))
     return by_steps.astype(np.uint8).tobytes() + _bytes(words, used)
 
 
@@ -163,7 +155,7 @@ def decode_integers(data: bytes | memoryview, rows: int, columns: int) -> NDArra
         raise FormatError(f"damaged: {len(data)} bytes for {columns} columns of integers")
     by_steps = np.frombuffer(data[:columns], np.uint8).astype(bool)
     values, words = np.empty((rows, columns), np.int64), _words(data[columns:])
-    used = _read_integers(words, by_steps, values, new_contexts(_INTEGER_CONTEXTS * columns))
+    used = _read_integers(words, by_steps, values, rc.new_contexts(_INTEGER_CONTEXTS * columns))
     if used == _OUTSIDE:
         raise FormatError("damaged: an integer is not below 2^52 in size")
     _check_used(words, used)
@@ -232,24 +224,24 @@ def _write_paths(paths, bits, neighbours, words, contexts):  # type: ignore[no-u
         for left in range(bits - 1, plain - 1, -1):
             bit = (paths[i] >> left) & 1
             context = _context(first, second, path, left, bits)
-            low, width, used = encode_bit(bit, context, contexts, low, width, words, used)
+            low, width, used = rc.encode_bit(bit, context, contexts, low, width, words, used)
             path = 2 * path + bit
-        low, width, used = encode_plain(paths[i] & ((1 << plain) - 1), plain, low, width, words, used)
-    return encode_end(low, words, used)
+        low, width, used = rc.encode_plain(paths[i] & ((1 << plain) - 1), plain, low, width, words, used)
+    return rc.encode_end(low, words, used)
 
 
 @partial(kernel, parallel=False, allocates=False)
 def _read_paths(words, bits, neighbours, paths, contexts):  # type: ignore[no-untyped-def]
-    code, width, used = decode_start(words)
+    code, width, used = rc.decode_start(words)
     plain = max(0, bits - _MODELLED_BITS)
     for i in range(len(paths)):
         first, second = _path_of(paths, neighbours[i, 0]), _path_of(paths, neighbours[i, 1])
         path = np.int64(0)
         for left in range(bits - 1, plain - 1, -1):
             context = _context(first, second, path, left, bits)
-            bit, code, width, used = decode_bit(context, contexts, code, width, words, used)
+            bit, code, width, used = rc.decode_bit(context, contexts, code, width, words, used)
             path = 2 * path + bit
-        rest, code, width, used = decode_plain(plain, code, width, words, used)
+        rest, code, width, used = rc.decode_plain(plain, code, width, words, used)
         paths[i] = (path << plain) + np.int64(rest)
         if _ended(words, used):
             break
@@ -288,7 +280,7 @@ def _write_length(length, start, contexts, low, width, words, used):  # type: ig
     node = 1
     for left in range(_LENGTH_BITS - 1, -1, -1):
         bit = (length >> left) & 1
-        low, width, used = encode_bit(bit, start + node, contexts, low, width, words, used)
+        low, width, used = rc.encode_bit(bit, start + node, contexts, low, width, words, used)
         node = 2 * node + bit
     return low, width, used
 
@@ -297,7 +289,7 @@ def _write_length(length, start, contexts, low, width, words, used):  # type: ig
 def _read_length(start, contexts, code, width, words, used):  # type: ignore[no-untyped-def]
     node = 1
     for _ in range(_LENGTH_BITS):
-        bit, code, width, used = decode_bit(start + node, contexts, code, width, words, used)
+        bit, code, width, used = rc.decode_bit(start + node, contexts, code, width, words, used)
         node = 2 * node + bit
     return node - (1 << _LENGTH_BITS), code, width, used
 
@@ -325,14 +317,14 @@ def _write_keys(keys, depths, words, contexts):  # type: ignore[no-untyped-def]
         length = _length(step)
         start = _key_context(depths[i], before)
         low, width, used = _write_length(length, start, contexts, low, width, words, used)
-        low, width, used = encode_plain(_below(step, length), length - 1, low, width, words, used)
+        low, width, used = rc.encode_plain(_below(step, length), length - 1, low, width, words, used)
         last, before = keys[i], (length + np.int64(shift) if length else 0)
-    return encode_end(low, words, used)
+    return rc.encode_end(low, words, used)
 
 
 @partial(kernel, parallel=False, allocates=False)
 def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
-    code, width, used = decode_start(words)
+    code, width, used = rc.decode_start(words)
     last, before = uint64(0), 0
     for i in range(len(keys)):
         shift = uint64(KEY_BITS - depths[i])
@@ -340,7 +332,7 @@ def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
         length, code, width, used = _read_length(start, contexts, code, width, words, used)
         if length > depths[i]:
             return _OUTSIDE
-        rest, code, width, used = decode_plain(length - 1, code, width, words, used)
+        rest, code, width, used = rc.decode_plain(length - 1, code, width, words, used)
         step = (uint64(1) << uint64(length - 1)) | rest if length else uint64(0)
         last = ((last >> shift) + step) << shift  # of two numbers below 2^63: no carry is lost
         if last > _KEY_MASK:
@@ -380,29 +372,29 @@ def _write_integers(values, words, contexts):  # type: ignore[no-untyped-def]
             start = _INTEGER_CONTEXTS * j
             low, width, used = _write_length(length, start, contexts, low, width, words, used)
             if length > 0:
-                low, width, used = encode_plain(values[i, j] < 0, 1, low, width, words, used)
+                low, width, used = rc.encode_plain(values[i, j] < 0, 1, low, width, words, used)
             if length > 1:
                 second = np.int64(size >> uint64(length - 2)) & 1
                 context = _second_context(start, length)
-                low, width, used = encode_bit(second, context, contexts, low, width, words, used)
-                low, width, used = encode_plain(_below(size, length - 1), length - 2, low, width, words, used)
-    return encode_end(low, words, used)
+                low, width, used = rc.encode_bit(second, context, contexts, low, width, words, used)
+                low, width, used = rc.encode_plain(_below(size, length - 1), length - 2, low, width, words, used)
+    return rc.encode_end(low, words, used)
 
 
 @partial(kernel, parallel=False, allocates=False)
 def _read_integers(words, by_steps, values, contexts):  # type: ignore[no-untyped-def]
-    code, width, used = decode_start(words)
+    code, width, used = rc.decode_start(words)
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
             start = _INTEGER_CONTEXTS * j
             length, code, width, used = _read_length(start, contexts, code, width, words, used)
             sign, size = uint64(0), uint64(min(length, 1))
             if length > 0:
-                sign, code, width, used = decode_plain(1, code, width, words, used)
+                sign, code, width, used = rc.decode_plain(1, code, width, words, used)
             if length > 1:
                 context = _second_context(start, length)
-                second, code, width, used = decode_bit(context, contexts, code, width, words, used)
-                rest, code, width, used = decode_plain(length - 2, code, width, words, used)
+                second, code, width, used = rc.decode_bit(context, contexts, code, width, words, used)
+                rest, code, width, used = rc.decode_plain(length - 2, code, width, words, used)
                 size = ((uint64(2) | uint64(second)) << uint64(length - 2)) | rest
             value = -np.int64(size) if sign else np.int64(size)
             if by_steps[j] and i > 0:

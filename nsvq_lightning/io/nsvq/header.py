@@ -23,28 +23,31 @@ import os
 import struct
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, astuple, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 from nsvq_lightning.io.errors import FormatError, naming_file
 
-PREFIX_BYTES = 32
-"""Bytes before the JSON, see :mod:`nsvq_lightning.io.nsvq.header`."""
+MAGIC = b"\x89NSVQ\r\n\x1a"
+VERSION = 2
+READABLE = (1, 2)
+"""Versions that are read; the header of version 1 spells out the columns of its tables in every row."""
 
+_PREFIX = struct.Struct("<8s16sII")
+_DIGEST_END = 24
 _T = TypeVar("_T")
 
 
-@dataclass(frozen=True)
-class AttributeEntry:
+class AttributeEntry(NamedTuple):
     """How one attribute of the splats is stored.
 
     Attributes:
         name: Attribute, for example ``quats``.
         dim: Values per splat, D.
         storage: ``raw`` (float32, one row per splat), ``codes`` (rows of a codebook), ``steps`` (integers, one row per
-            splat), ``levels`` (equal steps of [0, 1]), or ``grid`` (cells of a grid).
+            splat), ``levels`` (equal steps of [0, 1]), or ``cells`` (of a grid; ``grid`` in version 1).
         codes: Rows of the codebook K, or number of levels; 0 where there are none.
         step: Step of which the integers of this attribute, or of its codebook, are multiples; 0 for float32.
     """
@@ -61,8 +64,7 @@ class AttributeEntry:
         return max(0, self.codes - 1).bit_length()
 
 
-@dataclass(frozen=True)
-class StreamEntry:
+class StreamEntry(NamedTuple):
     """One run of bytes.
 
     Attributes:
@@ -103,7 +105,7 @@ class Header:
     @property
     def size(self) -> int:
         """Bytes before the first stream: prefix and JSON."""
-        return PREFIX_BYTES + len(self.to_json())
+        return _PREFIX.size + len(self.to_json())
 
     @property
     def file_bytes(self) -> int:
@@ -118,9 +120,8 @@ class Header:
         """
         try:
             table = asdict(self)
-            table["attributes"] = [astuple(entry) for entry in self.attributes]
-            table["streams"] = [astuple(stream) for stream in self.streams]
-            table["metrics"] = {name: _finite_or_none(value) for name, value in self.metrics.items()}
+            for name, value in self.metrics.items():
+                table["metrics"][name] = None if value is None or not math.isfinite(value) else value
             text = json.dumps(table, sort_keys=True, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
             return text.encode()
         except (TypeError, ValueError, RecursionError) as error:
@@ -139,18 +140,22 @@ class Header:
             raise FormatError(f"damaged: the header is not JSON ({error})") from None
         header = cls(
             level=_entry(table, "level", str),
-            splats=_size(table, "splats"),
-            sh_degree=_size(table, "sh_degree"),
-            origin=_origin(table),
-            attributes=tuple(_attribute(row) for row in _rows(table, "attributes", AttributeEntry)),
-            streams=tuple(_stream(row) for row in _rows(table, "streams", StreamEntry)),
+            splats=_entry(table, "splats", int),
+            sh_degree=_entry(table, "sh_degree", int),
+            origin=_origin(_entry(table, "origin", list)),
+            attributes=tuple(_row(AttributeEntry, row) for row in _entry(table, "attributes", list)),
+            streams=tuple(_row(StreamEntry, row) for row in _entry(table, "streams", list)),
             config=_entry(table, "config", dict),
-            metrics=_metrics(table),
+            metrics=_entry(table, "metrics", dict),
         )
         if header.sh_degree > 3:
             raise FormatError(f"damaged: SH degree {header.sh_degree}, the highest is 3")
         if len({stream.name for stream in header.streams}) != len(header.streams):
             raise FormatError("damaged: two streams have the same name")
+        if any(
+            isinstance(value, bool) or not isinstance(value, int | float | None) for value in header.metrics.values()
+        ):
+            raise FormatError("damaged: header entry 'metrics' must hold numbers only")
         return header
 
 
@@ -158,83 +163,32 @@ def _no_number(name: str) -> None:
     raise ValueError(f"it holds {name}, which JSON does not have")
 
 
-def _rows(table: object, key: str, kind: type[AttributeEntry | StreamEntry]) -> list[dict[str, Any]]:
-    """The entries of a table; version 1 of the format wrote dictionaries, which hold more than what is used."""
-    rows, columns = _items(table, key, (dict, list)), [column.name for column in fields(kind)]
-    if any(isinstance(row, list) and len(row) != len(columns) for row in rows):
-        raise FormatError(f"damaged: a row of header entry {key!r} does not hold {', '.join(columns)}")
-    return [row if isinstance(row, dict) else dict(zip(columns, row, strict=True)) for row in rows]
-
-
-def _attribute(row: dict[str, Any]) -> AttributeEntry:
-    return AttributeEntry(
-        name=_entry(row, "name", str),
-        dim=_size(row, "dim"),
-        storage=_entry(row, "storage", str),
-        codes=_size(row, "codes"),
-        step=_finite(row, "step"),
-    )
-
-
-def _stream(row: dict[str, Any]) -> StreamEntry:
-    return StreamEntry(_entry(row, "name", str), _size(row, "length"), _entry(row, "encoding", str))
-
-
 def _entry(table: object, key: str, kind: type[_T]) -> _T:
-    value = table.get(key) if isinstance(table, dict) else None
-    if not isinstance(value, kind) or isinstance(value, bool):
-        raise FormatError(f"damaged: header entry {key!r} must be of type {kind.__name__}, got {str(value)[:60]!r}")
-    return value
+    """An entry of a type; numbers must be finite and not negative, and a step may be missing, as in version 1."""
+    value: Any = table.get(key, 0.0 if kind is float else None) if isinstance(table, dict) else None
+    number = kind in (int, float)
+    fits = isinstance(value, int | float if kind is float else kind) and not isinstance(value, bool)
+    if not fits or (number and not 0 <= value <= sys.float_info.max):
+        expected = f"{kind.__name__}, finite and not negative" if number else kind.__name__
+        raise FormatError(f"damaged: header entry {key!r} must be of type {expected}, got {str(value)[:60]!r}")
+    return float(value) if kind is float else value  # type: ignore[return-value]
 
 
-def _size(table: object, key: str) -> int:
-    value = _entry(table, key, int)
-    if value < 0:
-        raise FormatError(f"damaged: header entry {key!r} must not be negative, got {value}")
-    return value
+def _row(kind: type[_T], row: object) -> _T:
+    """A row of a table; version 1 of the format wrote dictionaries, which hold more than what is used."""
+    columns = get_type_hints(kind)
+    if isinstance(row, list) and len(row) != len(columns):
+        raise FormatError(f"damaged: a row of the header's tables does not hold {', '.join(columns)}")
+    named = dict(zip(columns, row, strict=True)) if isinstance(row, list) else row
+    return kind(**{name: _entry(named, name, column) for name, column in columns.items()})
 
 
-def _items(table: object, key: str, kinds: tuple[type, ...]) -> list[Any]:
-    values = _entry(table, key, list)
-    if any(not isinstance(value, kinds) or isinstance(value, bool) for value in values):
-        raise FormatError(f"damaged: header entry {key!r} has a member of the wrong type")
-    return values
-
-
-def _finite(table: object, key: str) -> float:
-    value = table.get(key, 0.0) if isinstance(table, dict) else None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= sys.float_info.max:
-        raise FormatError(
-            f"damaged: header entry {key!r} must be a finite number, not negative, got {str(value)[:60]!r}"
-        )
-    return float(value)
-
-
-def _origin(table: object) -> tuple[float, float, float]:
-    values = _items(table, "origin", (int, float))
+def _origin(values: list[Any]) -> tuple[float, float, float]:
+    numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
     # Comparing is safe; float() of a huge integer would overflow.
-    if len(values) != 3 or not all(abs(value) <= sys.float_info.max for value in values):
+    if len(values) != 3 or not numbers or not all(abs(value) <= sys.float_info.max for value in values):
         raise FormatError("damaged: header entry 'origin' must be three finite numbers")
     return float(values[0]), float(values[1]), float(values[2])
-
-
-def _metrics(table: object) -> dict[str, float | None]:
-    metrics = _entry(table, "metrics", dict)
-    if any(isinstance(value, bool) or not isinstance(value, int | float | None) for value in metrics.values()):
-        raise FormatError("damaged: header entry 'metrics' must hold numbers only")
-    return metrics
-
-
-def _finite_or_none(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
-
-
-MAGIC = b"\x89NSVQ\r\n\x1a"
-VERSION = 2
-READABLE = (1, 2)
-"""Versions that are read; the header of version 1 spells out the columns of its tables in every row."""
-_PREFIX = struct.Struct("<8s16sII")
-_DIGEST_START, _DIGEST_END = 8, 24
 
 
 def frame(header: Header, streams: Mapping[str, bytes]) -> list[bytes]:
@@ -248,7 +202,7 @@ def frame(header: Header, streams: Mapping[str, bytes]) -> list[bytes]:
         raise ValueError(f"streams {lengths} do not fit the stream table {header.streams}")
     text = header.to_json()
     parts = [struct.pack("<II", VERSION, len(text)), text, *(streams[stream.name] for stream in header.streams)]
-    digest = blake2b(digest_size=_DIGEST_END - _DIGEST_START)
+    digest = blake2b(digest_size=16)
     for part in parts:
         digest.update(part)
     return [MAGIC, digest.digest(), *parts]
