@@ -110,17 +110,8 @@ def encode_compact(scene: CompressedScene, precision: Precision | None = None) -
     entries = {name: task.result().entry for name, task in rounding.items()}
     entries["means"] = AttributeEntry("means", 3, "cells", step=places.grid.step)
     attributes = tuple(entries[name] for name in _order("cells"))
-    header = Header(
-        level="compact",
-        splats=len(scene),
-        sh_degree=scene.sh_degree,
-        origin=(float(scene.origin[0]), float(scene.origin[1]), float(scene.origin[2])),
-        attributes=attributes,
-        streams=tuple(StreamEntry(name, len(streams[name]), kind) for name, kind in _stream_names(attributes)),
-        config=dict(scene.config),
-        metrics=dict(scene.metrics),
-    )
-    return header, streams
+    entry_of = tuple(StreamEntry(name, len(streams[name]), kind) for name, kind in _stream_names(attributes))
+    return Header.of(scene, "compact", attributes, entry_of), streams
 
 
 def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene:
@@ -150,10 +141,7 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
         codes={name: coded[name].values for name in QUANTIZABLE if name in coded},
         codebooks={name: coded[name].floats() for name in QUANTIZABLE if name in coded},
         raw={name: stored[name].floats() for name in QUANTIZABLE if name not in coded},
-        sh_degree=header.sh_degree,
-        config=header.config,
-        metrics=header.metrics,
-        origin=header.origin,
+        **header.of_scene,
     )
 
 

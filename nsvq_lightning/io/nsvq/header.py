@@ -28,6 +28,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_type_hints
 
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 
 MAGIC = b"\x89NSVQ\r\n\x1a"
@@ -101,6 +102,24 @@ class Header:
     streams: tuple[StreamEntry, ...]
     config: dict[str, Any] = field(default_factory=dict)
     metrics: dict[str, float | None] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        scene: CompressedScene,
+        level: str,
+        attributes: tuple[AttributeEntry, ...],
+        streams: tuple[StreamEntry, ...],
+    ) -> Header:
+        """Header of the file of a scene."""
+        x, y, z = map(float, scene.origin)
+        told = dict(scene.config), dict(scene.metrics)
+        return cls(level, len(scene), scene.sh_degree, (x, y, z), attributes, streams, *told)
+
+    @property
+    def of_scene(self) -> dict[str, Any]:
+        """What a scene has from its header as it is."""
+        return {name: getattr(self, name) for name in ("sh_degree", "config", "metrics", "origin")}
 
     @property
     def size(self) -> int:

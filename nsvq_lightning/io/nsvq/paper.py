@@ -25,8 +25,6 @@ from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims
 _CHUNK = 1 << 14
 """Rows per chunk: a multiple of 8, so that every chunk ends on a whole byte, and small enough for the cache."""
 
-_MAX_BITS = 32
-
 
 def packed_bytes(rows: int, widths: Sequence[int]) -> int:
     """Length of the packed stream, ⌈rows · Σ widths / 8⌉ bytes."""
@@ -40,85 +38,49 @@ def pack_fields(fields: Sequence[NDArray[np.integer]], widths: Sequence[int]) ->
     after the last row are 0.
 
     Args:
-        fields: Non-negative integer arrays ``[N]``, at least one.
+        fields: Integer arrays ``[N]``, at least one, each number not negative and within its width.
         widths: Bits of each field, 0 to 32. A field of 0 bits holds only zeros and takes no space.
 
     Returns:
         :func:`packed_bytes` bytes.
-
-    Raises:
-        ValueError: A value does not fit into its width, or the arrays differ in length.
     """
-    _check_widths(widths)
-    rows = len(fields[0])
-    for field, width in zip(fields, widths, strict=True):
-        if field.shape != (rows,):
-            raise ValueError(f"all fields must have shape [{rows}], got {list(field.shape)}")
-        if rows and (int(field.min()) < 0 or int(field.max()) >> width):
-            raise ValueError(f"values {field.min()}..{field.max()} do not fit into {width} bits")
-    return b"".join(
-        _pack_chunk([field[start : start + _CHUNK] for field in fields], widths) for start in range(0, rows, _CHUNK)
-    )
+    chunks = []
+    for start in range(0, len(fields[0]), _CHUNK):
+        number_bytes = (field[start : start + _CHUNK].astype("<u4").view(np.uint8).reshape(-1, 4) for field in fields)
+        columns = [
+            np.unpackbits(numbers, axis=1, count=width, bitorder="little")
+            for numbers, width in zip(number_bytes, widths, strict=True)
+        ]
+        chunks.append(np.packbits(np.concatenate(columns, axis=1), bitorder="little").tobytes())
+    return b"".join(chunks)
 
 
 def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) -> list[NDArray[np.unsignedinteger]]:
     """Invert :func:`pack_fields`.
 
     Args:
-        data: The packed stream.
+        data: The packed stream, :func:`packed_bytes` bytes.
         rows: N.
         widths: Bits of each field, 0 to 32.
 
     Returns:
         One array ``[N]`` per field: uint16 up to 16 bits, uint32 above.
-
-    Raises:
-        ValueError: ``data`` does not have exactly :func:`packed_bytes` bytes.
     """
-    _check_widths(widths)
-    if len(data) != packed_bytes(rows, widths):
-        raise ValueError(f"{rows} rows of {sum(widths)} bits need {packed_bytes(rows, widths)} bytes, got {len(data)}")
-    packed = np.frombuffer(data, np.uint8)
+    packed, record = np.frombuffer(data, np.uint8), sum(widths)
     fields: list[NDArray[np.unsignedinteger]] = [
         np.zeros(rows, np.uint16 if width <= 16 else np.uint32) for width in widths
     ]
-    chunk_bytes = _CHUNK * sum(widths) // 8
-    for chunk, start in enumerate(range(0, rows, _CHUNK)):
-        parts = [field[start : start + _CHUNK] for field in fields]
-        _unpack_chunk(packed[chunk * chunk_bytes : (chunk + 1) * chunk_bytes], parts, widths)
+    for start in range(0, rows, _CHUNK):
+        count = min(_CHUNK, rows - start)
+        chunk = packed[start * record // 8 : (start + _CHUNK) * record // 8]
+        bits = np.unpackbits(chunk, count=count * record, bitorder="little").reshape(count, record)
+        first = 0
+        for field, width in zip(fields, widths, strict=True):
+            number_bytes = np.packbits(bits[:, first : first + width], axis=1, bitorder="little")
+            for position, column in enumerate(number_bytes.T):
+                field[start : start + count] |= column.astype(field.dtype) << np.array(8 * position, field.dtype)
+            first += width
     return fields
-
-
-def _check_widths(widths: Sequence[int]) -> None:
-    if any(not 0 <= width <= _MAX_BITS for width in widths):
-        raise ValueError(f"fields must have 0 to {_MAX_BITS} bits, got {list(widths)}")
-
-
-def _pack_chunk(fields: Sequence[NDArray[np.integer]], widths: Sequence[int]) -> bytes:
-    columns = [
-        np.unpackbits(field.astype("<u4").view(np.uint8).reshape(-1, 4), axis=1, count=width, bitorder="little")
-        for field, width in zip(fields, widths, strict=True)
-        if width
-    ]
-    return np.packbits(np.concatenate(columns, axis=1), bitorder="little").tobytes() if columns else b""
-
-
-def _unpack_chunk(
-    packed: NDArray[np.uint8], fields: Sequence[NDArray[np.unsignedinteger]], widths: Sequence[int]
-) -> None:
-    rows, record = len(fields[0]), sum(widths)
-    bits = np.unpackbits(packed, count=rows * record, bitorder="little").reshape(rows, record)
-    start = 0
-    for field, width in zip(fields, widths, strict=True):
-        if width:
-            value_bytes = np.packbits(bits[:, start : start + width], axis=1, bitorder="little")
-            for position in range(value_bytes.shape[1]):
-                field |= value_bytes[:, position].astype(field.dtype) << np.array(8 * position, field.dtype)
-        start += width
-
-
-_FLOATS = "float32"
-_BITS = "bits"
 
 
 def paper_header(scene: CompressedScene) -> Header:
@@ -128,25 +90,16 @@ def paper_header(scene: CompressedScene) -> Header:
         AttributeEntry(name, dim, "codes", rows[name]) if name in rows else AttributeEntry(name, dim, "raw")
         for name, dim in _dims(scene.sh_degree).items()
     )
-    return Header(
-        level="paper",
-        splats=len(scene),
-        sh_degree=scene.sh_degree,
-        origin=(float(scene.origin[0]), float(scene.origin[1]), float(scene.origin[2])),
-        attributes=attributes,
-        streams=_layout(len(scene), attributes),
-        config=dict(scene.config),
-        metrics=dict(scene.metrics),
-    )
+    return Header.of(scene, "paper", attributes, _layout(len(scene), attributes))
 
 
 def encode_paper(scene: CompressedScene) -> tuple[Header, dict[str, bytes]]:
     """Header and streams of a scene."""
     header = paper_header(scene)
     coded = [entry for entry in header.attributes if entry.storage == "codes"]
-    streams = {"means": _float_bytes(scene.means), "opacities": _float_bytes(scene.opacities)}
-    streams |= {name: _float_bytes(values) for name, values in scene.raw.items()}
-    streams |= {f"{name}.codebook": _float_bytes(values) for name, values in scene.codebooks.items()}
+    floats = {"means": scene.means, "opacities": scene.opacities, **scene.raw}
+    floats |= {f"{name}.codebook": values for name, values in scene.codebooks.items()}
+    streams = {name: values.astype("<f4", copy=False).tobytes() for name, values in floats.items()}
     if coded:
         streams["codes"] = pack_fields([scene.codes[entry.name] for entry in coded], [entry.bits for entry in coded])
     return header, streams
@@ -172,10 +125,7 @@ def decode_paper(header: Header, streams: Mapping[str, memoryview]) -> Compresse
                 entry.name: _floats(streams[f"{entry.name}.codebook"], entry.codes, entry.dim) for entry in coded
             },
             raw={entry.name: _floats(streams[entry.name], n, entry.dim) for entry in raw},
-            sh_degree=header.sh_degree,
-            config=header.config,
-            metrics=header.metrics,
-            origin=header.origin,
+            **header.of_scene,
         )
     except ValueError as error:
         raise FormatError(f"damaged: {error}") from None
@@ -191,9 +141,9 @@ def _layout(n: int, attributes: tuple[AttributeEntry, ...]) -> tuple[StreamEntry
     """The streams: raw attributes, codes, codebooks."""
     coded = [entry for entry in attributes if entry.storage == "codes"]
     return (
-        *(StreamEntry(entry.name, 4 * n * entry.dim, _FLOATS) for entry in attributes if entry.storage == "raw"),
-        *([StreamEntry("codes", packed_bytes(n, [entry.bits for entry in coded]), _BITS)] if coded else []),
-        *(StreamEntry(f"{entry.name}.codebook", 4 * entry.codes * entry.dim, _FLOATS) for entry in coded),
+        *(StreamEntry(entry.name, 4 * n * entry.dim, "float32") for entry in attributes if entry.storage == "raw"),
+        *([StreamEntry("codes", packed_bytes(n, [entry.bits for entry in coded]), "bits")] if coded else []),
+        *(StreamEntry(f"{entry.name}.codebook", 4 * entry.codes * entry.dim, "float32") for entry in coded),
     )
 
 
@@ -209,10 +159,6 @@ def _check_tables(header: Header) -> None:
             raise FormatError(f"damaged: impossible attribute {entry}")
     if header.streams != _layout(header.splats, header.attributes):
         raise FormatError("damaged: the stream table does not fit the attribute table and the number of splats")
-
-
-def _float_bytes(values: NDArray[np.float32]) -> bytes:
-    return values.astype("<f4", copy=False).tobytes()
 
 
 def _floats(data: memoryview, rows: int, dim: int) -> NDArray[np.float32]:
