@@ -17,8 +17,6 @@ from nsvq_lightning.rendering.constants import ALPHA_MAX
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 
-__all__ = ["floaters", "removal_effects"]
-
 log = logging.getLogger(__name__)
 
 PROBES = 4

@@ -30,20 +30,6 @@ from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.canonical_covariance import canonical
 from nsvq_lightning.splats.splats import RawSplats, detached
 
-__all__ = [
-    "LADDER",
-    "MEASURED",
-    "PLAIN",
-    "PLAINS",
-    "Candidate",
-    "Compressor",
-    "Rung",
-    "finest_within",
-    "smallest_within",
-    "tuned",
-]
-
-
 FINAL = 0.05
 """Learning rates at the end, as a share of those at the start."""
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.io.ply import read_ply_columns, read_ply_size
+from nsvq_lightning.io.ply import read_ply_columns, read_ply_header
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 
@@ -24,7 +24,7 @@ def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     if not path.is_file():
         raise SceneError(f"points {path} do not exist: copy the file, or remove ply_file_path from the transforms file")
     try:
-        header, _ = read_ply_size(path)
+        header = read_ply_header(path)
         if missing := [axis for axis in "xyz" if axis not in header.properties]:
             raise FormatError(f"{path}: its vertices have no {', '.join(missing)}")
         rgb = ("red", "green", "blue")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +13,11 @@ from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.formats import FORMATS
 from nsvq_lightning.io.nsvq.header import MAGIC, read_header
 from nsvq_lightning.io.numbers import opacity_of
-from nsvq_lightning.io.ply import PLY_MAGIC, attribute_bytes, plain_ply_bytes, read_ply_size, splat_degree
+from nsvq_lightning.io.ply import PLY_MAGIC, attribute_bytes, plain_ply_bytes, read_ply_header, splat_degree
 from nsvq_lightning.io.sog import META, ZIP_MAGIC, read_sog_header
 from nsvq_lightning.io.splat import SPLAT_LAYOUT, count_splats
 from nsvq_lightning.io.spz import DEFAULT_AXES, SPZ_MAGICS, read_spz_header
 from nsvq_lightning.splats.conventions import unit
-
-__all__ = ["attribute_errors", "describe"]
 
 
 def attribute_errors(read: CompressedScene, written: CompressedScene) -> dict[str, float]:
@@ -60,21 +57,21 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
     path = Path(path)
     with open(path, "rb") as file:
         start = file.read(len(MAGIC))
-    for magics, describer in _DESCRIBERS:
-        if start.startswith(magics):
-            facts = describer(path)
-            break
-    else:
-        if path.suffix.lower() != ".splat":
-            raise FormatError(f"{path}: not a {', '.join(FORMATS)} file", "give the file of a scene")
-        facts = _describe_splat(path)
-    facts["plain_bytes"] = plain_ply_bytes(facts["splats"], facts["sh_degree"])
-    facts["ratio"] = facts["plain_bytes"] / max(1, facts["bytes"])  # an empty .splat has no bytes
-    return {"file": str(path), **facts}
+    total = path.stat().st_size
+    facts = _describe_nsvq(path, total) if start.startswith(MAGIC) else _describe_others(path, start, total)
+    plain_bytes = plain_ply_bytes(facts["splats"], facts["sh_degree"])
+    # An empty .splat has no bytes.
+    return {
+        "file": str(path),
+        **facts,
+        "bytes": total,
+        "plain_bytes": plain_bytes,
+        "ratio": plain_bytes / max(1, total),
+    }
 
 
-def _describe_nsvq(path: Path) -> dict[str, Any]:
-    header, total = read_header(path), path.stat().st_size
+def _describe_nsvq(path: Path, total: int) -> dict[str, Any]:
+    header = read_header(path)
     streams = [{"name": s.name, "encoding": s.encoding, "bytes": s.length} for s in header.streams]
     header_bytes = total - sum(stream.length for stream in header.streams)
     return {
@@ -82,7 +79,6 @@ def _describe_nsvq(path: Path) -> dict[str, Any]:
         "splats": header.splats,
         "sh_degree": header.sh_degree,
         "origin": list(header.origin),
-        "bytes": total,
         "attributes": [{**entry._asdict(), "bits": entry.bits} for entry in header.attributes],
         "streams": [{"name": "header", "encoding": "json", "bytes": header_bytes}, *streams],
         "config": header.config,
@@ -90,61 +86,27 @@ def _describe_nsvq(path: Path) -> dict[str, Any]:
     }
 
 
-def _describe_ply(path: Path) -> dict[str, Any]:
-    header, total = read_ply_size(path)
-    with naming_file(path):
-        sh_degree = splat_degree(header)
-    sizes = attribute_bytes(header)
-    # The lengths of ascii numbers vary, so only the total is known.
-    streams = {"header": total - sum(sizes.values()), **sizes} if header.encoding != "ascii" else {"text": total}
-    name = "compressed" if header.packed else header.encoding
-    return _facts(f"ply, {name}", header.count, sh_degree, total, streams, "ply")
-
-
-def _describe_sog(path: Path) -> dict[str, Any]:
-    count, sh_degree, sizes = read_sog_header(path)
-    total = path.stat().st_size
-    return _facts("sog, version 2", count, sh_degree, total, {**sizes, "zip": total - sum(sizes.values())}, "webp")
-
-
-def _describe_spz(path: Path) -> dict[str, Any]:
-    header, streams = read_spz_header(path)
-    encoding = "zstd" if header.version == 4 else "gzip"
-    total = path.stat().st_size
-    axes = header.axes or f"not stated, taken as {DEFAULT_AXES.upper()}"
-    return _facts(
-        f"spz, version {header.version}, axes {axes}", header.count, header.sh_degree, total, streams, encoding
-    )
-
-
-def _describe_splat(path: Path) -> dict[str, Any]:
-    count = count_splats(path)
-    sizes = {name: count * size for name, size in SPLAT_LAYOUT.items()}
-    return _facts("splat", count, 0, sum(sizes.values()), sizes, "splat")
-
-
-def _facts(
-    name: str, splats: int, sh_degree: int, total: int, streams: Mapping[str, int], encoding: str
-) -> dict[str, Any]:
-    return {
-        "format": name,
-        "splats": splats,
-        "sh_degree": sh_degree,
-        "bytes": total,
-        "streams": [
-            {"name": stream, "encoding": _OUTSIDE.get(stream, encoding), "bytes": size}
-            for stream, size in streams.items()
-        ],
-    }
-
-
-_OUTSIDE = {"header": "plain", META: "json", "zip": "zip"}
-"""The part of a file around the streams, and how it is encoded."""
-
-_DESCRIBERS: tuple[tuple[bytes | tuple[bytes, ...], Callable[[Path], dict[str, Any]]], ...] = (
-    (MAGIC, _describe_nsvq),
-    (PLY_MAGIC, _describe_ply),
-    (ZIP_MAGIC, _describe_sog),
-    (SPZ_MAGICS, _describe_spz),
-)
-"""First bytes of each format, and the function that describes it."""
+def _describe_others(path: Path, start: bytes, total: int) -> dict[str, Any]:
+    if start.startswith(PLY_MAGIC):
+        ply = read_ply_header(path)
+        with naming_file(path):
+            count, sh_degree = ply.count, splat_degree(ply)
+        kind, encoding = f"ply, {'compressed' if ply.packed else ply.encoding}", "ply"
+        # The lengths of ascii numbers vary, so only the total is known.
+        sizes = attribute_bytes(ply) if ply.encoding != "ascii" else {}
+        sizes = {"header": total - sum(sizes.values()), **sizes} if sizes else {"text": total}
+    elif start.startswith(ZIP_MAGIC):
+        count, sh_degree, sizes = read_sog_header(path)
+        kind, encoding, sizes = "sog, version 2", "webp", {**sizes, "zip": total - sum(sizes.values())}
+    elif start.startswith(SPZ_MAGICS):
+        spz, sizes = read_spz_header(path)
+        count, sh_degree, encoding = spz.count, spz.sh_degree, "zstd" if spz.version == 4 else "gzip"
+        kind = f"spz, version {spz.version}, axes {spz.axes or f'not stated, taken as {DEFAULT_AXES.upper()}'}"
+    elif path.suffix.lower() == ".splat":
+        count, sh_degree, kind, encoding = count_splats(path), 0, "splat", "splat"
+        sizes = {name: count * size for name, size in SPLAT_LAYOUT.items()}
+    else:
+        raise FormatError(f"{path}: not a {', '.join(FORMATS)} file", "give the file of a scene")
+    around = {"header": "plain", META: "json", "zip": "zip"}
+    streams = [{"name": s, "encoding": around.get(s, encoding), "bytes": size} for s, size in sizes.items()]
+    return {"format": kind, "splats": count, "sh_degree": sh_degree, "streams": streams}

@@ -8,7 +8,6 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
@@ -76,13 +75,25 @@ class PlyHeader:
 
 
 def read_ply_header(path: str | os.PathLike[str]) -> PlyHeader:
-    """Parse only the header; the size of the data is not checked.
+    """Header of a ``.ply`` file that is long enough for its vertices.
 
     Raises:
-        FormatError: The header is truncated or malformed, or has no vertices.
+        FormatError: The header is truncated or malformed, or has no vertices; or the rest is truncated.
     """
-    with open(path, "rb") as file:
-        start = file.read(1 << 20)
+    with naming_file(path), open(path, "rb") as file:
+        header, file_bytes = _parsed(file.read(1 << 20)), os.fstat(file.fileno()).st_size
+        # An ascii value takes at least one digit and one separator; the last separator may be missing.
+        row_bytes = 2 * len(header.properties) if header.encoding == "ascii" else header.dtype.itemsize
+        needed = header.offset + header.count * row_bytes - (header.encoding == "ascii" and header.count > 0)
+        if header.packed:
+            needed = max(needed, *(header.others[name].end for name in ("chunk", "sh") if name in header.others))
+        if needed > file_bytes:
+            raise FormatError(f"truncated: {header.count} vertices need {needed} bytes, the file has {file_bytes}")
+    return header
+
+
+def _parsed(start: bytes) -> PlyHeader:
+    """Header from the first bytes of a file."""
     end = re.search(rb"\nend_header[ \t]*\r?\n", start)
     if not re.match(rb"ply[ \t]*\r?\n", start):
         raise FormatError("not a .ply file: it does not start with the line 'ply'")
@@ -132,24 +143,6 @@ def _elements(lines: list[list[str]], encoding: str, offset: int) -> dict[str, P
         else:
             offset = found[name].end
     return found
-
-
-def read_ply_size(path: str | os.PathLike[str]) -> tuple[PlyHeader, int]:
-    """Header and size in bytes of a ``.ply`` file that is long enough for its vertices.
-
-    Raises:
-        FormatError: The file is truncated, or no ``.ply``.
-    """
-    with naming_file(path):
-        header, file_bytes = read_ply_header(path), Path(path).stat().st_size
-        # An ascii value takes at least one digit and one separator; the last separator may be missing.
-        row_bytes = 2 * len(header.properties) if header.encoding == "ascii" else header.dtype.itemsize
-        needed = header.offset + header.count * row_bytes - (header.encoding == "ascii" and header.count > 0)
-        if header.packed:
-            needed = max(needed, *(header.others[name].end for name in ("chunk", "sh") if name in header.others))
-        if needed > file_bytes:
-            raise FormatError(f"truncated: {header.count} vertices need {needed} bytes, the file has {file_bytes}")
-    return header, file_bytes
 
 
 def splat_columns(sh_degree: int) -> dict[str, list[str]]:
@@ -221,7 +214,7 @@ def read_ply(path: str | os.PathLike[str]) -> CompressedScene:
     Raises:
         FormatError: The file is truncated, or not a ``.ply`` of Gaussian splats.
     """
-    header, _ = read_ply_size(path)
+    header = read_ply_header(path)
     with naming_file(path):
         sh_degree = splat_degree(header)
     read = _read_packed if header.packed else _read_plain

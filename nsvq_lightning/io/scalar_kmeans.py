@@ -11,7 +11,7 @@ _STEPS = 500
 """Largest number of Lloyd steps; each costs one search of 256 borders, whatever the number of values."""
 
 
-def best_levels(
+def scalar_kmeans(
     values: NDArray[np.float32], weight: NDArray[np.integer] | None = None, count: int = 256
 ) -> NDArray[np.float32]:
     """Levels ``[count]``, ascending, that nearly minimize the mean squared distance of values to their nearest level.
@@ -33,7 +33,14 @@ def best_levels(
         padded = np.concatenate([numbers, np.full(count - len(numbers), numbers[-1] if len(numbers) else 0.0)])
         return padded.astype(np.float32)
     cells = _Cells(numbers, mass)
-    return _lloyd(numbers, cells, _split(cells, len(numbers), count)).astype(np.float32)
+    levels = cells.means(_split(cells, len(numbers), count), np.zeros(count))
+    for _ in range(_STEPS):
+        ends = np.concatenate([[0], np.searchsorted(numbers, _borders(levels)), [len(numbers)]])
+        moved = cells.means(ends, levels)
+        if np.array_equal(moved, levels):
+            break
+        levels = moved
+    return levels.astype(np.float32)
 
 
 def nearest_level(values: NDArray[np.float32], levels: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -80,15 +87,3 @@ def _split(cells: _Cells, numbers: int, count: int) -> NDArray[np.intp]:
             gain, inner = cells.best_split(start, stop)
             heapq.heappush(heap, (-gain, start, inner, stop))
     return np.array([*sorted(cell[1] for cell in heap), numbers])
-
-
-def _lloyd(numbers: NDArray[np.float64], cells: _Cells, ends: NDArray[np.intp]) -> NDArray[np.float64]:
-    levels = cells.means(ends, np.zeros(len(ends) - 1))
-    for _ in range(_STEPS):
-        borders = np.searchsorted(numbers, _borders(levels))
-        ends = np.concatenate([[0], borders, [len(numbers)]])
-        moved = cells.means(ends, levels)
-        if np.array_equal(moved, levels):
-            break
-        levels = moved
-    return levels

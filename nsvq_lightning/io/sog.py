@@ -38,12 +38,11 @@ from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FEW_SPLATS, FormatError, check_room, naming_file
 from nsvq_lightning.io.numbers import logits_of_bytes, opacity_of
-from nsvq_lightning.io.scalar_kmeans import best_levels, nearest_level
+from nsvq_lightning.io.scalar_kmeans import nearest_level, scalar_kmeans
 from nsvq_lightning.splats.conventions import from_smallest_three, sh_coefficients, smallest_three, unit
 
 META = "meta.json"
 ZIP_MAGIC = b"PK\x03\x04"
-_EPOCH = (1980, 1, 1, 0, 0, 0)
 _META_LIMIT = 1 << 20
 _TEXEL_BYTES = 8
 """Most bytes of a picture for each texel that the file may hold; uncompressed, a texel has four."""
@@ -68,23 +67,21 @@ def write_archive(
     Returns:
         Bytes of the file.
     """
-    text = json.dumps(meta, separators=(",", ":"), allow_nan=False).encode()
+    from PIL import Image
+
+    contents = {META: json.dumps(meta, separators=(",", ":"), allow_nan=False).encode()}
+    for name, texels in pictures.items():
+        buffer = io.BytesIO()
+        # exact=True: otherwise colours under alpha 0 are changed.
+        Image.fromarray(texels, "RGBA").save(buffer, "WEBP", lossless=True, exact=True, quality=75, method=3)
+        contents[name] = buffer.getvalue()
     with atomic_write(path) as file:
         with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-            for name, data in {META: text, **{name: _webp(texels) for name, texels in pictures.items()}}.items():
-                entry = zipfile.ZipInfo(name, _EPOCH)
+            for name, data in contents.items():
+                entry = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
                 entry.create_system = 3  # otherwise that of the machine
                 archive.writestr(entry, data)
         return file.tell()
-
-
-def _webp(texels: NDArray[np.uint8]) -> bytes:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    # exact=True: otherwise colours under alpha 0 are changed.
-    Image.fromarray(texels, "RGBA").save(buffer, "WEBP", lossless=True, exact=True, quality=75, method=3)
-    return buffer.getvalue()
 
 
 class SogArchive:
@@ -317,7 +314,7 @@ def _leveled(scene: CompressedScene, name: str) -> tuple[NDArray[np.uint8], list
 
 def _levels(scene: CompressedScene, name: str) -> NDArray[np.float32]:
     rows, uses = scene.table(name)[0], scene.uses(name)
-    return best_levels(rows, None if uses is None else uses[:, None], _LEVELS)
+    return scalar_kmeans(rows, None if uses is None else uses[:, None], _LEVELS)
 
 
 def _packed_sh(scene: CompressedScene) -> tuple[dict[str, Any], dict[str, NDArray[np.uint8]]]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.scalar_kmeans import best_levels, nearest_level
+from nsvq_lightning.io.scalar_kmeans import nearest_level, scalar_kmeans
 
 
 def mean_square(values: NDArray[np.float32], levels: NDArray[np.float32]) -> float:
@@ -28,24 +28,24 @@ def least_mean_square(values: NDArray[np.float32], count: int) -> float:
 @pytest.mark.parametrize("kind", ["normal", "laplace", "uniform", "lognormal"])
 def test_levels_are_nearly_the_best_and_better_than_equal_steps(kind: str) -> None:
     values = getattr(np.random.default_rng(1), kind)(size=300).astype(np.float32)
-    found = mean_square(values, best_levels(values, count=32))
+    found = mean_square(values, scalar_kmeans(values, count=32))
     assert found < 1.15 * least_mean_square(values, 32)
     assert found < mean_square(values, np.linspace(values.min(), values.max(), 32, dtype=np.float32))
 
 
 def test_few_values_are_exact_and_the_last_level_is_repeated() -> None:
     values = np.array([[3, -1], [3, 0.5], [np.pi, -1]], np.float32)
-    levels = best_levels(values, count=8)
+    levels = scalar_kmeans(values, count=8)
     np.testing.assert_array_equal(levels, np.array([-1, 0.5, 3, *[np.pi] * 5], np.float32))
     np.testing.assert_array_equal(levels[nearest_level(values, levels)], values)
-    np.testing.assert_array_equal(best_levels(np.zeros((0, 3), np.float32)), np.zeros(256, np.float32))
+    np.testing.assert_array_equal(scalar_kmeans(np.zeros((0, 3), np.float32)), np.zeros(256, np.float32))
 
 
 def test_a_weight_counts_like_repeated_values() -> None:
     rng = np.random.default_rng(2)
     values, weight = rng.normal(size=(500, 3)).astype(np.float32), rng.integers(0, 5, (500, 1))
-    weighted = best_levels(values, weight, 64)
-    repeated = best_levels(np.repeat(values, weight[:, 0], axis=0), count=64)
+    weighted = scalar_kmeans(values, weight, 64)
+    repeated = scalar_kmeans(np.repeat(values, weight[:, 0], axis=0), count=64)
     np.testing.assert_allclose(weighted, repeated, rtol=1e-5, atol=1e-6)
 
 

@@ -53,10 +53,6 @@ class Stored(NamedTuple):
         # In place of a float64 copy, which would take twice the memory of the result.
         return np.multiply(integers, self.entry.step, out=np.empty(integers.shape, np.float32), casting="same_kind")
 
-    def in_order(self, order: NDArray[np.int64]) -> Stored:
-        """The same with the splats in another order."""
-        return self._replace(values=self.values[order])
-
 
 def rounded(scene: CompressedScene, name: str, precision: Precision) -> Stored:
     """An attribute, but not the positions, as integers.
