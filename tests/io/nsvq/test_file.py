@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import itertools
 import json
 import struct
 from collections.abc import Callable
@@ -83,45 +82,6 @@ def test_round_trip_is_exact(tmp_path: Path, sizes: dict[str, int], degree: int)
         back = read_nsvq(path)
         assert_same(back, original)
         assert back.stored_bytes == path.stat().st_size
-
-
-def test_an_independent_reader_understands_the_file(tmp_path: Path) -> None:
-    """Oracle: the layout as documented, read with the standard library only."""
-    original, path = scene(50, {"quats": 33, "scales": 17, "sh0": 9, "shN": 5}), tmp_path / "x.nsvq"
-    write_nsvq(path, original)
-    data = path.read_bytes()
-    magic, digest, version, json_bytes = struct.unpack_from("<8s16sII", data)
-    assert (magic, version) == (b"\x89NSVQ\r\n\x1a", 2)
-    assert digest == hashlib.blake2b(data[24:], digest_size=16).digest()
-    header = json.loads(data[32 : 32 + json_bytes])
-    lengths = {name: length for name, length, _ in header["streams"]}
-    start = dict(zip(lengths, itertools.accumulate(lengths.values(), initial=32 + json_bytes), strict=False))
-    length = lengths["codes"]
-    fields = [
-        (name, codes, (codes - 1).bit_length(), dim)
-        for name, dim, storage, codes, _ in header["attributes"]
-        if storage == "codes"
-    ]
-    stream = int.from_bytes(data[start["codes"] : start["codes"] + length], "little")
-    for row in range(50):
-        assert struct.unpack_from("<3f", data, start["means"] + 12 * row) == tuple(original.means[row])
-        for name, k, bits, dim in fields:
-            code, stream = stream & ((1 << bits) - 1), stream >> bits
-            assert code == original.codes[name][row] < k
-            entry = struct.unpack_from(f"<{dim}f", data, start[f"{name}.codebook"] + 4 * dim * code)
-            assert entry == tuple(original.codebooks[name][code])
-    assert stream == 0
-
-
-def test_decode_gives_the_rows_of_the_codebooks(tmp_path: Path) -> None:
-    original = scene(40, {"quats": 8, "scales": 7, "sh0": 6, "shN": 5})
-    write_nsvq(tmp_path / "x.nsvq", original)
-    splats = read_nsvq(tmp_path / "x.nsvq").decode()
-    for name in DIMS:
-        expected = original.codebooks[name][original.codes[name]].reshape(getattr(splats, name).shape)
-        np.testing.assert_array_equal(getattr(splats, name).detach().numpy(), expected)
-    np.testing.assert_array_equal(splats.means.detach().numpy(), original.means)
-    np.testing.assert_array_equal(splats.opacities.detach().numpy(), original.opacities)
 
 
 def test_same_scene_same_bytes(tmp_path: Path) -> None:

@@ -1,14 +1,14 @@
-"""The reader for web pages decodes files to the numbers of the package; run by node."""
+"""The readers of the format's page (Python) and of web pages (JavaScript, run by node) find what the package finds."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 import struct
 import subprocess
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import nsvq_reader
@@ -19,13 +19,13 @@ from compressed_scenes import SIZES, arrays_of, scene
 from nsvq_lightning.io import CompressedScene, FormatError, read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.header import read_frame
 from nsvq_lightning.io.nsvq.precision import LEVELS, Precision
+from nsvq_lightning.splats.attributes import ATTRIBUTES
 
 ROOT = Path(__file__).resolve().parents[3]
 READER = ROOT / "nsvq_lightning/report/web/nsvq.js"
 DUMP = ROOT / "tests/support/nsvq_dump.js"
-ORDER = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
-pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
 
 
 def dumped(*paths: Path) -> bytes:
@@ -40,12 +40,26 @@ def refusal(path: Path) -> str:
     return done.stderr.decode()
 
 
-def content(arrays: SimpleNamespace) -> bytes:
-    return b"".join(getattr(arrays, name).tobytes() for name in ORDER)
-
-
 def compare(*paths: Path) -> None:
-    assert dumped(*paths) == b"".join(content(arrays_of(read_nsvq(path))) for path in paths)
+    """All readers find the same bits: the package, the Python of the page and the JavaScript."""
+    ours = [vars(arrays_of(read_nsvq(path))) for path in paths]
+    for path, arrays in zip(paths, ours, strict=True):
+        for name, values in nsvq_reader.read_nsvq(path).items():
+            assert (values.dtype, values.shape) == (arrays[name].dtype, arrays[name].shape), name
+            assert values.tobytes() == arrays.pop(name).tobytes(), name
+        assert arrays == {}
+    if shutil.which("node") is None:
+        pytest.skip("node is not installed")
+    scenes = [read_nsvq(path) for path in paths]
+    assert dumped(*paths) == b"".join(made.values(name).tobytes() for made in scenes for name in ATTRIBUTES)
+
+
+def test_the_python_reader_is_that_of_the_page() -> None:
+    page = (ROOT / "docs/nsvq_format.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    code = Path(nsvq_reader.__file__).read_text(encoding="utf-8")
+    assert code.partition("import numpy as np\n")[2] == "".join(f"\n\n{block}" for block in blocks)
+    assert "nsvq_lightning" not in code
 
 
 def with_far_splats() -> CompressedScene:
@@ -105,6 +119,7 @@ def test_not_a_number_keeps_its_bits(tmp_path: Path) -> None:
     compare(tmp_path / "a.nsvq")
 
 
+@needs_node
 @pytest.mark.parametrize(
     ("at", "words"),
     [(3, "does not begin like one"), (10, "checksum"), (25, "checksum"), (60, "checksum"), (-1, "checksum")],
@@ -115,9 +130,12 @@ def test_a_flipped_bit_is_noticed(tmp_path: Path, at: int, words: str) -> None:
     data = bytearray(path.read_bytes())
     data[at] ^= 16
     path.write_bytes(data)
+    with pytest.raises(AssertionError):
+        nsvq_reader.read_nsvq(path)
     assert words in refusal(path)
 
 
+@needs_node
 def test_a_short_file_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "a.nsvq"
     write_nsvq(path, scene(20))
@@ -141,6 +159,7 @@ def _framed(path: Path, text: bytes, body: bytes, version: int = 2) -> None:
     path.write_bytes(b"\x89NSVQ\r\n\x1a" + hashlib.blake2b(rest, digest_size=16).digest() + rest)
 
 
+@needs_node
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -167,6 +186,7 @@ def test_a_header_that_cannot_be_is_refused(tmp_path: Path, change: Any, words: 
     assert words in refusal(path)
 
 
+@needs_node
 def test_a_newer_version_is_told(tmp_path: Path) -> None:
     path = tmp_path / "a.nsvq"
     write_nsvq(path, scene(20))
@@ -174,6 +194,7 @@ def test_a_newer_version_is_told(tmp_path: Path) -> None:
     assert "version 3 is newer than this reader" in refusal(path)
 
 
+@needs_node
 def test_noise_in_the_streams_ends_with_an_error_or_numbers(tmp_path: Path) -> None:
     path = tmp_path / "a.nsvq"
     for seed in range(12):
@@ -232,6 +253,7 @@ CHANGES: dict[str, tuple[Any, str]] = {
 }
 
 
+@needs_node
 def test_all_readers_refuse_the_same_files(tmp_path: Path) -> None:
     """The package, the Python of the page and the JavaScript: what the page refuses, and noise in the streams."""
     paths = [tmp_path / f"{index:02}.nsvq" for index in range(len(CHANGES) + 24)]
