@@ -177,13 +177,13 @@ class LiveScene(WritingCallback):
         asked = live_preview.asked(folder)
         if asked == self._answered:
             return
-        host, began = as_host(pl_module), time.monotonic()
-        with host.stopwatch.paused(host.device):
-            splats = type(host.splats).from_tensors(*host.hard_splats(host.phase)).to("cpu")
-            state = {"iteration": trainer.global_step, "of": trainer.max_steps, "phase": host.phase.name.lower()}
-            if host.history:
-                state["psnr"] = f"{host.history[-1]['psnr']:.2f}"
-            config = {"antialiased": getattr(pl_module, "antialiased", False), "live": state}
+        began = time.monotonic()
+        with module.stopwatch.paused(module.device):
+            splats = type(module.splats).from_tensors(*module.hard_splats(module.phase)).to("cpu")
+            state = {"iteration": trainer.global_step, "of": trainer.max_steps, "phase": module.phase.name.lower()}
+            if module.history:
+                state["psnr"] = f"{module.history[-1]['psnr']:.2f}"
+            config = {"antialiased": module.antialiased, "live": state}
             scene = CompressedScene.from_splats(splats, config=config)
             save(scene, folder / live_preview.LIVE_SCENE, Storage("paper"))
         self._answered, ended = asked, time.monotonic()

@@ -56,8 +56,8 @@ def tuned(
     free = {name: torch.from_numpy(rows.copy()).requires_grad_() for name, rows in scene.codebooks.items()}
     free["opacities"] = original.opacities.clone().requires_grad_()
     free["means"] = original.means.clone().requires_grad_()
-    rates = {name: ATTRIBUTES[name].tuning_rate for name in free}
-    rates["means"] *= float(original.means.std(0).norm())
+    rates = {name: ATTRIBUTES[name].rate for name in free}
+    rates["means"] = 3e-5 * float(original.means.std(0).norm())  # nothing is far from its place
     groups = [{"params": [tensor], "lr": rates[name]} for name, tensor in free.items()]
     adam = torch.optim.Adam(groups, eps=1e-15)
     decay = torch.optim.lr_scheduler.ExponentialLR(adam, FINAL ** (1 / steps))

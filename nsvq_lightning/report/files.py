@@ -48,8 +48,9 @@ def summarize(
         return float(sum(getattr(score, name) for score in scores)) / len(scores)
 
     file_bytes, header = path.stat().st_size, read_header(path)
-    plain_bytes, ends = plain_ply_bytes(len(scene), scene.sh_degree), _phase_ends(host.history)
-    pruned = next((end for end in ends if end["phase"] == Phase.PRUNE.name.lower()), None)
+    plain_bytes = plain_ply_bytes(len(scene), scene.sh_degree)
+    last = {str(entry["phase"]): dict(entry) for entry in module.history}  # the last evaluation of each phase
+    ends = [last[phase.name.lower()] for phase in Phase if phase.name.lower() in last]
     return {
         "psnr": mean("psnr"),
         "ssim": mean("ssim"),

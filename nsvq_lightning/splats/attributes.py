@@ -22,15 +22,12 @@ class Attribute:
     Attributes:
         shape: Of the values of one splat; -1 stands for the number of higher SH coefficients.
         ply: Its properties in ``.ply``: their names, or what precedes their numbers.
-        rate: Learning rate at the start (3D Gaussian Splatting); that of the positions is times the extent of the
-            scene.
+        rate: Learning rate at the start (docs/recipe.md); that of the positions is times the extent of the scene.
         code_share: Number of codes relative to that for scales (paper, section 4: Ks = Kr = 4·Kc = 4·Ksh); 0 if the
             attribute never has a codebook.
         error: Largest error in files of level ``compact``, where it has no codebook.
         row_bits: Bits of a code there beyond log2 of the number of codes: colours of neighbours are alike.
         code_bits: Bits there of each number of the codebook.
-        tuning_rate: Learning rate at the start when a compressed scene is tuned, of its codebook if it has one; that of
-            the positions is times the root mean square distance of the splats from their middle.
     """
 
     shape: tuple[int, ...]
@@ -40,16 +37,15 @@ class Attribute:
     error: float = 0.0
     row_bits: float = 0.0
     code_bits: float = 0.0
-    tuning_rate: float = 0.0
 
 
 ATTRIBUTES = {
-    "means": Attribute((3,), "x y z", 1.6e-4, tuning_rate=3e-5),
-    "quats": Attribute((4,), "rot_", 1e-3, 1.0, error=0.005, row_bits=0.3, code_bits=5.7, tuning_rate=0.002),
-    "scales": Attribute((3,), "scale_", 5e-3, 1.0, error=0.02, row_bits=0.0, code_bits=6.0, tuning_rate=0.01),
-    "opacities": Attribute((), "opacity", 0.05, tuning_rate=0.025),
-    "sh0": Attribute((1, 3), "f_dc_", 2.5e-3, 0.25, error=0.01, row_bits=-1.3, code_bits=5.9, tuning_rate=0.0025),
-    "shN": Attribute((-1, 3), "f_rest_", 1.25e-4, 0.25, error=0.01, row_bits=-1.4, code_bits=5.5, tuning_rate=0.0005),
+    "means": Attribute((3,), "x y z", 3.2e-4),
+    "quats": Attribute((4,), "rot_", 2e-3, 1.0, error=0.005, row_bits=0.3, code_bits=5.7),
+    "scales": Attribute((3,), "scale_", 0.01, 1.0, error=0.02, row_bits=0.0, code_bits=6.0),
+    "opacities": Attribute((), "opacity", 0.025),
+    "sh0": Attribute((1, 3), "f_dc_", 2.5e-3, 0.25, error=0.01, row_bits=-1.3, code_bits=5.9),
+    "shN": Attribute((-1, 3), "f_rest_", 5e-4, 0.25, error=0.01, row_bits=-1.4, code_bits=5.5),
 }
 """The raw attributes by name, in the order of :meth:`nsvq_lightning.Splats.from_tensors`."""
 

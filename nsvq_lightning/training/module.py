@@ -8,12 +8,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from nsvq_lightning.compression.stored import to_compressed
-from nsvq_lightning.compute.devices import LateNumber, upload
-from nsvq_lightning.compute.environment import threads_spin
-from nsvq_lightning.data.scene import ONE_PLACE, Scene, View
-from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.formats import load
+from nsvq_lightning.compute.devices import AsyncScalar, to_device
+from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quality.metrics import eight_bit, image_metrics, psnr
@@ -135,13 +131,7 @@ class SplatModule(ResumedModule):
         To be called in ``on_train_batch_start``, for every view of the iteration; factors of several callbacks
         multiply.
         """
-        if len(self.splats) == 0:
-            raise ValueError("there are no splats to store or to measure: pass the checkpoint of a run (--ckpt_path)")
-        quantizers = self.quantizers if self.phase >= Phase.QUANTIZE else {}
-        if self.quantizers and not quantizers:
-            log.warning("the %s phase has no codebooks yet: the scene is stored unquantized", self.phase.name.lower())
-        scene = to_compressed(self.splats.raw(), quantizers)
-        return replace(scene, config=self._settings(quantizers))  # PostHoc fits its codebooks while the scene is stored
+        self._rate_factors[group] = factor * self._rate_factors.get(group, 1.0)
 
     def forward(self, camera: Camera, observe: Tensor | None = None) -> Render:
         """Render what the current phase trains or, outside training, what a file would hold.

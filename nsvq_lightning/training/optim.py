@@ -60,7 +60,7 @@ class LearningRates:
     """
 
     means: float = ATTRIBUTES["means"].rate
-    means_final: float = 1.6e-6
+    means_final: float = 4e-6
     scales: float = ATTRIBUTES["scales"].rate
     quats: float = ATTRIBUTES["quats"].rate
     opacities: float = ATTRIBUTES["opacities"].rate

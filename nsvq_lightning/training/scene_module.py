@@ -10,7 +10,7 @@ from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 from torchmetrics import MetricCollection
 
-from nsvq_lightning.compression.stored import compress
+from nsvq_lightning.compression.stored import to_compressed
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.precision import Storage
@@ -104,7 +104,7 @@ class SceneModule(LightningModule):
         quantizers = self.quantizers if self.phase >= Phase.QUANTIZE else {}
         if self.quantizers and not quantizers:
             log.warning("the %s phase has no codebooks yet: the scene is stored unquantized", self.phase.name.lower())
-        scene = compress(self.splats.raw(), quantizers)  # PostHoc fits its codebooks only now
+        scene = to_compressed(self.splats.raw(), quantizers)  # PostHoc fits its codebooks only now
         # Nothing that differs between two runs with the same seed.
         settings = {
             "version": __version__,
