@@ -1,11 +1,21 @@
-"""``nsvq convert``: write a scene file in another format, for viewers."""
+"""Write a scene file in another format; the suffixes select the formats.
+
+The codebooks of a .nsvq file are used as the palette of .sog, and to make .spz smaller. To make a .ply small, with
+codebooks fitted to it, use 'nsvq compress'.
+
+Examples:
+  nsvq convert scene.nsvq scene.sog
+  nsvq convert scene.ply scene.sog --palette 4096
+  nsvq convert scene.ply scene.spz --measure
+  nsvq convert scene.nsvq clean.nsvq --floaters --up z --data.root my/scene
+"""
 
 from __future__ import annotations
 
 import argparse
 import logging
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,89 +23,95 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.commands.arguments import Parser
 from nsvq_lightning.commands.progress import progress
-from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, cropped, rotated, turn_up
+from nsvq_lightning.io import formats, spz
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.describe import attribute_errors
-from nsvq_lightning.io.formats import FORMATS, read_scene, save
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.sog import PALETTE_LIMIT
-from nsvq_lightning.io.spz import DEFAULT_AXES, DEFAULT_VERSION, SPZ_AXES, SPZ_VERSIONS
 
 if TYPE_CHECKING:
+    import torch
+
     from nsvq_lightning.data.scene import View
 
-__all__ = ["main"]
-
-_OPTIONS = {
-    "level": ("--level", ".nsvq"),
-    "palette": ("--palette", ".sog"),
-    "version": ("--spz-version", ".spz"),
-    "axes": ("--spz-axes", ".spz"),
-}
-"""Options of writers: their flag here, and their format."""
-
-EPILOG = """\
-The codebooks of a .nsvq file are used as the palette of .sog, and to make .spz smaller. To make a .ply small, with
-codebooks fitted to it, use 'nsvq compress'.
-
-examples:
-  nsvq convert scene.nsvq scene.sog
-  nsvq convert scene.ply scene.sog --palette 4096
-  nsvq convert scene.ply scene.spz --measure
-  nsvq convert scene.nsvq clean.nsvq --floaters --up z --data.root my/scene
-"""
+__all__ = ["add_arguments", "run"]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what ``nsvq convert`` takes."""
+    add, suffixes = parser.add_argument, ", ".join(formats.FORMATS)
+    add("input", type=Path, metavar="SCENE", help=f"file to read: {suffixes}")
+    add("output", type=Path, metavar="OUT", help=f"file to write: {suffixes}")
+    help_ = "largest number of rows of the .sog palette for a scene without an SH codebook; "
+    help_ += f"{PALETTE_LIMIT} by default, 4096 to 16384 make a smaller file"
+    add("--palette", type=int, metavar="ROWS", help=help_)
+    help_ = f"version of .spz; {spz.DEFAULT_VERSION} by default, which more viewers support"
+    add("--spz-version", dest="version", type=int, choices=spz.SPZ_VERSIONS, help=help_)
+    help_ = f"axes of .spz; {spz.DEFAULT_AXES} by default, those of .ply, as viewers take them"
+    add("--spz-axes", dest="axes", choices=spz.SPZ_AXES, help=help_)
+    add("--level", choices=LEVELS, help="level of .nsvq")
+    add("--measure", action="store_true", help="render both files and say how they differ")
+    corners, help_ = ("X0", "Y0", "Z0", "X1", "Y1", "Z1"), "keep the splats with centres in this box, in scene units"
+    add("--crop", nargs=6, type=float, metavar=corners, help=f"{help_} of the input")
+    help_ = "remove splats that no photo of --data.root supports; takes minutes"
+    add("--floaters", action="store_true", help=help_)
+    help_ = "turn the scene so that up, as the cameras of --data.root hold it, is this axis"
+    add("--up", choices=UP_AXES, help=help_)
+    add("--up-from", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where up is in the input, for --up")
+    help_ = "scene folder: for --floaters and --up, and for --measure instead of views from around the scene"
+    add("--data.root", dest="root", type=Path, metavar="FOLDER", help=help_)
+
+
+def run(options: argparse.Namespace) -> int:
     """Convert a file.
 
-    Args:
-        argv: Arguments after ``nsvq convert``; those of the process if None.
-
-    Returns:
-        0, or 1 after an error in the user's files. Wrong arguments end the process with status 2.
+    Raises:
+        argparse.ArgumentError: Options do not go together.
+        ValueError: A file cannot be understood, or nothing is left of the scene.
+        OSError: A file cannot be read or written.
     """
-    parser = _parser()
-    options = parser.parse_args(argv)
-    chosen = {name: getattr(options, name) for name in _OPTIONS if getattr(options, name) is not None}
-    for flag, suffix in (_OPTIONS[name] for name in chosen):
-        if options.output.suffix.lower() != suffix:
-            parser.error(f"{flag} is an option of {suffix} files, but the output is {options.output}")
-    if options.up_from is not None and options.up is None:
-        parser.error("--up-from says where up is: add --up to say what it is to become")
-    if options.root is None and options.floaters:
-        parser.error("--floaters asks the photos: add --data.root")
-    if options.root is None and options.up is not None and options.up_from is None:
-        parser.error("--up needs to know where up is now: add --data.root or --up-from")
-    if options.root is not None and not (options.measure or options.floaters or options.up):
-        parser.error("--data.root says where to measure: add --measure")
-    if options.measure and (options.crop or options.floaters or options.up):
-        parser.error("--measure compares with the input as it is: convert without it first")
-    logging.basicConfig(format="%(message)s")
-    logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
-    if "level" in chosen:
-        chosen["storage"] = Storage(chosen.pop("level"))
-    try:
-        _convert(options, chosen)
-        if options.measure:
-            _measure(options.input, options.output, options.root)
-    except (ValueError, OSError) as error:
-        sys.stderr.write(f"nsvq convert: {error}\n")
-        return 1
-    return 0
-
-
-def _convert(options: argparse.Namespace, chosen: dict[str, Any]) -> None:
+    wrong = {
+        "--up-from says where up is: add --up to say what it is to become": options.up_from and not options.up,
+        "--floaters asks the photos: add --data.root": options.floaters and not options.root,
+        "--up needs to know where up is now: add --data.root or --up-from": options.up
+        and not (options.up_from or options.root),
+        "--data.root says where to measure: add --measure": options.root
+        and not (options.measure or options.floaters or options.up),
+        "--measure compares with the input as it is: convert without it first": options.measure
+        and (options.crop or options.floaters or options.up),
+    }
+    writer: dict[str, Any] = {}
+    for flag, name, suffix in (
+        ("--level", "level", ".nsvq"),
+        ("--palette", "palette", ".sog"),
+        ("--spz-version", "version", ".spz"),
+        ("--spz-axes", "axes", ".spz"),
+    ):
+        if (value := getattr(options, name)) is not None:
+            fits = options.output.suffix.lower() == suffix
+            wrong[f"{flag} is an option of {suffix} files, but the output is {options.output}"] = not fits
+            writer |= {"storage": Storage(value)} if name == "level" else {name: value}
+    for message, is_so in wrong.items():
+        if is_so:
+            raise argparse.ArgumentError(None, message)
     output: Path = options.output
     if not output.parent.is_dir():  # now, not after the minutes that floaters take
         raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
-    scene = _cleaned(read_scene(options.input).finite(), options)
-    size = save(scene, output, **chosen)
+    scene = _cleaned(formats.read_scene(options.input).finite(), options)
+    size = formats.save(scene, output, **writer)
     # What reading the output back would say of it is known here.
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
     each = f", {size / len(scene):.1f} per splat" if len(scene) else ""
-    sys.stdout.write(f"{output}: {len(scene):,} splats in {size:,} bytes{each}\n{_errors(scene, output)}")
+    sys.stdout.write(f"{output}: {len(scene):,} splats in {size:,} bytes{each}\n")
+    in_order = formats.FORMATS[output.suffix.lower()].in_order
+    if in_order is not None:  # the format is not exact
+        errors = attribute_errors(formats.read_scene(output).arrays(), in_order(scene).arrays())
+        listed = ", ".join(f"{name} {error:.2g}{'°' * (name == 'rotation')}" for name, error in errors.items())
+        sys.stdout.write(f"  root mean square errors: {listed}\n")
+    if options.measure:
+        _measure(options.input, output, options.root)
+    return 0
 
 
 def _cleaned(scene: CompressedScene, options: argparse.Namespace) -> CompressedScene:
@@ -114,6 +130,7 @@ def _cleaned(scene: CompressedScene, options: argparse.Namespace) -> CompressedS
 
 
 def _up(options: argparse.Namespace) -> NDArray[np.float64]:
+    """Where up is in the input, a unit vector ``[3]``."""
     if options.up_from is None:
         from nsvq_lightning.data.scene import load_scene
         from nsvq_lightning.rendering.camera import up_of
@@ -141,101 +158,31 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     def views() -> Iterator[View]:
         return (photos.view(index) for index in progress(photos.train, "photos"))
 
-    def quality(keep: torch.Tensor) -> str:
-        tested = evaluate(
-            lambda camera: look(type(splats)(*(t[keep] for t in splats)), camera).image,
-            (photos.view(index) for index in photos.test),
-            torch.device("cpu"),
-        )
-        return f"{tested.psnr:.2f} dB"
+    def psnr(keep: torch.Tensor) -> float:
+        kept = type(splats)(*(tensor[keep] for tensor in splats))
+        tests = (photos.view(index) for index in photos.test)
+        return evaluate(lambda camera: look(kept, camera).image, tests, torch.device("cpu")).psnr
 
     removed = floaters(splats, views, look)
-    before, after = quality(torch.ones_like(removed)), quality(~removed)
     sys.stdout.write(
-        f"floaters: {int(removed.sum()):,} of {len(scene):,} splats; test photos at {before} before, {after} after\n"
+        f"floaters: {int(removed.sum()):,} of {len(scene):,} splats; test photos at "
+        f"{psnr(torch.ones_like(removed)):.2f} dB before, {psnr(~removed):.2f} dB after\n"
     )
     return scene.take((~removed).numpy())
 
 
-def _errors(scene: CompressedScene, output: Path) -> str:
-    """A line with the errors of the values in the file; empty if the format is exact."""
-    in_order = FORMATS[output.suffix.lower()].in_order
-    if in_order is None:
-        return ""
-    errors = attribute_errors(read_scene(output), in_order(scene))
-    listed = ", ".join(f"{name} {error:.2g}{'°' * (name == 'rotation')}" for name, error in errors.items())
-    return f"  root mean square errors: {listed}\n"
-
-
 def _measure(source: Path, output: Path, root: Path | None) -> None:
+    """Say how pictures of two files differ."""
     from nsvq_lightning.compression.ladder import MEASURED
     from nsvq_lightning.compression.viewpoints import decibels, picture_error, pictures, views_of
 
-    original = read_scene(source).finite()
+    original = formats.read_scene(source).finite()
     if len(original) == 0:
         raise ValueError(f"{source} holds no finite splat; there is nothing to measure")
     splats = original.decode()
     cameras = views_of(splats, root, MEASURED)
     expected = pictures(splats, cameras, original.antialiased)
-    error = picture_error(read_scene(output).decode(), cameras, expected, original.antialiased)
+    error = picture_error(formats.read_scene(output).decode(), cameras, expected, original.antialiased)
     sys.stdout.write(
         f"  error {error:.4g} ({decibels(error):.2f} dB against {source.name} in {len(cameras)} pictures)\n"
     )
-
-
-def _parser() -> argparse.ArgumentParser:
-    suffixes = ", ".join(FORMATS)
-    parser = Parser(
-        prog="nsvq convert",
-        description="Write a scene file in another format; the suffixes select the formats.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("input", type=Path, metavar="SCENE", help=f"file to read: {suffixes}")
-    parser.add_argument("output", type=Path, metavar="OUT", help=f"file to write: {suffixes}")
-    parser.add_argument(
-        "--palette",
-        type=int,
-        metavar="ROWS",
-        help="largest number of rows of the .sog palette for a scene without an SH codebook; "
-        f"{PALETTE_LIMIT} by default, 4096 to 16384 make a smaller file",
-    )
-    parser.add_argument(
-        "--spz-version",
-        dest="version",
-        type=int,
-        choices=SPZ_VERSIONS,
-        help=f"version of .spz; {DEFAULT_VERSION} by default, which more viewers support",
-    )
-    parser.add_argument(
-        "--spz-axes",
-        dest="axes",
-        choices=SPZ_AXES,
-        help=f"axes of .spz; {DEFAULT_AXES} by default, those of .ply, as viewers take them",
-    )
-    parser.add_argument("--level", choices=LEVELS, help="level of .nsvq")
-    parser.add_argument("--measure", action="store_true", help="render both files and say how they differ")
-    parser.add_argument(
-        "--crop",
-        nargs=6,
-        type=float,
-        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-        help="keep the splats with centres in this box, in scene units of the input",
-    )
-    parser.add_argument(
-        "--floaters", action="store_true", help="remove splats that no photo of --data.root supports; takes minutes"
-    )
-    parser.add_argument(
-        "--up", choices=UP_AXES, help="turn the scene so that up, as the cameras of --data.root hold it, is this axis"
-    )
-    parser.add_argument(
-        "--up-from", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where up is in the input, for --up"
-    )
-    parser.add_argument(
-        "--data.root",
-        dest="root",
-        type=Path,
-        metavar="FOLDER",
-        help="scene folder: for --floaters and --up, and for --measure instead of views from around the scene",
-    )
-    return parser

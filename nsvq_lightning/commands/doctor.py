@@ -1,13 +1,18 @@
-"""``nsvq doctor [FOLDER]``: check whether this machine and a scene folder are fit for training.
+"""Check whether this machine is fit for training, and whether a COLMAP folder is a good scene.
 
-Each check imports what it needs: ``--help`` answers at once, and a package that is missing or broken fails only the
-checks that need it.
+Each line is good, a note (works, could be better or faster) or a problem (a run would fail).
+
+Examples:
+  nsvq doctor
+  nsvq doctor path/to/scene
+  nsvq doctor path/to/scene --json > doctor.json
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import logging
 import math
 import os
 import platform
@@ -24,49 +29,61 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
+# Each check imports what it needs: --help answers at once, and a package that is missing or broken fails only the
+# checks that need it.
 if TYPE_CHECKING:
     import torch
 
-    from nsvq_lightning.commands.benchmark.workloads import Workload
     from nsvq_lightning.data.colmap import ColmapModel
     from nsvq_lightning.data.scene import Scene
     from nsvq_lightning.splats.splats import Splats
 
-__all__ = ["Finding", "check_folder", "main"]
-
-EPILOG = """\
-Each line is good, a note (works, could be better or faster) or a problem (a run would fail).
-
-examples:
-  nsvq doctor
-  nsvq doctor path/to/scene
-  nsvq doctor path/to/scene --json > doctor.json
-"""
-
-PACKAGES = ("lightning", "torchmetrics", "jsonargparse", "scipy", "pycolmap")  # besides those of describe_machine
-EXTRAS = {"lpips": "torchvision", "tensorboard": "tensorboard"}  # the package that each brings
 OPENCV = "opencv-contrib-python-headless"
-WIDE = 256  # bits of a vector register; with fewer, kernels take about twice the time on x86, and ARM64 has none wider
-SMALL_MEMORY, SMALL_DISK = 4 << 30, 2 << 30  # bytes; less may not hold pictures and splats, or checkpoints and report
+SMALL_DISK = 2 << 30
+"""Bytes; less may not hold checkpoints and report."""
+REPEATS = 3
+"""Of what is timed; for the time of a run, of as many views."""
 
-SPLATS, WIDTH, HEIGHT = 4000, 96, 72  # of the self-test
-LARGEST_ERROR = 1e-3  # relative: rounding stays below 1e-4, but a splat that crosses α = 1/255 costs more
-REPEATS = 3  # of what is timed; for the time of a run, of as many views
 
-FEW_POINTS, FEW_VIEWS = 1000, 20
-FAR, MANY_OUTLIERS = 10.0, 0.02  # an outlier is this many times farther from the median than four fifths of the points
-# Two views may be a wrong match, three confirm each other; and the least share of points that should have three.
-SEEN_BY, SEEN_WELL = 3, 0.5
-# Points that two views must share to count as connected, and the least share of its points with its best partner.
-COMMON, LITTLE_OVERLAP = 15, 0.3
-GAMMA, LOWEST, ENOUGH = 2.2, 4.0, 30  # darker grey says nothing of exposure, nor do fewer points
-MOSTLY = 0.7  # share of excluded pixels from which on masks may be inverted
-UNEVEN = 0.5  # stops between the darkest and the brightest tenth of the photos above which colours visibly disagree
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what ``nsvq doctor`` takes."""
+    parser.add_argument("folder", nargs="?", type=Path, metavar="FOLDER", help="COLMAP folder to check")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of lines")
 
-# Iterations, and splats over them, on average, as a multiple of the default for the photos.
-FAST, FAST_SPLATS = 4000, 1.3  # fast.yaml
-PAPER, PAPER_SPLATS = 45_000, 4.0  # the paper's run
-RENDERS_A_STEP = 2.0  # time of a step over that of rendering forward and backward: loss, optimizer, codebooks
+
+def run(options: argparse.Namespace) -> int:
+    """Check this machine and, if given, a scene folder.
+
+    Returns:
+        0, or 1 if there is a problem: the self-test fails or the folder cannot be used.
+    """
+    logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
+    findings = []
+    for finding in check_all(options.folder):
+        findings.append(finding)
+        if not options.json:
+            print(finding, flush=True)  # each check takes seconds
+    verdicts = [finding.verdict for finding in findings]
+    problems, notes = verdicts.count("problem"), verdicts.count("note")
+    if options.json:
+        document = {"ok": not problems, "findings": [finding._asdict() for finding in findings]}
+        sys.stdout.write(json.dumps(document, indent=2, ensure_ascii=False) + "\n")
+    else:
+        said = f"{problems or 'no'} problem{'s' * (problems != 1)}, {notes or 'no'} note{'s' * (notes != 1)}"
+        sys.stdout.write(f"\n{said}\n")
+    return 1 if problems else 0
+
+
+def check_all(folder: Path | None) -> Iterator[Finding]:
+    """All findings about this machine and, if given, a scene folder."""
+    yield from attempt("machine", check_machine())
+    yield from attempt("packages", check_packages())
+    yield from attempt("threads", check_threads())
+    yield from attempt("memory", check_room(Path()))
+    yield from attempt("gpu", check_gpu())
+    yield from attempt("self-test", check_backends())
+    if folder is not None:
+        yield from check_folder(folder)
 
 
 class Finding(NamedTuple):
@@ -118,12 +135,14 @@ def check_machine() -> Iterator[Finding]:
     machine = describe_machine()
     yield judged("machine", f"{machine['system']}, {machine['cpu']}", **machine)
     bits, simd = machine["simd_bits"], machine["simd"]
+    text = f"{lanes.WIDTH} floats at a time in {bits}-bit registers ({', '.join(simd) or 'no vector extension'})"
+    # ARM64 has no wider ones.
+    narrow = bits < 256 and "neon" not in simd and "a processor with AVX2 or AVX-512 is about twice as fast"
     fused = not {"fma", "neon"}.isdisjoint(simd)
-    text = f"{WIDTH} floats at a time in {bits}-bit registers ({', '.join(simd) or 'no vector extension'})"
-    narrow = bits < WIDE and "neon" not in simd and "a processor with AVX2 or AVX-512 is about twice as fast"
     split = not fused and "somewhat slower without fused multiply-add, last digits may differ"
     yield judged("cpu", text, narrow, split, simd_bits=bits, simd=simd, fma=fused)
-    versions = machine["versions"] | {name: version(name) for name in PACKAGES}
+    more = ("lightning", "torchmetrics", "jsonargparse", "scipy", "pycolmap")
+    versions = machine["versions"] | {name: version(name) for name in more}
     yield judged("versions", ", ".join(f"{name} {number}" for name, number in versions.items()), **versions)
 
 
@@ -140,7 +159,7 @@ def check_packages() -> Iterator[Finding]:
         text = f"{cv2.__version__} ({' and '.join(packages) or 'not from pip'})"
         advice = f"they overwrite each other's files; uninstall all of them, then pip install {OPENCV}"
         yield judged("opencv", text, len(packages) > 1 and advice, packages=packages)
-    for extra, package in EXTRAS.items():
+    for extra, package in (("lpips", "torchvision"), ("tensorboard", "tensorboard")):
         missing = find_spec(package) is None
         advice = f"optional, pip install 'nsvq-lightning[{extra}]'"
         yield judged(extra, f"{package} is {'not ' * missing}installed", missing and advice)
@@ -179,7 +198,7 @@ def check_room(folder: Path) -> Iterator[Finding]:
     free, disk = available_memory(), shutil.disk_usage(folder).free
     text = "not told by this system" if free is None else f"{readable_bytes(free)} available"
     advice = "a usual run takes 2 to 4 GB; end programs, or try --data.max_width 800 --data.cache_bytes 500000000"
-    yield judged("memory", text, free is not None and free < SMALL_MEMORY and advice, available=free)
+    yield judged("memory", text, free is not None and free < 4 << 30 and advice, available=free)
     writable = os.access(folder, os.W_OK)
     text = f"{readable_bytes(disk)} free in {folder.resolve()}{'' if writable else ', which is read-only'}"
     advice = "checkpoints of a run take about 1 GB; see --trainer.default_root_dir"
@@ -211,22 +230,22 @@ def check_backends() -> Iterator[Finding]:
     from nsvq_lightning.compute.kernel_cache import kernel_folder
     from nsvq_lightning.splats.splats import RawSplats
 
-    def results(workload: Workload, backend: str, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+    def results(workload: workloads.Workload, backend: str, dtype: torch.dtype) -> dict[str, torch.Tensor]:
         traced = render.trace(workload, render.painter(backend), dtype)
         return {"image": traced.image, **render.gradients_of(traced, workload.image_gradient.to(dtype))}
 
-    crop = workloads.synthetic_workload("A20k").crop(WIDTH, HEIGHT)  # of splats in random order, so any part will do
-    small = replace(crop, splats=RawSplats(*(tensor[:SPLATS].clone() for tensor in crop.splats)))
+    crop = workloads.synthetic_workload("A20k").crop(96, 72)  # of splats in random order, so any part will do
+    small = replace(crop, splats=RawSplats(*(tensor[:4000].clone() for tensor in crop.splats)))
     truth = results(small, "reference", torch.float64)
     for device in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
         here = small.to(device)
         for backend in fast_backends(here.splats.means):
             run = partial(results, here, backend, torch.float32)
-            times = [timing.milliseconds(timing.Case(backend, run), device) for _ in range(REPEATS)]
+            times = [timing.milliseconds(run, device) for _ in range(REPEATS)]
             errors = {name: workloads.relative_l2(value.cpu(), truth[name]) for name, value in run().items()}
             values = {"backend": backend, "errors": errors, "ms": min(times), "first_seconds": times[0] / 1000}
-            # "not <" rather than ">=", so that NaN fails.
-            wrong = [f"{name} {error:.1e}" for name, error in errors.items() if not error < LARGEST_ERROR]
+            # Rounding stays below 1e-4, but a splat that crosses α = 1/255 costs more. "not <", so that NaN fails.
+            wrong = [f"{name} {error:.1e}" for name, error in errors.items() if not error < 1e-3]
             if wrong:
                 text = f"{backend}: relative error against the float64 oracle: {', '.join(wrong)}; do not trust a run; "
                 text += f"remove {kernel_folder()}, and if that does not help report it with nsvq doctor --json"
@@ -234,7 +253,7 @@ def check_backends() -> Iterator[Finding]:
             else:
                 image, *gradients = errors.values()
                 text = f"{backend}: image to {image:.1e}, gradients to {max(gradients):.1e} of the float64 oracle; "
-                text += f"{min(times):.1f} ms for {SPLATS:,} splats at {WIDTH}x{HEIGHT}"
+                text += f"{min(times):.1f} ms for 4,000 splats at {here.size}"
                 yield judged("self-test", text, **values)
 
 
@@ -284,11 +303,12 @@ def check_points(model: ColmapModel) -> Iterator[Finding]:
         yield problem("points", f"none is finite: run {'COLMAP' if model.source == 'COLMAP' else 'the export'} again")
     else:
         distances = np.linalg.norm(finite - np.median(finite, axis=0), axis=1)
-        far = float(np.mean(distances > FAR * max(float(np.quantile(distances, 0.8)), 1e-12)))
+        # Ten times farther from the median than four fifths of the points.
+        far = float(np.mean(distances > 10.0 * max(float(np.quantile(distances, 0.8)), 1e-12)))
         lost = count - len(finite)
         text = f"{count:,}, {100 * far:.2g} % far outliers{f', {lost} not finite (left out)' if lost else ''}"
-        few = count < FEW_POINTS and "few to start from; take more photos with more overlap, or match more features"
-        spread = far > MANY_OUTLIERS and "they become floaters; filter them with `colmap point_filtering`"
+        few = count < 1000 and "few to start from; take more photos with more overlap, or match more features"
+        spread = far > 0.02 and "they become floaters; filter them with `colmap point_filtering`"
         yield judged("points", text, few, spread, points=count, not_finite=lost, outliers=far)
 
 
@@ -302,21 +322,22 @@ def check_overlap(model: ColmapModel) -> Iterator[Finding]:
         yield judged("tracks", f"{model.source} has no observations", "the overlap of views is unknown")
         return
     lengths = np.bincount(pairs[:, 0], minlength=len(model.points))
-    share, mean = float(np.mean(lengths >= SEEN_BY)), float(lengths.mean())
-    text = f"{100 * share:.0f} % of the points were seen by {SEEN_BY} views or more, {mean:.1f} on average"
+    # Two views may be a wrong match, three confirm each other.
+    share, mean = float(np.mean(lengths >= 3)), float(lengths.mean())
+    text = f"{100 * share:.0f} % of the points were seen by 3 views or more, {mean:.1f} on average"
     advice = "many points are uncertain; take photos closer to each other"
-    yield judged("tracks", text, share < SEEN_WELL and advice, seen_by_three=share, mean=mean)
+    yield judged("tracks", text, share < 0.5 and advice, seen_by_three=share, mean=mean)
     seen = csr_array((np.ones(len(pairs), np.int64), pairs.T), shape=(len(lengths), len(names)))
     common = (seen.T @ seen).toarray()  # points that two views both saw [V, V]; on the diagonal, those of one view
     own = np.maximum(common.diagonal(), 1)
     np.fill_diagonal(common, 0)
     best = common.max(axis=1) / own
-    groups, group_of = connected_components(common >= COMMON, directed=False)
-    weak = np.flatnonzero(group_of != np.bincount(group_of).argmax() if groups > 1 else best < LITTLE_OVERLAP)
+    groups, group_of = connected_components(common >= 15, directed=False)
+    weak = np.flatnonzero(group_of != np.bincount(group_of).argmax() if groups > 1 else best < 0.3)
     named = ", ".join(names[i] for i in weak[:3]) + (f" and {len(weak) - 3} more" if len(weak) > 3 else "")
     usual, least = float(np.median(best)), float(best.min())
     text = f"a photo shares {100 * usual:.0f} % of its points with its best partner, at least {100 * least:.0f} %"
-    apart = groups > 1 and f"under {COMMON} with the rest for {named}; take photos between them, or leave them out"
+    apart = groups > 1 and f"under 15 with the rest for {named}; take photos between them, or leave them out"
     little = len(weak) > 0 and f"little for {named}; take photos in between"
     yield judged("overlap", text, apart, little, median=usual, least=least, groups=int(groups))
 
@@ -329,7 +350,7 @@ def check_scene(root: Path, model: ColmapModel) -> Iterator[Finding]:
     train, test = len(scene.train), len(scene.test)
     text = f"{train} train and {test} test photos ({scene.split})"
     advice = "few; what lies between them is guessed, and the test score says little; take more photos"
-    yield judged("split", text, train < FEW_VIEWS and advice, train=train, test=test)
+    yield judged("split", text, train < 20 and advice, train=train, test=test)
     if not scene.extent > 0:
         yield problem("extent", f"all train photos {ONE_PLACE}", extent=scene.extent)
     yield from attempt("sizes", check_sizes(scene, model))
@@ -421,8 +442,9 @@ def exposure_of(image: torch.Tensor, index: int, scene: Scene, model: ColmapMode
     inside = (local[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
     here = image[y[inside].long(), x[inside].long()].double().mean(1)
     usual = torch.from_numpy(model.colors[rows[inside.numpy()]]).double().mean(1)
-    clear = (here > LOWEST) & (usual > LOWEST)
-    return float(GAMMA * (here[clear] / usual[clear]).log2().median()) if int(clear.sum()) >= ENOUGH else math.nan
+    clear = (here > 4.0) & (usual > 4.0)  # darker grey says nothing of exposure, nor do few points
+    gamma = 2.2
+    return float(gamma * (here[clear] / usual[clear]).log2().median()) if int(clear.sum()) >= 30 else math.nan
 
 
 def check_exposure(photos: Mapping[str, tuple[float, float, float]]) -> Iterator[Finding]:
@@ -437,7 +459,7 @@ def check_exposure(photos: Mapping[str, tuple[float, float, float]]) -> Iterator
         share = 1 - float(counts[counts < 1].mean())
         text = f"{masked} of {len(names)} photos have pixels that do not count, {100 * share:.0f} % of them"
         advice = f"most in {names[counts.argmin()]}; masks are white where the photo counts; if not, invert them"
-        yield judged("masks", text, share > MOSTLY and advice, masked=masked, excluded=share)
+        yield judged("masks", text, share > 0.7 and advice, masked=masked, excluded=share)
     text = "mean grey level {:.0f} to {:.0f}".format(*np.quantile(grey, (0.1, 0.9)))
     if np.isnan(stops).mean() > 0.5:
         yield judged("exposure", f"{text}; without observations, exposure and content of a photo cannot be separated")
@@ -446,7 +468,7 @@ def check_exposure(photos: Mapping[str, tuple[float, float, float]]) -> Iterator
     text += f"; the same points are {low:+.2f} to {high:+.2f} stops from their usual brightness"
     brightest = names[np.nanargmax(stops)]
     advice = f"colours disagree, {brightest} is brightest; lock exposure and white balance, or equalize the photos"
-    yield judged("exposure", text, high - low > UNEVEN and advice, stops=[low, high], grey=grey.tolist())
+    yield judged("exposure", text, high - low > 0.5 and advice, stops=[low, high], grey=grey.tolist())
 
 
 def check_budget(scene: Scene) -> Iterator[Finding]:
@@ -455,8 +477,9 @@ def check_budget(scene: Scene) -> Iterator[Finding]:
     from nsvq_lightning.data.scene import detailed_pixels
     from nsvq_lightning.training.memory_estimate import CACHE_BYTES, available_memory, readable_bytes, run_bytes
 
+    # Splats over a run, on average, as a multiple of the default for the photos.
     default = splats_for_photos(len(scene.train), detailed_pixels(scene))
-    fast, paper = round(FAST_SPLATS * default), round(PAPER_SPLATS * default)
+    fast, paper = round(1.3 * default), round(4.0 * default)
     photos, needed, free = scene.images.nbytes, run_bytes(scene, paper), available_memory()
     shown = readable_bytes(min(photos, CACHE_BYTES))
     text = f"about {readable_bytes(needed)} with {paper:,} splats and {shown} of photos"
@@ -464,17 +487,18 @@ def check_budget(scene: Scene) -> Iterator[Finding]:
         text += f" (all would take {readable_bytes(photos)}; the others are decoded each time)"
     advice = f"{readable_bytes(free or 0)} are available; lower --data.max_width or --data.cache_bytes"
     yield judged("run memory", text, free is not None and needed > free and advice, bytes=needed)
-    step, paper_step = (RENDERS_A_STEP * render_seconds(scene, count) for count in (fast, paper))
-    text = f"about {FAST * step / 60:.0f} min for fast.yaml ({FAST:,} steps, {fast:,} splats on average), "
+    # A step is a render forward and backward, and as long again for loss, optimizer and codebooks.
+    step, paper_step = (2.0 * render_seconds(scene, count) for count in (fast, paper))
+    text = f"about {4000 * step / 60:.0f} min for fast.yaml (4,000 steps, {fast:,} splats on average), "
     text += (
-        f"{PAPER * paper_step / 3600:.1f} h for the paper's run ({PAPER:,}, {paper:,}), with the machine as busy as now"
+        f"{45_000 * paper_step / 3600:.1f} h for the paper's run (45,000, {paper:,}), with the machine as busy as now"
     )
     yield judged("run time", text, step_seconds=step, paper_step_seconds=paper_step)
 
 
 def render_seconds(scene: Scene, count: int) -> float:
     """Median over views of the shortest time to render ``count`` splats forward and backward."""
-    from nsvq_lightning.commands.benchmark.timing import Case, milliseconds
+    from nsvq_lightning.commands.benchmark.timing import milliseconds
     from nsvq_lightning.rendering.rasterize import render
 
     splats = grown(scene, count)
@@ -482,7 +506,7 @@ def render_seconds(scene: Scene, count: int) -> float:
     def step(view: int) -> None:
         render(splats, scene.cameras[view]).image.mean().backward()  # type: ignore[no-untyped-call]
 
-    cases = [Case("step", partial(step, view)) for view in scene.some_train(REPEATS)]
+    cases = [partial(step, view) for view in scene.some_train(REPEATS)]
     return float(np.median([min(milliseconds(case) for _ in range(REPEATS)) for case in cases])) / 1000
 
 
@@ -503,52 +527,3 @@ def grown(scene: Scene, count: int) -> Splats:
     tensors["scales"] = tensors["scales"] - math.log(copies) / 2 + 0.5
     tensors["opacities"] = torch.randn(len(rows), generator=draw) - 0.5
     return Splats.from_tensors(**tensors)
-
-
-def check_all(folder: Path | None) -> Iterator[Finding]:
-    """All findings about this machine and, if given, a scene folder."""
-    yield from attempt("machine", check_machine())
-    yield from attempt("packages", check_packages())
-    yield from attempt("threads", check_threads())
-    yield from attempt("memory", check_room(Path()))
-    yield from attempt("gpu", check_gpu())
-    yield from attempt("self-test", check_backends())
-    if folder is not None:
-        yield from check_folder(folder)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Check this machine and, if given, a scene folder.
-
-    Args:
-        argv: Arguments after ``nsvq doctor``; those of the process if None.
-
-    Returns:
-        0, or 1 if there is a problem: the self-test fails or the folder cannot be used. Wrong arguments end the process
-        with status 2.
-    """
-    parser = argparse.ArgumentParser(
-        prog="nsvq doctor",
-        description="Check whether this machine is fit for training, by a test against a float64 oracle, and whether a "
-        "COLMAP folder is a good scene.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("folder", nargs="?", type=Path, metavar="FOLDER", help="COLMAP folder to check")
-    parser.add_argument("--json", action="store_true", help="print JSON instead of lines")
-    options = parser.parse_args(argv)
-    findings = []
-    for finding in check_all(options.folder):
-        findings.append(finding)
-        if not options.json:
-            sys.stdout.write(f"{finding}\n")
-            sys.stdout.flush()  # each check takes seconds
-    verdicts = [finding.verdict for finding in findings]
-    problems, notes = verdicts.count("problem"), verdicts.count("note")
-    if options.json:
-        document = {"ok": not problems, "findings": [finding._asdict() for finding in findings]}
-        sys.stdout.write(json.dumps(document, indent=2, ensure_ascii=False) + "\n")
-    else:
-        said = f"{problems or 'no'} problem{'s' * (problems != 1)}, {notes or 'no'} note{'s' * (notes != 1)}"
-        sys.stdout.write(f"\n{said}\n")
-    return 1 if problems else 0

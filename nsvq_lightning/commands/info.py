@@ -1,52 +1,35 @@
-"""``nsvq info FILE``: describe a scene file without importing torch."""
+"""Describe a scene file: .nsvq, .ply, .sog, .spz or .splat."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.commands.arguments import Parser
 from nsvq_lightning.io.describe import describe
-from nsvq_lightning.io.errors import FormatError
 
-__all__ = ["main"]
+__all__ = ["add_arguments", "run"]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Print the description of one file.
-
-    Args:
-        argv: Arguments after ``nsvq info``; those of the process if None.
-
-    Returns:
-        0, or 1 after a one-line error if the file cannot be read.
-    """
-    parser = Parser(prog="nsvq info", description="Describe a scene file: .nsvq, .ply, .sog, .spz or .splat.")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what ``nsvq info`` takes."""
     parser.add_argument("file", type=Path, metavar="FILE", help="scene file")
     parser.add_argument("--json", action="store_true", help="print the description as JSON")
-    options = parser.parse_args(argv)
-    try:
-        description = describe(options.file)
-    except FormatError as error:
-        return _fail(str(error))
-    except OSError as error:
-        return _fail(f"{options.file}: {error.strerror or error}")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print the description of one file, without importing torch."""
+    description = describe(options.file)
     text = json.dumps(description, indent=2, ensure_ascii=False) if options.json else _text(description)
     sys.stdout.write(text + "\n")
     return 0
 
 
-def _fail(message: str) -> int:
-    sys.stderr.write(f"nsvq info: {message}\n")
-    return 1
-
-
 def _text(facts: dict[str, Any]) -> str:
-    size = facts["bytes"]
-    whole = max(1, size)
+    size, splats = facts["bytes"], max(1, facts["splats"])
     rows = [
         ("file", facts["file"]),
         ("format", facts["format"]),
@@ -61,34 +44,27 @@ def _text(facts: dict[str, Any]) -> str:
     if "attributes" in facts:
         entries = ((a["name"], a["storage"], a["dim"], a["codes"], a["bits"]) for a in facts["attributes"])
         parts.append(_table(("attribute", "storage", "D", "K", "bits"), entries))
-    splats = max(1, facts["splats"])
+    streams = ((s["name"], s["encoding"], s["bytes"]) for s in facts["streams"])
     shares = (
-        (s["name"], s["encoding"], s["bytes"], f"{8 * s['bytes'] / splats:.2f}", f"{100 * s['bytes'] / whole:.1f} %")
-        for s in facts["streams"]
+        (*stream, f"{8 * stream[2] / splats:.2f}", f"{100 * stream[2] / max(1, size):.1f} %") for stream in streams
     )
     parts.append(_table(("stream", "encoding", "bytes", "bits per splat", "share"), shares))
-    parts += [f"{key}\n{_indented(facts[key])}" for key in ("metrics", "config") if facts.get(key)]
+    for key in ("metrics", "config"):
+        if facts.get(key):
+            # Without the outer braces; the lines between them are already indented by two.
+            lines = json.dumps(facts[key], indent=2, ensure_ascii=False).splitlines()[1:-1]
+            parts.append("\n".join([key, *lines]))
     return "\n\n".join(parts)
 
 
 def _table(head: tuple[str, ...], rows: Iterable[tuple[str | int, ...]]) -> str:
     """A table of two columns of words, then columns of numbers; 0 is shown as a dash."""
-    lines = [head, *(tuple(_cell(value) for value in row) for row in rows)]
+    lines = [head]
+    for row in rows:
+        lines.append(tuple(cell if isinstance(cell, str) else f"{cell:,}" if cell else "-" for cell in row))
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join(
-        "  ".join(
-            cell.ljust(width) if column < 2 else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    )
-
-
-def _cell(value: str | int) -> str:
-    return value if isinstance(value, str) else f"{value:,}" if value else "-"
-
-
-def _indented(value: object) -> str:
-    text = json.dumps(value, indent=2, ensure_ascii=False)
-    # Drop the outer braces; the lines between them are already indented by two.
-    return "\n".join(text.splitlines()[1:-1])
+    padded = []
+    for line in lines:
+        cells = zip(line, widths, "<<" + ">" * (len(head) - 2), strict=True)
+        padded.append("  ".join(f"{cell:{side}{width}}" for cell, width, side in cells).rstrip())
+    return "\n".join(padded)

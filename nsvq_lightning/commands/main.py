@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
+import argparse
+import inspect
 import io
 import logging
 import os
+import re
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from typing import TextIO
 
-from nsvq_lightning.commands.arguments import (
-    check_config,
-    configs_among,
-    expand,
-    limit_aliases,
-    nearest,
-    resolve_configs,
-    written_by_run,
-)
+from nsvq_lightning.commands import arguments as given
 from nsvq_lightning.commands.registry import COMMANDS, overview
 from nsvq_lightning.version import __version__
 
-__all__ = ["main"]
+__all__ = ["main", "run_command"]
 
 TRACEBACK = "NSVQ_TRACEBACK"
 """Environment variable that makes errors show their traceback."""
@@ -53,7 +48,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments; those of the process if None.
 
     Returns:
-        Exit status: 0, 1 after an error in the user's files, 130 after Ctrl-C, 143 after SIGTERM.
+        Exit status: 0, 1 after an error in the user's files, 130 after Ctrl-C, 143 after SIGTERM. Wrong arguments end
+        the process with status 2.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in ("--help", "-h", "help"):
@@ -65,19 +61,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):  # for example, a pipe on Windows accepts only the locale's characters
         sys.stdout.reconfigure(errors="replace")
     try:
-        if arguments[0] in COMMANDS and (module := COMMANDS[arguments[0]].module) is not None:
-            command: Callable[[Sequence[str]], int] = import_module(module).main
-            return command(arguments[1:])
+        if arguments[0] in COMMANDS and COMMANDS[arguments[0]].module is not None:
+            return run_command(arguments[0], arguments[1:])
         if arguments[0] not in COMMANDS and not arguments[0].startswith("-"):
-            meant = nearest(arguments[0], COMMANDS)
+            meant = given.nearest(arguments[0], COMMANDS)
             sys.stderr.write(f"error: there is no command {arguments[0]!r}{meant}\nAll commands: nsvq --help\n")
             return 2
-        return _run_lightning(resolve_configs(arguments))
+        return _run_lightning(given.resolve_configs(arguments))
     except KeyboardInterrupt:
         sys.stderr.write("\n")  # below the ^C that the terminal shows
         return INTERRUPTED
     except (MemoryError, RuntimeError) as error:
-        if os.environ.get(TRACEBACK) or not _lacks_memory(error):
+        # Torch says so in words, on a CPU and on a GPU.
+        lacks_memory = isinstance(error, MemoryError) or re.search("allocate memory|out of memory", str(error))
+        if os.environ.get(TRACEBACK) or not lacks_memory:
             raise
         sys.stderr.write(
             "error: there is not enough memory: close other programs, or take fewer splats (--splats), smaller photos "
@@ -88,6 +85,44 @@ def main(argv: Sequence[str] | None = None) -> int:
         if error.name != "cv2":
             raise
         sys.stderr.write("error: OpenCV (cv2) is missing: pip install opencv-contrib-python-headless, or any other\n")
+        return 1
+
+
+def run_command(name: str, arguments: Sequence[str]) -> int:
+    """Run a command that is not Lightning's.
+
+    The docstring of its module is what ``--help`` shows around the options; its ``add_arguments(parser)`` adds them.
+    Its ``run(options)`` does the work. It raises :class:`argparse.ArgumentError` for options that do not go together,
+    and :class:`ValueError` or :class:`OSError` for what is wrong with the user's files.
+
+    Args:
+        name: One of :data:`~nsvq_lightning.commands.registry.COMMANDS` that has a module.
+        arguments: What follows the name.
+
+    Returns:
+        Exit status: what ``run`` returns, or 1 after an error in the user's files.
+    """
+    command = import_module(str(COMMANDS[name].module))
+    about, _, more = inspect.cleandoc(command.__doc__ or "").partition("\n\n")
+    form = argparse.RawDescriptionHelpFormatter
+    parser = given.Parser(prog=f"nsvq {name}", description=about, epilog=more, formatter_class=form)
+    command.add_arguments(parser)
+    options, further = parser.parse_known_args(arguments)
+    if "further" in options:  # the command passes them on
+        options.further = further
+    elif further:
+        parser.error(f"unrecognized arguments: {' '.join(further)}")
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
+    try:
+        return int(command.run(options))
+    except argparse.ArgumentError as error:
+        parser.error(str(error))
+    except (ValueError, OSError) as error:
+        text = str(error)
+        if isinstance(error, OSError) and error.filename is not None:
+            text = f"{error.filename}: {error.strerror}"
+        sys.stderr.write(f"nsvq {name}: {text}\n")
         return 1
 
 
@@ -102,12 +137,12 @@ def _run_lightning(arguments: list[str]) -> int:
     _quiet_lightning()
     if os.getcwd() not in sys.path:  # last, unlike `python -m`: for the user's own quantizers and callbacks
         sys.path.append(os.getcwd())
-    configs = configs_among(arguments)
-    limit_aliases()
+    configs = given.configs_among(arguments)
+    given.limit_aliases()
     try:
         for config in configs:
-            check_config(config)
-        SplatCLI(expand(arguments))
+            given.check_config(config)
+        SplatCLI(given.expand(arguments))
     except SIGTERMException:  # a kind of SystemExit
         return 128 + signal.SIGTERM  # Lightning itself would exit with the status of success
     except SystemExit as end:
@@ -115,7 +150,7 @@ def _run_lightning(arguments: list[str]) -> int:
             return INTERRUPTED
         if end.code == 2 and configs:  # the parser's messages name the option, not the file it came from
             sys.stderr.write(f"Settings came from {', '.join(configs)} and the command line\n")
-            if old := [config for config in configs if written_by_run(config)]:
+            if old := [config for config in configs if given.written_by_run(config)]:
                 sys.stderr.write(
                     f"A run has written {', '.join(old)}: if that was an earlier version of this package, what the "
                     "error names may have another name now; remove it from that file\n"
@@ -129,11 +164,6 @@ def _run_lightning(arguments: list[str]) -> int:
         sys.stderr.write(f"error: {error}\n({TRACEBACK}=1 shows where)\n")
         return 1
     return 0
-
-
-def _lacks_memory(error: Exception) -> bool:
-    """Whether memory ran out: of Python and NumPy, or of torch, which says so in words, on a CPU and on a GPU."""
-    return isinstance(error, MemoryError) or "allocate memory" in str(error) or "out of memory" in str(error)
 
 
 def _is_ours(error: BaseException) -> bool:
@@ -172,9 +202,5 @@ def _quiet_lightning() -> None:
         # With several processes, only the first logs below warnings; each logs its own warnings and errors.
         handler.addFilter(lambda record: record.levelno >= logging.WARNING or getattr(rank_zero_only, "rank", 0) == 0)
 
-    def keep(record: logging.LogRecord) -> bool:
-        text = record.getMessage()
-        return not any(part in text for part in NOT_OURS)
-
     for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
-        logging.getLogger(name).addFilter(keep)
+        logging.getLogger(name).addFilter(lambda record: not any(part in record.getMessage() for part in NOT_OURS))

@@ -11,7 +11,6 @@ __all__ = ["Progress", "progress"]
 
 LINES = 10
 """Lines at most if the output is not a terminal."""
-BAR = "{desc}{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}{unit} {elapsed}<{remaining}"
 
 _T = TypeVar("_T")
 
@@ -26,14 +25,14 @@ class Progress:
     """
 
     def __init__(self, total: int, before: str = "", after: str = "") -> None:
-        self._total, self._before, self._after = max(1, total), before, after
+        self._total, self._before, self._after = max(1, total), before and f"{before}: ", after and f" {after}"
         self._began, self._told = time.monotonic(), 0
         self._bar: Any = None
         if sys.stderr.isatty():
             from tqdm import tqdm
 
-            text = {"desc": f"{before} ", "unit": f" {after}"} if before else {"unit": f" {after}"}
-            self._bar = tqdm(total=self._total, bar_format=BAR, **text)
+            form = f"{self._before}{{percentage:3.0f}}%|{{bar}}| {{n}}/{{total}}{self._after} {{elapsed}}<{{remaining}}"
+            self._bar = tqdm(total=self._total, bar_format=form)
 
     def show(self, done: int) -> None:
         """Say that this much is done; the last call has done everything."""
@@ -42,15 +41,11 @@ class Progress:
             self._bar.refresh()
             if done >= self._total:
                 self._bar.close()
-            return
-        share = done * LINES // self._total
-        if share > self._told:
-            self._told, passed = share, time.monotonic() - self._began
+        elif done * LINES // self._total > self._told:
+            self._told, passed = done * LINES // self._total, time.monotonic() - self._began
             left = passed * (self._total - done) / done
-            front = f"{self._before}: " if self._before else ""
-            what = f" {self._after}" if self._after else ""
-            sys.stderr.write(f"{front}{done} of {self._total}{what}, {passed:.0f} s elapsed, {left:.0f} s left\n")
-            sys.stderr.flush()
+            text = f"{self._before}{done} of {self._total}{self._after}, {passed:.0f} s elapsed, {left:.0f} s left"
+            print(text, file=sys.stderr, flush=True)
 
 
 def progress(items: Sequence[_T], what: str) -> Iterator[_T]:

@@ -12,7 +12,8 @@ class Command(NamedTuple):
 
     summary: str
     module: str | None = None
-    """Module of its ``main(argv)``; None for those that Lightning's command line runs, which takes seconds to start."""
+    """What :func:`~nsvq_lightning.commands.main.run_command` runs; None for the commands of Lightning's command line,
+    which takes seconds to start."""
 
 
 COMMANDS = {
@@ -29,7 +30,7 @@ COMMANDS = {
     "render": Command("render pictures or a video along a path of cameras", "nsvq_lightning.commands.render"),
     "sweep": Command("train many runs and compare them", "nsvq_lightning.commands.sweep.run"),
     "doctor": Command("check whether this machine and a scene folder are fit", "nsvq_lightning.commands.doctor"),
-    "benchmark": Command("measure run time against error on this machine", "nsvq_lightning.commands.benchmark.cli"),
+    "benchmark": Command("measure run time against error on this machine", "nsvq_lightning.commands.benchmark.command"),
 }
 """All commands by name."""
 

@@ -1,14 +1,20 @@
-"""``nsvq view``: look at a scene in the browser, also while it trains."""
+"""Look at a scene in the browser, with the cameras of its photos.
+
+Examples:
+  nsvq view runs/fox/version_0
+  nsvq view runs/fox/version_1 --live           a fit that is running
+  nsvq view scene.ply --data.root scenes/fox    with the cameras of its photos
+  nsvq view scene.nsvq -o scene.html            one file to send to somebody, no server
+"""
 
 from __future__ import annotations
 
 import argparse
-import logging
 import sys
 import tempfile
 import threading
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
@@ -16,36 +22,36 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import urlsplit
 
-from nsvq_lightning.commands.arguments import Parser, cameras_of, photos_of, scene_file
+from nsvq_lightning.commands.arguments import cameras_of, photos_of, scene_file
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from nsvq_lightning.rendering.camera import Camera
 
-__all__ = ["main"]
+__all__ = ["add_arguments", "run"]
 
 PORT = 7007
-SECONDS = 3.0
-"""Time between two looks at a fit."""
-LIKELY = 12
-"""Cameras that are guessed for a scene without photos."""
-PATIENCE = 20.0
-"""Seconds after which a connection is closed on which nothing moves."""
 MOST = 64
 """Connections at a time; more are closed at once."""
-PART = 1 << 16
-"""Bytes that are sent in one go, for each of which a slow client has the whole patience."""
-THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
-ALL_ADDRESSES = ("0.0.0.0", "::")
 
-EPILOG = """\
-examples:
-  nsvq view runs/fox/version_0
-  nsvq view runs/fox/version_1 --live           a fit that is running
-  nsvq view scene.ply --data.root scenes/fox    with the cameras of its photos
-  nsvq view scene.nsvq -o scene.html            one file to send to somebody, no server
-"""
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what ``nsvq view`` takes."""
+    add = parser.add_argument
+    add("scene", type=Path, metavar="SCENE", help="scene file, or the folder of a run")
+    add("--live", action="store_true", help="follow a fit that is running, given its folder")
+    help_ = "folder of the photos, whose cameras are offered; that of the run by default"
+    add("--data.root", dest="root", type=Path, metavar="FOLDER", help=help_)
+    add("-o", "--output", type=Path, metavar="OUT.html", help="write one page with the scene instead")
+    add("--port", type=_port, default=PORT, help=f"{PORT} by default; 0 for any that is free")
+    help_ = "127.0.0.1, this machine only, by default; 0.0.0.0 for all of the network"
+    add("--host", default="127.0.0.1", help=help_)
+    add("--no-open", dest="open", action="store_false", help="do not open the browser")
+
+
+def _port(text: str) -> int:
+    if not (text.isdecimal() and int(text) < 1 << 16):
+        raise argparse.ArgumentTypeError(f"must be from 0 to 65535, got {text}")
+    return int(text)
 
 
 class Source(NamedTuple):
@@ -67,29 +73,40 @@ class Source(NamedTuple):
         return next((file for file in files if file.is_file()), None)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Serve a scene until Ctrl-C.
+def run(options: argparse.Namespace) -> int:
+    """Serve a scene until Ctrl-C, or write its page.
 
-    Args:
-        argv: Arguments after ``nsvq view``; those of the process if None.
-
-    Returns:
-        0, or 1 after an error in the user's files. Wrong arguments end the process with status 2.
+    Raises:
+        argparse.ArgumentError: Options contradict each other.
+        ValueError: The scene is empty, or it is not known where the photos of a running fit are.
+        OSError: A file cannot be read or written, or the port is taken.
     """
-    parser = _parser()
-    options = parser.parse_args(argv)
+    from nsvq_lightning.report.viewer import viewer_page, write_viewer
+
     if options.live and (options.output is not None or not options.scene.is_dir()):
-        parser.error("--live follows a fit that is running: give the folder of the run, and no --output")
-    logging.basicConfig(format="%(message)s")
-    try:
-        with _source(options) as source:
-            if options.output is not None:
-                _write(options, source)
-            else:
-                _serve(options, source)
-    except (ValueError, OSError) as error:
-        sys.stderr.write(f"nsvq view: {error}\n")
-        return 1
+        message = "--live follows a fit that is running: give the folder of the run, and no --output"
+        raise argparse.ArgumentError(None, message)
+    path = options.scene.resolve()
+    title = f"{path.parent.name} / {path.name}" if path.is_dir() else path.name
+    with _source(options) as source:
+        cameras = _cameras(options, source)
+        if options.output is not None:
+            options.output.parent.mkdir(parents=True, exist_ok=True)
+            size = write_viewer(options.output, source.file, cameras, title)
+            sys.stdout.write(f"{options.output}: {size:,} bytes\n")
+            return 0
+        page = viewer_page(cameras, title, live=3.0 if options.live else 0.0).encode()  # seconds between two looks
+        handler = type("Handler", (_Handler,), {"page": page, "source": source, "host": options.host})
+        try:
+            server = _Server((options.host, options.port), handler)
+        except OSError as error:
+            raise OSError(f"cannot listen on {options.host}:{options.port} ({error}); choose another --port") from None
+        with server:
+            address = f"http://{options.host}:{server.server_port}/"
+            print(f"{title} is at {address} until Ctrl-C", flush=True)
+            if options.open:
+                webbrowser.open(address)
+            server.serve_forever()
     return 0
 
 
@@ -132,39 +149,7 @@ def _cameras(options: argparse.Namespace, source: Source) -> dict[str, Camera]:
     if len(splats) == 0:
         raise ValueError(f"{options.scene} holds no splat; there is nothing to see")
     sys.stderr.write("no photos: cameras are guessed from the scene; --data.root names the folder of the photos\n")
-    return {f"guess {index}": camera for index, camera in enumerate(likely_cameras(splats, LIKELY), 1)}
-
-
-def _title(options: argparse.Namespace) -> str:
-    path = options.scene.resolve()
-    return f"{path.parent.name} / {path.name}" if path.is_dir() else path.name
-
-
-def _write(options: argparse.Namespace, source: Source) -> None:
-    from nsvq_lightning.report.viewer import write_viewer
-
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    size = write_viewer(options.output, source.file, _cameras(options, source), _title(options))
-    sys.stdout.write(f"{options.output}: {size:,} bytes\n")
-
-
-def _serve(options: argparse.Namespace, source: Source) -> None:
-    from nsvq_lightning.report.viewer import viewer_page
-
-    live = SECONDS if source.run is not None else 0.0
-    page = viewer_page(_cameras(options, source), _title(options), live=live).encode()
-    handler = type("Handler", (_Handler,), {"page": page, "source": source, "host": options.host})
-    try:
-        server = _Server((options.host, options.port), handler)
-    except OSError as error:
-        raise OSError(f"cannot listen on {options.host}:{options.port} ({error}); choose another --port") from None
-    with server:
-        address = f"http://{options.host}:{server.server_port}/"
-        sys.stdout.write(f"{_title(options)} is at {address} until Ctrl-C\n")
-        sys.stdout.flush()
-        if options.open:
-            webbrowser.open(address)
-        server.serve_forever()
+    return {f"guess {index}": camera for index, camera in enumerate(likely_cameras(splats, 12), 1)}
 
 
 class _Server(ThreadingHTTPServer):
@@ -199,19 +184,20 @@ class _Handler(BaseHTTPRequestHandler):
     page: bytes
     source: Source
     host: str
-    timeout = PATIENCE
+    timeout = 20.0
+    """Seconds after which a connection is closed on which nothing moves."""
     followed = False
     """Whether splats of the running fit have been shown."""
 
     def do_GET(self) -> None:
         if not _is_own(self.headers.get("Host", ""), self.host):
-            self._answer(403, "text/plain; charset=utf-8", b"open the address that nsvq view has printed")
+            self._answer(403, b"open the address that nsvq view has printed")
         elif self.path == "/":
-            self._answer(200, "text/html; charset=utf-8", self.page)
+            self._answer(200, self.page, "text/html; charset=utf-8")
         elif self.path in ("/scene.nsvq", "/version"):
             self._scene(self.path == "/version")
         else:
-            self._answer(404, "text/plain; charset=utf-8", b"there is no such page")
+            self._answer(404, b"there is no such page")
 
     def _scene(self, is_question: bool) -> None:
         from nsvq_lightning.training import live_preview
@@ -221,26 +207,27 @@ class _Handler(BaseHTTPRequestHandler):
             (live_preview.end if self.source.file.exists() else live_preview.ask)(self.source.run)
         file = self.source.current()
         try:
-            if file is None:
-                waiting = "waiting for the run to show its splats"
-                text = "the run trains no more; its scene is not there yet" if self.followed else waiting
-                self._answer(503, "text/plain; charset=utf-8", text.encode())
+            if file is None and self.followed:
+                self._answer(503, b"the run trains no more; its scene is not there yet")
+            elif file is None:
+                self._answer(503, b"waiting for the run to show its splats")
             elif is_question:
-                self._answer(200, "text/plain", f"{file.name} {file.stat().st_mtime_ns}".encode())
+                self._answer(200, f"{file.name} {file.stat().st_mtime_ns}".encode())
             else:
-                self._answer(200, "application/octet-stream", file.read_bytes())
+                self._answer(200, file.read_bytes(), "application/octet-stream")
                 type(self).followed = file != self.source.file
         except FileNotFoundError:  # the run has ended in between
-            self._answer(503, "text/plain; charset=utf-8", b"the scene is being written")
+            self._answer(503, b"the scene is being written")
 
-    def _answer(self, status: int, kind: str, content: bytes) -> None:
+    def _answer(self, status: int, content: bytes, kind: str = "text/plain; charset=utf-8") -> None:
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(content)))
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
-        for start in range(0, len(content), PART):
-            self.wfile.write(content[start : start + PART])
+        part = 1 << 16  # for each of which a slow client has the whole timeout
+        for start in range(0, len(content), part):
+            self.wfile.write(content[start : start + part])
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing of each request."""
@@ -255,37 +242,7 @@ def _is_own(header: str, bound: str) -> bool:
     """
     try:
         name = urlsplit(f"//{header}").hostname or ""
-        return name in (*THIS_MACHINE, bound.lower()) or (bound in ALL_ADDRESSES and bool(ip_address(name)))
+        is_here = name in ("localhost", "127.0.0.1", "::1", bound.lower())
+        return is_here or (bound in ("0.0.0.0", "::") and bool(ip_address(name)))
     except ValueError:
         return False
-
-
-def _port(text: str) -> int:
-    if not (text.isdecimal() and int(text) < 1 << 16):
-        raise argparse.ArgumentTypeError(f"must be from 0 to 65535, got {text}")
-    return int(text)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = Parser(
-        prog="nsvq view",
-        description="Look at a scene in the browser, with the cameras of its photos.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file, or the folder of a run")
-    parser.add_argument("--live", action="store_true", help="follow a fit that is running, given its folder")
-    parser.add_argument(
-        "--data.root",
-        dest="root",
-        type=Path,
-        metavar="FOLDER",
-        help="folder of the photos, whose cameras are offered; that of the run by default",
-    )
-    parser.add_argument("-o", "--output", type=Path, metavar="OUT.html", help="write one page with the scene instead")
-    parser.add_argument("--port", type=_port, default=PORT, help=f"{PORT} by default; 0 for any that is free")
-    parser.add_argument(
-        "--host", default="127.0.0.1", help="127.0.0.1, this machine only, by default; 0.0.0.0 for all of the network"
-    )
-    parser.add_argument("--no-open", dest="open", action="store_false", help="do not open the browser")
-    return parser

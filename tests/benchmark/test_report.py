@@ -16,7 +16,7 @@ MACHINE: dict[str, Any] = {**describe_machine(), "cpu": "Abacus 1", "usable_core
 
 
 def _row(method: str, ms: float, operation: str, note: str = "", **values: float) -> Measurement:
-    return Measurement("quantize", "W", method, operation, 1, Timing((ms, 2 * ms, 3 * ms), (10.0,)), values, note)
+    return Measurement(operation, "W", method, 1, Timing((ms, 2 * ms, 3 * ms), (10.0,)), values, note)
 
 
 ROWS = [
@@ -32,7 +32,7 @@ def test_numbers_have_three_digits() -> None:
 
 
 def test_tables_name_the_machine_and_every_operation() -> None:
-    text = as_markdown(MACHINE, Scope((1, 2), quick=True), ROWS)
+    text = as_markdown(MACHINE, Scope((1, 2), quick=True), {"quantize": ROWS})
     for said in ("Abacus 1 (", "), 2 of 4 cores, ", ", load average 0.2 at", "Rounds: 15; threads: 1, 2; quick."):
         assert said in text
     assert text.count("### search, W, 1 thread\n") == text.count("### other, W, 1 thread\n") == 1
@@ -43,15 +43,16 @@ def test_tables_name_the_machine_and_every_operation() -> None:
     assert lines[4][-2:] == ["wrong", "extra"]
     assert text.endswith("\n\nOnly half.\n")
     other = [dataclasses.replace(ROWS[0], workload="V"), dataclasses.replace(ROWS[0], threads=2), ROWS[0]]
-    assert "### search\n\n| workload | method | threads |" in as_markdown(MACHINE, Scope((1, 2)), other)
+    assert "### search\n\n| workload | method | threads |" in as_markdown(MACHINE, Scope((1, 2)), {"quantize": other})
 
 
 def test_json_has_the_samples_and_nothing_but_plain_values() -> None:
     scope = Scope((1,), scene=Path("a/b.ply"), beside=(Path("a/b.spz"),))
-    results = json.loads(json.dumps(as_json(MACHINE, scope, ROWS), allow_nan=False))
+    results = json.loads(as_json(MACHINE, scope, {"quantize": ROWS}))
     assert results["machine"] == MACHINE
     assert (results["settings"]["scene"], results["settings"]["beside"]) == ("a/b.ply", ["a/b.spz"])
     first, _, last = results["rows"]
+    assert first["suite"] == "quantize"
     assert first["timing"] == {"samples": [1, 2, 3], "sgemm": [10]}
     assert (first["median_ms"], first["sgemm_ratio"]) == (2, pytest.approx(0.2))
     assert last["values"] == {"wrong": 12, "extra": 1}

@@ -7,7 +7,7 @@ import torch
 
 from nsvq_lightning import save
 from nsvq_lightning.commands.benchmark import Scope
-from nsvq_lightning.commands.benchmark.workloads import relative_l2, scene_workload, synthetic_workload, workloads
+from nsvq_lightning.commands.benchmark.workloads import relative_l2, synthetic_workload, workloads
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats, Splats
@@ -37,16 +37,17 @@ def test_scene_file_is_seen_whole_and_without_broken_splats(tmp_path: Path, monk
     source.means.add_(torch.tensor([10.0, -3.0, 7.0]))
     path = tmp_path / "scene.ply"
     save(source, path)
-    (whole,) = workloads(Scope((1,), scene=path))
+    scope = Scope((1,), scene=path)
+    (whole,) = workloads(scope)
     assert str(whole) == "scene.ply 800x533"
     assert float((render(whole.splats, whole.camera).radii > 0).float().mean()) > 0.7
     # Our own writer drops such rows; files of others have them.
     source.opacities[3] = torch.nan
     monkeypatch.setattr("nsvq_lightning.commands.benchmark.workloads.load", lambda _: Splats.from_tensors(*source))
-    assert len(scene_workload(path).splats.means) == 499
+    assert len(workloads(scope)[0].splats.means) == 499
     source.opacities.fill_(torch.nan)
     with pytest.raises(ValueError, match="no splat"):
-        scene_workload(path)
+        workloads(scope)
 
 
 def test_folder_is_seen_by_its_first_train_camera(demo_scene: Path) -> None:

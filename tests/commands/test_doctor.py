@@ -16,7 +16,8 @@ from llvmlite import binding
 
 from nsvq_lightning.commands import doctor
 from nsvq_lightning.commands.benchmark import render as rendering
-from nsvq_lightning.commands.doctor import Finding, attempt, check_folder, main
+from nsvq_lightning.commands.doctor import Finding, attempt, check_folder
+from nsvq_lightning.commands.main import main
 from nsvq_lightning.compute import environment, jit
 from nsvq_lightning.data.colmap import import_pycolmap, read_model
 from nsvq_lightning.data.scene import load_scene
@@ -38,7 +39,7 @@ def _by_subject(root: Path) -> dict[str, Finding]:
 
 
 def test_json_has_every_finding_and_the_verdict(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--json"]) == 0
+    assert main(["doctor", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     subjects = {finding["subject"] for finding in document["findings"]}
     assert document["ok"]
@@ -47,7 +48,7 @@ def test_json_has_every_finding_and_the_verdict(capsys: pytest.CaptureFixture[st
 
 
 def test_a_bad_folder_gives_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([str(tmp_path)]) == 1
+    assert main(["doctor", str(tmp_path)]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert [line for line in lines if line.startswith(f"problem  model        no COLMAP model in {tmp_path}")]
     assert lines[-1].startswith("1 problem,")
@@ -61,7 +62,8 @@ def test_help_answers_before_torch_is_imported() -> None:
 
 
 def test_without_opencv_the_other_checks_are_still_made() -> None:
-    code = "import sys; sys.modules['cv2'] = None\nfrom nsvq_lightning.commands.doctor import main; sys.exit(main([]))"
+    code = "import sys; sys.modules['cv2'] = None\nfrom nsvq_lightning.commands.main import main\n"
+    code += "sys.exit(main(['doctor']))"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (run.returncode, "problem  opencv" in run.stdout, "waiting" in run.stdout) == (1, True, True)
 

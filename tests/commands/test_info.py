@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from splat_scenes import random_splats
 
-from nsvq_lightning.commands import main as cli
-from nsvq_lightning.commands.info import main
-from nsvq_lightning.io import CompressedScene, write_nsvq, write_ply
+from nsvq_lightning.commands.main import main
+from nsvq_lightning.io import CompressedScene, SplatArrays, write_nsvq, write_ply
 
 
 def _plain(n: int) -> CompressedScene:
@@ -31,7 +30,7 @@ def _scene(n: int) -> CompressedScene:
 def test_text_for_a_compressed_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "x.nsvq"
     write_nsvq(path, _scene(1000), "paper")
-    assert main([str(path)]) == 0
+    assert main(["info", str(path)]) == 0
     text = capsys.readouterr().out
     lines = [line.split() for line in text.splitlines()]
     assert ["splats", "1,000"] in lines
@@ -45,7 +44,7 @@ def test_names_that_the_output_cannot_show_are_no_error(tmp_path: Path, monkeypa
     write_ply(tmp_path / "höhle.ply", _plain(3))
     printed = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(printed, encoding="ascii"))
-    assert cli.main(["info", str(tmp_path / "höhle.ply")]) == 0
+    assert main(["info", str(tmp_path / "höhle.ply")]) == 0
     sys.stdout.flush()
     assert b"h?hle.ply" in printed.getvalue()
 
@@ -54,7 +53,7 @@ def test_streams_add_up_to_the_file(tmp_path: Path, capsys: pytest.CaptureFixtur
     write_nsvq(tmp_path / "x.nsvq", _scene(1000))
     write_ply(tmp_path / "x.ply", _plain(1000))
     for name in ("x.nsvq", "x.ply"):
-        assert main([str(tmp_path / name), "--json"]) == 0
+        assert main(["info", str(tmp_path / name), "--json"]) == 0
         facts = json.loads(capsys.readouterr().out)
         assert sum(stream["bytes"] for stream in facts["streams"]) == facts["bytes"]
         assert facts["bytes"] == (tmp_path / name).stat().st_size
@@ -76,7 +75,7 @@ def test_bad_files_are_one_line_and_status_1(
 ) -> None:
     (tmp_path / "bad.nsvq").write_bytes(content)
     for path in (tmp_path / "bad.nsvq", tmp_path / "missing.nsvq", tmp_path):
-        assert main([str(path)]) == 1
+        assert main(["info", str(path)]) == 1
         captured = capsys.readouterr()
         assert captured.out == ""
         assert captured.err.count("\n") == 1
@@ -85,7 +84,7 @@ def test_bad_files_are_one_line_and_status_1(
 
 def test_it_starts_without_torch_in_under_a_second(tmp_path: Path) -> None:
     write_nsvq(tmp_path / "x.nsvq", _scene(1000))
-    code = "import sys; from nsvq_lightning.commands.info import main; status = main(sys.argv[1:]); "
+    code = "import sys; from nsvq_lightning.commands.main import main; status = main(['info', *sys.argv[1:]]); "
     code += "assert 'torch' not in sys.modules; sys.exit(status)"
     times = []
     for _ in range(3):

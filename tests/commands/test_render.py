@@ -148,7 +148,7 @@ def test_folders_and_checkpoints_without_a_scene_are_told(tmp_path: Path, capsys
     ("arguments", "words"),
     [
         (["--frames", "0"], "must be above 0"),
-        (["--frames", "5", "--seconds", "2"], "say the same"),
+        (["--frames", "5", "--seconds", "2"], "not allowed with"),
         (["--size", "12"], "must be like 1280x720"),
         (["--what", "color,sound"], "color, depth, alpha"),
         (["--background", "2,0,0"], "three numbers from 0 to 1"),

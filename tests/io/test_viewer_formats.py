@@ -20,7 +20,7 @@ from ring import cameras_around
 from scipy.spatial.transform import Rotation
 from viewer_scenes import angles, assert_same, coded_scene, nearest_in, needs_zstd, plain_scene, sigmoid
 
-from nsvq_lightning.commands.info import main as info
+from nsvq_lightning.commands.main import main
 from nsvq_lightning.compression.viewpoints import decibels, picture_error, pictures
 from nsvq_lightning.io import CompressedScene, FormatError, load, read_scene, save
 from nsvq_lightning.io.describe import describe
@@ -296,7 +296,7 @@ def test_bytes_depend_on_the_scene_alone(tmp_path: Path, suffix: str) -> None:
 def test_empty_and_single_splats(tmp_path: Path, suffix: str, count: int) -> None:
     save(plain_scene(count, 2).decode(), tmp_path / f"x{suffix}")
     assert len(load(tmp_path / f"x{suffix}")) == count
-    assert info([str(tmp_path / f"x{suffix}")]) == 0
+    assert main(["info", str(tmp_path / f"x{suffix}")]) == 0
     zero = replace(plain_scene(1), raw={**plain_scene(1).raw, "quats": np.zeros((1, 4), np.float32)})
     back = arrays_of(read_scene_of(zero, tmp_path / f"x{suffix}"))
     assert angles(back.quats, np.array([[1, 0, 0, 0]], np.float32)).max() < 0.01

@@ -22,7 +22,6 @@ from nsvq_lightning.commands.sweep import run as module
 from nsvq_lightning.commands.sweep.plan import Run, plan
 from nsvq_lightning.commands.sweep.results import Row
 from nsvq_lightning.commands.sweep.run import commands, folder_of, prepare, run_subprocess, sweep, train
-from nsvq_lightning.commands.sweep.run import main as sweep_main
 from nsvq_lightning.training.run_folder import MARKER, _lock
 
 Calls = list[Sequence[str]]
@@ -262,23 +261,23 @@ def test_the_command_says_what_it_would_do(
     demo_scene: Path, configs: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = [f"--scenes={demo_scene}", f"--configs={configs[0]},plain", "--seeds=0,1", "--max-steps=60"]
-    assert sweep_main(["--dry-run", f"--output={tmp_path}", *given, *OPTIONS[:3]]) == 0
+    assert main(["sweep", "--dry-run", f"--output={tmp_path}", *given, *OPTIONS[:3]]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 4
     assert "60 iterations from trunks/scene-seed0-" in lines[0]
     assert lines[1].endswith("60 iterations from the start, new")
-    assert sweep_main([f"--output={tmp_path}", "--scenes=missing"]) == 1
+    assert main(["sweep", f"--output={tmp_path}", "--scenes=missing"]) == 1
     problem = "missing is no folder; --scenes takes COLMAP folders with commas between them"
     assert capsys.readouterr().err == f"nsvq sweep: {problem}\n"
     with pytest.raises(SystemExit):
-        sweep_main([f"--output={tmp_path}", "--scenes", "a", "b"])
+        main(["sweep", f"--output={tmp_path}", "--scenes", "a", "b"])
 
 
 def test_what_another_process_writes_is_left_alone(
     demo_scene: Path, runs: list[Run], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with held(tmp_path):
-        assert sweep_main([f"--output={tmp_path}", f"--scenes={demo_scene}"]) == 1
+        assert main(["sweep", f"--output={tmp_path}", f"--scenes={demo_scene}"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"nsvq sweep: another run is writing to {tmp_path} now")
     folder = folder_of(tmp_path, runs[0])

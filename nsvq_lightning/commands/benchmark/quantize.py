@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from itertools import count
 from typing import NamedTuple, cast
@@ -12,26 +12,18 @@ from torch import Tensor
 
 from nsvq_lightning.commands.benchmark import Scope
 from nsvq_lightning.commands.benchmark.report import Panel
-from nsvq_lightning.commands.benchmark.timing import Case, Measurement, measure, use_threads
-from nsvq_lightning.commands.benchmark.workloads import relative_l2, single_workload
+from nsvq_lightning.commands.benchmark.timing import Measurement, compare, use_threads
+from nsvq_lightning.commands.benchmark.workloads import relative_l2, synthetic_workload, workloads
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, CodebookQuantizer, kmeans, nearest, nearest_reference
 from nsvq_lightning.quantize.attributes import build_quantizers
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.optim import LearningRates
 
-__all__ = ["PANELS", "Attribute", "code_errors", "distortion", "plain_step", "prepare", "run", "step", "step_errors"]
-
 STEP, SEARCH, KMEANS = "step, forward + backward", "search", "k-means"
 PANELS = (Panel(STEP, "gradient error"), Panel(SEARCH, "wrong codes"), Panel(KMEANS, "distortion"))
-VISIBLE = 0.8
-"""Share of the splats that a camera sees."""
-CHUNK = 1 << 22
-"""Distances held at once by plain torch."""
 CHECKED_ROWS = 4_000
 """Rows an attribute whose codes are checked: the float64 oracle is slow."""
-LLOYD_STEPS = (1, 10)
-"""Lloyd steps that are compared; training takes the last number."""
 
 
 class Attribute(NamedTuple):
@@ -58,20 +50,40 @@ Results = dict[str, tuple[Tensor, Tensor, Tensor]]
 
 def run(scope: Scope) -> Iterator[Measurement]:
     """Time every operation with every number of threads."""
-    source = single_workload(scope, "B100k")
+    source = synthetic_workload("A20k" if scope.quick else "B100k") if scope.scene is None else workloads(scope)[0]
     with use_threads(max(scope.threads)):
         attributes = prepare(source.splats, scope.codebooks)
-    name = f"{source.name}, {scope.codebooks} codebooks"
+    for name, attribute in attributes.items():
+        x, codebook = attribute.x.detach(), attribute.quantizer.codebook.detach()
+        seen, size = x[attribute.rows], f"D {x.shape[1]}, K {len(codebook)}"
+        searches = {"nsvq_lightning": nearest, "cdist + argmin": _by_distances}
+        means = {f"Lloyd: {n} step{'s' * (n > 1)}": n for n in (1, 10)}  # the last one is training's
+        cases = {method: partial(search, seen, codebook) for method, search in searches.items()}
+        starts = {method: partial(_kmeans, x, len(codebook), name, steps) for method, steps in means.items()}
+        with use_threads(max(scope.threads)):
+            errors = {method: code_errors(seen, codebook, call()) for method, call in cases.items()}
+            kept = {method: {"distortion": distortion(x, call())} for method, call in starts.items()}
+        yield from compare(SEARCH, f"{name}: {len(seen)} rows, {size}", cases, errors, scope)
+        yield from compare(KMEANS, f"{name}: {len(x)} rows, {size}", starts, kept, scope)
     # The step comes last: it moves rows and codes, and the others measure them as they are fitted.
-    yield from _search_rows(attributes, scope)
-    yield from _kmeans_rows(attributes, scope)
-    yield from _step_rows(attributes, name, scope)
+    methods, clock = {"NSVQ": step, "plain torch": plain_step}, count(1)
+    with use_threads(max(scope.threads)):
+        errors = {method: step_errors(attributes, call(attributes, 0)) for method, call in methods.items()}
+    steps = {method: lambda call=call: call(attributes, next(clock)) for method, call in methods.items()}
+    note = f"codes checked on at most {CHECKED_ROWS} rows an attribute"
+    workload, move = f"{source.name}, {scope.codebooks} codebooks", lambda: _advance(attributes, next(clock))
+    yield from compare(STEP, workload, steps, errors, scope, note, prepare=move)
+
+
+def _kmeans(x: Tensor, codes: int, name: str, steps: int) -> Tensor:
+    return kmeans(x, codes, generator(0, 0, "start", name), steps=steps)
 
 
 def prepare(splats: RawSplats, codebooks: str) -> dict[str, Attribute]:
     """Quantizers with the paper's codebook sizes, fitted by one step of k-means, with the rows of a training view."""
     scene = Splats.from_tensors(*splats)
-    chosen = torch.randperm(len(scene), generator=generator(0, 0, "visible"))[: int(VISIBLE * len(scene))].sort().values
+    shuffled = torch.randperm(len(scene), generator=generator(0, 0, "visible"))
+    chosen = shuffled[: int(0.8 * len(scene))].sort().values  # about as many as a camera sees
     prepared = {}
     for name, module in build_quantizers(lambda k, d: NSVQ(k, d, kmeans_steps=1), codebooks, scene).items():
         quantizer = cast(CodebookQuantizer, module)
@@ -81,25 +93,6 @@ def prepare(splats: RawSplats, codebooks: str) -> dict[str, Attribute]:
         upstream = 1e-6 * torch.randn(len(chosen), x.shape[1], generator=generator(0, 0, "upstream", name))
         prepared[name] = Attribute(quantizer.train(), x, chosen, upstream, getattr(LearningRates(), name))
     return prepared
-
-
-def _step_rows(attributes: Mapping[str, Attribute], workload: str, scope: Scope) -> Iterator[Measurement]:
-    methods = {"NSVQ": step, "plain torch": plain_step}
-    with use_threads(max(scope.threads)):
-        errors = {name: step_errors(attributes, method(attributes, 0)) for name, method in methods.items()}
-    clock = count(1)
-    cases = [
-        Case(
-            name,
-            lambda method=method: method(attributes, next(clock)),  # type: ignore[misc]
-            lambda: _advance(attributes, next(clock)),
-        )
-        for name, method in methods.items()
-    ]
-    note = f"codes checked on at most {CHECKED_ROWS} rows an attribute"
-    for threads in scope.threads:
-        for name, timing in measure(cases, scope, threads).items():
-            yield Measurement("quantize", workload, name, STEP, threads, timing, errors[name], note)
 
 
 @torch.no_grad()
@@ -175,41 +168,8 @@ def code_errors(x: Tensor, codebook: Tensor, codes: Tensor) -> dict[str, float]:
 
 
 def _by_distances(x: Tensor, codebook: Tensor) -> Tensor:
-    parts = torch.split(x, max(1, CHUNK // len(codebook)))
+    parts = torch.split(x, max(1, (1 << 22) // len(codebook)))  # all distances at once would fill the memory
     return torch.cat([torch.cdist(part, codebook).argmin(1) for part in parts])
-
-
-SEARCHES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"nsvq_lightning": nearest, "cdist + argmin": _by_distances}
-"""Searches by name: rows ``[N, D]`` and codebook ``[K, D]`` to codes ``[N]``."""
-
-
-def _search_rows(attributes: Mapping[str, Attribute], scope: Scope) -> Iterator[Measurement]:
-    for name, attribute in attributes.items():
-        x, codebook = attribute.x.detach()[attribute.rows], attribute.quantizer.codebook.detach()
-        workload = f"{name}: {len(x)} rows, D {x.shape[1]}, K {len(codebook)}"
-        with use_threads(max(scope.threads)):
-            errors = {method: code_errors(x, codebook, search(x, codebook)) for method, search in SEARCHES.items()}
-        cases = [Case(method, partial(search, x, codebook)) for method, search in SEARCHES.items()]
-        for threads in scope.threads:
-            for method, timing in measure(cases, scope, threads).items():
-                yield Measurement("quantize", workload, method, SEARCH, threads, timing, errors[method])
-
-
-def _kmeans_rows(attributes: Mapping[str, Attribute], scope: Scope) -> Iterator[Measurement]:
-    for name, attribute in attributes.items():
-        x, codes = attribute.x.detach(), len(attribute.quantizer.codebook)
-
-        def start(steps: int, x: Tensor = x, codes: int = codes, name: str = name) -> Tensor:
-            return kmeans(x, codes, generator(0, 0, "start", name), steps=steps)
-
-        cases = [Case(f"Lloyd: {steps} step{'s' * (steps > 1)}", partial(start, steps)) for steps in LLOYD_STEPS]
-        with use_threads(max(scope.threads)):
-            kept = {case.name: distortion(x, cast(Tensor, case.run())) for case in cases}
-        workload = f"{name}: {len(x)} rows, D {x.shape[1]}, K {codes}"
-        for threads in scope.threads:
-            for method, timing in measure(cases, scope, threads).items():
-                values = {"distortion": kept[method]}
-                yield Measurement("quantize", workload, method, KMEANS, threads, timing, values)
 
 
 def distortion(x: Tensor, codebook: Tensor) -> float:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from nsvq_lightning.commands.benchmark import Scope
 from nsvq_lightning.commands.benchmark.report import Panel
-from nsvq_lightning.commands.benchmark.timing import Case, Measurement, measure, use_threads
+from nsvq_lightning.commands.benchmark.timing import Measurement, compare, use_threads
 from nsvq_lightning.commands.benchmark.workloads import Workload, relative_l2, workloads
 from nsvq_lightning.compute.devices import fast_backends
 from nsvq_lightning.quality.loss import photometric_loss
@@ -26,17 +26,11 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats
 
-__all__ = ["PANELS", "Painter", "crop_for_oracle", "errors_of", "gradients_of", "painter", "run", "trace"]
-
 FORWARD, BOTH, LOSS = "forward", "forward + backward", "L1 + D-SSIM, forward + backward"
 PANELS = (Panel(FORWARD, "max error"), Panel(BOTH, "gradient error"), Panel(LOSS, "gradient error"))
 ORACLE_WORK = {True: 1e8, False: 6e9}
 """Splats times pixels that the oracle is given, quick and full: half a minute on one core at most."""
-FLIPPED = 1e-3
-OUTLIER = 10.0
-"""A pixel is left out if its error is this many times the median of the errors that are not 0."""
 PHOTO = (533, 800, 3)
-DSSIM_WEIGHT = 0.2
 
 Painter = Callable[[RawSplats, Workload], Tensor]
 """Renders splats as the camera of a workload sees them: image ``[H, W, 3]``."""
@@ -54,11 +48,9 @@ class Traced(NamedTuple):
 def run(scope: Scope) -> Iterator[Measurement]:
     """Time every back-end of every device on every workload with every number of threads; errors once a workload."""
     for device in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
-        # On a GPU, threads are those of the host, which do not matter.
-        threads = scope.threads if device == "cpu" else (max(scope.threads),)
         for workload in workloads(scope):
-            yield from _render_rows(workload.to(device), scope, device, threads)
-        yield from _loss_rows(scope, device, threads)
+            yield from _render_rows(workload.to(device), scope, device)
+        yield from _loss_rows(scope, device)
 
 
 def painter(backend: str) -> Painter:
@@ -71,44 +63,31 @@ def painter(backend: str) -> Painter:
     return paint
 
 
-def _render_rows(workload: Workload, scope: Scope, device: str, all_threads: tuple[int, ...]) -> Iterator[Measurement]:
+def _render_rows(workload: Workload, scope: Scope, device: str) -> Iterator[Measurement]:
     fast = {name: painter(name) for name in fast_backends(workload.splats.means)}
     every = fast | {"plain torch": painter("reference")}
-    crop = crop_for_oracle(workload, ORACLE_WORK[scope.quick])
+    crop = workload
+    while len(crop.splats.means) * crop.camera.width * crop.camera.height > ORACLE_WORK[scope.quick]:
+        crop = workload.crop(crop.camera.width // 2, crop.camera.height // 2)
     with use_threads(max(scope.threads)):
         truth = trace(crop, every["plain torch"], torch.float64)
         errors = {name: errors_of(crop, paint, truth) for name, paint in every.items()}
     note = f"errors on {'all' if crop is workload else f'the middle {crop.size}'} pixels"
     for where, painters in ((workload, fast), (crop, every)) if crop is not workload else ((workload, every),):
         leaves = RawSplats(*(tensor.clone().requires_grad_() for tensor in where.splats))
-        cases = [case for name, paint in painters.items() for case in _cases(name, paint, where, leaves)]
-        for threads in all_threads:
-            timings = measure(cases, scope, threads, device)
-            for method in painters:
-                for operation in (FORWARD, BOTH):
-                    timing, values = timings[f"{method} {operation}"], errors[method][operation]
-                    yield Measurement("render", str(where), method, operation, threads, timing, values, note)
+        for operation, call in ((FORWARD, _forward), (BOTH, _both)):
+            cases = {name: partial(call, paint, where, leaves) for name, paint in painters.items()}
+            values = {name: errors[name][operation] for name in painters}
+            yield from compare(operation, str(where), cases, values, scope, note, device)
 
 
-def _cases(name: str, paint: Painter, workload: Workload, leaves: RawSplats) -> tuple[Case, Case]:
-    """The two operations on splats that all cases of a workload share."""
-
-    def forward() -> None:
-        with torch.no_grad():
-            paint(leaves, workload)
-
-    def both() -> None:
-        torch.autograd.grad(paint(leaves, workload), leaves, workload.image_gradient)
-
-    return Case(f"{name} {FORWARD}", forward), Case(f"{name} {BOTH}", both)
+@torch.no_grad()
+def _forward(paint: Painter, workload: Workload, leaves: RawSplats) -> None:
+    paint(leaves, workload)
 
 
-def crop_for_oracle(workload: Workload, most_work: float) -> Workload:
-    """The workload, or the middle of its view, halved until it is not too much for the oracle (``ORACLE_WORK``)."""
-    crop = workload
-    while len(crop.splats.means) * crop.camera.width * crop.camera.height > most_work:
-        crop = workload.crop(crop.camera.width // 2, crop.camera.height // 2)
-    return crop
+def _both(paint: Painter, workload: Workload, leaves: RawSplats) -> None:
+    torch.autograd.grad(paint(leaves, workload), leaves, workload.image_gradient)
 
 
 def errors_of(crop: Workload, paint: Painter, truth: Traced) -> dict[str, dict[str, float]]:
@@ -120,11 +99,10 @@ def errors_of(crop: Workload, paint: Painter, truth: Traced) -> dict[str, dict[s
         truth: The same by the oracle.
     """
     found = trace(crop, paint, torch.float32)
-    usual = _usual(found.image, truth.image)
+    image, usual = image_errors(found.image, truth.image)
     weights = crop.image_gradient * usual[..., None]
     expected = gradients_of(truth, weights.double())
     by_name = {name: relative_l2(value, expected[name]) for name, value in gradients_of(found, weights).items()}
-    image = image_errors(found.image, truth.image, usual)
     return {FORWARD: image, BOTH: {"gradient error": max(by_name.values()), **by_name}}
 
 
@@ -140,55 +118,44 @@ def gradients_of(traced: Traced, weights: Tensor) -> dict[str, Tensor]:
     return dict(zip(RawSplats._fields, gradients, strict=True))
 
 
-def _pixel_errors(image: Tensor, truth: Tensor) -> Tensor:
-    return (image.detach().double() - truth.detach()).abs().amax(-1)
-
-
-def _usual(image: Tensor, truth: Tensor) -> Tensor:
-    """Pixels ``[H, W]`` bool without those that jumped."""
-    error = _pixel_errors(image, truth)
-    typical = error[error > 0].median() if bool((error > 0).any()) else error.new_zeros(())
-    return error <= OUTLIER * typical
-
-
-def image_errors(image: Tensor, truth: Tensor, usual: Tensor | None = None) -> dict[str, float]:
-    """Errors of an image ``[H, W, 3]``, largest over the channels.
+def image_errors(image: Tensor, truth: Tensor) -> tuple[dict[str, float], Tensor]:
+    """Errors of an image ``[H, W, 3]``, largest over the channels, where pixels did not jump; and which these are.
 
     Args:
         image: What is judged.
         truth: What it should be.
-        usual: Pixels ``[H, W]`` bool that enter; by default those without a jump.
+
+    Returns:
+        Errors by name, and ``[H, W]`` bool: the pixels whose error is at most ten times the median of those above 0.
     """
-    error = _pixel_errors(image, truth)
-    usual = _usual(image, truth) if usual is None else usual
-    return {
+    error = (image.detach().double() - truth.detach()).abs().amax(-1)
+    usual = error <= (10.0 * error[error > 0].median() if bool((error > 0).any()) else 0.0)
+    errors = {
         "max error": float(error[usual].max()),
         "mean error": float(error[usual].mean()),
         "pixels left out": float((~usual).sum()),
-        "pixels above 1e-3": float((error > FLIPPED).sum()),
+        "pixels above 1e-3": float((error > 1e-3).sum()),
     }
+    return errors, usual
 
 
-def _loss_rows(scope: Scope, device: str, all_threads: tuple[int, ...]) -> Iterator[Measurement]:
+def _loss_rows(scope: Scope, device: str) -> Iterator[Measurement]:
     draw = generator(0, 0, "loss")
     photo = torch.randint(0, 220, PHOTO, generator=draw, dtype=torch.uint8)
     # No value is almost right: the gradient of its absolute error would be the sign of a rounding.
     image = (photo / 255 + 0.01 + 0.1 * torch.rand(PHOTO, generator=draw)).to(device)
     photo = photo.to(device)
     methods: dict[str, Loss] = {f"fused, {device}": photometric_loss, f"plain torch, {device}": plain_loss}
+
+    def gradient(loss: Loss, image: Tensor) -> Tensor:
+        image = image.detach().requires_grad_()
+        return torch.autograd.grad(loss(image, photo, 0.2), image)[0]
+
     with use_threads(max(scope.threads)):
-        truth = _loss_gradient(plain_loss, image.double(), photo)
-        errors = {name: relative_l2(_loss_gradient(loss, image, photo), truth) for name, loss in methods.items()}
-    cases = [Case(name, partial(_loss_gradient, loss, image, photo)) for name, loss in methods.items()]
-    for threads in all_threads:
-        for name, timing in measure(cases, scope, threads, device).items():
-            values = {"gradient error": errors[name]}
-            yield Measurement("render", f"{PHOTO[1]}x{PHOTO[0]}", name, LOSS, threads, timing, values)
-
-
-def _loss_gradient(loss: Loss, image: Tensor, photo: Tensor) -> Tensor:
-    image = image.detach().requires_grad_()
-    return torch.autograd.grad(loss(image, photo, DSSIM_WEIGHT), image)[0]
+        truth = gradient(plain_loss, image.double())
+        errors = {name: {"gradient error": relative_l2(gradient(loss, image), truth)} for name, loss in methods.items()}
+    cases = {name: partial(gradient, loss, image) for name, loss in methods.items()}
+    yield from compare(LOSS, f"{PHOTO[1]}x{PHOTO[0]}", cases, errors, scope, device=device)
 
 
 def plain_loss(image: Tensor, photo: Tensor, dssim_weight: float) -> Tensor:

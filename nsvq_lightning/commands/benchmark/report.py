@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import json
 import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,16 +17,11 @@ from llvmlite import binding
 from nsvq_lightning.commands.benchmark import Scope
 from nsvq_lightning.commands.benchmark.timing import Measurement
 from nsvq_lightning.compute.environment import usable_cores
-from nsvq_lightning.report.figures import colours_of, draw_keys, markdown_table, markers_of, panels, write_figure
+from nsvq_lightning.report import figures
 from nsvq_lightning.version import __version__
 
-__all__ = ["Panel", "as_json", "as_markdown", "describe_machine", "draw_suite", "number"]
-
-PANEL_HEIGHT = 4.2
-"""Inches."""
-SIMD_BITS = (("avx512f", 512), ("avx2", 256), ("avx", 256), ("neon", 128), ("sse2", 128))
-"""Widest vectors by the feature that gives them, widest first."""
-NOTABLE = ("avx512f", "avx512_bf16", "avx512bf16", "amx-tile", "avx2", "fma", "f16c", "neon", "sve")
+Suites = Mapping[str, Sequence[Measurement]]
+"""Measurements by the name of their suite."""
 
 
 def describe_machine() -> dict[str, Any]:
@@ -33,71 +29,70 @@ def describe_machine() -> dict[str, Any]:
     features = {name for name, present in binding.get_host_cpu_features().items() if present}
     if platform.machine().lower() in ("arm64", "aarch64"):
         features.add("neon")  # always there, but on a Mac LLVM may name no feature at all
+    # The platform module knows only the architecture of the processor on Linux.
+    about = Path("/proc/cpuinfo")
+    lines = about.read_text(encoding="utf-8").splitlines() if about.is_file() else []
+    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    packages = ("numpy", "torch", "numba", "llvmlite")
+    bits = {"avx512f": 512, "avx2": 256, "avx": 256, "neon": 128, "sse2": 128}  # of a vector, the widest first
+    notable = ("avx512f", "avx512_bf16", "avx512bf16", "amx-tile", "avx2", "fma", "f16c", "neon", "sve")
     return {
-        "cpu": _cpu_model(),
+        "cpu": next(models, platform.processor() or platform.machine()),
         "llvm_cpu": binding.get_host_cpu_name(),
         "cores": os.cpu_count(),
         "usable_cores": usable_cores(),
-        "simd_bits": next((bits for name, bits in SIMD_BITS if name in features), 32),
-        "simd": [name for name in NOTABLE if name in features],
+        "simd_bits": next((width for name, width in bits.items() if name in features), 32),
+        "simd": [name for name in notable if name in features],
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "system": f"{platform.system()} {platform.machine()}",
         "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "versions": {
             "nsvq-lightning": __version__,
             "python": platform.python_version(),
-            **{name: importlib.metadata.version(name) for name in ("numpy", "torch", "numba", "llvmlite")},
+            **{name: importlib.metadata.version(name) for name in packages},
         },
     }
 
 
-def _cpu_model() -> str:
-    """Name of the processor; the platform module knows only its architecture on Linux."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.processor() or platform.machine())
-
-
-def as_json(machine: Mapping[str, Any], scope: Scope, rows: Sequence[Measurement]) -> dict[str, Any]:
-    """Everything that was measured, samples included, as JSON values.
+def as_json(machine: Mapping[str, Any], scope: Scope, suites: Suites) -> str:
+    """Everything that was measured, samples included.
 
     Args:
         machine: From :func:`describe_machine`.
         scope: What was measured, and how thoroughly.
-        rows: Measurements.
+        suites: Measurements.
     """
-    settings = asdict(scope) | {"beside": [str(path) for path in scope.beside]}
-    for name in ("scene", "init_from"):
-        settings[name] = None if settings[name] is None else str(settings[name])
-    return {"machine": dict(machine), "settings": settings, "rows": [row.as_json() for row in rows]}
+    rows = []
+    for suite, found in suites.items():
+        for row in found:
+            times = {"median_ms": row.timing.median, "quartiles_ms": row.timing.quartiles}
+            rows.append({"suite": suite, **asdict(row), **times, "sgemm_ratio": row.timing.ratio})
+    document = {"machine": machine, "settings": asdict(scope), "rows": rows}
+    return json.dumps(document, indent=2, ensure_ascii=False, default=str) + "\n"  # paths are not JSON
 
 
-def as_markdown(machine: Mapping[str, Any], scope: Scope, rows: Sequence[Measurement]) -> str:
+def as_markdown(machine: Mapping[str, Any], scope: Scope, suites: Suites) -> str:
     """The machine, then one table for every operation of every suite."""
-    parts = ["# nsvq benchmark", *_machine_lines(machine, scope)]
-    for suite in dict.fromkeys(row.suite for row in rows):
-        parts.append(f"## {suite}")
-        for operation in dict.fromkeys(row.operation for row in rows if row.suite == suite):
-            parts += _table([row for row in rows if (row.suite, row.operation) == (suite, operation)])
-    return "\n\n".join(parts) + "\n"
-
-
-def _machine_lines(machine: Mapping[str, Any], scope: Scope) -> Iterator[str]:
     load = machine["load_average"]
-    busy = "" if load is None else f", load average {load:.1f} at the start"
-    simd = f"{machine['simd_bits']}-bit vectors ({', '.join(machine['simd']) or 'no extension'})"
-    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
-    cores = f"{machine['usable_cores']} of {machine['cores']} cores"
-    yield f"{machine['cpu']} ({machine['llvm_cpu']}), {cores}, {simd}{gpu}, {machine['system']}{busy}"
-    yield ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
-    yield (
+    about = [
+        f"{machine['cpu']} ({machine['llvm_cpu']})",
+        f"{machine['usable_cores']} of {machine['cores']} cores",
+        f"{machine['simd_bits']}-bit vectors ({', '.join(machine['simd']) or 'no extension'})",
+        *filter(None, [machine["gpu"], machine["system"]]),
+        *([] if load is None else [f"load average {load:.1f} at the start"]),
+    ]
+    parts = ["# nsvq benchmark", ", ".join(about)]
+    parts.append(", ".join(f"{name} {version}" for name, version in machine["versions"].items()))
+    parts.append(
         f"Rounds: {scope.repeats}; threads: {', '.join(map(str, scope.threads))}{'; quick' * scope.quick}. "
         "ms: median of the calls; quartiles and n beside it. sgemm: the median as a multiple of a 2048³ float32 matrix "
         "product of torch that took turns with it."
     )
+    for suite, rows in suites.items():
+        parts.append(f"## {suite}")
+        for operation in dict.fromkeys(row.operation for row in rows):
+            parts += _table([row for row in rows if row.operation == operation])
+    return "\n\n".join(parts) + "\n"
 
 
 def _table(rows: Sequence[Measurement]) -> Iterator[str]:
@@ -119,7 +114,8 @@ def _table(rows: Sequence[Measurement]) -> Iterator[str]:
         times += [str(len(timing.samples)), number(timing.ratio)]
         values = [number(row.values[name]) if name in row.values else "" for name in names]
         cells.append([*(str(getattr(row, name)) for name in own), *times, *values])
-    yield markdown_table([*own, "ms", "quartiles", "min", "n", "sgemm", *names], cells, words=("workload", "method"))
+    head = [*own, "ms", "quartiles", "min", "n", "sgemm", *names]
+    yield figures.markdown_table(head, cells, words=("workload", "method"))
     notes = dict.fromkeys(row.note for row in rows if row.note)
     for note in notes:
         about = dict.fromkeys(row.workload for row in rows if row.note == note)
@@ -134,9 +130,7 @@ def number(value: float) -> str:
         return f"{value:,.0f}"
     if abs(value) < 1e-3 or abs(value) >= 1e7:
         return f"{value:.2g}"
-    if abs(value) >= 100:
-        return f"{value:,.0f}"
-    return f"{value:.3g}"
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
 class Panel(NamedTuple):
@@ -177,10 +171,10 @@ def draw_suite(path: Path, rows: Sequence[Measurement], wanted: Sequence[Panel])
     if not drawn:
         return
     rows = [row for row in rows if any(panel.points(row) for panel in drawn)]
-    colours = colours_of(list(dict.fromkeys(row.method.partition(":")[0] for row in rows)))
-    markers = markers_of(list(dict.fromkeys(row.workload for row in rows)))
+    colours = figures.colours_of(list(dict.fromkeys(row.method.partition(":")[0] for row in rows)))
+    markers = figures.markers_of(list(dict.fromkeys(row.workload for row in rows)))
     most = max(row.threads for row in rows)
-    figure, axes = panels(len(drawn), PANEL_HEIGHT, max(len(colours), len(markers)))
+    figure, axes = figures.panels(len(drawn), 4.2, max(len(colours), len(markers)))
     for axis, panel in zip(axes, drawn, strict=True):
         lines: dict[tuple[str, str, int], list[tuple[float, float]]] = {}
         for row in rows:
@@ -189,17 +183,14 @@ def draw_suite(path: Path, rows: Sequence[Measurement], wanted: Sequence[Panel])
             face = colours[method] if threads == most else "none"
             style = {"marker": markers[workload], "color": colours[method], "markerfacecolor": face}
             axis.plot([x for x, _ in points], [y for _, y in points], linewidth=1, **style)
-        axis.set(xscale="log", xlabel=panel.against, ylabel=panel.value)
-        axis.set_title(f"{rows[0].suite}: {panel.operation}", fontsize="medium")
+        axis.set(xscale="log", xlabel=panel.against, ylabel=panel.value, title=panel.operation)
         axis.xaxis.set_major_formatter("{x:g}")
-        axis.xaxis.set_minor_formatter("{x:g}")
-        axis.tick_params(axis="x", which="minor", labelsize=7, rotation=45)
-        axis.grid(alpha=0.3, which="major")
+        axis.grid(alpha=0.3)
         heights = [y for points in lines.values() for _, y in points]
         if min(heights) > 0 and "dB" not in panel.value:
             axis.set_yscale("log")
         elif min(heights) == 0:
             axis.set_yscale("symlog", linthresh=min((y for y in heights if y > 0), default=1.0))
     fewer = any(row.threads < most for row in rows)
-    draw_keys(figure, colours, markers, f"fewer than {most} threads" if fewer else None)
-    write_figure(path, figure)
+    figures.draw_keys(figure, colours, markers, f"fewer than {most} threads" if fewer else None)
+    figures.write_figure(path, figure)

@@ -5,19 +5,19 @@ from __future__ import annotations
 import gc
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
 
 import torch
 
 from nsvq_lightning.commands.benchmark import Scope
 from nsvq_lightning.random import generator
 
-__all__ = ["Case", "Measurement", "Timing", "finish", "measure", "milliseconds", "sgemm", "use_threads"]
-
 SGEMM_SIDE = 2048
+
+Call = Callable[[], object]
+"""What is timed."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,9 @@ class Measurement:
     """One row of a table.
 
     Attributes:
-        suite: Name of the suite.
+        operation: What was done; measurements of one operation are compared with each other.
         workload: What it was done to.
         method: How it was done; what is before a colon is the name of a curve.
-        operation: What was done; measurements of one operation are compared with each other.
         threads: Threads it was done with.
         timing: How long it took.
         values: Errors and sizes by name, the unit in the name where there is one.
@@ -67,39 +66,46 @@ class Measurement:
         course: Seconds and the first value during a run, ``(s, value)``. Empty for single calls.
     """
 
-    suite: str
+    operation: str
     workload: str
     method: str
-    operation: str
     threads: int
     timing: Timing
     values: Mapping[str, float] = field(default_factory=dict)
     note: str = ""
     course: tuple[tuple[float, float], ...] = ()
 
-    def as_json(self) -> dict[str, Any]:
-        """The measurement as JSON values, samples included."""
-        timing = self.timing
-        known = {"median_ms": timing.median, "quartiles_ms": timing.quartiles, "sgemm_ratio": timing.ratio}
-        return {**asdict(self), **known}
 
+def compare(
+    operation: str,
+    workload: str,
+    cases: Mapping[str, Call],
+    values: Mapping[str, Mapping[str, float]],
+    scope: Scope,
+    note: str = "",
+    device: str = "cpu",
+    prepare: Call | None = None,
+) -> Iterator[Measurement]:
+    """Time the methods of one operation with every number of threads; on a GPU only with the most, those of the host.
 
-@dataclass(frozen=True, eq=False)
-class Case:
-    """Something to be timed.
-
-    Attributes:
-        name: Key of the result.
-        run: The timed call.
+    Args:
+        operation: See :class:`Measurement`.
+        workload: See :class:`Measurement`.
+        cases: What to time, by method.
+        values: Errors and sizes by method, then by name.
+        scope: Numbers of threads and of rounds, and the time limit.
+        note: See :class:`Measurement`.
+        device: Where the work is done.
         prepare: Done before every call, not timed.
     """
+    for threads in scope.threads if device == "cpu" else (max(scope.threads),):
+        for method, timing in measure(cases, scope, threads, device, prepare).items():
+            yield Measurement(operation, workload, method, threads, timing, values[method], note)
 
-    name: str
-    run: Callable[[], object]
-    prepare: Callable[[], object] | None = None
 
-
-def measure(cases: Sequence[Case], scope: Scope, threads: int, device: torch.device | str = "cpu") -> dict[str, Timing]:
+def measure(
+    cases: Mapping[str, Call], scope: Scope, threads: int, device: str = "cpu", prepare: Call | None = None
+) -> dict[str, Timing]:
     """Time cases in turns, in an order that rotates from round to round, after one call each that is not counted.
 
     The first call compiles kernels and grows buffers. A case that has used up ``scope.seconds`` sits out the
@@ -107,37 +113,35 @@ def measure(cases: Sequence[Case], scope: Scope, threads: int, device: torch.dev
     cyclic collector waits for the end.
 
     Args:
-        cases: What to time, by different names.
+        cases: What to time, by name.
         scope: Number of rounds and time limit.
         threads: Threads of torch and of the kernels.
         device: Where the work is done, and the matrix product.
+        prepare: Done before every call of a case, not timed.
 
     Returns:
         Times by name of the case.
-
-    Raises:
-        ValueError: Two cases have the same name.
     """
-    names = [case.name for case in cases]
-    if len(set(names)) != len(names):
-        raise ValueError(f"cases need different names, got {names}")
     product = sgemm(device)
-    players = [product, *cases]
-    samples: dict[str, list[float]] = {case.name: [] for case in players}
+    players = [("", product), *cases.items()]
+    samples: dict[str, list[float]] = {name: [] for name, _ in players}
     gc.collect()
     gc.disable()
     try:
         with use_threads(threads):
-            for case in players:
-                milliseconds(case, device)
-            for turn in range(scope.repeats):
-                shift = turn % len(players)
-                for case in players[shift:] + players[:shift]:
-                    if case is product or sum(samples[case.name]) < 1000 * scope.seconds:
-                        samples[case.name].append(milliseconds(case, device))
+            for turn in range(-1, scope.repeats):
+                shift = max(turn, 0) % len(players)
+                for name, call in players[shift:] + players[:shift]:
+                    if name and sum(samples[name]) >= 1000 * scope.seconds:
+                        continue
+                    if name and prepare is not None:
+                        prepare()
+                    took = milliseconds(call, device)
+                    if turn >= 0:
+                        samples[name].append(took)
     finally:
         gc.enable()
-    return {name: Timing(tuple(samples[name]), tuple(samples[product.name])) for name in names}
+    return {name: Timing(tuple(samples[name]), tuple(samples[""])) for name in cases}
 
 
 @contextmanager
@@ -151,23 +155,21 @@ def use_threads(threads: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def milliseconds(case: Case, device: torch.device | str = "cpu") -> float:
-    """Time one call, its preparation left out.
+def milliseconds(call: Call, device: str = "cpu") -> float:
+    """Time one call.
 
     On a GPU, that is from when it begins the first work to when it ends the last, its waits for the host included.
     """
-    if case.prepare is not None:
-        case.prepare()
     finish()
     if torch.device(device).type == "cuda":
         first, last = (torch.cuda.Event(enable_timing=True) for _ in range(2))  # type: ignore[no-untyped-call]
         first.record()
-        case.run()
+        call()
         last.record()
         last.synchronize()
         return float(first.elapsed_time(last))
     start = time.perf_counter_ns()
-    case.run()
+    call()
     finish()
     return (time.perf_counter_ns() - start) / 1e6
 
@@ -178,9 +180,9 @@ def finish() -> None:
         torch.cuda.synchronize()
 
 
-def sgemm(device: torch.device | str = "cpu") -> Case:
-    """The matrix product that all times are compared with."""
+def sgemm(device: str = "cpu") -> Call:
+    """The 2048³ float32 matrix product that all times are compared with."""
     draw = generator(0, 0, "sgemm")
     left, right = (torch.randn(SGEMM_SIDE, SGEMM_SIDE, generator=draw).to(device) for _ in range(2))
     out = torch.empty_like(left)
-    return Case("2048³ float32 matrix product", lambda: torch.mm(left, right, out=out))
+    return lambda: torch.mm(left, right, out=out)

@@ -8,24 +8,29 @@ same number of steps. Variants differ from the first one in one thing. Where one
 
 from __future__ import annotations
 
+import cProfile
 import logging
 import multiprocessing
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean, median
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numba
 import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark import SIZES, Scope
+from nsvq_lightning.commands.arguments import find_config
+from nsvq_lightning.commands.benchmark import SIZES, Scope, timing
 from nsvq_lightning.commands.benchmark.report import Panel
-from nsvq_lightning.commands.benchmark.runs import OTHER, OUTSIDE, PARTS, Step, StepSampler, config_run, run_name
-from nsvq_lightning.commands.benchmark.timing import Case, Measurement, Timing, measure, milliseconds, sgemm
 from nsvq_lightning.commands.benchmark.workloads import synthetic_workload
+from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import photometric_loss
@@ -36,24 +41,17 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.training.schedule import Phase
 
-__all__ = ["PANELS", "different_numbers", "part_rows", "run", "run_rows", "serial_share", "size_rows", "variants"]
-
 log = logging.getLogger(__name__)
 
 RUN, ALONE = "run", "step by itself"
 PANELS = (Panel(RUN, "PSNR dB", "seconds"), Panel(ALONE, "ms", "splats"), Panel(ALONE, "peak MB", "splats"))
-ROUNDS = {True: 1, False: 2}
-"""Runs of every variant, quick and full; their order turns, their steps are counted together."""
-EVALUATIONS = 16
-"""Points during a run at which its test views are compared, besides the ends of the phases."""
-PRODUCT_EVERY = 8
-"""Steps between two matrix products."""
-FIRST_STEPS = 8
-"""Steps of a first run that is not counted, through all phases."""
-SHIPPED, WHOLE = "as shipped", "whole step"
+WATCHING = ("report", "export", "predictions", "checkpoint", "kernels", "progress")
+"""Callbacks of ``nsvq fit`` that write files or lines but train nothing; the benchmark measures by itself."""
+QUICK_DEMO = ("--data.factor=4",)
+SHIPPED, WHOLE, OUTSIDE = "as shipped", "whole step", "between the functions"
 
 
-def run(scope: Scope) -> Iterator[Measurement]:
+def run(scope: Scope) -> Iterator[timing.Measurement]:
     """Train with every variant, then profile the steps of a run, then time steps of growing size."""
     yield from run_rows(scope)
     if sys.version_info < (3, 12) or numba.config.ENABLE_SYS_MONITORING:
@@ -63,116 +61,195 @@ def run(scope: Scope) -> Iterator[Measurement]:
     yield from size_rows(scope)
 
 
+class Step(NamedTuple):
+    """One step: its 1-based iteration, its phase, and milliseconds."""
+
+    iteration: int
+    phase: Phase
+    milliseconds: float
+
+
+class StepClock(Callback):
+    """Times steps from the end of one to the end of the next: data, hooks, loggers and loops are in it.
+
+    Args:
+        between: Called after each step with the module and the step; not in the time.
+    """
+
+    def __init__(self, between: Callable[[SplatModule, Step], None]) -> None:
+        self._between = between
+        self._since = 0.0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the first step."""
+        self._since = time.perf_counter()
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: View, batch_idx: int
+    ) -> None:
+        """End a step, the work of a GPU included, and start the next."""
+        timing.finish()
+        took = 1000 * (time.perf_counter() - self._since)
+        module = cast(SplatModule, pl_module)
+        self._between(module, Step(trainer.global_step, module.phase, took))
+        self._since = time.perf_counter()
+
+
+class _Run(SplatCLI):
+    """``nsvq fit`` with a clock, and without what follows the last step."""
+
+    def __init__(self, arguments: list[str], clock: StepClock) -> None:
+        self._clock = clock
+        super().__init__(arguments)
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        trainer = super().instantiate_trainer(**kwargs)
+        trainer.callbacks.append(self._clock)  # type: ignore[attr-defined]  # Lightning does not type it
+        return trainer
+
+    def after_fit(self) -> None:
+        """Nothing: the steps are all that is asked for."""
+
+
+def _train(
+    scope: Scope, threads: int, between: Callable[[SplatModule, Step], None], options: Sequence[str] = ()
+) -> SplatModule:
+    """Train ``scope.steps`` iterations of the config on the scene, or on the demo scene if that is no folder of photos.
+
+    Args:
+        scope: Says which config, scene, first splats and length.
+        threads: Of torch and of the kernels.
+        between: Called after every step.
+        options: Further ones of ``nsvq fit``.
+
+    Returns:
+        What was trained.
+    """
+    data: tuple[str, ...] = ("--data=ColmapDataModule", f"--data.root={scope.photos}")
+    if scope.photos is None:
+        data = ("--data=DemoDataModule", *(QUICK_DEMO if scope.quick else ()))
+    if scope.init_from is not None:
+        data += (f"--model.init_from={scope.init_from}",)
+    logging.disable(logging.WARNING)  # of Lightning, about devices, loaders and the end of the run
+    try:
+        with (
+            tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder,
+            timing.use_threads(threads),
+            warnings.catch_warnings(action="ignore"),
+        ):
+            arguments = [
+                "fit",
+                f"--config={find_config(_config(scope))}",
+                *data,
+                f"--trainer.default_root_dir={folder}",
+                f"--trainer.max_steps={scope.steps}",
+                "--trainer.enable_progress_bar=false",
+                "--trainer.enable_checkpointing=false",
+                *(f"--callbacks.{name}=null" for name in WATCHING),
+                *options,
+            ]
+            module: SplatModule = _Run(arguments, StepClock(between)).model
+    finally:
+        logging.disable(logging.NOTSET)
+    return module
+
+
+def _config(scope: Scope) -> str:
+    return scope.config or ("fast.yaml" if scope.photos else "demo.yaml")
+
+
+def _run_name(scope: Scope) -> str:
+    """The run in the tables."""
+    scene = "demo" if scope.photos is None else scope.photos.resolve().name
+    return f"{scene}, {Path(_config(scope)).name}, {scope.steps} steps"
+
+
 # Whole runs
 
 
-class Variant(NamedTuple):
-    """One way to run: threads, further options of ``nsvq fit``, and the switch that is off, if one is."""
+class Watched:
+    """What is seen of the runs of one variant; its ``between`` is called between their steps.
 
-    name: str
-    threads: int
-    options: tuple[str, ...] = ()
-    off: str | None = None
-
-
-class Trained(NamedTuple):
-    """The result of one run.
+    Args:
+        steps: Length of a run.
 
     Attributes:
         steps: All steps.
-        course: Seconds and test PSNR in dB, during the run and at its end.
-        sgemm: Matrix products in between, ms.
-        numbers: Everything that was trained, by name.
+        course: Seconds and test PSNR in dB, during the first run and at its end.
+        products: Matrix products in between, ms.
+        numbers: Everything that the first run has trained, by name.
     """
 
-    steps: list[Step]
-    course: list[tuple[float, float]]
-    sgemm: list[float]
-    numbers: Mapping[str, Tensor]
+    def __init__(self, steps: int) -> None:
+        self.steps: list[Step] = []
+        self.course: list[tuple[float, float]] = []
+        self.products: list[float] = []
+        self.numbers: Mapping[str, Tensor] = {}
+        self._product, self._every = timing.sgemm(), max(1, steps // 16)
+
+    def between(self, module: SplatModule, step: Step) -> None:
+        """Keep a step, and compare the test views now and then."""
+        self.steps.append(step)
+        # Between the round numbers: opacities are reset at those, and just then a picture says nothing.
+        if not self.numbers and (
+            step.iteration in module.schedule.ends or step.iteration % self._every == self._every // 2
+        ):
+            self.course.append((sum(step.milliseconds for step in self.steps) / 1000, _test_psnr(module)))
+        if step.iteration % 8 == 0 or not self.products:
+            self.products.append(timing.milliseconds(self._product))
 
     @property
-    def seconds(self) -> float:
-        """Time of all steps."""
-        return sum(step.milliseconds for step in self.steps) / 1000
+    def timing(self) -> timing.Timing:
+        """Times of all steps."""
+        return timing.Timing(tuple(step.milliseconds for step in self.steps), tuple(self.products))
+
+    @property
+    def relative(self) -> float:
+        """The mean step in matrix products, so that a busy machine is not mistaken for a slow variant."""
+        return fmean(self.timing.samples) / median(self.products)
 
 
-def variants(scope: Scope) -> list[Variant]:
-    """What is compared: threads, the run without codebooks, and each switch that is asked for, inverted."""
-    most = max(scope.threads)
-    chosen = [Variant(SHIPPED, most)]
-    chosen += [Variant(f"{n} thread{'s' * (n > 1)}", n) for n in scope.threads if n != most]
+def run_rows(scope: Scope) -> Iterator[timing.Measurement]:
+    """A row as shipped, for fewer threads, and without codebooks or for each inverted switch that is asked for."""
+    most, rounds = max(scope.threads), 1 if scope.quick else 2
+    variants: dict[str, tuple[int, tuple[str, ...]]] = {SHIPPED: (most, ())}
+    variants |= {f"{n} thread{'s' * (n > 1)}": (n, ()) for n in scope.threads if n != most}
+    variants |= {f"no skip of {name}": (most, (f"--skips.{name}=false",)) for name in scope.switches}
     if not scope.switches:
-        chosen.append(Variant("without codebooks", most, ("--model.codebooks=null",)))
-    for name in scope.switches:
-        chosen.append(Variant(f"no skip of {name}", most, (f"--skips.{name}=false",), off=name))
-    return chosen
+        variants["without codebooks"] = most, ("--model.codebooks=null",)
+    # Not counted, through all phases: kernels are loaded, and compiled where they never were.
+    _train(replace(scope, steps=8), most, lambda module, step: None)
+    found = {name: Watched(scope.steps) for name in variants}
+    for turn in range(rounds):
+        order = list(variants)
+        for name in order[turn:] + order[:turn]:
+            module = _train(scope, variants[name][0], found[name].between, variants[name][1])
+            found[name].numbers = found[name].numbers or {n: p.detach() for n, p in module.named_parameters()}
+    shipped = found[SHIPPED]
+    for name, watched in found.items():
+        by_phase: dict[Phase, list[float]] = {}
+        for step in watched.steps:
+            by_phase.setdefault(step.phase, []).append(step.milliseconds)
+        values = {
+            "PSNR dB": watched.course[-1][1],
+            "seconds": sum(watched.timing.samples) / 1000 / rounds,
+            "times as shipped": watched.relative / shipped.relative,
+            **{f"{phase.name.lower()} ms": median(times) for phase, times in by_phase.items()},
+            "splats": float(len(watched.numbers["splats.means"])),
+            "other numbers": float(different_numbers(watched.numbers, shipped.numbers)),
+        }
+        if name.startswith("no skip"):
+            values["saves %"] = 100 * (1 - shipped.relative / watched.relative)
+        threads, course = variants[name][0], tuple(watched.course)
+        note = "times are of whole steps, those that start a phase included; PSNR is that of the test views"
+        yield timing.Measurement(RUN, _run_name(scope), name, threads, watched.timing, values, note, course)
 
 
-def run_rows(scope: Scope) -> Iterator[Measurement]:
-    """A row for each variant, see :func:`variants`."""
-    chosen = variants(scope)
-    # Not counted: kernels are loaded, and compiled where they never were.
-    _train(chosen[0], replace(scope, steps=FIRST_STEPS))
-    trained: dict[str, list[Trained]] = {variant.name: [] for variant in chosen}
-    for turn in range(ROUNDS[scope.quick]):
-        for variant in chosen[turn:] + chosen[:turn]:
-            trained[variant.name].append(_train(variant, scope))
-    for variant in chosen:
-        yield _run_row(run_name(scope), variant, trained[variant.name], trained[SHIPPED])
-
-
-def _train(variant: Variant, scope: Scope) -> Trained:
-    steps: list[Step] = []
-    course: list[tuple[float, float]] = []
-    products: list[float] = []
-    product, every = sgemm(), max(1, scope.steps // EVALUATIONS)
-
-    def between(module: SplatModule, _: View, step: Step) -> None:
-        steps.append(step)
-        # Between the round numbers: opacities are reset at those, and just then a picture says nothing.
-        if step.iteration in module.schedule.ends or step.iteration % every == every // 2:
-            course.append((sum(step.milliseconds for step in steps) / 1000, _test_psnr(module)))
-        if step.iteration % PRODUCT_EVERY == 0:
-            products.append(milliseconds(product))
-
-    module = config_run(scope, variant.threads, between, variant.options)
-    numbers = {name: tensor.detach() for name, tensor in module.named_parameters()}
-    return Trained(steps, course, products or [milliseconds(product)], numbers)
-
-
+@torch.no_grad()
 def _test_psnr(module: SplatModule) -> float:
     data: ColmapDataModule = module.trainer.datamodule  # type: ignore[attr-defined]  # Lightning does not type it
-    with torch.no_grad():
-        splats = module.hard_splats(module.phase)
-        return evaluate(
-            lambda camera: module.render_splats(splats, camera).image, data.test_dataloader(), module.device
-        ).psnr
-
-
-def _run_row(workload: str, variant: Variant, runs: Sequence[Trained], shipped: Sequence[Trained]) -> Measurement:
-    timing, first = _timing(runs), runs[0]
-    # Mean steps in matrix products, so that a busy machine is not mistaken for a slow variant.
-    own, other = (fmean(each.samples) / median(each.sgemm) for each in (timing, _timing(shipped)))
-    by_phase: dict[Phase, list[float]] = {}
-    for step in (step for trained in runs for step in trained.steps):
-        by_phase.setdefault(step.phase, []).append(step.milliseconds)
-    values = {
-        "PSNR dB": first.course[-1][1],
-        "seconds": fmean(trained.seconds for trained in runs),
-        "times as shipped": own / other,
-        **{f"{phase.name.lower()} ms": median(times) for phase, times in by_phase.items()},
-        "splats": float(len(first.numbers["splats.means"])),
-        "other numbers": float(different_numbers(first.numbers, shipped[0].numbers)),
-    }
-    if variant.off is not None:
-        values["saves %"] = 100 * (1 - other / own)
-    note = "times are of whole steps, those that start a phase included; PSNR is that of the test views"
-    return Measurement("train", workload, variant.name, RUN, variant.threads, timing, values, note, tuple(first.course))
-
-
-def _timing(runs: Sequence[Trained]) -> Timing:
-    steps = tuple(step.milliseconds for trained in runs for step in trained.steps)
-    return Timing(steps, tuple(time for trained in runs for time in trained.sgemm))
+    splats, views = module.hard_splats(module.phase), data.test_dataloader()
+    return evaluate(lambda camera: module.render_splats(splats, camera).image, views, module.device).psnr
 
 
 def different_numbers(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> int:
@@ -190,81 +267,93 @@ def different_numbers(found: Mapping[str, Tensor], expected: Mapping[str, Tensor
 # The parts of a step
 
 
-def part_rows(scope: Scope) -> Iterator[Measurement]:
-    """A table of parts for each phase, whose sum is the whole step, with the largest number of threads.
+class StepSampler:
+    """Times all steps of a run, every second one under cProfile; its ``between`` is called between the steps.
 
-    With several thread counts, the same run with the fewest of them trains the same bits, so that each part is compared
-    over the same steps; whole steps are compared without cProfile.
+    cProfile gives each Python function and each Numba kernel the time that it spends in itself. An operator of torch
+    counts for the Python function that called it.
+
+    Args:
+        last: Last iteration of the run.
+
+    Attributes:
+        plain: The steps without cProfile.
+        profiled: Those with it, and what each part took, ms.
+        products: Matrix products in between, ms.
     """
-    few, many = min(scope.threads), max(scope.threads)
-    samplers = {}
-    for threads in {many, few}:
-        samplers[threads] = StepSampler(scope.steps)
-        config_run(scope, threads, samplers[threads])
-    products = samplers[many].products
+
+    def __init__(self, last: int) -> None:
+        self.plain: list[Step] = []
+        self.profiled: list[tuple[Step, dict[str, float]]] = []
+        self.products: list[float] = []
+        self._last, self._product = last, timing.sgemm()
+        self._profiler = cProfile.Profile(builtins=False, subcalls=False)
+
+    def between(self, module: SplatModule, step: Step) -> None:
+        """Keep a step, and profile the next if it is its turn."""
+        self._profiler.disable()
+        stats = self._profiler.getstats()
+        self._profiler.clear()
+        files = {getattr(each, "__dict__", {}).get("__file__"): name for name, each in list(sys.modules.items())}
+        parts: dict[str, float] = {}
+        for entry in cast(list[Any], stats):
+            # Our modules, each by itself; of other packages only their name.
+            package, _, ours = files.get(entry.code.co_filename, "elsewhere").partition(".")
+            name = ours if package == "nsvq_lightning" else package
+            parts[name] = parts.get(name, 0.0) + 1000 * entry.inlinetime
+        if parts:
+            self.profiled.append((step, parts))
+        else:
+            self.plain.append(step)
+        # After each step, a product would empty the caches for the next. After every third, steps with and without
+        # cProfile come after a product equally often.
+        if step.iteration % 3 == 0:
+            self.products.append(timing.milliseconds(self._product))
+        if step.iteration % 2 == 0 and step.iteration < self._last:
+            self._profiler.enable()
+
+
+def part_rows(scope: Scope) -> Iterator[timing.Measurement]:
+    """A table of parts for each phase, whose sum is the whole step, with the largest number of threads."""
+    threads, sampler = max(scope.threads), StepSampler(scope.steps)
+    _train(scope, threads, sampler.between)
     for phase in Phase:
-        steps = _middle(samplers[many], phase)
-        plain = {n: [step.milliseconds for step in each.plain if step.phase is phase] for n, each in samplers.items()}
-        if not steps or not plain[many]:
+        plain = [step.milliseconds for step in sampler.plain if step.phase is phase]
+        steps = sorted((each for each in sampler.profiled if each[0].phase is phase), key=lambda e: e[0].milliseconds)
+        # What is outside the middle half had a disturbance or a pause.
+        steps = steps[len(steps) // 4 : len(steps) - len(steps) // 4]
+        if not steps or not plain:
             continue  # a short run may have no step of a phase
-        parts, fewer = _parts_of(samplers[many], steps), _parts_of(samplers[few], steps)
-        note = f"cProfile is in the times: without it the median step takes {median(plain[many]):.3g} ms"
-        if few < many:
-            faster = median(samplers[few].products) / median(products)
-            note += f"; with {many} threads instead of {few} the matrix product is {faster:.2f} times faster"
-        for name, times in parts.items():
-            values = {"share %": 100 * fmean(times) / fmean(parts[WHOLE])}
-            few_ms, many_ms = median(fewer.get(name, times)), median(times)
-            if name == WHOLE:
-                few_ms, many_ms = median(plain[few]), median(plain[many])
-            if few < many and few_ms > 0 and many_ms > 0:
-                values["times faster"] = few_ms / many_ms
-                values["serial %"] = 100 * serial_share(few, few_ms, many, many_ms)
-            timing, operation = Timing(tuple(times), tuple(products)), f"parts of a {phase.name.lower()} step"
-            yield Measurement("train", run_name(scope), name, operation, many, timing, values, note)
-
-
-def _middle(sampler: StepSampler, phase: Phase) -> set[int]:
-    """Profiled iterations of a phase, the middle half by time: what is outside had a disturbance or a pause."""
-    times = sorted((step.milliseconds, step.iteration) for step, _ in sampler.profiled if step.phase is phase)
-    return {iteration for _, iteration in times[len(times) // 4 : len(times) - len(times) // 4]}
-
-
-def _parts_of(sampler: StepSampler, iterations: set[int]) -> dict[str, list[float]]:
-    """Milliseconds of the whole step and of each part in some profiled steps, the longest part first."""
-    profiled = [(step, parts) for step, parts in sampler.profiled if step.iteration in iterations]
-    found = {name: [parts.get(name, 0.0) for _, parts in profiled] for name in (*PARTS, OTHER)}
-    found = {name: times for name, times in found.items() if any(times)}
-    found[OUTSIDE] = [step.milliseconds - sum(parts.values()) for step, parts in profiled]
-    longest = sorted(found.items(), key=lambda item: -sum(item[1]))
-    return {WHOLE: [step.milliseconds for step, _ in profiled], **dict(longest)}
-
-
-def serial_share(few: int, few_ms: float, many: int, many_ms: float) -> float:
-    """Amdahl: the share s of the time with one thread that is not divided by their number, T(n) ∝ s + (1 - s) / n.
-
-    Clipped to [0, 1], where noise or caches go beyond it.
-    """
-    serial = (many * many_ms - few * few_ms) / (many - few)
-    divided = few * (few_ms - serial)
-    return min(1.0, max(0.0, serial / (serial + divided)))
+        found = {WHOLE: [step.milliseconds for step, _ in steps]}
+        names = {name for _, parts in steps for name in parts}
+        times = {name: [parts.get(name, 0.0) for _, parts in steps] for name in names}
+        times[OUTSIDE] = [step.milliseconds - sum(parts.values()) for step, parts in steps]
+        little = [name for name in names if sum(times[name]) < 0.01 * sum(found[WHOLE])]
+        if little:
+            times["others"] = [sum(each) for each in zip(*(times.pop(name) for name in little), strict=True)]
+        found |= dict(sorted(times.items(), key=lambda item: -sum(item[1])))
+        note = f"cProfile is in the times: without it the median step takes {median(plain):.3g} ms"
+        for name, samples in found.items():
+            values = {"share %": 100 * fmean(samples) / fmean(found[WHOLE])}
+            took, operation = timing.Timing(tuple(samples), tuple(sampler.products)), f"{phase.name.lower()} step"
+            yield timing.Measurement(f"parts of a {operation}", _run_name(scope), name, threads, took, values, note)
 
 
 # Growth
 
 
-def size_rows(scope: Scope) -> Iterator[Measurement]:
+def size_rows(scope: Scope) -> Iterator[timing.Measurement]:
     """Render, loss, backward pass and Adam on every workload, each in a process whose peak of memory is its own."""
     threads = max(scope.threads)
     for name in scope.workloads:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
-            timing, peak = pool.apply(_step_alone, (name, scope, threads))
+            took, peak = pool.apply(_step_alone, (name, scope, threads))
         size = SIZES[name]
         values = {"splats": float(size.splats), "megapixels": size.width * size.height / 1e6, "peak MB": peak / 1e6}
-        yield Measurement("train", "synthetic scenes", f"step: {name}", ALONE, threads, timing, values)
+        yield timing.Measurement(ALONE, "synthetic scenes", f"step: {name}", threads, took, values)
 
 
-def _step_alone(name: str, scope: Scope, threads: int) -> tuple[Timing, int]:
+def _step_alone(name: str, scope: Scope, threads: int) -> tuple[timing.Timing, int]:
     """Times of a step, and the largest resident memory of this process so far, bytes; 0 where no one says."""
     workload = synthetic_workload(name)
     splats = Splats.from_tensors(*workload.splats)
@@ -277,8 +366,8 @@ def _step_alone(name: str, scope: Scope, threads: int) -> tuple[Timing, int]:
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
 
-    timing = measure([Case("step", step)], scope, threads)["step"]
+    took = timing.measure({"step": step}, scope, threads)["step"]
     # Not resource.getrusage, whose maximum a new process takes over from the one that starts it.
     status = Path("/proc/self/status")
     lines = status.read_text(encoding="utf-8").splitlines() if status.exists() else []
-    return timing, next((1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM:")), 0)
+    return took, next((1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM:")), 0)

@@ -1,10 +1,9 @@
-"""Synthetic scenes with the statistics of captured ones, always the same for a name."""
+"""Synthetic scenes with the statistics of captured ones, always the same for a name; and scenes of the user."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,14 +18,9 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats.attributes import finite_rows
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
-__all__ = ["Workload", "relative_l2", "scene_workload", "single_workload", "synthetic_workload", "workloads"]
-
 Floats = NDArray[np.float64]
 
 SEED = 7
-BACKGROUND = (0.2, 0.3, 0.4)
-AZIMUTH, ELEVATION, DISTANCE, FIELD_OF_VIEW = 0.5, 0.35, 4.0, 60.0
-"""Where the camera stands: radians, scene units from the target, and degrees across the image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +45,8 @@ class Workload:
         """The middle ``width`` x ``height`` pixels of the view, with the splats and the depth they have there.
 
         The pixels are not quite the same: the projection of splats outside a margin around the view is clamped.
-
-        Raises:
-            ValueError: The view is smaller.
         """
         left, top = (self.camera.width - width) // 2, (self.camera.height - height) // 2
-        if left < 0 or top < 0:
-            raise ValueError(f"cannot crop {self.camera.width}x{self.camera.height} to {width}x{height}")
         K = self.camera.K.clone()
         K[0, 2] -= left
         K[1, 2] -= top
@@ -90,27 +79,32 @@ def relative_l2(value: Tensor, truth: Tensor) -> float:
 def workloads(scope: Scope) -> list[Workload]:
     """The scene that the user gives, or the synthetic scenes that the scope names.
 
+    A scene file is seen from the side, at 800x533, from twice the distance that holds four fifths of its splats; a
+    COLMAP folder by the camera of its first train view. Splats of files with a number that is not finite are left out.
+
     Raises:
-        ValueError: As :func:`scene_workload`.
+        ValueError: A file has an unknown suffix or no finite splat.
+        FormatError: It is damaged.
         SceneError: The COLMAP folder cannot be used.
     """
-    if scope.scene is None:
+    path, file = scope.scene, scope.scene if scope.photos is None else scope.init_from
+    if path is None:
         return [synthetic_workload(name) for name in scope.workloads]
-    if scope.scene.is_dir():
-        return [_folder_workload(scope.scene, scope.init_from)]
-    return [scene_workload(scope.scene)]
-
-
-def single_workload(scope: Scope, full: str) -> Workload:
-    """The scene that the user gives, or one synthetic scene: ``full``, in a quick run the smallest.
-
-    Raises:
-        ValueError: As :func:`workloads`.
-        SceneError: As :func:`workloads`.
-    """
-    if scope.scene is None:
-        return synthetic_workload(next(iter(SIZES)) if scope.quick else full)
-    return workloads(scope)[0]
+    name, scene = path.resolve().name, None if scope.photos is None else load_scene(scope.photos)
+    if file is not None:
+        splats = RawSplats(*(tensor.detach() for tensor in load(file).raw()))
+        finite, _ = finite_rows(splats._asdict())
+        if not bool(finite.any()):
+            raise ValueError(f"{file} holds no splat with finite numbers; there is nothing to measure")
+        splats = RawSplats(*(tensor[finite] for tensor in splats))
+        name += f" {file.name}" if scene is not None else ""
+    elif scene is not None:
+        raw = Splats.from_points(scene.points, scene.colors, sh_degree=3).raw()
+        splats = RawSplats(*(tensor.detach() for tensor in raw))
+    if scene is not None:
+        return [_seen_by(scene.cameras[scene.train[0]], splats, name)]
+    centre, reach = middle_of(splats.means.numpy())
+    return [_seen_by(_camera(800, 533, centre, 2 * reach), splats, name)]
 
 
 def synthetic_workload(name: str) -> Workload:
@@ -130,51 +124,7 @@ def synthetic_workload(name: str) -> Workload:
     harmonics = rng.normal(size=(n, 16, 3)) * 0.08
     harmonics[:, 0] = rng.normal(size=(n, 3)) * 0.9
     attributes = (means, quats, scales, opacities, harmonics[:, :1], harmonics[:, 1:])
-    camera = _camera(width, height, np.zeros(3), DISTANCE)
-    return _seen_by(camera, RawSplats(*map(_tensor, attributes)), name)
-
-
-def scene_workload(path: Path) -> Workload:
-    """A scene file seen from the side, at 800x533, from twice the distance that holds four fifths of its splats.
-
-    Splats with a number that is not finite are left out.
-
-    Raises:
-        ValueError: The file has an unknown suffix or no finite splat.
-        FormatError: It is damaged.
-    """
-    splats = _finite_splats(path)
-    centre, reach = middle_of(splats.means.numpy())
-    camera = _camera(800, 533, centre, 2 * reach)
-    return _seen_by(camera, splats, path.name)
-
-
-def _folder_workload(root: Path, init_from: Path | None = None) -> Workload:
-    """A COLMAP folder's first train view, of the splats in a scene file or of those that its points become.
-
-    Raises:
-        ValueError: The file has an unknown suffix or no finite splat.
-        FormatError: It is damaged.
-        SceneError: The folder cannot be used.
-    """
-    scene = load_scene(root)
-    camera = scene.cameras[scene.train[0]]
-    if init_from is not None:
-        splats = _finite_splats(init_from)
-    else:
-        raw = Splats.from_points(scene.points, scene.colors, sh_degree=3).raw()
-        splats = RawSplats(*(tensor.detach() for tensor in raw))
-    name = root.resolve().name if init_from is None else f"{root.resolve().name} {init_from.name}"
-    return _seen_by(camera, splats, name)
-
-
-def _finite_splats(path: Path) -> RawSplats:
-    """The splats of a file without those that have a number that is not finite."""
-    loaded = RawSplats(*(tensor.detach() for tensor in load(path).raw()))
-    finite, _ = finite_rows(loaded._asdict())
-    if not bool(finite.any()):
-        raise ValueError(f"{path} holds no splat with finite numbers; there is nothing to measure")
-    return RawSplats(*(tensor[finite] for tensor in loaded))
+    return _seen_by(_camera(width, height, np.zeros(3), 4.0), RawSplats(*map(_tensor, attributes)), name)
 
 
 def _tensor(values: Floats) -> Tensor:
@@ -190,8 +140,7 @@ def _directions(rng: np.random.Generator, count: int, dim: int) -> Floats:
 
 def _positions(count: int, rng: np.random.Generator) -> Floats:
     """Positions ``[count, 3]``, shuffled: a sphere, the ground, a box, a loose cloud, a shell of background."""
-    parts = [int(share * count) for share in (0.25, 0.25, 0.10, 0.25)]
-    on_sphere, on_ground, on_box, in_cloud = parts
+    on_sphere, on_ground, on_box, in_cloud = parts = [int(share * count) for share in (0.25, 0.25, 0.10, 0.25)]
     sphere = _directions(rng, on_sphere, 3) * 0.9 + rng.normal(size=(on_sphere, 3)) * 0.02
     ground = [rng.uniform(-2.2, 2.2, on_ground), 0.9 + rng.normal(size=on_ground) * 0.02]
     ground.append(rng.uniform(-2.2, 2.2, on_ground))
@@ -208,12 +157,13 @@ def _positions(count: int, rng: np.random.Generator) -> Floats:
 
 def _camera(width: int, height: int, target: Floats, distance: float) -> Camera:
     """A camera that looks at ``target`` from above and aside, y down."""
-    across = math.cos(ELEVATION)
-    direction = np.array([across * math.sin(AZIMUTH), -math.sin(ELEVATION), -across * math.cos(AZIMUTH)])
-    return look_at(target, target + distance * direction, width, height, math.radians(FIELD_OF_VIEW))
+    azimuth, elevation = 0.5, 0.35
+    across = math.cos(elevation)
+    direction = np.array([across * math.sin(azimuth), -math.sin(elevation), -across * math.cos(azimuth)])
+    return look_at(target, target + distance * direction, width, height, math.radians(60.0))
 
 
 def _seen_by(camera: Camera, splats: RawSplats, name: str) -> Workload:
     shape = camera.height, camera.width, 3
     gradient = _tensor(np.random.default_rng(SEED + 1).normal(size=shape) / math.prod(shape))
-    return Workload(name, splats, camera, torch.tensor(BACKGROUND), gradient)
+    return Workload(name, splats, camera, torch.tensor((0.2, 0.3, 0.4)), gradient)

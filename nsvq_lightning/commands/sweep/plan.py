@@ -148,27 +148,22 @@ def plan(
         data["root"] = str(Path(place or data["root"]).resolve())
         if seed is not None:
             model["seed"] = data["seed"] = seed
-        run = Run(_names(name, settings), settings)
+        sizes = model["codebooks"] or ""
+        names = {
+            "scene": Path(data["root"]).name,
+            "config": name,
+            "quantizer": model["quantizer"]["class_path"].rpartition(".")[2] if sizes else "",
+            "codebooks": " ".join(f"{k}={codes}" for k, codes in sizes.items()) if isinstance(sizes, dict) else sizes,
+            "seed": model["seed"],
+            "steps": settings["trainer"]["max_steps"],
+        }
+        run = Run(names, settings)
         if any(run.settings == other.settings for other in runs):
             continue
         if any(run.title == other.title for other in runs):
             raise ValueError(f"two runs are called {run.title}: rename a scene or configuration to tell them apart")
         runs.append(run)
     return runs
-
-
-def _names(config: str, settings: Settings) -> dict[str, Any]:
-    model, sizes = settings["model"], settings["model"]["codebooks"] or ""
-    if isinstance(sizes, dict):
-        sizes = " ".join(f"{name}={codes}" for name, codes in sizes.items())
-    return {
-        "scene": Path(settings["data"]["init_args"]["root"]).name,
-        "config": config,
-        "quantizer": model["quantizer"]["class_path"].rpartition(".")[2] if sizes else "",
-        "codebooks": sizes,
-        "seed": model["seed"],
-        "steps": settings["trainer"]["max_steps"],
-    }
 
 
 class _Reader(SplatCLI):

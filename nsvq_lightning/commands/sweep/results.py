@@ -10,33 +10,15 @@ from typing import Any
 import numpy as np
 
 from nsvq_lightning.io.atomic import write_text
-from nsvq_lightning.report.figures import (
-    colours_of,
-    draw_keys,
-    markdown_table,
-    markers_of,
-    panels,
-    write_csv,
-    write_figure,
-)
+from nsvq_lightning.report import figures
 from nsvq_lightning.training.schedule import Phase
 
 __all__ = ["Row", "as_markdown", "draw_sweep", "grouped", "moments", "read", "row_of", "series_of", "write_results"]
 
-NAMES = ("scene", "config", "quantizer", "codebooks")
-"""Columns that say which runs a line of the table is about: they differ in the seed alone."""
-
 Row = dict[str, Any]
 
-TABLE = {
-    "PSNR, dB": ("psnr", 1.0, ".2f"),
-    "SSIM": ("ssim", 1.0, ".4f"),
-    "MB": ("bytes", 1e-6, ".3f"),
-    "splats": ("splats", 1.0, ",.0f"),
-    "PSNR before, dB": ("psnr_before", 1.0, ".2f"),
-    "seconds": ("seconds", 1.0, ",.0f"),
-}
-"""Column, factor and format by the head of a column of the table."""
+NAMES = ("scene", "config", "quantizer", "codebooks")
+"""Columns that say which runs a line of the table is about: they differ in the seed alone."""
 
 
 def read(path: Path) -> Any:
@@ -78,7 +60,7 @@ def row_of(names: Row, folder: Path, error: str = "") -> Row:
 def write_results(output: Path, rows: Sequence[Row]) -> None:
     """Write ``results.csv``, ``results.md`` and ``results.png``; nothing without rows."""
     if rows:
-        write_csv(output / "results.csv", rows)
+        figures.write_csv(output / "results.csv", rows)
         write_text(output / "results.md", as_markdown(rows))
         draw_sweep(output / "results.png", rows)
 
@@ -110,17 +92,25 @@ def series_of(rows: Sequence[Row]) -> list[str]:
 
 def as_markdown(rows: Sequence[Row]) -> str:
     """A table of the means over the seeds, with their standard deviation, and a list of what has failed."""
+    table = {
+        "PSNR, dB": ("psnr", 1.0, ".2f"),
+        "SSIM": ("ssim", 1.0, ".4f"),
+        "MB": ("bytes", 1e-6, ".3f"),
+        "splats": ("splats", 1.0, ",.0f"),
+        "PSNR before, dB": ("psnr_before", 1.0, ".2f"),
+        "seconds": ("seconds", 1.0, ",.0f"),
+    }
     lines = []
     for group in grouped(rows):
         line = [*(group[0][name] or "–" for name in NAMES), str(len(group))]
-        for column, scale, form in TABLE.values():
+        for column, scale, form in table.values():
             mean, spread = moments(group, column, scale)
             plus_minus = f" ± {spread:{form}}" if len(group) > 1 else ""
             line.append("–" if np.isnan(mean) else f"{mean:{form}}{plus_minus}")
         lines.append(line)
     parts = ["# nsvq sweep"]
     if lines:
-        parts.append(markdown_table([*NAMES, "runs", *TABLE], lines, words=NAMES))
+        parts.append(figures.markdown_table([*NAMES, "runs", *table], lines, words=NAMES))
         parts.append(
             "Mean ± standard deviation over the seeds. PSNR and SSIM are those of the decoded file on the test views; "
             "before: of the plain splats. Seconds include those that runs have shared (`trunk_seconds` in the CSV)."
@@ -147,16 +137,19 @@ def draw_sweep(path: Path, rows: Sequence[Row]) -> None:
     if not rows:
         return
     rows = [row | {"series": name} for row, name in zip(rows, series_of(rows), strict=True)]
-    colours = colours_of(list(dict.fromkeys(row["series"] for row in rows)))
-    markers = markers_of(list(dict.fromkeys(row["scene"] for row in rows)))
-    figure, axes = panels(2 * len(markers), 4.6, max(len(colours), len(markers)))
+    colours = figures.colours_of(list(dict.fromkeys(row["series"] for row in rows)))
+    markers = figures.markers_of(list(dict.fromkeys(row["scene"] for row in rows)))
+    figure, axes = figures.panels(2 * len(markers), 4.6, max(len(colours), len(markers)))
     for (scene, marker), over_size, over_time in zip(markers.items(), axes[::2], axes[1::2], strict=True):
         shown = [row for row in rows if row["scene"] == scene]
         _draw_sizes(over_size, shown, colours, marker)
-        over_size.set_title(scene, fontsize="medium")
+        over_size.set(title=scene, xlabel="size of the file, MB", ylabel="test PSNR of the decoded file, dB")
         _draw_times(over_time, shown, colours, marker)
-    draw_keys(figure, colours, markers)
-    write_figure(path, figure)
+        over_time.set(xlabel="training, minutes", ylabel="test PSNR, dB")
+        for axis in (over_size, over_time):
+            axis.grid(alpha=0.3)
+    figures.draw_keys(figure, colours, markers)
+    figures.write_figure(path, figure)
 
 
 def _draw_sizes(axis: Any, rows: Sequence[Row], colours: dict[str, Any], marker: str) -> None:
@@ -166,8 +159,15 @@ def _draw_sizes(axis: Any, rows: Sequence[Row], colours: dict[str, Any], marker:
     labelled = set()
     for name, colour in colours.items():
         note = {"textcoords": "offset points", "fontsize": 7, "color": colour}
-        groups = grouped([row for row in rows if row["series"] == name])
-        points = [group for group in groups if group[0]["codebooks"] or are_points]
+        points = []
+        for group in grouped([row for row in rows if row["series"] == name]):
+            if group[0]["codebooks"] or are_points:
+                points.append(group)
+                continue
+            # As a point, it would be far outside the picture.
+            psnr, size = moments(group, "psnr")[0], moments(group, "bytes", 1e-6)[0]
+            axis.axhline(psnr, color=colour, linestyle="--", linewidth=1)
+            axis.annotate(f"{size:.3g} MB", (0, psnr), (3, 3), xycoords=("axes fraction", "data"), **note)
         points.sort(key=lambda group: moments(group, "bytes"))
         x, x_spread = np.reshape([moments(group, "bytes", 1e-6) for group in points], (-1, 2)).T
         y, y_spread = np.reshape([moments(group, "psnr") for group in points], (-1, 2)).T
@@ -177,13 +177,6 @@ def _draw_sizes(axis: Any, rows: Sequence[Row], colours: dict[str, Any], marker:
             labelled.add(sizes)
             for size, *place in zip(sizes, x, y, strict=True):
                 axis.annotate(size, place, (4, 5), **note)
-        for group in groups:
-            if group not in points:  # it would be far outside the picture
-                psnr, size = moments(group, "psnr")[0], moments(group, "bytes", 1e-6)[0]
-                axis.axhline(psnr, color=colour, linestyle="--", linewidth=1)
-                axis.annotate(f"{size:.3g} MB", (0, psnr), (3, 3), xycoords=("axes fraction", "data"), **note)
-    axis.grid(alpha=0.3)
-    axis.set(xlabel="size of the file, MB", ylabel="test PSNR of the decoded file, dB")
 
 
 def _draw_times(axis: Any, rows: Sequence[Row], colours: dict[str, Any], marker: str) -> None:
@@ -195,5 +188,3 @@ def _draw_times(axis: Any, rows: Sequence[Row], colours: dict[str, Any], marker:
         axis.plot([row["seconds"] / 60], [row["psnr"]], marker, color=colours[row["series"]], markersize=5)
     # What comes before that is steep and the same for all.
     axis.set_ylim(bottom=min(row["psnr"] for row in rows) - 2.0)
-    axis.grid(alpha=0.3)
-    axis.set(xlabel="training, minutes", ylabel="test PSNR, dB")

@@ -1,4 +1,12 @@
-"""``nsvq sweep``: train the runs, what they share only once, and keep the tables up to date. Light until it starts."""
+"""Train every combination of the lists; write a table and a picture of PSNR over file size.
+
+What several runs share is trained once. The same command goes on where it was, and trains only what is new. Options
+of 'nsvq fit' may follow; they hold for every run: --data.factor=2 --callbacks.density.max_splats=80000
+
+Examples:
+  nsvq sweep --scenes fox --codebooks 0.5k,1k,2k,4k,8k,16k --seeds 0,1,2 --max-steps 4500 --output sweeps/fox
+  nsvq sweep --scenes fox,horns --configs nsvq_4k,plain,own.yaml --output sweeps/own
+"""
 
 from __future__ import annotations
 
@@ -15,83 +23,26 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nsvq_lightning.commands.arguments import Parser, integers, names
-from nsvq_lightning.commands.sweep.results import Row, read, row_of, write_results
+from nsvq_lightning.commands.arguments import integers, names
+from nsvq_lightning.commands.sweep import results
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.version import __version__
 
 if TYPE_CHECKING:
     from nsvq_lightning.commands.sweep.plan import Run, Settings
 
-__all__ = ["commands", "folder_of", "main", "prepare", "preview", "run_subprocess", "sweep", "train"]
+__all__ = ["add_arguments", "commands", "folder_of", "prepare", "preview", "run", "run_subprocess", "sweep", "train"]
 
-log = logging.getLogger("nsvq_lightning.commands.sweep")
+log = logging.getLogger(__name__)
 
 CHECKPOINT = Path("checkpoints", "last.ckpt")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Train what is missing and write the tables.
-
-    Args:
-        argv: Arguments after ``nsvq sweep``; those of the process if None.
-
-    Returns:
-        0; 1 if a run has failed, the scenes or configurations are wrong, or another sweep writes to the folder; 130
-        after Ctrl-C. Wrong arguments end the process with status 2.
-    """
-    parser = _parser()
-    given, further = parser.parse_known_args(argv)
-    if further and not further[0].startswith("--"):
-        parser.error(f"unknown argument {further[0]!r}; a list has commas between its entries, and no spaces")
-    logging.basicConfig(format="%(message)s")
-    log.setLevel(logging.INFO)
-    from nsvq_lightning.commands.sweep.plan import plan
-    from nsvq_lightning.training.run_folder import hold, let_go
-
-    try:
-        steps = [] if given.max_steps is None else [f"--trainer.max_steps={given.max_steps}"]
-        lists = (given.scenes, given.configs, given.quantizers, given.codebooks, given.seeds)
-        runs = plan(*lists, options=[*steps, *further])
-        given.output.mkdir(parents=True, exist_ok=True)
-        if not given.dry_run:
-            hold(given.output)
-    except (ValueError, OSError) as error:
-        sys.stderr.write(f"nsvq sweep: {error}\n")
-        return 1
-    # What a job scheduler sends ends the training that is on, too; it would go on alone otherwise.
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        if given.dry_run or given.commands:
-            sys.stdout.writelines((preview if given.dry_run else commands)(given.output, runs))
-            return 0
-        rows = sweep(given.output, runs, keep_checkpoints=given.keep_checkpoints)
-    except KeyboardInterrupt:
-        sys.stderr.write("nsvq sweep: interrupted; the same command goes on where it stopped\n")
-        return 128 + signal.SIGINT
-    finally:
-        signal.signal(signal.SIGTERM, before)
-        let_go(given.output)
-    sys.stdout.write((given.output / "results.md").read_text(encoding="utf-8"))
-    return int(any(row["error"] for row in rows))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = Parser(
-        prog="nsvq sweep",
-        usage="nsvq sweep --output FOLDER [options] [options of nsvq fit]",
-        description="Train every combination of the lists; write a table and a picture of PSNR over file size. What "
-        "several runs share is trained once. The same command goes on where it was, and trains only what is new.",
-        epilog="""\
-Options of 'nsvq fit' may follow; they hold for every run: --data.factor=2 --callbacks.density.max_splats=80000
-
-examples:
-  nsvq sweep --scenes fox --codebooks 0.5k,1k,2k,4k,8k,16k --seeds 0,1,2 --max-steps 4500 --output sweeps/fox
-  nsvq sweep --scenes fox,horns --configs nsvq_4k,plain,own.yaml --output sweeps/own
-""",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what ``nsvq sweep`` takes; what it does not know are options of ``nsvq fit``."""
+    parser.usage = "nsvq sweep --output FOLDER [options] [options of nsvq fit]"
+    parser.allow_abbrev = False
+    parser.set_defaults(further=[])
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="where all results go")
     add = parser.add_argument_group("what is combined; lists have commas between their entries").add_argument
     add("--scenes", type=names, default=(), metavar="A,B", help="COLMAP folders (default: that of the configuration)")
@@ -104,7 +55,50 @@ examples:
     add = parser.add_mutually_exclusive_group().add_argument
     add("--dry-run", action="store_true", help="only say which runs there are")
     add("--commands", action="store_true", help="only print a command for each unfinished run, to be run anywhere")
-    return parser
+
+
+def run(options: argparse.Namespace) -> int:
+    """Train what is missing and write the tables.
+
+    Returns:
+        0, or 1 if a run has failed.
+
+    Raises:
+        argparse.ArgumentError: There is an argument that is no option.
+        ValueError: The scenes or configurations are wrong.
+        OSError: Another sweep writes to the folder, or a file cannot be read or written.
+        KeyboardInterrupt: After Ctrl-C or SIGTERM.
+    """
+    from nsvq_lightning.commands.sweep.plan import plan
+    from nsvq_lightning.training.run_folder import hold, let_go
+
+    output, further = options.output, options.further
+    if further and not further[0].startswith("--"):
+        message = f"unknown argument {further[0]!r}; a list has commas between its entries, and no spaces"
+        raise argparse.ArgumentError(None, message)
+    steps = [] if options.max_steps is None else [f"--trainer.max_steps={options.max_steps}"]
+    lists = (options.scenes, options.configs, options.quantizers, options.codebooks, options.seeds)
+    runs = plan(*lists, options=[*steps, *further])
+    if options.dry_run:
+        sys.stdout.writelines(preview(output, runs))
+        return 0
+    output.mkdir(parents=True, exist_ok=True)
+    hold(output)
+    # What a job scheduler sends ends the training that is on, too; it would go on alone otherwise.
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        if options.commands:
+            sys.stdout.writelines(commands(output, runs))
+            return 0
+        rows = sweep(output, runs, keep_checkpoints=options.keep_checkpoints)
+    except KeyboardInterrupt:
+        sys.stderr.write("nsvq sweep: interrupted; the same command goes on where it stopped\n")
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, before)
+        let_go(output)
+    sys.stdout.write((output / "results.md").read_text(encoding="utf-8"))
+    return int(any(row["error"] for row in rows))
 
 
 def run_subprocess(arguments: Sequence[str], log: Path) -> int:
@@ -208,7 +202,7 @@ def commands(output: Path, runs: Sequence[Run]) -> Iterator[str]:
                 log.info("%s", error)
 
 
-def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> list[Row]:
+def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> list[results.Row]:
     """Train what is not finished yet; a run that fails does not keep the others from theirs.
 
     The tables are written anew after each run, so they are complete whenever this is interrupted. A trunk is what
@@ -224,11 +218,12 @@ def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> 
         A row for each run, in their order.
     """
     folders = {folder_of(output, run): run for run in runs}
-    rows = {
-        folder: row_of(run.names, folder) for folder, run in folders.items() if (folder / "finished.json").is_file()
-    }
+    rows: dict[Path, results.Row] = {}
+    for folder, run in folders.items():
+        if (folder / "finished.json").is_file():
+            rows[folder] = results.row_of(run.names, folder)
     failed: dict[Path, str] = {}
-    write_results(output, list(rows.values()))
+    results.write_results(output, list(rows.values()))
     for number, (folder, run) in enumerate(folders.items(), start=1):
         counted = f"[{number}/{len(runs)}] {run.title}"
         if folder in rows:
@@ -237,10 +232,10 @@ def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> 
         error = _finish(output, run, folder, failed)
         if not (error or keep_checkpoints):  # they are larger than everything else
             shutil.rmtree(folder / CHECKPOINT.parent, ignore_errors=True)
-        row = rows[folder] = row_of(run.names, folder, error)
+        row = rows[folder] = results.row_of(run.names, folder, error)
         result = "PSNR {:.2f} dB, {bytes} bytes, {seconds:.0f} s of training, {trunk_seconds:.0f} s of it shared"
         log.info("%s: %s", counted, f"failed: {error}" if error else result.format(row["psnr"] or float("inf"), **row))
-        write_results(output, [rows[folder] for folder in folders if folder in rows])
+        results.write_results(output, [rows[folder] for folder in folders if folder in rows])
     return [rows[folder] for folder in folders]
 
 
@@ -256,18 +251,18 @@ def _finish(output: Path, run: Run, folder: Path, failed: dict[Path, str]) -> st
     trunk, start, shared = run.trunk, None, None
     if trunk is not None:
         base = folder_of(output, trunk, "trunks")
-        start, shared = base / CHECKPOINT, read(base / "metrics.json")
+        start, shared = base / CHECKPOINT, results.read(base / "metrics.json")
         # A run that was interrupted after its trunk goes on from its own checkpoint.
         needed = not any((folder / name).is_file() for name in ("metrics.json", CHECKPOINT))
         if needed and (shared is None or not start.is_file()):
             failed[base] = failed.get(base) or train(base, trunk.settings)
             if failed[base]:
                 return f"trunk: {failed[base]}"
-            shared = read(base / "metrics.json")
+            shared = results.read(base / "metrics.json")
     if not (folder / "metrics.json").is_file() and (error := train(folder, run.settings, start)):
         return error
     # A run that its command has started has not branched, and has measured other times.
-    branched = shared is not None and shared["phases"][-1] in read(folder / "metrics.json")["phases"]
+    branched = shared is not None and shared["phases"][-1] in results.read(folder / "metrics.json")["phases"]
     record = {"version": __version__, "trunk": base.name if branched else None}
     write_text(folder / "finished.json", json.dumps(record, indent=2) + "\n")
     return ""
