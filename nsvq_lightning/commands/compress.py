@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from nsvq_lightning.io.compressed import CompressedScene
     from nsvq_lightning.rendering.camera import Camera
 
-__all__ = ["add_arguments", "run"]
-
 log = logging.getLogger("nsvq_lightning.compress")
 
 SIZES = ("16k", "8k", "4k", "2k", "1k", "0.5k", "128k", "64k", "32k", "none")

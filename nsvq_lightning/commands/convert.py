@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
     from nsvq_lightning.data.scene import View
 
-__all__ = ["add_arguments", "run"]
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq convert`` takes."""

@@ -76,12 +76,10 @@ def run(options: argparse.Namespace) -> int:
 
 def check_all(folder: Path | None) -> Iterator[Finding]:
     """All findings about this machine and, if given, a scene folder."""
-    yield from attempt("machine", check_machine())
-    yield from attempt("packages", check_packages())
-    yield from attempt("threads", check_threads())
-    yield from attempt("memory", check_room(Path()))
-    yield from attempt("gpu", check_gpu())
-    yield from attempt("self-test", check_backends())
+    checks = {"machine": check_machine(), "packages": check_packages(), "threads": check_threads()}
+    checks |= {"memory": check_room(Path()), "gpu": check_gpu(), "self-test": check_backends()}
+    for subject, check in checks.items():
+        yield from attempt(subject, check)
     if folder is not None:
         yield from check_folder(folder)
 

@@ -11,8 +11,6 @@ from typing import Any
 
 from nsvq_lightning.io.describe import describe
 
-__all__ = ["add_arguments", "run"]
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq info`` takes."""

@@ -13,8 +13,6 @@ from importlib.metadata import EntryPoint, entry_points
 
 from nsvq_lightning.commands.registry import COMMANDS
 
-__all__ = ["main"]
-
 _OURS = "nsvq-lightning"
 
 

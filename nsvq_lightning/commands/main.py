@@ -19,8 +19,6 @@ from nsvq_lightning.commands import arguments as given
 from nsvq_lightning.commands.registry import COMMANDS, overview
 from nsvq_lightning.version import __version__
 
-__all__ = ["main", "run_command"]
-
 TRACEBACK = "NSVQ_TRACEBACK"
 """Environment variable that makes errors show their traceback."""
 

@@ -26,8 +26,6 @@ from nsvq_lightning.io.atomic import write_text
 if TYPE_CHECKING:
     from nsvq_lightning.data.reconstruct import Verdict
 
-__all__ = ["add_arguments", "run"]
-
 RECORD = "prepare.json"
 """File that shows that a folder was made by this command, and from what."""
 MADE = ("images", "sparse", "mapping", "database.db", "database.db-shm", "database.db-wal", RECORD)

@@ -7,8 +7,6 @@ import time
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
-__all__ = ["Progress", "progress"]
-
 LINES = 10
 """Lines at most if the output is not a terminal."""
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-__all__ = ["COMMANDS", "Command", "overview"]
-
 
 class Command(NamedTuple):
     """A command."""

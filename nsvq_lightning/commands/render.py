@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from nsvq_lightning.rendering.rasterize import Render
     from nsvq_lightning.splats.splats import Splats
 
-__all__ = ["add_arguments", "run"]
-
 log = logging.getLogger(__name__)
 
 WHAT = ("color", "depth", "alpha")

@@ -27,8 +27,6 @@ from nsvq_lightning.commands.arguments import cameras_of, photos_of, scene_file
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
 
-__all__ = ["add_arguments", "run"]
-
 PORT = 7007
 MOST = 64
 """Connections at a time; more are closed at once."""

@@ -9,7 +9,7 @@ import cv2
 import pytest
 
 from nsvq_lightning.commands.benchmark import Scope
-from nsvq_lightning.commands.benchmark.report import Panel, as_json, as_markdown, describe_machine, draw_suite, number
+from nsvq_lightning.commands.benchmark.report import as_json, as_markdown, describe_machine, draw_suite, number
 from nsvq_lightning.commands.benchmark.timing import Measurement, Timing
 
 MACHINE: dict[str, Any] = {**describe_machine(), "cpu": "Abacus 1", "usable_cores": 2, "cores": 4, "load_average": 0.25}
@@ -60,7 +60,7 @@ def test_json_has_the_samples_and_nothing_but_plain_values() -> None:
 
 def test_picture_has_a_panel_for_each_value_that_rows_have(tmp_path: Path) -> None:
     run = dataclasses.replace(ROWS[0], operation="run", course=((0.1, 12.0), (1.0, 20.0)))
-    panels = [Panel("search", "wrong"), Panel("other", "extra", "wrong"), Panel("run", "PSNR dB", "seconds")]
+    panels = [("search", "wrong", "ms"), ("other", "extra", "wrong"), ("run", "PSNR dB", "seconds")]
     sizes = []
     for rows in (ROWS[:2], ROWS, [*ROWS, run]):
         draw_suite(tmp_path / "drawn.png", rows, panels)

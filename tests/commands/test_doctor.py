@@ -54,13 +54,6 @@ def test_a_bad_folder_gives_status_1(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert lines[-1].startswith("1 problem,")
 
 
-def test_help_answers_before_torch_is_imported() -> None:
-    code = "import sys; from nsvq_lightning.commands.main import main\ntry: main(['doctor', '--help'])\n"
-    code += "finally: assert 'torch' not in sys.modules"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
-
-
 def test_without_opencv_the_other_checks_are_still_made() -> None:
     code = "import sys; sys.modules['cv2'] = None\nfrom nsvq_lightning.commands.main import main\n"
     code += "sys.exit(main(['doctor']))"
@@ -93,17 +86,13 @@ def test_threads_and_waiting_are_judged(monkeypatch: pytest.MonkeyPatch) -> None
     for policy, verdict in (("passive", "good"), ("ACTIVE", "note")):
         monkeypatch.setenv("OMP_WAIT_POLICY", policy)
         assert list(doctor.check_threads())[1].verdict == verdict
-
-
-def test_the_slow_cores_of_a_mac_are_not_missed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(environment, "usable_cores", lambda: 8)
-    monkeypatch.setattr(jit, "thread_count", lambda: 4)
+    monkeypatch.setattr(jit, "thread_count", lambda: 2)
     monkeypatch.setattr(platform, "system", lambda: "Darwin")
     monkeypatch.setattr(platform, "machine", lambda: "arm64")
     for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
         monkeypatch.delenv(name, raising=False)
-    assert next(doctor.check_threads()).verdict == "good"
-    monkeypatch.setenv("OMP_NUM_THREADS", "4")
+    assert next(doctor.check_threads()).verdict == "good"  # a Mac's slow cores are not missed
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
     assert next(doctor.check_threads()).verdict == "note"
 
 

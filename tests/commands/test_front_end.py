@@ -38,6 +38,20 @@ def test_version_and_overview_come_without_torch(argument: str, said: str) -> No
         )
 
 
+def test_help_of_commands_without_training_comes_without_torch() -> None:
+    code = (
+        "import sys\nfrom nsvq_lightning.commands.main import main\n"
+        "for name in sys.argv[1:]:\n"
+        "    try: main([name, '--help'])\n"
+        "    except SystemExit as end: assert not end.code\n"
+        "assert not {'torch', 'numba', 'lightning'} & set(sys.modules)"
+    )
+    names = [name for name, command in COMMANDS.items() if command.module is not None]
+    done = subprocess.run([sys.executable, "-c", code, *names], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.count("\nExamples:\n") == len(names) - 1  # info has none
+
+
 def test_no_command_is_an_error_that_shows_them(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 2
     assert "nsvq COMMAND --help" in capsys.readouterr().out

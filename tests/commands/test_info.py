@@ -2,10 +2,7 @@ from __future__ import annotations
 
 import io
 import json
-import subprocess
 import sys
-import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -80,16 +77,3 @@ def test_bad_files_are_one_line_and_status_1(
         assert captured.out == ""
         assert captured.err.count("\n") == 1
         assert captured.err.startswith(f"nsvq info: {path}: ")
-
-
-def test_it_starts_without_torch_in_under_a_second(tmp_path: Path) -> None:
-    write_nsvq(tmp_path / "x.nsvq", _scene(1000))
-    code = "import sys; from nsvq_lightning.commands.main import main; status = main(['info', *sys.argv[1:]]); "
-    code += "assert 'torch' not in sys.modules; sys.exit(status)"
-    times = []
-    for _ in range(3):
-        start = time.perf_counter()
-        subprocess.run([sys.executable, "-c", code, str(tmp_path / "x.nsvq")], check=True, capture_output=True)
-        times.append(time.perf_counter() - start)
-    # The target is one second; other work may run on the machine that tests.
-    assert min(times) < 2.0

@@ -13,13 +13,11 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark import Scope, timing
-from nsvq_lightning.commands.benchmark.quantize import prepare
-from nsvq_lightning.commands.benchmark.report import Panel
+from nsvq_lightning.commands.benchmark import Scope, quantize, timing
 from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.commands.compress import DEFAULT_TUNING, VIEWS
-from nsvq_lightning.compression.ladder import LADDER, PLAIN, Compressor, Rung
-from nsvq_lightning.compression.stored import to_compressed
+from nsvq_lightning.compression import ladder
+from nsvq_lightning.compression.stored import compress
 from nsvq_lightning.compression.viewpoints import decibels, pictures, views_of
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.atomic import atomic_write
@@ -34,7 +32,7 @@ from nsvq_lightning.splats.splats import SplatTensors
 log = logging.getLogger(__name__)
 
 SMALL = "made small"
-PANELS = (Panel("write", "bytes a splat"), Panel("read", "image error"), Panel(SMALL, "PSNR dB", "bytes"))
+PANELS = (("write", "bytes a splat", "ms"), ("read", "image error", "ms"), (SMALL, "PSNR dB", "bytes"))
 
 
 def run(scope: Scope) -> Iterator[timing.Measurement]:
@@ -54,8 +52,8 @@ def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[timin
     paths: dict[str, Path] = {}
     with timing.use_threads(max(scope.threads)):
         # Codebooks of one step of k-means: sizes and times do not depend on how good they are.
-        quantizers = {name: as_quantizer(a.quantizer) for name, a in prepare(workload.splats, scope.codebooks).items()}
-        scene = to_compressed(workload.splats, quantizers)
+        fitted = quantize.prepare(workload.splats, scope.codebooks)
+        scene = compress(workload.splats, {name: as_quantizer(each.quantizer) for name, each in fitted.items()})
         writers: dict[str, Callable[[Path], int]] = {".ply": partial(save, workload.splats)}
         writers |= {f".nsvq {level}": partial(save, scene, storage=Storage(level)) for level in LEVELS}
         images = {".ply": _image(workload, workload.splats), ".nsvq": _image(workload, scene.decode())}
@@ -112,17 +110,17 @@ def _ways(plain: CompressedScene, scope: Scope) -> dict[str, tuple[str, Callable
     views, tuning = (2, 2) if scope.quick else (VIEWS, DEFAULT_TUNING)
     plain = splats.to_splats()
 
-    def compressed(rung: Rung, path: Path) -> None:
+    def compressed(rung: ladder.Rung, path: Path) -> None:
         """What ``nsvq compress`` does without photos, the search for views included."""
         cameras = views_of(plain, None, views)
-        put(Compressor(splats, cameras, Storage(), tuning=tuning).at(rung).data, path)
+        put(ladder.Compressor(splats, cameras, Storage(), tuning=tuning).at(rung).data, path)
 
     def put(data: bytes, path: Path) -> None:
         with atomic_write(path) as file:
             file.write(data)
 
     ways: dict[str, tuple[str, Callable[[Path], object]]] = {}
-    for rung in (PLAIN, *(rung for rung in LADDER if rung.name in sizes)):
+    for rung in (ladder.PLAIN, *(rung for rung in ladder.LADDER if rung.name in sizes)):
         ways[f"nsvq compress: {rung.name}"] = ".nsvq", partial(compressed, rung)
     for rows in palettes:
         ways[f".sog: palette {rows}"] = ".sog", partial(save, plain, palette=rows)

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.commands.benchmark import Scope
-from nsvq_lightning.commands.benchmark.report import Panel
 from nsvq_lightning.commands.benchmark.timing import Measurement, compare, use_threads
 from nsvq_lightning.commands.benchmark.workloads import relative_l2, synthetic_workload, workloads
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, CodebookQuantizer, kmeans, nearest, nearest_reference
@@ -21,7 +20,7 @@ from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.optim import LearningRates
 
 STEP, SEARCH, KMEANS = "step, forward + backward", "search", "k-means"
-PANELS = (Panel(STEP, "gradient error"), Panel(SEARCH, "wrong codes"), Panel(KMEANS, "distortion"))
+PANELS = ((STEP, "gradient error", "ms"), (SEARCH, "wrong codes", "ms"), (KMEANS, "distortion", "ms"))
 CHECKED_ROWS = 4_000
 """Rows an attribute whose codes are checked: the float64 oracle is slow."""
 

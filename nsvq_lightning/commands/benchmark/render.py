@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.commands.benchmark import Scope
-from nsvq_lightning.commands.benchmark.report import Panel
 from nsvq_lightning.commands.benchmark.timing import Measurement, compare, use_threads
 from nsvq_lightning.commands.benchmark.workloads import Workload, relative_l2, workloads
 from nsvq_lightning.compute.devices import fast_backends
@@ -27,7 +26,7 @@ from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats
 
 FORWARD, BOTH, LOSS = "forward", "forward + backward", "L1 + D-SSIM, forward + backward"
-PANELS = (Panel(FORWARD, "max error"), Panel(BOTH, "gradient error"), Panel(LOSS, "gradient error"))
+PANELS = ((FORWARD, "max error", "ms"), (BOTH, "gradient error", "ms"), (LOSS, "gradient error", "ms"))
 ORACLE_WORK = {True: 1e8, False: 6e9}
 """Splats times pixels that the oracle is given, quick and full: half a minute on one core at most."""
 PHOTO = (533, 800, 3)

@@ -9,7 +9,7 @@ import platform
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from llvmlite import binding
@@ -22,6 +22,9 @@ from nsvq_lightning.version import __version__
 
 Suites = Mapping[str, Sequence[Measurement]]
 """Measurements by the name of their suite."""
+Panel = tuple[str, str, str]
+"""What a panel of the picture shows: rows of an operation, a value of theirs or ``ms``, and what that stands over:
+``ms``, a value, or ``seconds`` for the course of a run."""
 
 
 def describe_machine() -> dict[str, Any]:
@@ -133,27 +136,15 @@ def number(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
-class Panel(NamedTuple):
-    """What a panel of the picture shows of the rows of one operation.
-
-    Attributes:
-        operation: Which.
-        value: Name of a value, or ``ms``.
-        against: What stands on the other axis: ``ms``, a value, or ``seconds`` for the course of a run.
-    """
-
-    operation: str
-    value: str
-    against: str = "ms"
-
-    def points(self, row: Measurement) -> Sequence[tuple[float, float]]:
-        """Where the row is in the panel, ``(x, y)``; nowhere if it is of another operation or lacks a value."""
-        if row.operation != self.operation:
-            return ()
-        if self.against == "seconds":
-            return row.course
-        known = {"ms": row.timing.median, **row.values}
-        return [(known[self.against], known[self.value])] if {self.against, self.value} <= known.keys() else ()
+def points(row: Measurement, panel: Panel) -> Sequence[tuple[float, float]]:
+    """Where a row is in a panel, ``(x, y)``; nowhere if it is of another operation or lacks a value."""
+    operation, value, against = panel
+    if row.operation != operation:
+        return ()
+    if against == "seconds":
+        return row.course
+    known = {"ms": row.timing.median, **row.values}
+    return [(known[against], known[value])] if {against, value} <= known.keys() else ()
 
 
 def draw_suite(path: Path, rows: Sequence[Measurement], wanted: Sequence[Panel]) -> None:
@@ -167,10 +158,10 @@ def draw_suite(path: Path, rows: Sequence[Measurement], wanted: Sequence[Panel])
         rows: Those of one suite.
         wanted: The panels, those without rows are left out.
     """
-    drawn = [panel for panel in wanted if any(panel.points(row) for row in rows)]
+    drawn = [panel for panel in wanted if any(points(row, panel) for row in rows)]
     if not drawn:
         return
-    rows = [row for row in rows if any(panel.points(row) for panel in drawn)]
+    rows = [row for row in rows if any(points(row, panel) for panel in drawn)]
     colours = figures.colours_of(list(dict.fromkeys(row.method.partition(":")[0] for row in rows)))
     markers = figures.markers_of(list(dict.fromkeys(row.workload for row in rows)))
     most = max(row.threads for row in rows)
@@ -178,16 +169,17 @@ def draw_suite(path: Path, rows: Sequence[Measurement], wanted: Sequence[Panel])
     for axis, panel in zip(axes, drawn, strict=True):
         lines: dict[tuple[str, str, int], list[tuple[float, float]]] = {}
         for row in rows:
-            lines.setdefault((row.method.partition(":")[0], row.workload, row.threads), []).extend(panel.points(row))
-        for (method, workload, threads), points in lines.items():
+            lines.setdefault((row.method.partition(":")[0], row.workload, row.threads), []).extend(points(row, panel))
+        for (method, workload, threads), line in lines.items():
             face = colours[method] if threads == most else "none"
             style = {"marker": markers[workload], "color": colours[method], "markerfacecolor": face}
-            axis.plot([x for x, _ in points], [y for _, y in points], linewidth=1, **style)
-        axis.set(xscale="log", xlabel=panel.against, ylabel=panel.value, title=panel.operation)
+            axis.plot([x for x, _ in line], [y for _, y in line], linewidth=1, **style)
+        operation, value, against = panel
+        axis.set(xscale="log", xlabel=against, ylabel=value, title=operation)
         axis.xaxis.set_major_formatter("{x:g}")
         axis.grid(alpha=0.3)
-        heights = [y for points in lines.values() for _, y in points]
-        if min(heights) > 0 and "dB" not in panel.value:
+        heights = [y for line in lines.values() for _, y in line]
+        if min(heights) > 0 and "dB" not in value:
             axis.set_yscale("log")
         elif min(heights) == 0:
             axis.set_yscale("symlog", linthresh=min((y for y in heights if y > 0), default=1.0))

@@ -28,7 +28,6 @@ from torch import Tensor
 
 from nsvq_lightning.commands.arguments import find_config
 from nsvq_lightning.commands.benchmark import SIZES, Scope, timing
-from nsvq_lightning.commands.benchmark.report import Panel
 from nsvq_lightning.commands.benchmark.workloads import synthetic_workload
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.data.datamodule import ColmapDataModule
@@ -37,14 +36,14 @@ from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.report.evaluation import evaluate
 from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.training import optim
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.training.schedule import Phase
 
 log = logging.getLogger(__name__)
 
 RUN, ALONE = "run", "step by itself"
-PANELS = (Panel(RUN, "PSNR dB", "seconds"), Panel(ALONE, "ms", "splats"), Panel(ALONE, "peak MB", "splats"))
+PANELS = ((RUN, "PSNR dB", "seconds"), (ALONE, "ms", "splats"), (ALONE, "peak MB", "splats"))
 WATCHING = ("report", "export", "predictions", "checkpoint", "kernels", "progress")
 """Callbacks of ``nsvq fit`` that write files or lines but train nothing; the benchmark measures by itself."""
 QUICK_DEMO = ("--data.factor=4",)
@@ -357,7 +356,7 @@ def _step_alone(name: str, scope: Scope, threads: int) -> tuple[timing.Timing, i
     """Times of a step, and the largest resident memory of this process so far, bytes; 0 where no one says."""
     workload = synthetic_workload(name)
     splats = Splats.from_tensors(*workload.splats)
-    optimizer = build_adam(param_groups(splats, {}, LearningRates(), extent=1.0))
+    optimizer = optim.build_adam(optim.param_groups(splats, {}, optim.LearningRates(), extent=1.0))
     photo = torch.full(workload.image_gradient.shape, 128, dtype=torch.uint8)
 
     def step() -> None:

@@ -20,8 +20,6 @@ from nsvq_lightning.training.resume import QUANTIZE_RULES
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.version import __version__
 
-__all__ = ["Run", "Settings", "plan", "resolve"]
-
 Settings = dict[str, Any]
 """All settings of a ``nsvq fit``: what ``--print_config`` shows, as JSON values."""
 

@@ -13,8 +13,6 @@ from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.report import figures
 from nsvq_lightning.training.schedule import Phase
 
-__all__ = ["Row", "as_markdown", "draw_sweep", "grouped", "moments", "read", "row_of", "series_of", "write_results"]
-
 Row = dict[str, Any]
 
 NAMES = ("scene", "config", "quantizer", "codebooks")

@@ -31,8 +31,6 @@ from nsvq_lightning.version import __version__
 if TYPE_CHECKING:
     from nsvq_lightning.commands.sweep.plan import Run, Settings
 
-__all__ = ["add_arguments", "commands", "folder_of", "prepare", "preview", "run", "run_subprocess", "sweep", "train"]
-
 log = logging.getLogger(__name__)
 
 CHECKPOINT = Path("checkpoints", "last.ckpt")
