@@ -74,8 +74,10 @@ def run(options: argparse.Namespace) -> int:
         wrong = "--max-steps trains with photos: give their COLMAP folder with --data.root"
     elif options.max_steps and options.codebooks == "none":
         wrong = "--max-steps trains codebooks, and there are none with --codebooks=none"
-    elif min(options.tune, options.max_steps or 0) < 0:
-        wrong = "--tune and --max-steps must be at least 0"
+    elif options.max_steps is not None and options.max_steps < 0:
+        wrong = f"--max-steps must be at least 0, got {options.max_steps}"
+    elif options.tune < 0:
+        wrong = f"--tune must be at least 0, got {options.tune}"
     if wrong:
         raise argparse.ArgumentError(None, wrong)
     from nsvq_lightning.compression.ladder import Compressor

@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
     most = int(numba.config.NUMBA_NUM_THREADS)
     values: dict[str, Any] = {"threads": tuple(sorted({1, most}))}
     if options.quick:
-        values: dict[str, Any] = {"threads": (most,), "repeats": 3, "seconds": 0.5, "workloads": ("A20k",), "steps": 40}
+        values = {"threads": (most,), "repeats": 3, "seconds": 0.5, "workloads": ("A20k",), "steps": 40}
     given = {name: value for name, value in vars(options).items() if name in Scope.__dataclass_fields__}
     scope = Scope(**values | {name: value for name, value in given.items() if value is not None})
     wrong = ""
