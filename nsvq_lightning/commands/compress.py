@@ -90,8 +90,8 @@ def run(options: argparse.Namespace) -> int:
     scene = read_scene(source).finite()
     if len(scene) == 0:
         raise ValueError(f"{source} holds no finite splat; there is nothing to compress")
-    cameras = views_of(arrays.to_splats(), options.root, VIEWS)
-    candidate, pictures = _candidate(options, arrays, cameras, scene)
+    cameras = views_of(scene.decode(), options.root, VIEWS)
+    candidate, pictures = _candidate(options, scene, cameras)
     data, error, settings = candidate.data, candidate.error, candidate.rung.name
     options.output.parent.mkdir(parents=True, exist_ok=True)
     trains = options.root is not None and options.max_steps != 0
@@ -103,7 +103,7 @@ def run(options: argparse.Namespace) -> int:
             return status
         trained = with_origin((folder / "scene.nsvq").read_bytes(), scene.origin)
         # A new one: keeping the pictures of the original would fill the memory during training.
-        found = Compressor(arrays, cameras, candidate.storage, antialiased=scene.antialiased).error(trained)
+        found = Compressor(scene, cameras, candidate.storage).error(trained)
         missed = ""
         if options.target_bytes is not None and len(trained) > options.target_bytes:
             missed = f"has {len(trained):,} bytes, more than --target-bytes={options.target_bytes}"
@@ -119,23 +119,18 @@ def run(options: argparse.Namespace) -> int:
         file.write(data)
     before, after = source.stat().st_size, len(data)
     sys.stdout.write(
-        f"{options.output}: {len(arrays):,} splats in {after:,} bytes, {before / after:.1f} times smaller than "
+        f"{options.output}: {len(scene):,} splats in {after:,} bytes, {before / after:.1f} times smaller than "
         f"{source.name}\n  {settings}, error {error:.4g} ({decibels(error):.2f} dB against the original in {pictures} "
         "pictures)\n"
     )
     return 0
 
 
-def _candidate(
-    options: argparse.Namespace, arrays: SplatArrays, cameras: list[Camera], scene: CompressedScene
-) -> tuple[Candidate, int]:
+def _candidate(options: argparse.Namespace, scene: CompressedScene, cameras: list[Camera]) -> tuple[Candidate, int]:
     """The scene as the options ask for it, and the number of pictures in which its error was measured."""
     from nsvq_lightning.compression import ladder
 
-    storage = Storage(options.level)
-    compressor = ladder.Compressor(
-        arrays, cameras, storage, options.seed, scene.origin, options.tune, scene.antialiased
-    )
+    compressor = ladder.Compressor(scene, cameras, Storage(options.level), options.seed, options.tune)
     if options.max_error is not None:
         candidate = ladder.smallest_within(compressor, options.max_error)
     elif options.target_bytes is not None:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.commands.progress import progress
 from nsvq_lightning.io import formats, spz
-from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, cropped, rotated, turn_up
 from nsvq_lightning.io.describe import attribute_errors
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.sog import PALETTE_LIMIT
@@ -104,7 +104,7 @@ def run(options: argparse.Namespace) -> int:
     sys.stdout.write(f"{output}: {len(scene):,} splats in {size:,} bytes{each}\n")
     in_order = formats.FORMATS[output.suffix.lower()].in_order
     if in_order is not None:  # the format is not exact
-        errors = attribute_errors(formats.read_scene(output).arrays(), in_order(scene).arrays())
+        errors = attribute_errors(formats.read_scene(output), in_order(scene))
         listed = ", ".join(f"{name} {error:.2g}{'°' * (name == 'rotation')}" for name, error in errors.items())
         sys.stdout.write(f"  root mean square errors: {listed}\n")
     if options.measure:

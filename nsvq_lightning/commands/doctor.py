@@ -133,7 +133,7 @@ def check_machine() -> Iterator[Finding]:
     machine = describe_machine()
     yield judged("machine", f"{machine['system']}, {machine['cpu']}", **machine)
     bits, simd = machine["simd_bits"], machine["simd"]
-    text = f"{lanes.WIDTH} floats at a time in {bits}-bit registers ({', '.join(simd) or 'no vector extension'})"
+    text = f"{WIDTH} floats at a time in {bits}-bit registers ({', '.join(simd) or 'no vector extension'})"
     # ARM64 has no wider ones.
     narrow = bits < 256 and "neon" not in simd and "a processor with AVX2 or AVX-512 is about twice as fast"
     fused = not {"fma", "neon"}.isdisjoint(simd)

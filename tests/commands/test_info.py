@@ -10,7 +10,7 @@ import pytest
 from splat_scenes import random_splats
 
 from nsvq_lightning.commands.main import main
-from nsvq_lightning.io import CompressedScene, SplatArrays, write_nsvq, write_ply
+from nsvq_lightning.io import CompressedScene, write_nsvq, write_ply
 
 
 def _plain(n: int) -> CompressedScene:

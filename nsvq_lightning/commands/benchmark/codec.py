@@ -17,7 +17,6 @@ from nsvq_lightning.commands.benchmark import Scope, quantize, timing
 from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.commands.compress import DEFAULT_TUNING, VIEWS
 from nsvq_lightning.compression import ladder
-from nsvq_lightning.compression.stored import compress
 from nsvq_lightning.compression.viewpoints import decibels, pictures, views_of
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.atomic import atomic_write
@@ -53,7 +52,7 @@ def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[timin
     with timing.use_threads(max(scope.threads)):
         # Codebooks of one step of k-means: sizes and times do not depend on how good they are.
         fitted = quantize.prepare(workload.splats, scope.codebooks)
-        scene = compress(workload.splats, {name: as_quantizer(each.quantizer) for name, each in fitted.items()})
+        scene = to_compressed(workload.splats, {name: as_quantizer(each.quantizer) for name, each in fitted.items()})
         writers: dict[str, Callable[[Path], int]] = {".ply": partial(save, workload.splats)}
         writers |= {f".nsvq {level}": partial(save, scene, storage=Storage(level)) for level in LEVELS}
         images = {".ply": _image(workload, workload.splats), ".nsvq": _image(workload, scene.decode())}
@@ -78,7 +77,7 @@ def _image(workload: Workload, splats: SplatTensors) -> Tensor:
 
 
 def _small_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[timing.Measurement]:
-    splats, cameras = SplatArrays.from_splats(workload.splats), [workload.camera]
+    plain, cameras = CompressedScene.from_splats(workload.splats), [workload.camera]
     images = pictures(workload.splats, cameras)
     if scope.photos is not None:
         scene = load_scene(scope.photos, masks=None)
@@ -91,14 +90,14 @@ def _small_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[timi
         return fmean(decibels(float((a - b).double().square().mean().sqrt())) for a, b in pairs)
 
     original, product = psnr(workload.splats), timing.sgemm()
-    for method, (suffix, write) in _ways(splats, scope).items():
+    for method, (suffix, write) in _ways(plain, scope).items():
         path = folder / f"small{suffix}"
         took = timing.Timing((timing.milliseconds(partial(write, path)),), (timing.milliseconds(product),))
         size = path.stat().st_size
         values = {"PSNR dB": psnr(load(path)), "bytes": float(size), "bits a splat": 8 * size / len(plain)}
         if isfinite(original):
             values["dB lost"] = original - values["PSNR dB"]
-        described = f"{workload.name}, {len(splats):,} splats"
+        described = f"{workload.name}, {len(plain):,} splats"
         yield timing.Measurement(SMALL, described, method, max(scope.threads), took, values)
 
 
@@ -108,12 +107,11 @@ def _ways(plain: CompressedScene, scope: Scope) -> dict[str, tuple[str, Callable
     if scope.quick:
         del sizes[:-1], palettes[:-1]
     views, tuning = (2, 2) if scope.quick else (VIEWS, DEFAULT_TUNING)
-    plain = splats.to_splats()
 
     def compressed(rung: ladder.Rung, path: Path) -> None:
         """What ``nsvq compress`` does without photos, the search for views included."""
-        cameras = views_of(plain, None, views)
-        put(ladder.Compressor(splats, cameras, Storage(), tuning=tuning).at(rung).data, path)
+        cameras = views_of(plain.decode(), None, views)
+        put(ladder.Compressor(plain, cameras, Storage(), tuning=tuning).at(rung).data, path)
 
     def put(data: bytes, path: Path) -> None:
         with atomic_write(path) as file:
