@@ -17,6 +17,7 @@ from nsvq_lightning.commands.benchmark import Scope, quantize, timing
 from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.commands.compress import DEFAULT_TUNING, VIEWS
 from nsvq_lightning.compression import ladder
+from nsvq_lightning.compression.stored import to_compressed
 from nsvq_lightning.compression.viewpoints import decibels, pictures, views_of
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.atomic import atomic_write
