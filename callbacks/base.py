@@ -14,9 +14,7 @@ from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.run_folder import hold, is_trial, let_go, run_folder, take
 from nsvq_lightning.training.schedule import next_iteration
 
-__all__ = ["SplatCallback", "WritingCallback", "finite_search_is_due", "keep_finite_splats"]
-
-
+# What a setting may be, by how an error says it.
 BOUNDS: dict[str, Callable[[float], bool]] = {
     "at least 1": lambda value: value >= 1,
     "at least 0": lambda value: value >= 0,
@@ -25,7 +23,6 @@ BOUNDS: dict[str, Callable[[float], bool]] = {
     "in [0, 1)": lambda value: 0 <= value < 1,
     "in (0, 1]": lambda value: 0 < value <= 1,
 }
-"""What a setting may be, by how an error says it."""
 
 
 class SplatCallback(Callback):

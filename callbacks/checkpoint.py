@@ -26,14 +26,11 @@ from nsvq_lightning.training.schedule import Phase, Schedule
 
 from .base import WritingCallback
 
-__all__ = ["GracefulStop", "RunCheckpoint", "StepSnapshot"]
-
-
 log = logging.getLogger(__name__)
 
 HELD = (signal.SIGINT, signal.SIGTERM)
+# Steps between two exchanges of signals among several GPUs.
 APART = 16
-"""Steps between two exchanges of signals among several GPUs."""
 
 
 class GracefulStop:

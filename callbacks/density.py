@@ -29,8 +29,6 @@ from nsvq_lightning.training.schedule import Phase, next_iteration
 
 from .base import SplatCallback, finite_search_is_due, keep_finite_splats
 
-__all__ = ["Densification", "DensityControl", "add_view", "limit_growth", "split"]
-
 log = logging.getLogger(__name__)
 
 
@@ -190,8 +188,8 @@ class Densification(SplatCallback, ABC):
             table.add_(total)
 
 
+# Side tables of the splats: sum of the screen-space gradient norms, and number of views that saw the splat.
 GRADIENTS, VIEWS = "gradient_sum", "view_count"
-"""Side tables of the splats: sum of the screen-space gradient norms, and number of views that saw the splat."""
 
 
 @dataclass(eq=False)

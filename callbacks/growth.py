@@ -28,17 +28,6 @@ from .base import SplatCallback
 from .density import Densification
 from .quantization import RateDistortion
 
-__all__ = [
-    "BudgetedGrowth",
-    "SplatBudget",
-    "add_observed",
-    "budget_at",
-    "draw_rows",
-    "lowest_share",
-    "split_longest",
-]
-
-
 log = logging.getLogger(__name__)
 
 
@@ -105,14 +94,14 @@ class SplatBudget(SplatCallback):
         log.info("budget: %d splats, %s", module.splat_budget, reason)
 
 
+# Distance of a child from its parent's centre, in units of the parent's longest axis (Improved-GS, section 3.2).
 CHILD_OFFSET = 1.35
-"""Distance of a child from its parent's centre, in units of the parent's longest axis (Improved-GS, section 3.2)."""
+# Longest axis of a child over that of its parent, before the factor of all axes.
 CHILD_LENGTH = 0.55
-"""Longest axis of a child over that of its parent, before the factor of all axes."""
+# Other axes of a child over those of its parent: √(1 - 0.45²), the width of an ellipsoid at 0.45 of its length.
 CHILD_WIDTH = 0.893
-"""Other axes of a child over those of its parent: √(1 - 0.45²), the width of an ellipsoid at 0.45 of its length."""
+# Opacity of a child over that of its parent.
 CHILD_OPACITY = 0.6
-"""Opacity of a child over that of its parent."""
 
 
 def add_observed(
@@ -196,8 +185,8 @@ def lowest_share(opacities: Tensor, share: float) -> Tensor:
 
 GRADIENTS, VIEWS, EDGES = "gradient_sum", "view_count", "edge_sum"
 
+# Growth is idle if it adds at most this share of what it may add, or of what there is.
 IDLE = 0.01
-"""Growth is idle if it adds at most this share of what it may add, or of what there is."""
 
 
 @dataclass(eq=False)

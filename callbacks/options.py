@@ -20,9 +20,6 @@ from nsvq_lightning.training.schedule import Phase, next_iteration
 
 from .base import SplatCallback
 
-__all__ = ["ExposureCompensation", "FrequencyLimit"]
-
-
 log = logging.getLogger(__name__)
 
 
@@ -137,12 +134,12 @@ class ExposureCompensation(SplatCallback):
         self._loaded = state_dict or None
 
 
+# Iterations after which the sizes of pixels are looked at anew, as splats move; those of new splats are at once.
 EVERY = 100
-"""Iterations after which the sizes of pixels are looked at anew, as splats move; those of new splats are at once."""
+# Side table: size of a pixel in the photo that sees the splat closest, scene units; 0 where not yet looked at.
 PIXEL_SIZES = "pixel_sizes"
-"""Side table: size of a pixel in the photo that sees the splat closest, scene units; 0 where not yet looked at."""
+# Size for splats that no photo sees.
 NO_LIMIT = 1e-30
-"""Size for splats that no photo sees."""
 
 
 @dataclass(eq=False)

@@ -24,14 +24,11 @@ from nsvq_lightning.training.scene_access import scene_of
 
 from .base import WritingCallback
 
-__all__ = ["ExportScene", "LiveScene", "RenderWriter"]
-
-
 log = logging.getLogger(__name__)
 
 
+# Formats that can be written.
 EXPORT_FORMATS = tuple(suffix.removeprefix(".") for suffix in FORMATS)
-"""Formats that can be written."""
 
 
 @dataclass(eq=False)
@@ -136,10 +133,10 @@ class RenderWriter(BasePredictionWriter):
             log.info("rendered views are in %s", self._target)
 
 
+# Iterations after which the callback sees whether somebody asks; it takes some microseconds.
 CHECKED_EVERY = 20
-"""Iterations after which the callback sees whether somebody asks; it takes some microseconds."""
+# Largest share of the time that goes into showing.
 SHARE = 0.05
-"""Largest share of the time that goes into showing."""
 
 
 class LiveScene(WritingCallback):

@@ -17,9 +17,6 @@ from nsvq_lightning.training.module import SplatModule
 
 from .base import SplatCallback
 
-__all__ = ["CompileAhead"]
-
-
 log = logging.getLogger(__name__)
 
 

@@ -13,10 +13,8 @@ from nsvq_lightning.compute.compilation import compile_seconds, compile_watcher
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.training.module import SplatModule
 
-__all__ = ["SplatProgressBar"]
-
+# Lines of a run if the output is not a terminal.
 LINES = 50
-"""Lines of a run if the output is not a terminal."""
 
 
 class SplatProgressBar(TQDMProgressBar):

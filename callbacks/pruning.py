@@ -19,8 +19,6 @@ from nsvq_lightning.training.schedule import Phase, next_iteration
 from .base import SplatCallback
 from .growth import draw_rows
 
-__all__ = ["OpacityRegularization", "OpacitySelection", "pressure"]
-
 
 @dataclass(eq=False)
 class OpacityRegularization(SplatCallback):
@@ -59,14 +57,14 @@ class OpacityRegularization(SplatCallback):
 
 log = logging.getLogger(__name__)
 
+# Logit from which the pressure on opacities counts: below it no splat is ever seen.
 SHIFT = 20.0
-"""Logit from which the pressure on opacities counts: below it no splat is ever seen."""
+# Between these shares of the line the strength of the pressure stays.
 NEAR_LINE = 0.9, 1.1
-"""Between these shares of the line the strength of the pressure stays."""
+# Factors of the strength below and above.
 WEAKER, STRONGER = 0.8, 1.2
-"""Factors of the strength below and above."""
+# Where the line starts, as a share of the opacity of the last splat within the budget.
 START_OF_LINE = 0.8
-"""Where the line starts, as a share of the opacity of the last splat within the budget."""
 
 
 @dataclass(eq=False)

@@ -37,18 +37,6 @@ from nsvq_lightning.training.schedule import Phase, next_iteration
 
 from .base import SplatCallback, finite_search_is_due, keep_finite_splats
 
-__all__ = [
-    "CanonicalCovariance",
-    "CodebookInit",
-    "CodebookRefit",
-    "CodebookReplacement",
-    "FiniteCodes",
-    "FreezeCodes",
-    "RateDistortion",
-    "perplexity",
-]
-
-
 log = logging.getLogger(__name__)
 
 
@@ -322,16 +310,16 @@ def _refittable(module: SplatModule) -> dict[str, Refittable]:
     return {name: quantizer for name, quantizer in module.quantizers.items() if is_refittable(quantizer)}
 
 
+# How often sensitivities are measured in the phase.
 MEASUREMENTS = 3
-"""How often sensitivities are measured in the phase."""
+# Most train views in which a measurement renders the splats.
 VIEWS = 32
-"""Most train views in which a measurement renders the splats."""
+# Iterations in which every splat has its codes chosen once.
 TURNS = 8
-"""Iterations in which every splat has its codes chosen once."""
+# What a splat takes in a file, about; with the strength it makes the price of a bit independent of the scene.
 BITS_A_SPLAT = 64
-"""What a splat takes in a file, about; with the strength it makes the price of a bit independent of the scene."""
+# Share of the mean that no splat's sensitivity is below: a test view may see what no train view sees.
 LEAST = 0.05
-"""Share of the mean that no splat's sensitivity is below: a test view may see what no train view sees."""
 
 
 @dataclass(eq=False)

@@ -37,8 +37,6 @@ from nsvq_lightning.training.schedule import next_iteration
 
 from .base import WritingCallback
 
-__all__ = ["MetricReport", "notify_monitors"]
-
 
 def notify_monitors(trainer: Trainer, module: SplatModule) -> None:
     """Let early stopping and checkpoints that monitor ``report/…`` act now.

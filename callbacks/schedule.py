@@ -13,9 +13,6 @@ from nsvq_lightning.training.schedule import Phase, Schedule, next_iteration
 
 from .base import SplatCallback
 
-__all__ = ["LearningRateDecay", "PhaseSchedule", "ShDegreeSchedule"]
-
-
 log = logging.getLogger(__name__)
 
 

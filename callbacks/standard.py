@@ -25,8 +25,7 @@ from .quantization import (
 from .report import MetricReport
 from .schedule import LearningRateDecay, PhaseSchedule, ShDegreeSchedule
 
-__all__ = ["OPTIONAL", "STANDARD", "standard"]
-
+# Callback by name. Density control comes before the canonical form, which may act after the same iteration.
 STANDARD: dict[str, type[Callback]] = {
     "phases": PhaseSchedule,
     "sh_degree": ShDegreeSchedule,
@@ -50,11 +49,9 @@ STANDARD: dict[str, type[Callback]] = {
     "kernels": CompileAhead,
     "progress": SplatProgressBar,
 }
-"""Callback by name. Density control comes before the canonical form, which may act after the same iteration.
-"""
 
+# Those that a run has only if a config or the user asks for them.
 OPTIONAL = frozenset({"opacity", "codebook_refit", "rate_distortion"})
-"""Those that a run has only if a config or the user asks for them."""
 
 
 class _IfWanted(Callback):

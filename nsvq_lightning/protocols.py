@@ -6,8 +6,6 @@
 
 from __future__ import annotations
 
-__all__ = ["missing_members"]
-
 
 def missing_members(value: object, protocol: type) -> list[str]:
     """Names of the members of ``protocol`` that ``value`` does not have, sorted.

@@ -10,8 +10,6 @@ import hashlib
 
 import torch
 
-__all__ = ["derive_seed", "generator"]
-
 
 def derive_seed(seed: int, step: int = 0, *salts: int | str) -> int:
     """Mix a seed, a step and any salts into 63 bits (SHA-256: neighbouring inputs give unrelated outputs).

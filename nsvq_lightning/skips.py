@@ -20,8 +20,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-__all__ = ["SKIPS", "Skip", "is_on", "switch", "switched"]
-
 
 @dataclass(frozen=True)
 class Skip:
@@ -43,6 +41,7 @@ class Skip:
         return f"skip {self.work}: {self.when}"
 
 
+# All switches by name.
 SKIPS = {
     skip.name: skip
     for skip in (
@@ -62,7 +61,6 @@ SKIPS = {
         Skip("resizing", "resampling a photo", "it has its size already"),
     )
 }
-"""All switches by name."""
 
 _ON = dict.fromkeys(SKIPS, True)
 

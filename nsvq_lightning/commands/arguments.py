@@ -19,29 +19,6 @@ if TYPE_CHECKING:
 
     from nsvq_lightning.rendering.camera import Camera
 
-__all__ = [
-    "SHORTHANDS",
-    "Parser",
-    "cameras_of",
-    "check_config",
-    "configs_among",
-    "expand",
-    "find_config",
-    "in_plain_words",
-    "integers",
-    "limit_aliases",
-    "names",
-    "nearest",
-    "photos_of",
-    "positive",
-    "read_config",
-    "resolve_configs",
-    "scene_file",
-    "shipped_configs",
-    "unknown_option",
-    "written_by_run",
-]
-
 
 def names(text: str) -> tuple[str, ...]:
     """The entries of ``A,B``, each once."""
@@ -79,12 +56,12 @@ def positive(kind: type[int] | type[float]) -> Callable[[str], int | float]:
 
 BUDGET = "--callbacks.budget"
 
+# Name and meaning of the numbers of :class:`nsvq_lightning.callbacks.SplatBudget`, of which one holds.
 SHORTHANDS: dict[str, str] = {
     "quality": "Splats, as a multiple of the default for the photos; more look better and take more bytes and time",
     "splats": "Splats of the scene, instead of --quality",
     "bytes": "Size of the file, instead of --quality",
 }
-"""Name and meaning of the numbers of :class:`nsvq_lightning.callbacks.SplatBudget`, of which one holds."""
 
 
 def expand(arguments: Sequence[str]) -> list[str]:
@@ -114,8 +91,8 @@ def expand(arguments: Sequence[str]) -> list[str]:
     return expanded
 
 
+# Types as users call them; others by their name.
 WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text", "NoneType": "null"}
-"""Types as users call them; others by their name."""
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -166,8 +143,8 @@ class Parser(argparse.ArgumentParser):
 
 
 CONFIG_OPTIONS = ("--config", "-c")
+# Of a config, and of its values with every alias written out; that of a run has 6 kB and 500 values.
 _MOST_BYTES, _MOST_VALUES = 1 << 17, 100_000
-"""Of a config, and of its values with every alias written out; that of a run has 6 kB and 500 values."""
 
 
 def resolve_configs(arguments: Sequence[str]) -> list[str]:

@@ -34,8 +34,8 @@ log = logging.getLogger("nsvq_lightning.compress")
 
 SIZES = ("16k", "8k", "4k", "2k", "1k", "0.5k", "128k", "64k", "32k", "none")
 DEFAULT_TUNING = 400
+# Largest number of views in which a scene is tuned.
 VIEWS = 96
-"""Largest number of views in which a scene is tuned."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

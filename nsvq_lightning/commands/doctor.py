@@ -39,10 +39,10 @@ if TYPE_CHECKING:
     from nsvq_lightning.splats.splats import Splats
 
 OPENCV = "opencv-contrib-python-headless"
+# Bytes; less may not hold checkpoints and report.
 SMALL_DISK = 2 << 30
-"""Bytes; less may not hold checkpoints and report."""
+# Of what is timed; for the time of a run, of as many views.
 REPEATS = 3
-"""Of what is timed; for the time of a run, of as many views."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

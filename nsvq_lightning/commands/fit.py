@@ -43,8 +43,6 @@ from nsvq_lightning.training.resume import check_settings, read_checkpoint
 from nsvq_lightning.training.run_folder import is_trial, reserve, run_folder
 from nsvq_lightning.training.trainer import SplatTrainer
 
-__all__ = ["SplatCLI", "default_loggers"]
-
 TRAINER_DEFAULTS: dict[str, Any] = {
     "max_epochs": -1,  # the sampler is endless: steps end the run
     "limit_val_batches": 0,  # MetricReport evaluates, outside the training time
@@ -55,14 +53,14 @@ TRAINER_DEFAULTS: dict[str, Any] = {
     "default_root_dir": "runs",
 }
 
+# Options of the trainer that the help explains.
 TRAINER_OPTIONS = ("run_folder", "allow_other_scene", "max_steps", "accelerator", "devices", "logger", "callbacks")
-"""Options of the trainer that the help explains."""
 
+# Names that options take as they are: short class names resolve to what is imported.
 CLASSES = (*callbacks.__all__, *quantize.__all__, "ColmapDataModule", "DemoDataModule")
-"""Names that options take as they are: short class names resolve to what is imported."""
 
+# Words that Lightning accepts instead of a checkpoint's path; ``last`` and ``best`` refer to its own callback.
 NAMED_CHECKPOINTS = frozenset({"hpc", "registry"})
-"""Words that Lightning accepts instead of a checkpoint's path; ``last`` and ``best`` refer to its own callback."""
 
 PARSER_SETTINGS: dict[str, Any] = {
     "prog": "nsvq",

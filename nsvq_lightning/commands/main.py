@@ -19,11 +19,12 @@ from nsvq_lightning.commands import arguments as given
 from nsvq_lightning.commands.registry import COMMANDS, overview
 from nsvq_lightning.version import __version__
 
+# Environment variable that makes errors show their traceback.
 TRACEBACK = "NSVQ_TRACEBACK"
-"""Environment variable that makes errors show their traceback."""
 
 INTERRUPTED = 128 + signal.SIGINT
 
+# Fragments of Lightning's and torch's warnings that a user of this command can do nothing about.
 NOT_ACTIONABLE = (
     "does not have many workers",  # views come from a cache in memory; each worker would hold a copy
     "args parameter is intended",  # we pass the arguments after looking up configs
@@ -33,10 +34,9 @@ NOT_ACTIONABLE = (
     "`tensorboardX` has been removed",
     "Couldn't infer the batch indices",  # RenderWriter names pictures after their photos
 )
-"""Fragments of Lightning's and torch's warnings that a user of this command can do nothing about."""
 
+# Fragments of Lightning's messages that advertise, or repeat the progress bar in the middle of its line.
 NOT_OURS = ("Tip:", "TPU available", "HPU available", "litlogger", "litmodels", "`Trainer.fit` stopped")
-"""Fragments of Lightning's messages that advertise, or repeat the progress bar in the middle of its line."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

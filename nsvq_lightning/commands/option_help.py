@@ -20,10 +20,8 @@ from jsonargparse import Namespace
 
 from nsvq_lightning.commands.arguments import SHORTHANDS
 
-__all__ = ["class_help", "command_help", "first_sentence"]
-
+# Largest width in columns to which text is wrapped, even on a wider terminal.
 WIDEST = 100
-"""Largest width in columns to which text is wrapped, even on a wider terminal."""
 
 
 class Option(NamedTuple):

@@ -26,15 +26,15 @@ from nsvq_lightning.io.atomic import write_text
 if TYPE_CHECKING:
     from nsvq_lightning.data.reconstruct import Verdict
 
+# File that shows that a folder was made by this command, and from what.
 RECORD = "prepare.json"
-"""File that shows that a folder was made by this command, and from what."""
+# What this command makes in a scene.
 MADE = ("images", "sparse", "mapping", "database.db", "database.db-shm", "database.db-wal", RECORD)
-"""What this command makes in a scene."""
 FRAMES, MAX_SIZE = 150, 1600
+# Photos below which a scene is likely to look good only from where they were taken.
 FEW = 20
-"""Photos below which a scene is likely to look good only from where they were taken."""
+# Photos that are named at most.
 LISTED = 8
-"""Photos that are named at most."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

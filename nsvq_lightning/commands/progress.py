@@ -7,8 +7,8 @@ import time
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
+# Lines at most if the output is not a terminal.
 LINES = 10
-"""Lines at most if the output is not a terminal."""
 
 _T = TypeVar("_T")
 

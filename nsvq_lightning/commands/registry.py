@@ -14,6 +14,7 @@ class Command(NamedTuple):
     which takes seconds to start."""
 
 
+# All commands by name.
 COMMANDS = {
     "prepare": Command("make a scene of photos or a video", "nsvq_lightning.commands.prepare"),
     "fit": Command("train a scene, compress it, and measure the decoded file"),
@@ -30,7 +31,6 @@ COMMANDS = {
     "doctor": Command("check whether this machine and a scene folder are fit", "nsvq_lightning.commands.doctor"),
     "benchmark": Command("measure run time against error on this machine", "nsvq_lightning.commands.benchmark.command"),
 }
-"""All commands by name."""
 
 
 def overview() -> str:

@@ -36,8 +36,8 @@ log = logging.getLogger(__name__)
 
 WHAT = ("color", "depth", "alpha")
 FPS, SECONDS = 24.0, 10.0
+# Steps of a scene unit in a 16-bit picture of the depth.
 UNIT = 1000
-"""Steps of a scene unit in a 16-bit picture of the depth."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
 
 PORT = 7007
+# Connections at a time; more are closed at once.
 MOST = 64
-"""Connections at a time; more are closed at once."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -112,7 +112,7 @@ def run(options: argparse.Namespace) -> int:
 def _source(options: argparse.Namespace) -> Iterator[Source]:
     """The scene that is meant, as a ``.nsvq`` file."""
     from nsvq_lightning.io.formats import read_scene, save
-    from nsvq_lightning.io.nsvq.file import read_header
+    from nsvq_lightning.io.nsvq.header import read_header
     from nsvq_lightning.io.nsvq.precision import Storage
 
     if options.live:

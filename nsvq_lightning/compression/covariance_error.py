@@ -14,8 +14,8 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.canonical_covariance import FORMS, Form, canonical
 
+# Size of a sample of splats that is enough to rank the forms.
 SAMPLE = 1 << 15
-"""Size of a sample of splats that is enough to rank the forms."""
 
 
 def covariances(scales: Tensor, quats: Tensor) -> Tensor:

@@ -19,17 +19,17 @@ from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 
 log = logging.getLogger(__name__)
 
+# Random signs for a picture: the estimate of a splat seen in five views has a relative error of 0.3.
 PROBES = 4
-"""Random signs for a picture: the estimate of a splat seen in five views has a relative error of 0.3."""
+# Share of its opacity, at most, that the photos want of a floater; 0 for one in front of a finished scene.
 UNWANTED = 1 / 3
-"""Share of its opacity, at most, that the photos want of a floater; 0 for one in front of a finished scene."""
+# Share of the squared error, at least, by which removing a floater lowers it; less is not seen, and is noise.
 SHARE = 1e-4
-"""Share of the squared error, at least, by which removing a floater lowers it; less is not seen, and is noise."""
+# Of splats in the same pixels, the worst goes first: a round takes those whose gain is this share of the largest.
 FALL = 0.25
-"""Of splats in the same pixels, the worst goes first: a round takes those whose gain is this share of the largest."""
 MOST_ROUNDS = 12
+# A channel of a photo from here on agrees with every brighter one.
 SATURATED = 250 / 255
-"""A channel of a photo from here on agrees with every brighter one."""
 
 
 def floaters(

@@ -108,14 +108,14 @@ def sensitivity(
     return RawSplats(*squares), image.detach()
 
 
+# Size in pixels below which the scale of a splat is not visible; the rasterizer blurs every splat by 0.55 pixels.
 INVISIBLE = 0.25
-"""Size in pixels below which the scale of a splat is not visible; the rasterizer blurs every splat by 0.55 pixels."""
+# Share of the splats that may be seen from closer than the floor assumes.
 CLOSE = 0.05
-"""Share of the splats that may be seen from closer than the floor assumes."""
+# Largest number of splats in the sample.
 SAMPLE = 1 << 16
-"""Largest number of splats in the sample."""
+# Pairs of a splat and a view that are looked at together; they fit into a processor's cache.
 BATCH = 1 << 17
-"""Pairs of a splat and a view that are looked at together; they fit into a processor's cache."""
 
 
 @torch.no_grad()

@@ -30,8 +30,8 @@ from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.canonical_covariance import canonical
 from nsvq_lightning.splats.splats import RawSplats, detached
 
+# Learning rates at the end, as a share of those at the start.
 FINAL = 0.05
-"""Learning rates at the end, as a share of those at the start."""
 
 
 def tuned(
@@ -83,8 +83,8 @@ def tuned(
 
 log = logging.getLogger(__name__)
 
+# Largest number of views in which errors are measured.
 MEASURED = 24
-"""Largest number of views in which errors are measured."""
 
 
 @dataclass(frozen=True)
@@ -107,16 +107,16 @@ def _sizes(codes: int) -> dict[str, int]:
 
 
 PLAIN = Rung("no codebooks", {})
+# Settings without codebooks. They need no k-means, and give smaller files where splats are few.
 PLAINS: tuple[Rung, ...] = (Rung("no codebooks, a quarter of the errors", {}, 0.25), PLAIN)
-"""Settings without codebooks. They need no k-means, and give smaller files where splats are few."""
 
+# Settings with codebooks, from the most exact to the smallest.
 LADDER: tuple[Rung, ...] = (
     *(Rung(f"{codes // 1024}k", _sizes(codes), 0.5) for codes in (1 << 17, 1 << 16, 1 << 15)),
     *(Rung(name, codebook_sizes(name)) for name in ("16k", "8k", "4k", "2k", "1k", "0.5k")),
     Rung("0.5k, twice the errors", codebook_sizes("0.5k"), 2.0),
     Rung("0.25k, four times the errors", _sizes(256), 4.0),
 )
-"""Settings with codebooks, from the most exact to the smallest."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,16 +66,16 @@ def decibels(error: float) -> float:
     return math.inf if error == 0 else -20 * math.log10(error)
 
 
+# Views that are looked at for each that is taken.
 CANDIDATES = 5
-"""Views that are looked at for each that is taken."""
+# How far from the middle of the detail a candidate stands, in root mean square distances of the detail.
 DISTANCE = 1.5, 3.0
-"""How far from the middle of the detail a candidate stands, in root mean square distances of the detail."""
+# How far from that middle it looks, standard deviation in the same unit.
 STRAY = 0.6
-"""How far from that middle it looks, standard deviation in the same unit."""
+# Horizontal field of view.
 ANGLE = math.radians(70)
-"""Horizontal field of view."""
+# Pixels of a candidate's picture.
 PREVIEW = 96, 67
-"""Pixels of a candidate's picture."""
 
 
 def views_of(splats: SplatTensors, root: Path | None, most: int) -> list[Camera]:

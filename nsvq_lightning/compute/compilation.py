@@ -16,12 +16,10 @@ from numba.core import event
 
 from nsvq_lightning.compute.jit import kernels_ready
 
-__all__ = ["compile_seconds", "compile_watcher"]
-
 log = logging.getLogger(__name__)
 
+# Called when a compilation begins, with a line that says how many kernels there are and how many are ready.
 Watcher = Callable[[str], None]
-"""Called when a compilation begins, with a line that says how many kernels there are and how many are ready."""
 
 
 class _Clock(event.Listener):

@@ -16,15 +16,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-__all__ = ["BACKENDS", "COMPILE", "AsyncScalar", "fast_backends", "kernels_for", "resolve_backend", "to_device"]
-
 log = logging.getLogger(__name__)
 
+# Names that ``render(backend=...)`` takes; ``auto`` is this package's fastest one for the device of the splats.
 BACKENDS = ("auto", "reference", "cpu", "cuda")
-"""Names that ``render(backend=...)`` takes; ``auto`` is this package's fastest one for the device of the splats."""
+# Options of every launch. Triton's default is about to change; values on which the forward and backward pass must
+# agree to the bit are computed with an explicit ``fma``.
 COMPILE = {"enable_fp_fusion": True}
-"""Options of every launch. Triton's default is about to change; values on which the forward and backward pass must
-agree to the bit are computed with an explicit ``fma``."""
 
 
 def kernels_for(like: Tensor) -> Literal["cpu", "cuda"] | None:

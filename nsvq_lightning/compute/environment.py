@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import sys
 
-__all__ = ["set_defaults", "threads_spin", "usable_cores"]
-
 DEFAULTS = {
     # Idle OpenMP threads otherwise spin: as soon as anything else runs on the machine, the threads that have work
     # wait for cores that idle ones occupy, and a step takes several times as long.
@@ -18,8 +16,8 @@ if sys.platform == "linux":
     # Splats grow, and with them every tensor: blocks of the old size would lie idle in a GPU's memory.
     DEFAULTS["PYTORCH_ALLOC_CONF"] = "expandable_segments:True"
 
+# Names under which a user may have set the same.
 _OTHER_ALLOC_CONF = {"PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_HIP_ALLOC_CONF"}
-"""Names under which a user may have set the same."""
 
 _came_late = False
 

@@ -15,10 +15,8 @@ from numba.core import event
 
 from nsvq_lightning.compute.kernel_cache import KernelCache
 
-__all__ = ["F", "inline", "kernel", "kernels_ready", "thread_count"]
-
+# Type of the numeric literals in kernels; Python floats would promote their operands to float64.
 F = np.float32
-"""Type of the numeric literals in kernels; Python floats would promote their operands to float64."""
 
 _OPTIONS: dict[str, Any] = {
     # Products and sums may fuse; NaN and infinity keep their meaning because this package's guards rely on them.
@@ -30,8 +28,8 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
+# Every kernel of the modules that are loaded.
 _kernels: list[Any] = []
-"""Every kernel of the modules that are loaded."""
 
 
 class _HelperLevel(event.Listener):

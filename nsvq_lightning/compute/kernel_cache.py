@@ -21,12 +21,10 @@ import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.misc.appdirs import AppDirs
 
-__all__ = ["KernelCache", "kernel_folder", "source_digest"]
-
+# An import that is not in a function: a module and names, or modules.
 IMPORT = re.compile(r"^(?:from +([\w.]+) +import +(\([^)]*\)|.*)|import +(.*))", re.MULTILINE)
-"""An import that is not in a function: a module and names, or modules."""
+# So many folders are kept; those of a few checkouts, between which one may change.
 MAX_FOLDERS = 64
-"""So many folders are kept; those of a few checkouts, between which one may change."""
 
 
 @functools.cache

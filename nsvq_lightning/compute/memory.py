@@ -109,13 +109,13 @@ class Workspace:
         return self.array(name, rows * columns, dtype).reshape(rows, columns)
 
 
+# By size.
 _BUFFERS: list[Array] = []
-"""By size."""
 _LOCK = threading.Lock()
+# A buffer of up to this many times the requested size is reused.
 _SLACK = 4
-"""A buffer of up to this many times the requested size is reused."""
+# Floats in a memory page.
 _PAGE = 1024
-"""Floats in a memory page."""
 
 
 def _is_idle(index: int) -> bool:

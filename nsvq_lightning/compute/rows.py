@@ -15,8 +15,6 @@ from nsvq_lightning.compute.jit import inline, kernel, thread_count
 from nsvq_lightning.compute.memory import INT64, Array, flat, flat_checked, outside, recycled
 from nsvq_lightning.compute.simd import get, put
 
-__all__ = ["clear", "clear_between", "count_outside", "gather_rows", "put_rows", "spread_rows", "take_rows"]
-
 
 @inline
 def clear(array, first, last):

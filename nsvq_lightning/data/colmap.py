@@ -20,10 +20,10 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
+# Pixels; a camera with a larger side is damaged.
 LARGEST_SIDE = (1 << 20) - 1
-"""Pixels; a camera with a larger side is damaged."""
+# Upper bound on poses and intrinsics: their squares, which rendering computes in float32, stay finite.
 LARGEST = 1e18
-"""Upper bound on poses and intrinsics: their squares, which rendering computes in float32, stay finite."""
 
 
 class SceneError(ValueError):
@@ -109,10 +109,10 @@ def check_name(name: str, source: object, allow_outside: bool = False) -> None:
         )
 
 
+# Where a model may be inside a scene folder, in order of preference.
 FOLDERS = ("sparse/0", "sparse", ".")
-"""Where a model may be inside a scene folder, in order of preference."""
+# The three tables every COLMAP model has.
 TABLES = ("cameras", "images", "points3D")
-"""The three tables every COLMAP model has."""
 
 
 def find_model(root: Path, folders: Sequence[str] = FOLDERS) -> dict[str, Path] | None:

@@ -16,11 +16,10 @@ from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, IterableDataset, Sampler
 
+from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.images import Picture
-from nsvq_lightning.data.scene import Factor, Scene, SceneError, View, load_scene
+from nsvq_lightning.data.scene import Factor, Scene, View, load_scene
 from nsvq_lightning.random import generator
-
-__all__ = ["DEMO", "ColmapDataModule", "DemoDataModule", "DevicePhotos", "ViewSampler"]
 
 
 class ViewSampler(Sampler[int]):
@@ -103,8 +102,8 @@ def _spare(device: torch.device) -> int:
     return torch.cuda.mem_get_info(device)[0] // 4 if device.type == "cuda" else 1 << 62
 
 
+# Folder of the demo scene, a COLMAP scene as any other; nothing is ever written there.
 DEMO = Path(__file__).parent / "demo"
-"""Folder of the demo scene, a COLMAP scene as any other; nothing is ever written there."""
 
 
 class ColmapDataModule(LightningDataModule):

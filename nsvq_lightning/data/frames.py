@@ -16,10 +16,10 @@ from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.images import ORIENTATION, opened
 from nsvq_lightning.io.atomic import atomic_path, atomic_write
 
+# Suffixes of photos that both COLMAP and this package read.
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-"""Suffixes of photos that both COLMAP and this package read."""
+# Suffixes of videos.
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-"""Suffixes of videos."""
 JPEG_QUALITY = 95
 
 
@@ -84,8 +84,8 @@ def sharpness(picture: MatLike) -> float:
     return float(cv2.Laplacian(small, cv2.CV_64F).var())
 
 
+# Mean difference, of 255, below which the camera has not moved between two frames.
 STILL = 2.0
-"""Mean difference, of 255, below which the camera has not moved between two frames."""
 
 
 def write_frames(video: Path, folder: Path, count: int, done: Callable[[int], None]) -> list[Path]:

@@ -24,13 +24,13 @@ from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.undistort import Pinhole, Undistortion
 from nsvq_lightning.skips import is_on
 
+# Relative difference of aspect ratios that rounding explains.
 ROUNDED = 0.01
-"""Relative difference of aspect ratios that rounding explains."""
+# EXIF and TIFF tag: how to turn the stored pixels.
 ORIENTATION = 274
-"""EXIF and TIFF tag: how to turn the stored pixels."""
 
+# What Pillow raises for a file that is damaged or not a picture.
 _DAMAGED = (OSError, ValueError, SyntaxError, KeyError)
-"""What Pillow raises for a file that is damaged or not a picture."""
 
 
 def _undecodable(path: Path, reason: str) -> SceneError:
@@ -70,9 +70,9 @@ def image_head(path: Path) -> ImageHead:
     return ImageHead((width, height), orientation, has_alpha)
 
 
+# Pixels that any file may have, however short, such as a white mask; beyond, most pixels per byte of the file. 32
+# leave a quarter of a bit for each. So many are decoded in less than 1 GB.
 _FEW_PIXELS, _MOST_A_BYTE = 1 << 25, 32
-"""Pixels that any file may have, however short, such as a white mask; beyond, most pixels per byte of the file. 32
-leave a quarter of a bit for each. So many are decoded in less than 1 GB."""
 _LIMIT = threading.Lock()
 
 
@@ -169,8 +169,8 @@ def _check_whole(data: bytes) -> None:
             raise OSError("there is no end marker")  # OpenCV 4 would fill the missing part with grey
 
 
+# EXIF orientation from which on a photo is stored lying on its side.
 _TURNED = 5
-"""EXIF orientation from which on a photo is stored lying on its side."""
 
 
 def _turned_back(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:

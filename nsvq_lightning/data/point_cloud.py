@@ -46,8 +46,8 @@ def share_seen(points: NDArray[np.float64], cameras: list[Camera]) -> float:
     return float(_sightings(points, cameras).mean() / len(cameras)) if len(points) else 0.0
 
 
+# Points of a scene that comes without.
 RANDOM_POINTS = 20_000
-"""Points of a scene that comes without."""
 
 
 def random_points(cameras: list[Camera]) -> NDArray[np.float64]:

@@ -16,8 +16,8 @@ from typing import Any
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
 from nsvq_lightning.data.images import image_head
 
+# Called with a step, how much of it is done, and how much there is.
 Report = Callable[[str, int, int], None]
-"""Called with a step, how much of it is done, and how much there is."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +87,8 @@ def reconstruct(
     )
 
 
+# Photos of one size from which on their camera has a lens model of four numbers, not one.
 SHARED = 8
-"""Photos of one size from which on their camera has a lens model of four numbers, not one."""
 
 
 def _find_features(
@@ -126,10 +126,10 @@ def _find_features(
             report("finding features", done, len(names))
 
 
+# Photos up to which every pair is compared; frames of a video are compared with those near them from half of it on.
 EXHAUSTIVE = 120
-"""Photos up to which every pair is compared; frames of a video are compared with those near them from half of it on."""
+# Frames after each with which it is compared, and as many farther ones at distances that double.
 OVERLAP = 12
-"""Frames after each with which it is compared, and as many farther ones at distances that double."""
 
 
 def _compare(database: Path, count: int, report: Report, is_video: bool, threads: int) -> None:

@@ -24,8 +24,6 @@ from nsvq_lightning.data.transforms import read_poses
 from nsvq_lightning.data.undistort import rectify
 from nsvq_lightning.rendering.camera import Camera
 
-__all__ = ["Factor", "Scene", "SceneError", "View", "detailed_pixels", "edge_strength", "find_masks", "load_scene"]
-
 log = logging.getLogger(__name__)
 
 Factor = Literal[1, 2, 4, 8]
@@ -112,8 +110,8 @@ class Scene:
         return View(self.names[index], index, self.cameras[index], *self.images[index])
 
 
+# Distance of the cameras from the origin, in extents, from which float32 positions are too coarse: as on a map.
 _FARTHEST = 1e4
-"""Distance of the cameras from the origin, in extents, from which float32 positions are too coarse: as on a map."""
 
 
 def load_scene(
@@ -292,8 +290,8 @@ def same_shape(camera: Any, width: int, height: int) -> bool:
     return bool(abs(width * camera.height / (height * camera.width) - 1) < ROUNDED)
 
 
+# With more distorted cameras than this (say, one per photo), the undistortion maps would take more than the images.
 _CAMERAS_WITH_KEPT_MAPS = 8
-"""With more distorted cameras than this (say, one per photo), the undistortion maps would take more than the images."""
 
 
 def _image_sources(
@@ -335,8 +333,8 @@ def _camera(image: ColmapImage, source: ImageSource) -> Camera:
         raise SceneError(f"camera {image.camera_id} of image {image.name}: {error}; run COLMAP again") from error
 
 
+# Distance from a camera's centre, in extents, within which a point is a failed triangulation, not a surface.
 _AT_CAMERA = 1e-6
-"""Distance from a camera's centre, in extents, within which a point is a failed triangulation, not a surface."""
 
 
 def _away_from(centres: NDArray[np.float64], points: NDArray[np.float64], radius: float) -> NDArray[np.bool_]:
@@ -366,10 +364,10 @@ def edge_strength(image: Tensor, mask: Tensor | None = None) -> Tensor:
     return ((edges.float() - low) / max(high - low, 1)).to(image.device)
 
 
+# High-pass value, of grey values up to 255, from which a pixel counts as detailed: well above the noise of a photo.
 _DETAIL = 20
-"""High-pass value, of grey values up to 255, from which a pixel counts as detailed: well above the noise of a photo."""
+# Photos that are looked at for the detail of a scene.
 _SAMPLE = 32
-"""Photos that are looked at for the detail of a scene."""
 
 
 def detailed_pixels(scene: Scene) -> float:

@@ -56,8 +56,8 @@ def read_poses(
     return poses
 
 
+# COLMAP's name of a camera model, width, height, parameters.
 _Lens = tuple[str, int, int, tuple[float, ...]]
-"""COLMAP's name of a camera model, width, height, parameters."""
 
 
 @dataclass(frozen=True, eq=False)

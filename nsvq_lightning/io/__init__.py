@@ -4,9 +4,11 @@ Nothing here imports torch before a scene is turned into :class:`nsvq_lightning.
 """
 
 from nsvq_lightning.io.atomic import atomic_path, atomic_write
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.formats import FORMATS, Format, load, read_scene, save
-from nsvq_lightning.io.nsvq.file import CompressedScene, read_header, read_nsvq, write_nsvq
+from nsvq_lightning.io.nsvq.file import read_nsvq, write_nsvq
+from nsvq_lightning.io.nsvq.header import read_header
 from nsvq_lightning.io.ply import plain_ply_bytes, read_ply, write_ply
 
 __all__ = [

@@ -220,13 +220,13 @@ def _check_codes(name: str, codes: NDArray[np.integer], codebook: NDArray[np.flo
         raise ValueError(f"codes[{name!r}] must be in 0..{rows - 1}, got {codes.min()}..{codes.max()}")
 
 
+# Rotations that turn COLMAP's up, -y, to an axis; x stays.
 UP_AXES = {
     "y": np.diag([1.0, -1.0, -1.0]),
     "minus-y": np.eye(3),
     "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
     "minus-z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
 }
-"""Rotations that turn COLMAP's up, -y, to an axis; x stays."""
 
 
 def turn_up(up: NDArray[np.float64], axis: str) -> NDArray[np.float64]:

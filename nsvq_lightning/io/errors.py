@@ -37,11 +37,11 @@ def naming_file(path: str | PathLike[str]) -> Iterator[None]:
         raise FormatError(f"{fspath(path)}: {error.defect}", error.remedy) from None
 
 
+# Splats that any file may hold, however short, such as one of equal splats; beyond, each takes two bytes or more. A
+# file below 1 MB is then read in half a gigabyte of memory and a few seconds.
 FEW_SPLATS = 1 << 18
-"""Splats that any file may hold, however short, such as one of equal splats; beyond, each takes two bytes or more. A
-file below 1 MB is then read in half a gigabyte of memory and a few seconds."""
+# The same for the rows of a codebook in level ``compact`` of ``.nsvq``, and the bytes of its stream.
 FEW_ROWS = 1 << 16
-"""The same for the rows of a codebook in level ``compact`` of ``.nsvq``, and the bytes of its stream."""
 
 
 def check_room(what: str, count: int, size: int, few: int = FEW_SPLATS, each: int = 2) -> None:

@@ -119,6 +119,7 @@ def _format_of(path: Path, action: str) -> Format:
         raise ValueError(f"cannot {action} {path}: unknown suffix {path.suffix!r}; supported are {supported}") from None
 
 
+# Formats by suffix; a new format is one more entry.
 FORMATS: dict[str, Format] = {
     ".ply": Format("3D Gaussian Splatting", read_ply, write_ply),
     ".nsvq": Format("compressed scene of this package", read_nsvq, write_finite, keeps_origin=True, takes_storage=True),
@@ -131,4 +132,3 @@ FORMATS: dict[str, Format] = {
         in_order=lambda scene: scene,
     ),
 }
-"""Formats by suffix; a new format is one more entry."""

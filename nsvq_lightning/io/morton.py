@@ -13,21 +13,21 @@ from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import INT64, UINT64, check_array, outside
 from nsvq_lightning.io.numbers import power_above, power_below
 
+# Bits per coordinate: three coordinates make a key of 63 bits.
 AXIS_BITS = 21
-"""Bits per coordinate: three coordinates make a key of 63 bits."""
 
+# Rows before a row that are searched for neighbours. 64 instead of 16 would save another 0.05 of 8 bits of codes.
 _WINDOW = 16
-"""Rows before a row that are searched for neighbours. 64 instead of 16 would save another 0.05 of 8 bits of codes."""
 
+# Rows that are searched side by side.
 _BLOCK = 256
-"""Rows that are searched side by side."""
 
+# No step is finer than the extent times ½ to this power: the scene takes up to half of each side of the grid.
 _EXTENT_BITS = AXIS_BITS - 1
-"""No step is finer than the extent times ½ to this power: the scene takes up to half of each side of the grid."""
 
+# The first cell of a grid is a multiple of 2 to this power, so cells up to that wide lie on multiples of their own
+# width, whichever scene the grid was made for.
 _BASE_BITS = AXIS_BITS - 2
-"""The first cell of a grid is a multiple of 2 to this power, so cells up to that wide lie on multiples of their own
-width, whichever scene the grid was made for."""
 
 
 @dataclass(frozen=True)
@@ -107,13 +107,13 @@ def unmorton(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
     return cells
 
 
+# Masks of groups of 1, 2, 4, 8, 16 and 21 adjacent bits, with gaps of twice that length between.
 _MASKS = tuple(
     map(
         np.uint64,
         (0x1249249249249249, 0x10C30C30C30C30C3, 0x100F00F00F00F00F, 0x1F0000FF0000FF, 0x1F00000000FFFF, 0x1FFFFF),
     )
 )
-"""Masks of groups of 1, 2, 4, 8, 16 and 21 adjacent bits, with gaps of twice that length between."""
 
 _SHIFTS = tuple(map(np.uint64, (2, 4, 8, 16, 32)))
 
@@ -157,8 +157,8 @@ def nearest_before(cells: NDArray[np.int64]) -> NDArray[np.int32]:
     return found
 
 
+# Above every squared distance times the window.
 _NONE = 2.0**52
-"""Above every squared distance times the window."""
 
 
 @partial(kernel, parallel=False)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+# Magnitude of the logit that replaces ±inf: its sigmoid is 1 in float32, and training can still move it.
 _OPAQUE = 20.0
-"""Magnitude of the logit that replaces ±inf: its sigmoid is 1 in float32, and training can still move it."""
 
 
 def opacity_of(logits: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -35,8 +35,8 @@ def logits_of_bytes(levels: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 logger = logging.getLogger(__name__)
 
+# What float32 rounding may add to a distance of one half.
 _ROUNDING = 1e-3
-"""What float32 rounding may add to a distance of one half."""
 
 
 class Clamped:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from nsvq_lightning.compute.jit import kernel
 from nsvq_lightning.compute.memory import check_array, check_table
 
+# Power-iteration steps for the direction of a cut, which need not be exact.
 _ITERATIONS = 4
-"""Power-iteration steps for the direction of a cut, which need not be exact."""
 
 
 def find_palette(

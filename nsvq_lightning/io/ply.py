@@ -22,18 +22,18 @@ from nsvq_lightning.splats.conventions import SH_C0, from_smallest_three, shN_de
 
 PLY_MAGIC = b"ply"
 
+# Comments of Brush and of Postshot, and the word after each that says: trained with anti-aliasing.
 _MIP_COMMENTS = {"SplatRenderMode:": "mip", "antialiased": "1"}
-"""Comments of Brush and of Postshot, and the word after each that says: trained with anti-aliasing."""
 _BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
+# Properties of a compressed ``.ply``, and the attributes in them; the opacity is in the colour.
 _PACKED = {"packed_position": "means", "packed_rotation": "quats", "packed_scale": "scales", "packed_color": "sh0"}
-"""Properties of a compressed ``.ply``, and the attributes in them; the opacity is in the colour."""
+# Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene.
 _ROWS = 1 << 12
-"""Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene."""
 
 
 @dataclass(frozen=True)
@@ -321,8 +321,8 @@ def _parts(words: NDArray[np.uint32], *bits: int) -> NDArray[np.float64]:
     return np.stack(shares, axis=1)
 
 
+# Order of the columns; the normals of points, which splats do not have, are 0.
 _ORDER = tuple(dict.fromkeys(("means", "unused", "sh0", "shN", "opacities", "scales", "quats", *ATTRIBUTES)))
-"""Order of the columns; the normals of points, which splats do not have, are 0."""
 
 
 def write_ply(path: str | os.PathLike[str], scene: CompressedScene) -> int:

@@ -7,8 +7,8 @@ import heapq
 import numpy as np
 from numpy.typing import NDArray
 
+# Largest number of Lloyd steps; each costs one search of 256 borders, whatever the number of values.
 _STEPS = 500
-"""Largest number of Lloyd steps; each costs one search of 256 borders, whatever the number of values."""
 
 
 def scalar_kmeans(

@@ -44,8 +44,8 @@ from nsvq_lightning.splats.conventions import from_smallest_three, sh_coefficien
 META = "meta.json"
 ZIP_MAGIC = b"PK\x03\x04"
 _META_LIMIT = 1 << 20
+# Most bytes of a picture for each texel that the file may hold; uncompressed, a texel has four.
 _TEXEL_BYTES = 8
-"""Most bytes of a picture for each texel that the file may hold; uncompressed, a texel has four."""
 
 
 def picture_shape(count: int) -> tuple[int, int]:
@@ -172,8 +172,8 @@ class SogArchive:
             raise FormatError(f"damaged: {name} cannot be unpacked ({error})") from None
 
 
+# Number of rows that a 16-bit label can address.
 PALETTE_LIMIT = 1 << 16
-"""Number of rows that a 16-bit label can address."""
 _ROWS_A_LINE = 64
 _LEVELS = 256
 _FARTHEST = math.log1p(float(np.finfo(np.float32).max))

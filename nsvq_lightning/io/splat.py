@@ -28,10 +28,10 @@ from nsvq_lightning.splats.conventions import SH_C0, unit
 logger = logging.getLogger(__name__)
 
 _RECORD = np.dtype([("means", "<f4", 3), ("lengths", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
+# Bytes of each part of a splat.
 SPLAT_LAYOUT = {name: _RECORD[name].itemsize for name in _RECORD.names or ()}
-"""Bytes of each part of a splat."""
+# Logarithms of the smallest and largest length that float32 holds with full precision.
 _SMALLEST, _LARGEST = -87.0, 88.0
-"""Logarithms of the smallest and largest length that float32 holds with full precision."""
 
 
 def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:

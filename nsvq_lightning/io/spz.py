@@ -63,35 +63,35 @@ from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, opacity_of
 from nsvq_lightning.splats.conventions import from_smallest_three, sh_coefficients, smallest_three, unit
 
 _MAGIC = b"NGSP"
+# First bytes: those of gzip up to version 3, those of the plain header from version 4 on.
 SPZ_MAGICS = (b"\x1f\x8b", _MAGIC)
-"""First bytes: those of gzip up to version 3, those of the plain header from version 4 on."""
+# Versions that are written.
 SPZ_VERSIONS = (3, 4)
-"""Versions that are written."""
+# Largest number of fractional bits of a position.
 MOST_FRACTION = 30
-"""Largest number of fractional bits of a position."""
 
 _HEADER = struct.Struct("<4sIIBBBB")
 _TABLE_OFFSET = struct.Struct("<I12x")
 _HEAD = _HEADER.size + _TABLE_OFFSET.size
 _ENTRY = struct.Struct("<QQ")
+# Most bytes that one byte of Zstandard can expand to: a block of 128 KiB of equal bytes takes four.
 _MOST_A_BYTE = 1 << 15
-"""Most bytes that one byte of Zstandard can expand to: a block of 128 KiB of equal bytes takes four."""
 _LEVEL = 19
+# Bytes of extensions that are read; those in use have less than a hundred.
 _MOST_EXTENDED = 1 << 20
-"""Bytes of extensions that are read; those in use have less than a hundred."""
+# The flag of a scene that was trained with anti-aliasing.
 ANTIALIASED = 1
-"""The flag of a scene that was trained with anti-aliasing."""
+# The flag of extensions.
 _EXTENDED = 2
-"""The flag of extensions."""
+# Type and length, then the number of the axes.
 _EXTENSION = struct.Struct("<III")
-"""Type and length, then the number of the axes."""
+# The extension that states the axes.
 _AXES = 0xADBE0003
-"""The extension that states the axes."""
+# Axes by the number that the extension holds; 0 says nothing.
 _SYSTEMS = (
     *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
     *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
 )
-"""Axes by the number that the extension holds; 0 says nothing."""
 
 
 @dataclass(frozen=True)
@@ -333,23 +333,23 @@ def _parse(start: bytes) -> SpzHeader:
 
 logger = logging.getLogger(__name__)
 
+# The version that every reader of the format supports.
 DEFAULT_VERSION = 3
-"""The version that every reader of the format supports."""
+# Axes that are written.
 SPZ_AXES = ("rdf", "rub")
-"""Axes that are written."""
+# The axes that viewers take a file to have, whatever it says.
 DEFAULT_AXES = "rdf"
-"""The axes that viewers take a file to have, whatever it says."""
 _POSITION = 24
 _USUAL_FRACTION = 12
+# Largest error of a coordinate as a share of the splat's size, for all but the smallest thousandth of the splats.
 _POSITION_ERROR = 0.05
-"""Largest error of a coordinate as a share of the splat's size, for all but the smallest thousandth of the splats."""
 _COLOR = 0.15
+# Rows of spherical harmonics rounded at a time.
 _BLOCK = 1 << 16
-"""Rows of spherical harmonics rounded at a time."""
+# Attributes by whose codes the splats are sorted, the most important last.
 _ORDER = ("quats", "scales", "sh0", "shN")
-"""Attributes by whose codes the splats are sorted, the most important last."""
+# Coordinates that the real spherical harmonics of degree 1 to 3 are odd functions of.
 _ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
-"""Coordinates that the real spherical harmonics of degree 1 to 3 are odd functions of."""
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,6 @@ from torch.autograd.function import once_differentiable
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.quality.ssim import check_pair, in_range, plain_ssim
 
-__all__ = ["apply_mask", "mean_of_kept", "photometric_loss", "ssim"]
-
 
 def apply_mask(image: Tensor, mask: Tensor | None) -> Tensor:
     """An image ``[H, W, 3]`` that is 0 where its mask ``[H, W]`` is; itself without a mask."""

@@ -15,12 +15,9 @@ from torchmetrics import Metric, MetricCollection
 from nsvq_lightning.quality.loss import apply_mask, mean_of_kept, ssim
 from nsvq_lightning.quality.ssim import check_pair
 
-__all__ = ["PSNR", "SSIM", "build_lpips", "color_corrected", "eight_bit", "image_metrics", "psnr"]
-
-
 ROUNDS = 5
+# Values beyond which a pixel is clipped, so that it says nothing about the map of colours.
 DARK, BRIGHT = 0.5 / 255, 1 - 0.5 / 255
-"""Values beyond which a pixel is clipped, so that it says nothing about the map of colours."""
 
 
 def color_corrected(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:

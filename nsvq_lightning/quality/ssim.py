@@ -6,8 +6,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["SSIM_C1", "SSIM_C2", "SSIM_RADIUS", "check_pair", "in_range", "plain_ssim", "ssim_window"]
-
 SSIM_RADIUS = 5
 SSIM_SIGMA = 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2

@@ -20,12 +20,10 @@ from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat_checked, recycled
 from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
 
-__all__ = ["l1_dssim"]
-
 G0, G1, G2, G3, G4, G5 = (F(tap) for tap in ssim_window()[SSIM_RADIUS:].tolist())
 C1, C2 = F(SSIM_C1), F(SSIM_C2)
+# Zeros beside every row, at least 3·radius floats, so that the horizontal blur needs no special case at the border.
 PAD = 16
-"""Zeros beside every row, at least 3·radius floats, so that the horizontal blur needs no special case at the border."""
 RING = 2 * SSIM_RADIUS + 1
 IMAGES = 2
 MOMENTS = 4

@@ -21,20 +21,18 @@ from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
 
-__all__ = ["Derivatives", "l1_dssim", "l1_dssim_backward"]
-
 G0, G1, G2, G3, G4, G5 = (tl.constexpr(tap) for tap in ssim_window()[SSIM_RADIUS:].tolist())
 C1, C2 = tl.constexpr(SSIM_C1), tl.constexpr(SSIM_C2)
 WHITE = tl.constexpr(255.0)
 
 MOMENTS = 4
 DERIVATIVES = 3
+# Image rows per program: four floats per thread, so that registers suffice for all taps.
 ROWS = 4
-"""Image rows per program: four floats per thread, so that registers suffice for all taps."""
+# Floats of each row per program, three to a pixel.
 COLUMNS = 128
-"""Floats of each row per program, three to a pixel."""
+# Number of programs whose sums are added up at a time.
 BLOCK = 1024
-"""Number of programs whose sums are added up at a time."""
 
 
 class Derivatives(NamedTuple):

@@ -47,11 +47,11 @@ class QuantizedAttribute:
 
 
 _DIMS = attribute_dims(sh_degree=3)
+# The quantized attributes by name, those with most codes first. Positions and opacities are not vector quantized.
 QUANTIZED = {
     name: QuantizedAttribute(name, ATTRIBUTES[name].code_share)
     for name in sorted(QUANTIZABLE, key=lambda name: (-ATTRIBUTES[name].code_share, _DIMS[name]))
 }
-"""The quantized attributes by name, those with most codes first. Positions and opacities are not vector quantized."""
 
 
 def check_attributes(name: str, attributes: Iterable[str]) -> None:

@@ -25,10 +25,10 @@ from nsvq_lightning.compute.jit import inline, kernel, thread_count
 from nsvq_lightning.compute.memory import aligned_empty, check_array, check_table, outside
 from nsvq_lightning.compute.rows import count_outside
 
+# Beyond this dimension, boxes prune too little, and the scores of :mod:`scores` are faster.
 MAX_DIM = 8
-"""Beyond this dimension, boxes prune too little, and the scores of :mod:`scores` are faster."""
+# Factor on the bounds, far above the relative rounding error of a float32 distance.
 ROUNDING = 1.0 + 1e-5
-"""Factor on the bounds, far above the relative rounding error of a float32 distance."""
 
 _UNKNOWN = np.int32(-1)  # stands for the last code of a row that has not been searched
 _NO_CODE = np.int32(np.iinfo(np.int32).max)  # label of a lane without a code

@@ -21,8 +21,8 @@ from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import inline, kernel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, aligned_empty, check_array, check_table
 
+# Codes in the list of a row.
 LIST = 8
-"""Codes in the list of a row."""
 
 _BEST = LIST + 1  # scores that a row keeps: those of a list, and the smallest of a code outside it
 _FEW = 4  # scores that a row keeps where no list is requested

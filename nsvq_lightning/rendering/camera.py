@@ -14,8 +14,6 @@ from torch import Tensor
 
 from nsvq_lightning.rendering.constants import FRUSTUM_MARGIN
 
-__all__ = ["Camera", "looked_at", "poses", "up_of"]
-
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -93,12 +91,12 @@ class Camera:
         return Camera(K, viewmat, self.width, self.height, self._intrinsics)
 
 
+# Weight of what decides where cameras that all look the same way leave a direction open.
 LITTLE = 1e-5
-"""Weight of what decides where cameras that all look the same way leave a direction open."""
+# How often cameras are weighted again by how level they are.
 ROUNDS = 20
-"""How often cameras are weighted again by how level they are."""
+# Sine of the roll below which a camera counts as level.
 LEVEL = 0.02
-"""Sine of the roll below which a camera counts as level."""
 
 
 def poses(cameras: Sequence[Camera]) -> tuple[NDArray[np.float64], Rotation]:

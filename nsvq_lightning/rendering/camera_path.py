@@ -16,14 +16,12 @@ from scipy.spatial.transform import RotationSpline
 
 from nsvq_lightning.rendering.camera import Camera, looked_at, poses, up_of
 
-__all__ = ["orbit", "read_camera_path", "reframed", "smooth_path"]
-
+# Points of a path at which its speed is measured, for each of its frames.
 FINE = 16
-"""Points of a path at which its speed is measured, for each of its frames."""
+# Arc that cameras must fill for an orbit to go all the way round.
 SURROUNDED = math.radians(270)
-"""Arc that cameras must fill for an orbit to go all the way round."""
+# From a camera with y up that looks along -z to one with y down that looks along z.
 OPENGL = np.diag([1.0, -1.0, -1.0])
-"""From a camera with y up that looks along -z to one with y down that looks along z."""
 
 
 def reframed(camera: Camera, width: int, height: int) -> Camera:

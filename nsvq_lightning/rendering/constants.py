@@ -2,36 +2,36 @@
 
 from __future__ import annotations
 
+# Splats whose centre is nearer than this along the viewing axis are culled, scene units.
 NEAR = 0.2
-"""Splats whose centre is nearer than this along the viewing axis are culled, scene units."""
 
+# Added to both variances of the projected Gaussian, square pixels.
 BLUR = 0.3
-"""Added to both variances of the projected Gaussian, square pixels."""
 
+# Contributions below one 8-bit step are skipped.
 ALPHA_MIN = 1.0 / 255.0
-"""Contributions below one 8-bit step are skipped."""
 
+# Smallest factor of an opacity by anti-aliasing: far below what any pixel shows, and its logarithm is finite.
 FAINTEST = 1e-6
-"""Smallest factor of an opacity by anti-aliasing: far below what any pixel shows, and its logarithm is finite."""
 
+# Opacity of one splat at one pixel is capped here; the cap has no gradient.
 ALPHA_MAX = 0.99
-"""Opacity of one splat at one pixel is capped here; the cap has no gradient."""
 
+# A pixel is finished before the splat that would bring its transmittance below this.
 TRANSMITTANCE_MIN = 1e-4
-"""A pixel is finished before the splat that would bring its transmittance below this."""
 
+# The projection's Jacobian is evaluated at most this fraction of half the image size outside the image.
 FRUSTUM_MARGIN = 0.3
-"""The projection's Jacobian is evaluated at most this fraction of half the image size outside the image."""
 
+# Quaternions with a larger component are first scaled by ``SHRINK``: their squares would overflow in float32.
 HUGE_QUATERNION, SHRINK = 1e18, 2.0**-66
-"""Quaternions with a larger component are first scaled by ``SHRINK``: their squares would overflow in float32."""
 
+# Float32 back-ends cull splats whose sum of both variances is larger, square pixels: even the sum is unsafe there.
 LARGEST_FOOTPRINT = 1e36
-"""Float32 back-ends cull splats whose sum of both variances is larger, square pixels: even the sum is unsafe there."""
 
+# Float32 back-ends cull splats with any larger value on the image plane: it comes from broken attributes.
 FINITE = 1e30
-"""Float32 back-ends cull splats with any larger value on the image plane: it comes from broken attributes."""
 
+# Where the sum of both variances is larger, square pixels, the determinant is computed in units of that sum: its
+# terms would overflow in float32.
 HUGE_FOOTPRINT = 1e10
-"""Where the sum of both variances is larger, square pixels, the determinant is computed in units of that sum: its
-terms would overflow in float32."""

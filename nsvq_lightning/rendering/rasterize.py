@@ -11,12 +11,11 @@ from torch import Tensor
 from nsvq_lightning.compute.devices import resolve_backend
 from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats, SplatTensors, check_shapes, sh_degree_of
+from nsvq_lightning.splats.attributes import ATTRIBUTES
+from nsvq_lightning.splats.splats import RawSplats, SplatTensors, check_shapes, sh_degree_of
 
-__all__ = ["Render", "render", "visible"]
-
+# Largest opacity of a splat that anti-aliasing has changed: the rasterizer caps it lower, and its logit is finite.
 OPAQUE = 1 - 2.0**-20
-"""Largest opacity of a splat that anti-aliasing has changed: the rasterizer caps it lower, and its logit is finite."""
 
 
 class Render(NamedTuple):

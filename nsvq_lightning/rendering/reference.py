@@ -15,13 +15,12 @@ from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.sh import sh_colors
+from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM
-from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats, SplatTensors
+from nsvq_lightning.splats.splats import RawSplats, SplatTensors
 
-__all__ = ["Projection", "light_kept", "project", "render", "rotation_matrices", "times_vectors", "visible"]
-
+# Side in pixels of the squares that are blended at a time.
 TILE = 32
-"""Side in pixels of the squares that are blended at a time."""
 
 
 class Projection(NamedTuple):

@@ -9,14 +9,12 @@ from torch import Tensor
 
 from nsvq_lightning.splats.conventions import sh_coefficients
 
-__all__ = ["C0", "C1", "C2", "C3", "sh_basis", "sh_colors", "sh_rotation"]
-
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+# Directions at which rotated functions are compared, evenly spread: four for each function of the largest band.
 _PROBES = 32
-"""Directions at which rotated functions are compared, evenly spread: four for each function of the largest band."""
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 

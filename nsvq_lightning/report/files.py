@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from nsvq_lightning.compression.stored import formula_bytes
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.nsvq.file import read_header
+from nsvq_lightning.io.nsvq.header import read_header
 from nsvq_lightning.io.nsvq.paper import paper_header
 from nsvq_lightning.io.ply import plain_ply_bytes
 from nsvq_lightning.report.evaluation import ViewScore

@@ -18,8 +18,8 @@ from torch import Tensor
 from nsvq_lightning.data.images import encode_png
 from nsvq_lightning.io.atomic import atomic_write
 
+# Bytes of a file name without suffix; file systems take 143 to 255 with it.
 LONGEST = 120
-"""Bytes of a file name without suffix; file systems take 143 to 255 with it."""
 
 
 def file_stem(name: str, names: tuple[str, ...] = ()) -> str:

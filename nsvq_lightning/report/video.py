@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import atomic_path
 
-__all__ = ["SUFFIX", "VideoWriter", "video_writer"]
-
+# Suffix of videos.
 SUFFIX = ".mp4"
-"""Suffix of videos."""
 
 
 class VideoWriter(NamedTuple):

@@ -18,13 +18,11 @@ import torch
 
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.atomic import write_text
-from nsvq_lightning.io.nsvq.file import read_header
+from nsvq_lightning.io.nsvq.header import read_header
 from nsvq_lightning.rendering.camera import Camera
 
-__all__ = ["BACKGROUNDS", "camera_entry", "page_cameras", "some_cameras", "viewer_page", "write_viewer"]
-
+# RGB of the backgrounds that have names.
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-"""RGB of the backgrounds that have names."""
 
 
 def some_cameras(scene: Scene) -> dict[str, Camera]:

@@ -11,8 +11,8 @@ import numpy as np
 
 from nsvq_lightning.splats.conventions import sh_coefficients
 
+# NumPy arrays, or torch tensors on any device; torch is not imported for the former.
 _Array = TypeVar("_Array")
-"""NumPy arrays, or torch tensors on any device; torch is not imported for the former."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class Attribute:
     code_bits: float = 0.0
 
 
+# The raw attributes by name, in the order of :meth:`nsvq_lightning.Splats.from_tensors`.
 ATTRIBUTES = {
     "means": Attribute((3,), "x y z", 3.2e-4),
     "quats": Attribute((4,), "rot_", 2e-3, 1.0, error=0.005, row_bits=0.3, code_bits=5.7),
@@ -47,10 +48,9 @@ ATTRIBUTES = {
     "sh0": Attribute((1, 3), "f_dc_", 2.5e-3, 0.25, error=0.01, row_bits=-1.3, code_bits=5.9),
     "shN": Attribute((-1, 3), "f_rest_", 5e-4, 0.25, error=0.01, row_bits=-1.4, code_bits=5.5),
 }
-"""The raw attributes by name, in the order of :meth:`nsvq_lightning.Splats.from_tensors`."""
 
+# Attributes that may have a codebook, in file order; positions and opacities never have (paper, section 3).
 QUANTIZABLE = tuple(name for name, attribute in ATTRIBUTES.items() if attribute.code_share)
-"""Attributes that may have a codebook, in file order; positions and opacities never have (paper, section 3)."""
 
 
 def attribute_shapes(sh_degree: int) -> dict[str, tuple[int, ...]]:

@@ -16,8 +16,8 @@ from torch import Tensor
 from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM
 
 Form = Literal["none", "sign", "full"]
+# How much of the redundancy is removed, in ascending order.
 FORMS: tuple[Form, ...] = ("none", "sign", "full")
-"""How much of the redundancy is removed, in ascending order."""
 
 
 def _right_products(quats: Tensor) -> Tensor:
@@ -28,6 +28,7 @@ def _right_products(quats: Tensor) -> Tensor:
 
 
 _H = math.sqrt(0.5)
+# For each order of the axes, a rotation whose columns are, up to sign, the unit vectors in that order.
 _AXIS_TURNS = torch.tensor(
     [
         [1.0, 0.0, 0.0, 0.0],  # axes 0 1 2
@@ -39,11 +40,10 @@ _AXIS_TURNS = torch.tensor(
     ],
     dtype=torch.float64,
 )
-"""For each order of the axes, a rotation whose columns are, up to sign, the unit vectors in that order."""
 
 
+# ``[6, 4, 4, 4]``: for each order of the axes and each of four half turns, the product from the right as a matrix.
 _TURNS = _right_products(torch.eye(4, dtype=torch.float64)) @ _right_products(_AXIS_TURNS)[:, None]
-"""``[6, 4, 4, 4]``: for each order of the axes and each of four half turns, the product from the right as a matrix."""
 
 
 class Canonical(NamedTuple):

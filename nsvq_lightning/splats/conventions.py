@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+# Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh0.
 SH_C0 = 0.5 / math.sqrt(math.pi)
-"""Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh0."""
 
 
 def sh_coefficients(degree: int) -> int:
@@ -35,8 +35,8 @@ def shN_degree(coefficients: int) -> int:
     return degree
 
 
+# Squared quaternion norms are floored here, so that a zero quaternion is the identity and has no gradient.
 MIN_SQUARED_NORM = 1e-24
-"""Squared quaternion norms are floored here, so that a zero quaternion is the identity and has no gradient."""
 
 
 def unit(quats: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -53,8 +53,8 @@ def turned(quats: NDArray[np.float32], rotation: NDArray[np.float64]) -> NDArray
     return np.asarray(quats.astype(np.float64) @ product.T, np.float32)
 
 
+# ``[4, 3]``: the components other than each one, ascending.
 _OTHERS = np.array([[j for j in range(4) if j != i] for i in range(4)])
-"""``[4, 3]``: the components other than each one, ascending."""
 
 
 def smallest_three(units: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:

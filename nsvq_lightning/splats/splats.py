@@ -14,8 +14,6 @@ from torch import Tensor, nn
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_shapes
 from nsvq_lightning.splats.conventions import SH_C0, sh_coefficients, shN_degree
 
-__all__ = ["ATTRIBUTES", "RawSplats", "SplatTensors", "Splats", "check_shapes", "detached", "sh_degree_of"]
-
 
 class RawSplats(NamedTuple):
     """The six raw attributes of N splats as plain tensors.
@@ -197,8 +195,8 @@ class Splats(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 
+# What has the six raw attributes as tensors; :func:`nsvq_lightning.render` takes it.
 SplatTensors = Splats | RawSplats
-"""What has the six raw attributes as tensors; :func:`nsvq_lightning.render` takes it."""
 
 
 def detached(splats: SplatTensors) -> RawSplats:

@@ -15,15 +15,6 @@ from torch.distributed import all_reduce, broadcast
 from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.training.optim import raw_optimizer
 
-__all__ = [
-    "ViewParallelStrategy",
-    "check_replicas",
-    "checksum",
-    "follow_first",
-    "from_first_process",
-    "sum_over_processes",
-]
-
 
 def follow_first(strategy: Strategy, module: nn.Module) -> None:
     """Copy the first process's parameters and buffers to the module on every process; row counts may differ before."""

@@ -12,32 +12,19 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from nsvq_lightning.splats.attributes import dropped, finite_rows, listed
-from nsvq_lightning.splats.splats import ATTRIBUTES, Splats
+from nsvq_lightning.splats.attributes import ATTRIBUTES, dropped, finite_rows, listed
+from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training.optim import find_group
-
-__all__ = [
-    "LARGEST_LOG_SCALE",
-    "append_rows",
-    "change_coordinates",
-    "drop_non_finite",
-    "finite_splats",
-    "keep_rows",
-    "raise_scales",
-    "replace_attribute",
-    "reset_moments",
-    "trainable_rows",
-]
 
 log = logging.getLogger(__name__)
 
+# Up to here (8e13 scene units) float32 holds the square of a splat's extent on the near plane of any camera; no view
+# shows larger splats, so nothing would ever train or prune them.
 LARGEST_LOG_SCALE = 32.0
-"""Up to here (8e13 scene units) float32 holds the square of a splat's extent on the near plane of any camera; no view
-shows larger splats, so nothing would ever train or prune them."""
 
 FIRST_MOMENT = "exp_avg"
+# Per-row state of Adam; everything else in its state belongs to the whole parameter.
 MOMENTS = (FIRST_MOMENT, "exp_avg_sq", "max_exp_avg_sq")
-"""Per-row state of Adam; everything else in its state belongs to the whole parameter."""
 
 
 def append_rows(splats: Splats, optimizer: Optimizer, new: Mapping[str, Tensor]) -> None:

@@ -4,12 +4,10 @@ from pathlib import Path
 
 from nsvq_lightning.io.atomic import write_text
 
-__all__ = ["LIVE_SCENE", "ask", "asked", "end"]
-
+# The splats of a running fit, while somebody looks.
 LIVE_SCENE = "live.nsvq"
-"""The splats of a running fit, while somebody looks."""
+# File whose time of modification says when a viewer last asked.
 REQUEST = "live.request"
-"""File whose time of modification says when a viewer last asked."""
 
 
 def ask(folder: Path) -> None:

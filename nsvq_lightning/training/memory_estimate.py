@@ -8,19 +8,16 @@ from lightning.pytorch import Trainer
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.training.scene_access import scene_of
 
-__all__ = ["CACHE_BYTES", "available_memory", "readable_bytes", "run_bytes", "say_footprint"]
-
-
 log = logging.getLogger(__name__)
 
+# Bytes for Python, torch, Lightning, compiled kernels and evaluations.
 BASE = 1.2e9
-"""Bytes for Python, torch, Lightning, compiled kernels and evaluations."""
+# Bytes per splat: 59 float32, each with gradient, two moments, and copies while quantizing or editing.
 BYTES_A_SPLAT = 59 * 4 * 6
-"""Bytes per splat: 59 float32, each with gradient, two moments, and copies while quantizing or editing."""
+# Bytes per pixel of a photo: buffers of the renderer, the loss and the picture itself.
 BYTES_A_PIXEL = 100
-"""Bytes per pixel of a photo: buffers of the renderer, the loss and the picture itself."""
+# Default of ``--data.cache_bytes``.
 CACHE_BYTES = 4 << 30
-"""Default of ``--data.cache_bytes``."""
 
 
 def run_bytes(scene: Scene, splats: int, cache_bytes: int = CACHE_BYTES) -> float:

@@ -27,12 +27,10 @@ from nsvq_lightning.training.schedule import Phase, Schedule, log_interval
 from nsvq_lightning.training.start import background_of, check_precision, extent_of, first_splats, warn_of_device
 from nsvq_lightning.training.stopwatch import Stopwatch
 
-__all__ = ["LossTerm", "SplatModule"]
-
 log = logging.getLogger(__name__)
 
+# A term of the loss ``[]``, from the rendering of a train view and the view.
 LossTerm = Callable[[Render, View], Tensor]
-"""A term of the loss ``[]``, from the rendering of a train view and the view."""
 
 
 class SplatModule(ResumedModule):

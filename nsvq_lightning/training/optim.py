@@ -11,32 +11,20 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor, nn
 
-from nsvq_lightning.splats.splats import ATTRIBUTES, Splats
+from nsvq_lightning.splats.attributes import ATTRIBUTES
+from nsvq_lightning.splats.splats import Splats
 
-__all__ = [
-    "LearningRates",
-    "apply_rates",
-    "build_adam",
-    "check_groups",
-    "codebook_group",
-    "find_group",
-    "group_lr",
-    "param_groups",
-    "position_lr",
-    "raw_optimizer",
-]
-
+# Adam's defaults.
 BETAS = 0.9, 0.999
-"""Adam's defaults."""
 
+# Adam's epsilon in 3D Gaussian splatting: gradients of a splat are far below PyTorch's default of 1e-8.
 EPS = 1e-15
-"""Adam's epsilon in 3D Gaussian splatting: gradients of a splat are far below PyTorch's default of 1e-8."""
 
+# Device types for which torch has a fused Adam.
 FUSED_DEVICES = frozenset({"cpu", "cuda"})
-"""Device types for which torch has a fused Adam."""
 
+# Prefix of a codebook's parameter group, before the name of its attribute.
 CODEBOOK_PREFIX = "codebook_"
-"""Prefix of a codebook's parameter group, before the name of its attribute."""
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,8 @@ from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
-__all__ = ["rehearse", "settings_of"]
-
+# Splats, so that some search trees have more than one level.
 FEWEST = 600
-"""Splats, so that some search trees have more than one level."""
 
 
 def settings_of(module: SplatModule) -> bytes | None:

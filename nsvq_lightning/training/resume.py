@@ -21,47 +21,29 @@ from torch.optim import Optimizer
 
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.splats.splats import ATTRIBUTES, sh_degree_of
+from nsvq_lightning.splats.attributes import ATTRIBUTES
+from nsvq_lightning.splats.splats import sh_degree_of
 from nsvq_lightning.training.scene_access import scene_of
 from nsvq_lightning.training.scene_module import SceneModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 from nsvq_lightning.training.stopwatch import Stopwatch
 
-__all__ = [
-    "QUANTIZER_SETTINGS",
-    "QUANTIZE_RULES",
-    "SCENE",
-    "PlainCheckpointIO",
-    "ResumedModule",
-    "branch_checkpoint",
-    "branch_optimizer_state",
-    "can_branch",
-    "changed_schedule",
-    "check_continuation",
-    "check_scene",
-    "check_settings",
-    "continued_schedule",
-    "plain",
-    "read_checkpoint",
-    "scene_record",
-]
-
 log = logging.getLogger(__name__)
 
+# Settings of a schedule that have no effect before the quantize phase.
 QUANTIZE_RULES = ("quantize_end", "min_finetune", "min_replacement_interval")
-"""Settings of a schedule that have no effect before the quantize phase."""
 
+# Prefix of the codebooks in a module's state.
 CODEBOOKS = "codebooks."
-"""Prefix of the codebooks in a module's state."""
 
+# Prefix of the splats in a module's state.
 SPLATS = "splats."
-"""Prefix of the splats in a module's state."""
 
+# Key under which a checkpoint holds the class and number of codes that each quantizer was made with.
 QUANTIZER_SETTINGS = "quantizer_settings"
-"""Key under which a checkpoint holds the class and number of codes that each quantizer was made with."""
 
+# Key of :meth:`ResumedModule.get_extra_state` in a module's state.
 RUN = "_extra_state"
-"""Key of :meth:`ResumedModule.get_extra_state` in a module's state."""
 
 
 def can_branch(checkpoint: Mapping[str, Any], codebooks: nn.ModuleDict) -> bool:
@@ -218,11 +200,11 @@ def _prefixed(codebooks: nn.ModuleDict) -> dict[str, Tensor]:
     return {f"{CODEBOOKS}{name}": value for name, value in codebooks.state_dict().items()}
 
 
+# Key under which a checkpoint holds which scene it is of.
 SCENE = "scene"
-"""Key under which a checkpoint holds which scene it is of."""
 
+# Settings of a module whose text, whatever it is, is only text; Lightning and :func:`check_settings` know the last.
 NEVER_IMPORTED = ("init_from", "codebooks", "_instantiator")
-"""Settings of a module whose text, whatever it is, is only text; Lightning and :func:`check_settings` know the last."""
 
 WAY_OUT = "pass a checkpoint that nsvq fit has written, …/checkpoints/last.ckpt"
 

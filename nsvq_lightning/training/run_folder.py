@@ -17,10 +17,9 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
 from nsvq_lightning.io.atomic import remove_temporaries
 
-__all__ = ["claim_version", "hold", "is_trial", "let_go", "reserve", "run_folder", "take"]
-
 log = logging.getLogger(__name__)
 
+# Files that show that a folder holds a run.
 RUN_FILES = (
     "scene.nsvq",
     "metrics.json",
@@ -31,19 +30,18 @@ RUN_FILES = (
     "renders",
     "predictions",
 )
-"""Files that show that a folder holds a run."""
 
+# File of Lightning's CSV logger, which removes an existing one.
 LOG = "metrics.csv"
-"""File of Lightning's CSV logger, which removes an existing one."""
 
+# File that the process of a run keeps locked; it names that process and its machine.
 MARKER = ".running"
-"""File that the process of a run keeps locked; it names that process and its machine."""
 
+# On Windows, what is locked cannot be read: lock a byte beyond the text.
 _LOCKED_BYTE = 1 << 20
-"""On Windows, what is locked cannot be read: lock a byte beyond the text."""
 
+# The locked marker of each folder that this process writes a run to.
 _HELD: dict[Path, TextIO] = {}
-"""The locked marker of each folder that this process writes a run to."""
 
 _FOLDERS: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
 _RESERVED: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()

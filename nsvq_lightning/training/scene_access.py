@@ -11,8 +11,6 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.scene_module import SceneModule
 
-__all__ = ["needed_scene", "scene_of", "train_cameras", "train_contributions"]
-
 
 def scene_of(trainer: Trainer | None) -> Scene | None:
     """The scene of the trainer's data module; None if it has none."""

@@ -25,8 +25,6 @@ from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.schedule import Phase, Schedule
 from nsvq_lightning.version import __version__
 
-__all__ = ["SceneModule"]
-
 log = logging.getLogger(__name__)
 
 

@@ -42,8 +42,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from lightning.pytorch import Trainer
 
-__all__ = ["Phase", "Schedule", "log_interval", "next_iteration"]
-
 
 class Phase(IntEnum):
     """Phase of a run (paper, section 4.1)."""

@@ -11,8 +11,6 @@ from nsvq_lightning.io.formats import load
 from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training.edit import finite_splats
 
-__all__ = ["background_of", "check_precision", "extent_of", "first_splats", "warn_of_device"]
-
 log = logging.getLogger(__name__)
 
 

@@ -8,8 +8,6 @@ import torch
 
 from nsvq_lightning.compute.compilation import compile_seconds
 
-__all__ = ["Stopwatch"]
-
 
 class Stopwatch:
     """Adds the time between two laps to :attr:`seconds`, without pauses and the compilation of kernels."""

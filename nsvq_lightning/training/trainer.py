@@ -14,8 +14,6 @@ from nsvq_lightning.training.distributed import ViewParallelStrategy  # noqa: F4
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.resume import PlainCheckpointIO, read_checkpoint
 
-__all__ = ["SplatTrainer"]
-
 log = logging.getLogger(__name__)
 
 

@@ -12,7 +12,7 @@ from nsvq_lightning.callbacks import LiveScene, PhaseSchedule
 from nsvq_lightning.callbacks import outputs as live_callback
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io import load
-from nsvq_lightning.io.nsvq.file import read_header
+from nsvq_lightning.io.nsvq.header import read_header
 from nsvq_lightning.training import live_preview
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import run_folder

@@ -15,8 +15,9 @@ from runs import quiet_trainer
 from torch import Tensor, nn
 
 from nsvq_lightning.data import datamodule
+from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.datamodule import DEMO, ColmapDataModule, DemoDataModule, DevicePhotos, ViewSampler
-from nsvq_lightning.data.scene import SceneError, View
+from nsvq_lightning.data.scene import View
 from nsvq_lightning.rendering.camera import Camera
 
 SceneFactory = Callable[..., Path]

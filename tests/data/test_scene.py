@@ -18,10 +18,10 @@ from lightning.fabric.utilities import move_data_to_device
 from runs import quiet_trainer
 from transforms_scenes import write_blender, write_nerfstudio
 
-from nsvq_lightning.data.colmap import import_pycolmap, larger_models
+from nsvq_lightning.data.colmap import SceneError, import_pycolmap, larger_models
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.reconstruct import reconstruct
-from nsvq_lightning.data.scene import SceneError, edge_strength, load_scene
+from nsvq_lightning.data.scene import edge_strength, load_scene
 from nsvq_lightning.training.module import SplatModule
 
 SceneFactory = Callable[..., Path]

@@ -15,10 +15,10 @@ import pytest
 import torch
 from transforms_scenes import APPLIED, opengl_matrix, write_blender, write_nerfstudio
 
-from nsvq_lightning.data.colmap import read_model
+from nsvq_lightning.data.colmap import SceneError, read_model
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.point_cloud import RANDOM_POINTS, random_points, read_points, share_seen
-from nsvq_lightning.data.scene import Scene, SceneError, load_scene
+from nsvq_lightning.data.scene import Scene, load_scene
 
 SceneFactory = Callable[..., Path]
 

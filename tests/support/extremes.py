@@ -25,7 +25,8 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.report.figures import markdown_table
-from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats, Splats
+from nsvq_lightning.splats.attributes import ATTRIBUTES
+from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.edit import trainable_rows
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 

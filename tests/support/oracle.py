@@ -6,7 +6,8 @@ import torch
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, render
-from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats
+from nsvq_lightning.splats.attributes import ATTRIBUTES
+from nsvq_lightning.splats.splats import RawSplats
 
 Gradients = dict[str, torch.Tensor]
 

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from nsvq_lightning.splats.splats import ATTRIBUTES, Splats
+from nsvq_lightning.splats.attributes import ATTRIBUTES
+from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training.edit import (
     append_rows,
     change_coordinates,

@@ -22,7 +22,8 @@ from nsvq_lightning.quantize.nsvq import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render, visible
-from nsvq_lightning.splats.splats import ATTRIBUTES, RawSplats, Splats
+from nsvq_lightning.splats.attributes import ATTRIBUTES
+from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.resume import plain

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from nsvq_lightning.quantize import PostHoc
-from nsvq_lightning.splats.splats import ATTRIBUTES, Splats
+from nsvq_lightning.splats.attributes import ATTRIBUTES
+from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 

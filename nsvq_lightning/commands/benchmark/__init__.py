@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+# Modules of this package; each has a function ``run(scope)``, which returns measurements, and ``PANELS``.
 SUITES = ("render", "quantize", "codec", "train")
-"""Modules of this package; each has a function ``run(scope)``, which returns measurements, and ``PANELS``."""
 
 
 class Size(NamedTuple):
@@ -22,6 +22,7 @@ class Size(NamedTuple):
     scale: float
 
 
+# The synthetic scenes by name: smaller splats where there are more, as training leaves them.
 SIZES = {
     "A20k": Size(20_000, 400, 300, 0.0175),
     "B100k": Size(100_000, 800, 533, 0.0100),
@@ -29,7 +30,6 @@ SIZES = {
     "D1M": Size(1_000_000, 1600, 1060, 0.0044),
     "E3M": Size(3_000_000, 1600, 1060, 0.0031),
 }
-"""The synthetic scenes by name: smaller splats where there are more, as training leaves them."""
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from nsvq_lightning.training.optim import LearningRates
 
 STEP, SEARCH, KMEANS = "step, forward + backward", "search", "k-means"
 PANELS = ((STEP, "gradient error", "ms"), (SEARCH, "wrong codes", "ms"), (KMEANS, "distortion", "ms"))
+# Rows an attribute whose codes are checked: the float64 oracle is slow.
 CHECKED_ROWS = 4_000
-"""Rows an attribute whose codes are checked: the float64 oracle is slow."""
 
 
 class Attribute(NamedTuple):
@@ -43,8 +43,8 @@ class Attribute(NamedTuple):
     rate: float
 
 
+# Quantized rows ``[V, D]``, their gradient by the rows ``[N, D]``, and codes ``[V]`` by attribute.
 Results = dict[str, tuple[Tensor, Tensor, Tensor]]
-"""Quantized rows ``[V, D]``, their gradient by the rows ``[N, D]``, and codes ``[V]`` by attribute."""
 
 
 def run(scope: Scope) -> Iterator[Measurement]:

@@ -27,14 +27,14 @@ from nsvq_lightning.splats.splats import RawSplats
 
 FORWARD, BOTH, LOSS = "forward", "forward + backward", "L1 + D-SSIM, forward + backward"
 PANELS = ((FORWARD, "max error", "ms"), (BOTH, "gradient error", "ms"), (LOSS, "gradient error", "ms"))
+# Splats times pixels that the oracle is given, quick and full: half a minute on one core at most.
 ORACLE_WORK = {True: 1e8, False: 6e9}
-"""Splats times pixels that the oracle is given, quick and full: half a minute on one core at most."""
 PHOTO = (533, 800, 3)
 
+# Renders splats as the camera of a workload sees them: image ``[H, W, 3]``.
 Painter = Callable[[RawSplats, Workload], Tensor]
-"""Renders splats as the camera of a workload sees them: image ``[H, W, 3]``."""
+# Of an image and a photo ``[H, W, 3]``, with the weight of D-SSIM.
 Loss = Callable[[Tensor, Tensor, float], Tensor]
-"""Of an image and a photo ``[H, W, 3]``, with the weight of D-SSIM."""
 
 
 class Traced(NamedTuple):

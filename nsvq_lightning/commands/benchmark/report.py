@@ -20,11 +20,11 @@ from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.report import figures
 from nsvq_lightning.version import __version__
 
+# Measurements by the name of their suite.
 Suites = Mapping[str, Sequence[Measurement]]
-"""Measurements by the name of their suite."""
+# What a panel of the picture shows: rows of an operation, a value of theirs or ``ms``, and what that stands over:
+# ``ms``, a value, or ``seconds`` for the course of a run.
 Panel = tuple[str, str, str]
-"""What a panel of the picture shows: rows of an operation, a value of theirs or ``ms``, and what that stands over:
-``ms``, a value, or ``seconds`` for the course of a run."""
 
 
 def describe_machine() -> dict[str, Any]:

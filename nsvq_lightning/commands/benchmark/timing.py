@@ -16,8 +16,8 @@ from nsvq_lightning.random import generator
 
 SGEMM_SIDE = 2048
 
+# What is timed.
 Call = Callable[[], object]
-"""What is timed."""
 
 
 @dataclass(frozen=True)

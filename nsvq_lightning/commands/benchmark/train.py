@@ -44,8 +44,8 @@ log = logging.getLogger(__name__)
 
 RUN, ALONE = "run", "step by itself"
 PANELS = ((RUN, "PSNR dB", "seconds"), (ALONE, "ms", "splats"), (ALONE, "peak MB", "splats"))
+# Callbacks of ``nsvq fit`` that write files or lines but train nothing; the benchmark measures by itself.
 WATCHING = ("report", "export", "predictions", "checkpoint", "kernels", "progress")
-"""Callbacks of ``nsvq fit`` that write files or lines but train nothing; the benchmark measures by itself."""
 QUICK_DEMO = ("--data.factor=4",)
 SHIPPED, WHOLE, OUTSIDE = "as shipped", "whole step", "between the functions"
 

@@ -20,11 +20,11 @@ from nsvq_lightning.training.resume import QUANTIZE_RULES
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.version import __version__
 
+# All settings of a ``nsvq fit``: what ``--print_config`` shows, as JSON values.
 Settings = dict[str, Any]
-"""All settings of a ``nsvq fit``: what ``--print_config`` shows, as JSON values."""
 
+# Callbacks that do nothing before the iterations of the prune phase are done.
 BRANCH_CALLBACKS = ("canonical", "codebook_init", "codebook_refit", "codebook_replacement", "codebook_finite", "freeze")
-"""Callbacks that do nothing before the iterations of the prune phase are done."""
 
 
 @dataclass(frozen=True)

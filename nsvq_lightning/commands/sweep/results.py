@@ -15,8 +15,8 @@ from nsvq_lightning.training.schedule import Phase
 
 Row = dict[str, Any]
 
+# Columns that say which runs a line of the table is about: they differ in the seed alone.
 NAMES = ("scene", "config", "quantizer", "codebooks")
-"""Columns that say which runs a line of the table is about: they differ in the seed alone."""
 
 
 def read(path: Path) -> Any:

@@ -54,12 +54,12 @@ _GRID = struct.Struct("<qqqd")
 _POSITIONS = ("means.grid", "means", "means.far")
 _STREAMS = {"grid": _POSITIONS, "cells": _POSITIONS, "codes": ("{}.codebook", "{}"), "steps": ("{}",)}
 _ENCODINGS = {"means.grid": "grid", "means": "keys", "means.far": "float32"}
+# Attributes whose streams come before those of the positions, by the storage of these.
 _BEFORE_POSITIONS = {"cells": ("opacities", "scales"), "grid": ("scales",)}
-"""Attributes whose streams come before those of the positions, by the storage of these."""
+# The other attributes, by the time they take: the longest task should not begin last.
 _LARGEST_FIRST = sorted((name for name in QUANTIZABLE if name != "scales"), key=lambda name: -attribute_dims(3)[name])
-"""The other attributes, by the time they take: the longest task should not begin last."""
+# Three float32.
 _FAR_BYTES = 12
-"""Three float32."""
 
 
 class _Places(NamedTuple):

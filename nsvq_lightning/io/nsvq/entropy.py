@@ -17,24 +17,24 @@ from nsvq_lightning.compute.memory import INT32, INT64, UINT64, check_array, out
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.nsvq import range_coder as rc
 
+# Bits of a key; the highest is bit 62.
 KEY_BITS = 63
-"""Bits of a key; the highest is bit 62."""
 
+# Decisions of a path that have contexts; those further down are written without a model.
 _MODELLED_BITS = 16
-"""Decisions of a path that have contexts; those further down are written without a model."""
 
 _LONGEST_PATH = 32
 
+# What two neighbours say about a decision: each one has left the path before, takes 0 here, or takes 1 here.
 _RELATIONS = 9
-"""What two neighbours say about a decision: each one has left the path before, takes 0 here, or takes 1 here."""
 
 _START = uint64(0xFFFFFFFFFFFFFFFF)
 _WORD_BITS = 32
+# Integers are below it in size: they and their sums are exact in float64.
 _TOO_LARGE = 1 << 52
-"""Integers are below it in size: they and their sums are exact in float64."""
 _KEY_MASK = uint64((1 << KEY_BITS) - 1)
+# What a reader returns instead of the number of words when it meets a value out of range.
 _OUTSIDE = -1
-"""What a reader returns instead of the number of words when it meets a value out of range."""
 
 
 def encode_paths(paths: NDArray[np.int64], bits: int, neighbours: NDArray[np.int32]) -> bytes:
@@ -250,8 +250,8 @@ def _read_paths(words, bits, neighbours, paths, contexts):  # type: ignore[no-un
 
 # Lengths of numbers
 
+# Decisions that encode a number's bit length, 0 to 63.
 _LENGTH_BITS = 6
-"""Decisions that encode a number's bit length, 0 to 63."""
 
 
 @inline
@@ -296,8 +296,8 @@ def _read_length(start, contexts, code, width, words, used):  # type: ignore[no-
 
 # Keys
 
+# Number of size classes of the previous difference.
 _BEFORE = 11
-"""Number of size classes of the previous difference."""
 _KEY_CONTEXTS = (KEY_BITS + 1) * _BEFORE << _LENGTH_BITS
 
 
@@ -346,8 +346,8 @@ def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
 
 # Integers
 
+# Contexts per column: the tree of the lengths, and the second bit by length.
 _INTEGER_CONTEXTS = 2 << _LENGTH_BITS
-"""Contexts per column: the tree of the lengths, and the second bit by length."""
 
 
 def _bit_lengths(values: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -9,11 +9,9 @@ from dataclasses import replace
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
-from nsvq_lightning.io.nsvq.header import Header, frame, read_frame, read_header
+from nsvq_lightning.io.nsvq.header import Header, frame, read_frame
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Precision, Storage, check_level
 from nsvq_lightning.splats.attributes import listed
-
-__all__ = ["CompressedScene", "as_stored", "decode", "encode", "read_header", "read_nsvq", "write_finite", "write_nsvq"]
 
 
 def encode(

@@ -33,8 +33,8 @@ from nsvq_lightning.io.errors import FormatError, naming_file
 
 MAGIC = b"\x89NSVQ\r\n\x1a"
 VERSION = 2
+# Versions that are read; the header of version 1 spells out the columns of its tables in every row.
 READABLE = (1, 2)
-"""Versions that are read; the header of version 1 spells out the columns of its tables in every row."""
 
 _PREFIX = struct.Struct("<8s16sII")
 _DIGEST_END = 24

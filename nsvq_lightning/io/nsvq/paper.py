@@ -22,8 +22,8 @@ from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims
 
+# Rows per chunk: a multiple of 8, so that every chunk ends on a whole byte, and small enough for the cache.
 _CHUNK = 1 << 14
-"""Rows per chunk: a multiple of 8, so that every chunk ends on a whole byte, and small enough for the cache."""
 
 
 def packed_bytes(rows: int, widths: Sequence[int]) -> int:

@@ -9,16 +9,16 @@ from typing import Any
 
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 
+# Compression levels: ``compact`` is small; ``paper`` stores float32 values and whole bits, as the paper counts.
 LEVELS = ("compact", "paper")
-"""Compression levels: ``compact`` is small; ``paper`` stores float32 values and whole bits, as the paper counts."""
 
 DEFAULT_LEVEL = "compact"
 
+# Largest number of opacity levels that readers accept.
 MOST_OPACITY_LEVELS = 1 << 20
-"""Largest number of opacity levels that readers accept."""
 
+# Smallest and largest error that the opacity may have.
 OPACITY_ERRORS = 0.5 / MOST_OPACITY_LEVELS, 0.25
-"""Smallest and largest error that the opacity may have."""
 
 
 @dataclass(frozen=True)

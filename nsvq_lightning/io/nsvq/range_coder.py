@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline
 
+# Number of bits after which the probability of a context moves at its slowest.
 COUNT_LIMIT = 126
-"""Number of bits after which the probability of a context moves at its slowest."""
 
 _RATES = np.rint(65536 / (np.arange(COUNT_LIMIT + 1) + 1.6)).astype(np.int64)
+# No probability is below 48/65536: an unlikely bit costs at most 11 bits.
 _LEAST = 48
-"""No probability is below 48/65536: an unlikely bit costs at most 11 bits."""
 
+# Largest number of bits written at once without a model.
 PLAIN_BITS = 16
-"""Largest number of bits written at once without a model."""
 
 _FULL = uint64(0xFFFFFFFFFFFFFFFF)
 _LOW_WORD = uint64(0xFFFFFFFF)

@@ -20,12 +20,12 @@ from nsvq_lightning.io.nsvq.header import AttributeEntry
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.io.numbers import coarsest_power, nearest_power, opacity_of
 
+# Largest base-2 logarithm of a width in scene units whose multiples float64 still holds.
 _MOST_DOUBLINGS = 500.0
-"""Largest base-2 logarithm of a width in scene units whose multiples float64 still holds."""
+# A codebook on a lattice this much finer than necessary is stored on it, without an error.
 _FINER = 4
-"""A codebook on a lattice this much finer than necessary is stored on it, without an error."""
+# Step of a codebook whose rows do not differ.
 _SMALLEST_STEP = 2.0**-16
-"""Step of a codebook whose rows do not differ."""
 
 
 class Stored(NamedTuple):

@@ -261,8 +261,8 @@ def sorted_by_code(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:
     return order, starts
 
 
+# Rows by code of codes that still exist, after the version of these codes and how many there may be.
 _sorted = WeakTensorKeyDictionary()
-"""Rows by code of codes that still exist, after the version of these codes and how many there may be."""
 
 
 def _remembered(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:

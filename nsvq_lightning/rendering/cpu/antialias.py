@@ -23,8 +23,6 @@ from nsvq_lightning.rendering.cpu.projection import BLUR, BLUR_SQUARED, HUGE_FOO
 from nsvq_lightning.rendering.cpu.projection_backward import axes_backward
 from nsvq_lightning.splats.splats import SplatTensors
 
-__all__ = ["light_kept"]
-
 LEAST = F(constants.FAINTEST**2)
 
 

@@ -11,8 +11,8 @@ from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES
 
 DIGIT_BITS = 11
 DIGITS = 1 << DIGIT_BITS
+# How many splats ahead a box is prefetched.
 AHEAD = 16
-"""How many splats ahead a box is prefetched."""
 
 
 @kernel

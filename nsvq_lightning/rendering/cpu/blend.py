@@ -22,13 +22,13 @@ from nsvq_lightning.rendering.cpu import records as rec
 ALPHA_MAX = F(constants.ALPHA_MAX)
 TRANSMITTANCE_MIN = F(constants.TRANSMITTANCE_MIN)
 BATCH = 128
+# Lower bound on the transmittance of closed pixels: far below the threshold, far above denormal numbers.
 TINY = F(1e-20)
-"""Lower bound on the transmittance of closed pixels: far below the threshold, far above denormal numbers."""
+# How far below the threshold, in log2 α, a block still counts as reached: what rounding can add to the exponent of a
+# pixel, so that culling blocks changes no bit. It lets one block in a thousand more through.
 REACH_MARGIN = F(2.0**-8)
-"""How far below the threshold, in log2 α, a block still counts as reached: what rounding can add to the exponent of a
-pixel, so that culling blocks changes no bit. It lets one block in a thousand more through."""
+# How many entries ahead a record is prefetched; its slot, whose number is in the record, a little later.
 AHEAD = 24
-"""How many entries ahead a record is prefetched; its slot, whose number is in the record, a little later."""
 SLOT_AHEAD = 10
 BLOCKS = 16
 BLOCK_SIDE = 4

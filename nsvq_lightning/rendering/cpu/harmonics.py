@@ -13,10 +13,10 @@ from nsvq_lightning.rendering.cpu import records as rec
 C0, C1 = F(sh.C0), F(sh.C1)
 C2A, C2B, C2C = (F(value) for value in sh.C2)
 C3A, C3B, C3C, C3D, C3E = (F(value) for value in sh.C3)
+# How many splats ahead the rows of a list are prefetched.
 AHEAD = 32
-"""How many splats ahead the rows of a list are prefetched."""
+# Floats in a row of degree-3 coefficients, which is read in whole vectors.
 SH_ROW = 45
-"""Floats in a row of degree-3 coefficients, which is read in whole vectors."""
 
 
 @inline

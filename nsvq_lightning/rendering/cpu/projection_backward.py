@@ -12,8 +12,8 @@ from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import AHEAD, coefficients_of, color_backward, prefetch_sh
 from nsvq_lightning.rendering.cpu.projection import BLUR, affine, axes_of, image_axes
 
+# Converts moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)².
 COVARIANCE_SCALE = F(2 * np.log(2.0) ** 2)
-"""Converts moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)²."""
 
 
 @inline

@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 from nsvq_lightning.compute.jit import thread_count
 from nsvq_lightning.compute.memory import Array, Workspace, flat, flat_checked, recycled
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.cpu.antialias import light_kept
+from nsvq_lightning.rendering.cpu.antialias import light_kept as light_kept
 from nsvq_lightning.rendering.cpu.binning import DIGITS, count_tiles, fill_tiles, sort_by_depth
 from nsvq_lightning.rendering.cpu.blend import (
     BACKWARD_SCRATCH,
@@ -27,9 +27,8 @@ from nsvq_lightning.rendering.cpu.projection import find_visible, finish_records
 from nsvq_lightning.rendering.cpu.projection_backward import project_backward
 from nsvq_lightning.rendering.cpu.records import GROUP_TILES, RECORD, group_grid, pack_camera
 from nsvq_lightning.skips import is_on
-from nsvq_lightning.splats.splats import ATTRIBUTES, SplatTensors, sh_degree_of
-
-__all__ = ["light_kept", "render", "visible"]
+from nsvq_lightning.splats.attributes import ATTRIBUTES
+from nsvq_lightning.splats.splats import SplatTensors, sh_degree_of
 
 PROJECTION_SCRATCH = 2048 + 64
 MAX_ENTRIES = 2**31 - 1

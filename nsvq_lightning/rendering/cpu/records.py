@@ -22,13 +22,13 @@ from nsvq_lightning.compute.jit import F, inline
 from nsvq_lightning.compute.memory import Array
 from nsvq_lightning.rendering.camera import Camera
 
+# Floats in a record and in a slot.
 RECORD = 16
-"""Floats in a record and in a slot."""
 
 # Fields of a record.
+# SLOPE_X, SLOPE_Y: dy/dx and dx/dy of the exponent's ridges, for the largest value on a rectangle. The last four hold
+# integers: first slot; first tile column and row; tile columns and rows (16 bits each); radius in pixels.
 X, Y, A, B, C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, SLOPE_X, SLOPE_Y, SLOT, ORIGIN, EXTENT, RADIUS = range(RECORD)
-"""SLOPE_X, SLOPE_Y: dy/dx and dx/dy of the exponent's ridges, for the largest value on a rectangle. The last four hold
-integers: first slot; first tile column and row; tile columns and rows (16 bits each); radius in pixels."""
 
 # Fields of a slot: with h = α·dL/dα, sums over pixels of w·g (colour), h, h·u, h·v, h·u², h·u·v, h·v², w·g (depth) and,
 # if somebody observes the pass, |h·u|, |B·h·u + C·h·v|, w·map.
@@ -39,13 +39,13 @@ SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_D
 TILE_SHIFT = 4
 TILE = 1 << TILE_SHIFT
 GROUP_SHIFT = 2
+# Tiles in a group.
 GROUP_TILES = 1 << 2 * GROUP_SHIFT
-"""Tiles in a group."""
 
 LOG2_ALPHA_MIN = F(-math.log2(255))
 LOG2_E = F(math.log2(math.e))
+# √(½·log2 e): turns the Cholesky factor of the inverse covariance into that of the binary exponent.
 FACTOR_SCALE = F(math.sqrt(0.5 * math.log2(math.e)))
-"""√(½·log2 e): turns the Cholesky factor of the inverse covariance into that of the binary exponent."""
 
 # Elements of the camera array of `pack_camera`.
 ROTATION, TRANSLATION, POSITION, FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, WIDTH, HEIGHT = (
@@ -54,12 +54,12 @@ ROTATION, TRANSLATION, POSITION, FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, W
 CAMERA = 25
 
 
+# Largest image side in pixels: a record has 16 bits, one of them the sign, for a tile's column or row.
 MAX_SIDE = TILE * (2**15 - 1)
-"""Largest image side in pixels: a record has 16 bits, one of them the sign, for a tile's column or row."""
 
 
+# Cameras as kernels read them, and the version of the matrix that it was made from.
 _packed: WeakKeyDictionary[Camera, tuple[int, Array]] = WeakKeyDictionary()
-"""Cameras as kernels read them, and the version of the matrix that it was made from."""
 
 
 def pack_camera(camera: Camera) -> Array:

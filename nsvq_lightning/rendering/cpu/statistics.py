@@ -10,10 +10,8 @@ from nsvq_lightning.compute.jit import F, kernel, thread_count
 from nsvq_lightning.compute.memory import INT32, flat_checked
 from nsvq_lightning.compute.simd import get, put
 
-__all__ = ["add_observed", "add_view"]
-
+# Parts of the splats whose weights are summed one by one: as many for any number of threads, so with the same bits.
 CHUNKS = 64
-"""Parts of the splats whose weights are summed one by one: as many for any number of threads, so with the same bits."""
 
 
 @kernel

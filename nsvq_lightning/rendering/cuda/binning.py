@@ -16,12 +16,10 @@ from torch import Tensor
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 
-__all__ = ["Tiles", "list_tiles"]
-
 MAX_PAIRS = 2**31 - 1
 
+# Pairs per program.
 BLOCK = 512
-"""Pairs per program."""
 
 
 class Tiles(NamedTuple):

@@ -56,18 +56,16 @@ from nsvq_lightning.rendering.cuda.records import (
     Y,
 )
 
-__all__ = ["blend", "blend_backward", "tile_grid"]
-
+# Splats between two checks of whether a tile is finished.
 BATCH = 32
-"""Splats between two checks of whether a tile is finished."""
+# Warps per tile: with one, every reduction stays inside the warp.
 WARPS = 1
-"""Warps per tile: with one, every reduction stays inside the warp."""
+# Splats whose slots a program adds up: most have a few, and a program for each would have little to do.
 SPLATS = 16
-"""Splats whose slots a program adds up: most have a few, and a program for each would have little to do."""
+# Number of slots of one splat that are added up at a time.
 SLOTS = 8
-"""Number of slots of one splat that are added up at a time."""
+# Power of two that holds the fields of a slot.
 LANES = 16
-"""Power of two that holds the fields of a slot."""
 
 
 @triton.jit

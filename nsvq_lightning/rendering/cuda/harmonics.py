@@ -11,8 +11,6 @@ import triton.language as tl
 
 from nsvq_lightning.rendering import sh
 
-__all__ = ["color", "color_backward", "load3", "store3"]
-
 C0, C1 = tl.constexpr(sh.C0), tl.constexpr(sh.C1)
 C2A, C2B, C2C = (tl.constexpr(value) for value in sh.C2)
 C3A, C3B, C3C, C3D, C3E = (tl.constexpr(value) for value in sh.C3)

@@ -42,9 +42,7 @@ from nsvq_lightning.rendering.cuda.records import (
     Y,
 )
 from nsvq_lightning.splats import conventions
-from nsvq_lightning.splats.splats import ATTRIBUTES
-
-__all__ = ["Lens", "Projected", "project", "project_backward", "project_radii"]
+from nsvq_lightning.splats.attributes import ATTRIBUTES
 
 NEAR = tl.constexpr(constants.NEAR)
 BLUR = tl.constexpr(constants.BLUR)
@@ -56,10 +54,10 @@ HUGE_FOOTPRINT = tl.constexpr(constants.HUGE_FOOTPRINT)
 LARGEST_FOOTPRINT = tl.constexpr(constants.LARGEST_FOOTPRINT)
 HUGE_QUATERNION, SHRINK = tl.constexpr(constants.HUGE_QUATERNION), tl.constexpr(constants.SHRINK)
 
+# Splats per program.
 BLOCK = 128
-"""Splats per program."""
+# Passed as the SH degree where no record is wanted.
 RADIUS_ONLY = -1
-"""Passed as the SH degree where no record is wanted."""
 
 
 @triton.jit
@@ -378,8 +376,8 @@ class Lens(NamedTuple):
         return lens
 
 
+# Packed cameras by device, with the version of the matrix that each was made from.
 _lenses: WeakKeyDictionary[Camera, dict[torch.device, tuple[int, Lens]]] = WeakKeyDictionary()
-"""Packed cameras by device, with the version of the matrix that each was made from."""
 
 
 class Projected(NamedTuple):

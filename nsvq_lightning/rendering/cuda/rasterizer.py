@@ -12,10 +12,8 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda.binning import Tiles, list_tiles
 from nsvq_lightning.rendering.cuda.blend import blend, blend_backward, tile_grid
 from nsvq_lightning.rendering.cuda.projection import Lens, project, project_backward, project_radii
-from nsvq_lightning.rendering.reference import light_kept
+from nsvq_lightning.rendering.reference import light_kept as light_kept
 from nsvq_lightning.splats.splats import SplatTensors
-
-__all__ = ["light_kept", "render", "visible"]
 
 
 def _attributes(splats: SplatTensors) -> tuple[Tensor, ...]:

@@ -19,14 +19,14 @@ import triton.language as tl
 
 from nsvq_lightning.rendering import constants
 
+# Stride between records, or slots, in floats: whole 16-byte words.
 RECORD = tl.constexpr(12)
-"""Stride between records, or slots, in floats: whole 16-byte words."""
+# Floats used in a record or slot.
 FIELDS = tl.constexpr(10)
-"""Floats used in a record or slot."""
+# Stride between slots, in floats, if somebody observes the pass.
 OBSERVED_SLOT = tl.constexpr(16)
-"""Stride between slots, in floats, if somebody observes the pass."""
+# Floats used in such a slot.
 OBSERVED_FIELDS = tl.constexpr(13)
-"""Floats used in such a slot."""
 
 # Fields of a record.
 X, Y, A, B, C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH = (tl.constexpr(field) for field in range(10))
@@ -37,15 +37,15 @@ SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_D
     tl.constexpr(field) for field in range(13)
 )
 
+# Side of a tile in pixels.
 TILE = tl.constexpr(16)
-"""Side of a tile in pixels."""
 
 LN2 = tl.constexpr(math.log(2.0))
 LOG2_E = tl.constexpr(math.log2(math.e))
 LOG2_ALPHA_MIN = tl.constexpr(math.log2(constants.ALPHA_MIN))
 ALPHA_MAX = tl.constexpr(constants.ALPHA_MAX)
 TRANSMITTANCE_MIN = tl.constexpr(constants.TRANSMITTANCE_MIN)
+# √(½·log2 e): turns the Cholesky factor of the inverse covariance into that of the binary exponent.
 FACTOR_SCALE = tl.constexpr(math.sqrt(0.5 * math.log2(math.e)))
-"""√(½·log2 e): turns the Cholesky factor of the inverse covariance into that of the binary exponent."""
+# Converts moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)².
 COVARIANCE_SCALE = tl.constexpr(2 * math.log(2.0) ** 2)
-"""Converts moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)²."""
