@@ -4,8 +4,6 @@
 ``__getattr__``, through which an ``nn.Module`` gives its parameters and buffers, and so finds none of them.
 """
 
-from __future__ import annotations
-
 
 def missing_members(value: object, protocol: type) -> list[str]:
     """Names of the members of ``protocol`` that ``value`` does not have, sorted.

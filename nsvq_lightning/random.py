@@ -4,8 +4,6 @@ The global generators of torch, NumPy and Python are not used anywhere in this p
 the number of threads, nor on the number of processes, nor on whether a run was interrupted and resumed.
 """
 
-from __future__ import annotations
-
 import hashlib
 
 import torch

@@ -14,8 +14,6 @@ An attribute with no more distinct rows than codes has no switch either: its cod
 first step on, training moves rows and codes apart, so that they must be searched like any others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ An installed package contains them, and in a checkout, symbolic links lead to th
 Windows, it writes small text files instead; this module then finds the folders at the top level.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from importlib.abc import MetaPathFinder

@@ -1,7 +1,5 @@
 """LightningCLI with this package's module, data, callbacks and defaults."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import os

@@ -1,7 +1,5 @@
 """Describe a scene file: .nsvq, .ply, .sog, .spz or .splat."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

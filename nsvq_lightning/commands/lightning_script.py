@@ -4,8 +4,6 @@ Lightning itself has shipped no ``lightning`` script since 2.5.1, but lightning-
 distribution installed last own the name. This one runs ``lightning fit`` and passes on what it does not know.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Sequence

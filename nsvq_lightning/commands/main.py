@@ -1,7 +1,5 @@
 """The ``nsvq`` command. Kept light: ``nsvq info`` must answer without importing torch."""
 
-from __future__ import annotations
-
 import argparse
 import inspect
 import io

@@ -4,8 +4,6 @@ The parser's own help lists all classes that any option might take, even those o
 default callbacks.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 import shutil

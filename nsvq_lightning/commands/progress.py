@@ -1,7 +1,5 @@
 """Progress of a command's work: a bar on a terminal, a few plain lines in a file."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Iterator, Sequence

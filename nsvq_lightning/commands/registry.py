@@ -1,7 +1,5 @@
 """The commands that may follow ``nsvq``. Light: it imports no heavy modules."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

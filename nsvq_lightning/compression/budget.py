@@ -1,7 +1,5 @@
 """How many splats photos support, and how many fit into a number of bytes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

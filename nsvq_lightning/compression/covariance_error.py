@@ -1,7 +1,5 @@
 """The error that quantization makes in the covariances of splats, by canonical form."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

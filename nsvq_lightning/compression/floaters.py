@@ -1,7 +1,5 @@
 """Find the splats that the photos speak against: floaters."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterable
 

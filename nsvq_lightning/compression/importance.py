@@ -1,7 +1,5 @@
 """How much each splat matters to the pictures: its weight, the effect of its attributes, its size in pixels."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 

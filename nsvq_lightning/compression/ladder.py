@@ -1,7 +1,5 @@
 """Compress a scene that is already trained: k-means, and the smallest of several settings that is good enough."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

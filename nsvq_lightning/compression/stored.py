@@ -1,7 +1,5 @@
 """From a trained module to the scene that is written to disk."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """A scene's own pictures: from where it shows detail, and how far two pictures are apart."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ A kernel is compiled at its first call on a machine and read from the disk cache
 training, so clocks leave it out, and it can look like a hang, so the progress display says what is going on.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Iterator

@@ -5,8 +5,6 @@ from step to step, such as that of the splats in view, are named in ``do_not_spe
 the middle of a run.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import logging
 import os

@@ -1,7 +1,5 @@
 """Environment variables that torch and OpenMP read when they are loaded, and the cores that there are."""
 
-from __future__ import annotations
-
 import os
 import sys
 

@@ -1,7 +1,5 @@
 """How kernels are compiled, cached and run in parallel."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import threading

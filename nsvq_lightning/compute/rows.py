@@ -1,7 +1,5 @@
 """Copy distinct rows out of a table, and back into one."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, cast
 

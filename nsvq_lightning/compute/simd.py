@@ -11,8 +11,6 @@ bounds-checked. Floating-point code may be contracted (a·b + c with one roundin
 infinity keep their meaning.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -3,8 +3,6 @@
 The only place that imports pycolmap.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import mmap

@@ -1,7 +1,5 @@
 """Lightning data modules: a scene folder, and the embedded demo scene."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial

@@ -1,7 +1,5 @@
 """Sharp, evenly spread frames of a video, and photos turned upright, as the pictures of a scene."""
 
-from __future__ import annotations
-
 import itertools
 import shutil
 from collections.abc import Callable, Iterator, Sequence

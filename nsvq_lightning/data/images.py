@@ -1,7 +1,5 @@
 """Image files: decoding to RGB bytes and which of them count, and a cache of them with a byte budget."""
 
-from __future__ import annotations
-
 import io
 import threading
 from collections.abc import Iterator, Sequence

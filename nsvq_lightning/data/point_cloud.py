@@ -1,7 +1,5 @@
 """Points to start from: those of a ``.ply`` file, or random ones where the cameras look."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

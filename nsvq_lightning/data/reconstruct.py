@@ -1,7 +1,5 @@
 """Where photos were taken from: structure from motion by COLMAP, in steps that can be continued."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import shutil

@@ -1,7 +1,5 @@
 """Reads the cameras of a ``transforms.json``: nerfstudio, instant-ngp, Polycam, and Blender's NeRF-synthetic scenes."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math

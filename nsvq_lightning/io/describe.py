@@ -1,7 +1,5 @@
 """What a scene file holds, and how far what is read is from what was written."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ numbers shrink to nothing: a few kilobytes would otherwise ask for all memory th
 takes 16 bits or more of a splat, and a whole splat 5 bytes or more in every format.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike, fspath

@@ -1,7 +1,5 @@
 """Numbers in few bits: opacities as bytes, values clamped to a range, powers of two."""
 
-from __future__ import annotations
-
 import logging
 import math
 import os

@@ -1,7 +1,5 @@
 """A palette for many rows: cells of similar rows, found by always splitting the cell where that gains most."""
 
-from __future__ import annotations
-
 import heapq
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """The few levels that represent many values with the least squared error (Max 1960, Lloyd 1982)."""
 
-from __future__ import annotations
-
 import heapq
 
 import numpy as np

@@ -10,8 +10,6 @@ offset     bytes  content
 =========  =====  ====================================================================
 """
 
-from __future__ import annotations
-
 import logging
 import os
 from pathlib import Path

@@ -4,8 +4,6 @@ No loss and no metric depends on masked pixels. Both pictures are black there, a
 to be beyond their borders, and means are over the pixels that count.
 """
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 import torch

@@ -4,8 +4,6 @@ Rendered images are rounded to 8 bit first, as if read back from a PNG. Every me
 per image.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

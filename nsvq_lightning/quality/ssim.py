@@ -1,7 +1,5 @@
 """Structural similarity (Wang et al. 2004): its window and constants, and the index itself in plain torch."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn import functional

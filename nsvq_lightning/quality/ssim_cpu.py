@@ -6,8 +6,6 @@ horizontal blur of those into a second ring buffer; another five rows later thei
 (the blur is its own adjoint). Only these rows are ever in memory.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

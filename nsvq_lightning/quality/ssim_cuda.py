@@ -8,8 +8,6 @@ Every program writes its own sums and one program adds them up: no atomics, the 
 back from the device.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Which attributes are quantized, with which codebooks, and a scene whose rows are replaced by their codes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """The interface that a quantizer must offer to the callbacks."""
 
-from __future__ import annotations
-
 from typing import Protocol, TypeGuard, cast
 
 import torch

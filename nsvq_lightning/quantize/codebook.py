@@ -1,7 +1,5 @@
 """A codebook that is fitted, counted, repaired, frozen and stored: the base of every vector quantizer here."""
 
-from __future__ import annotations
-
 import logging
 from abc import ABC, abstractmethod
 from typing import Any, Literal

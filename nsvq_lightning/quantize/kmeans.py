@@ -3,8 +3,6 @@
 Sums of rows by code, also the gradient of a codebook, have the same bits on any number of threads.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

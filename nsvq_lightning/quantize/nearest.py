@@ -8,8 +8,6 @@ Gray 1989): that with the least D + λ·R, D what the error does and R the bits 
 for a row that matters h, it has the least ‖x − c‖² + (λ/h)·R.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Noise substitution in vector quantization (NSVQ, Vali and Bäckström 2022), and its relative DiVeQ."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -8,8 +8,6 @@ yields a short list of the nearest codes and a distance below which there is no 
 skip most searches.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Quantizers for comparison: straight-through ones, k-means after training, and those of another library."""
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 import torch

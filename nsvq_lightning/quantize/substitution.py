@@ -13,8 +13,6 @@ rounds of 64-bit mixing (the finalizer of splitmix64, with the seed entering twi
 Box-Muller transform turns into two normal ones. There are no branches and no tables, so all of it is vectorized.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

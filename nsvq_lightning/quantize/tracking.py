@@ -9,8 +9,6 @@ of all (the triangle inequality, as in Hamerly's k-means). In few dimensions the
 :mod:`box_search` checks itself, and the order in which codes were put into boxes.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

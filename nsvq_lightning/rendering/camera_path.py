@@ -1,7 +1,5 @@
 """Cameras along a path: through given ones, around what they look at, or from a file of nerfstudio's."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Constants of 3D Gaussian Splatting's rasterizer (Kerbl et al. 2023); every back-end shares them."""
 
-from __future__ import annotations
-
 # Splats whose centre is nearer than this along the viewing axis are culled, scene units.
 NEAR = 0.2
 

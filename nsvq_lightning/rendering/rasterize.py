@@ -1,7 +1,5 @@
 """One function renders splats; the device determines the back-end."""
 
-from __future__ import annotations
-
 import importlib
 from typing import Any, NamedTuple
 

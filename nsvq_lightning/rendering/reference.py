@@ -3,8 +3,6 @@
 Written for correctness, not for speed: the fast back-ends are tested against it in float64.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import torch

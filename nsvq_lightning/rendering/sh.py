@@ -1,7 +1,5 @@
 """Real spherical harmonics up to degree 3, in the order and sign of 3D Gaussian Splatting."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Score rendered views against their photos."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple

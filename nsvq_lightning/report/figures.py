@@ -1,7 +1,5 @@
 """Matplotlib figures without pyplot, and legends for plots with a colour and a marker for each point."""
 
-from __future__ import annotations
-
 import csv
 import io
 import itertools

@@ -1,7 +1,5 @@
 """The numbers of a report, ``metrics.json``, and its curve, ``curve.png``."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """``report.html``: what a run has come to, on one page that needs no other file."""
 
-from __future__ import annotations
-
 import base64
 import math
 import platform

@@ -1,7 +1,5 @@
 """PNG files of rendered views."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Write pictures as a video that browsers and players open."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import tempfile

@@ -1,7 +1,5 @@
 """One HTML file that shows a compressed scene in any browser with WebGL 2, offline."""
 
-from __future__ import annotations
-
 import base64
 import json
 import math

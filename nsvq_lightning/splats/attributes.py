@@ -1,7 +1,5 @@
 """The attributes of a splat, declared once, and which rows of them are finite. Without torch: files open fast."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ cube), nor when the quaternion changes its sign or length. Vectors that mean the
 codebook; a canonical representative brings them together.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Literal, NamedTuple
 

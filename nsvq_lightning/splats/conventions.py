@@ -1,7 +1,5 @@
 """How splats are laid out: quaternions, coefficients of an SH degree. Without torch, so that files are read fast."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

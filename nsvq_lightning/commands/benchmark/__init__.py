@@ -3,8 +3,6 @@
 Here is only what is measured, and how thoroughly: arguments are refused before torch is loaded.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Suite ``codec``: writing and reading scene files, and what a scene loses when it is made small without its photos."""
 
-from __future__ import annotations
-
 import logging
 import tempfile
 from collections.abc import Callable, Iterator, Mapping

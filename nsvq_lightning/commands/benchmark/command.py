@@ -13,8 +13,6 @@ Examples:
   nsvq benchmark codec --scene path/to/colmap/folder --init-from scene.ply --beside scene.sog,scene.spz
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import logging

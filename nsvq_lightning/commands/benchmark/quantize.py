@@ -1,7 +1,5 @@
 """Suite ``quantize``: a step of NSVQ, the search for the nearest code in it, and the k-means it starts from."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from functools import partial
 from itertools import count

@@ -6,8 +6,6 @@ rounding, float32 decides by chance and the pixel's error jumps by orders of mag
 left out of the other errors: they say nothing about the quality of the arithmetic.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import NamedTuple

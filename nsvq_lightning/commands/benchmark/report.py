@@ -1,7 +1,5 @@
 """The results, and what they were measured on, as JSON, as Markdown tables, and as a picture for each suite."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import json
 import os

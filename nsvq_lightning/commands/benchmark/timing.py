@@ -1,7 +1,5 @@
 """Fair times on a shared machine: what is compared takes turns, and a matrix product takes part."""
 
-from __future__ import annotations
-
 import gc
 import statistics
 import time

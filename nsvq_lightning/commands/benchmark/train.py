@@ -6,8 +6,6 @@ same number of steps. Variants differ from the first one in one thing. Where one
 ``other numbers`` checks it: it counts the trained numbers that are not those of the first row.
 """
 
-from __future__ import annotations
-
 import cProfile
 import logging
 import multiprocessing

@@ -1,7 +1,5 @@
 """The results of a sweep: a row for each run, means over the seeds, and the picture of quality over size and time."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

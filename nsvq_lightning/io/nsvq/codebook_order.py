@@ -1,7 +1,5 @@
 """Order the rows of a codebook so that similar rows have similar indices: the leaves of a tree of halvings."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -27,8 +27,6 @@ In files of version 1, whose positions have the storage ``grid`` instead of ``ce
 size alone, and the opacities come after the positions, with near splats as neighbours.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Mapping

@@ -4,8 +4,6 @@ All three write binary decisions with :mod:`nsvq_lightning.io.nsvq.range_coder` 
 probability of a decision is kept.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -10,8 +10,6 @@ codebook. The header is the 32-byte prefix and the JSON;
 :attr:`nsvq_lightning.io.nsvq.header.Header.size` states it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -7,8 +7,6 @@ The probability of a bit is kept per *context* as a 16-bit number that moves tow
 at the n-th and finally by 1/128: as exact as a count at first, as adaptive as a running mean later.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import uint32, uint64
 from numpy.typing import NDArray

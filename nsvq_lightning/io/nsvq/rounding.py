@@ -4,8 +4,6 @@ Steps of positions and of codebooks are powers of two. So rounding is idempotent
 again without another error.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import NamedTuple

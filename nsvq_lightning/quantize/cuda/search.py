@@ -13,8 +13,6 @@ of :mod:`nsvq_lightning.quantize.tracking`; here rows of any dimension have a li
 be searched is known to the GPU alone: it queues them and works the queue off, and the host reads nothing back.
 """
 
-from __future__ import annotations
-
 import torch
 import triton
 import triton.language as tl

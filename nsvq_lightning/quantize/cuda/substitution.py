@@ -7,8 +7,6 @@ radial term (g·d̂) r/‖r‖ is (g·(x̃ - x)) r/‖r‖². The noise of a row
 the integers are the same, and the arithmetic after them is the same sequence of roundings, polynomials included.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

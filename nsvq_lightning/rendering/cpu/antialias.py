@@ -3,8 +3,6 @@
 The equation is that of :func:`nsvq_lightning.rendering.reference.light_kept`.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

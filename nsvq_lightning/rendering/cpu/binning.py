@@ -1,7 +1,5 @@
 """Which splats touch which tile, front to back: one radix sort by depth, then a stable counting sort into tiles."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import prange
 

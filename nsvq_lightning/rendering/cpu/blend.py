@@ -9,8 +9,6 @@ with d = g·colour and ``rest`` = what this splat and all after it (and the back
 (T·d - rest)/(1 - α), so neither the last contributor nor any atomic operation is needed.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import prange
 

@@ -1,7 +1,5 @@
 """Colours from spherical harmonics and their backward pass, 16 splats at a time."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from nsvq_lightning.compute import simd

@@ -3,8 +3,6 @@
 Equations: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting (Kerbl et al. 2023, sec. 4).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import prange
 

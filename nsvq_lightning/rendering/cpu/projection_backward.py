@@ -1,7 +1,5 @@
 """The backward pass of the projection, 16 splats at a time: from the sums of a splat to gradients of its attributes."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import prange
 

@@ -1,7 +1,5 @@
 """The CPU back-end as differentiable functions: projection, then binning and blend."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -10,8 +10,6 @@ group sums the gradients of one splat. Slots are numbered splat by splat, so tha
 fixed order, whichever thread processed which group: results have the same bits for any number of threads.
 """
 
-from __future__ import annotations
-
 import math
 from weakref import WeakKeyDictionary
 

@@ -1,7 +1,5 @@
 """Screen-space statistics of density control in one pass over the splats."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import prange
 from torch import Tensor

@@ -4,8 +4,6 @@ The splats come sorted by depth, so the order inside a tile needs no key of its 
 pair instead of 64.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -9,8 +9,6 @@ splat and all after it (and the background) add to g·image, α·dL/dα = α/(1 
 tile writes its own slot and a second kernel adds up the slots of each splat: no atomics, the same bits every time.
 """
 
-from __future__ import annotations
-
 import torch
 import triton
 import triton.language as tl

@@ -4,8 +4,6 @@ Order and signs are those of :mod:`nsvq_lightning.rendering.sh`. A row of higher
 with three channels each.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

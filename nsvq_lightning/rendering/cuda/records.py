@@ -11,8 +11,6 @@ consecutive, so that its total is summed in one fixed order and no kernel needs 
 every time.
 """
 
-from __future__ import annotations
-
 import math
 
 import triton.language as tl
