@@ -1,80 +1,145 @@
-"""What a module must have to host the callbacks is said by each of them, once, in the same words."""
+"""What callbacks share: they need a SplatModule, act once per iteration, and refuse settings by name."""
 
 from __future__ import annotations
 
+import math
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import Callback, LightningModule
 
 from nsvq_lightning import callbacks
-from nsvq_lightning.callbacks.progress import SplatProgressBar
-from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.callbacks import (
+    BudgetedGrowth,
+    CanonicalCovariance,
+    CodebookInit,
+    CodebookRefit,
+    CodebookReplacement,
+    ContributionPruning,
+    DensityControl,
+    ExposureCompensation,
+    FiniteCodes,
+    FrequencyLimit,
+    LearningRateDecay,
+    MetricReport,
+    OpacityRegularization,
+    OpacitySelection,
+    PhaseSchedule,
+    RateDistortion,
+    RunCheckpoint,
+    ShDegreeSchedule,
+    SplatBudget,
+)
+from nsvq_lightning.callbacks.base import SplatCallback
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.optim import LearningRates, param_groups
 
-HOSTED = [
+KINDS = [
     kind
     for name in callbacks.__all__
-    if isinstance(kind := getattr(callbacks, name), type)
-    and issubclass(kind, Callback)
-    and kind is not callbacks.RenderWriter  # it works with any module that predicts pictures
-    and kind is not callbacks.CompileAhead  # it does nothing with other modules
-    and kind is not SplatProgressBar  # it edits no parameters
+    if isinstance(kind := getattr(callbacks, name), type) and issubclass(kind, SplatCallback)
 ]
 
 
-class StandIn(Trainer):
-    """A trainer with the optimisers of its module, as if a fit had begun."""
-
-    def __init__(self, module: LightningModule, optimizers: list[torch.optim.Optimizer] | None = None) -> None:
-        super().__init__(accelerator="cpu", logger=False, enable_checkpointing=False, max_steps=10)
-        module._trainer = self
-        self.optimizers = [torch.optim.Adam(module.parameters())] if optimizers is None else optimizers
+@pytest.mark.parametrize("kind", KINDS)
+def test_another_module_is_refused_before_anything_starts(kind: type[Callback]) -> None:
+    said = rf"{kind.__name__} needs a nsvq_lightning.SplatModule: derive LightningModule from it"
+    with pytest.raises(TypeError, match=said):
+        kind().setup(SimpleNamespace(callbacks=[]), LightningModule(), "fit")  # type: ignore[arg-type]
 
 
-def host() -> SplatModule:
-    module = SplatModule(sh_degree=0, codebooks={"scales": 4}, splats=Splats(0))
-    module.extent = 1.0
-    return module
+class Acting(SplatCallback):
+    """Notes the iterations before and after which it acts."""
 
-
-@pytest.mark.parametrize("kind", [*HOSTED, SplatProgressBar])
-def test_a_module_without_splats_is_refused_before_anything_starts(kind: type[Callback]) -> None:
-    module = LightningModule()
-    with pytest.raises(TypeError, match=r"LightningModule cannot host the splat callbacks, it lacks: .*splats, "):
-        kind().setup(StandIn(module, []), module, "fit")
-
-
-class Delegate(LightningModule):
-    """Answers for the module that it holds; what is set on it does not reach that one."""
+    state = ("count",)
+    count = 0
 
     def __init__(self) -> None:
-        super().__init__()
-        self.inner = host()
+        self.noted: list[tuple[str, int]] = []
 
-    def __getattr__(self, name: str) -> Any:
-        return super().__getattr__(name) if name == "inner" else getattr(self.inner, name)
+    def before_step(self, trainer: Any, module: Any, iteration: int) -> None:
+        self.noted.append(("before", iteration))
 
-
-def test_a_module_that_passes_on_to_a_host_is_told_to_derive_from_it() -> None:
-    module = Delegate()
-    with pytest.raises(TypeError, match=r"Delegate cannot host .* holds a SplatModule .* derive Delegate from Splat"):
-        callbacks.PhaseSchedule().setup(StandIn(module, []), module, "fit")
+    def after_step(self, trainer: Any, module: Any, iteration: int) -> None:
+        self.noted.append(("after", iteration))
+        self.count += 1
 
 
-@pytest.mark.parametrize("kind", HOSTED)
-@pytest.mark.parametrize("names", [{}, {"codebook_scales": "codebook"}])
-def test_an_optimiser_whose_groups_have_other_names_is_refused(kind: type[Callback], names: dict[str, str]) -> None:
-    module = host()
-    groups: list[dict[str, Any]] = param_groups(module.splats, module.codebooks, LearningRates(), 1.0)  # type: ignore[arg-type]
-    renamed = [group | {"name": names[group["name"]]} if group["name"] in names else group for group in groups]
-    optimizers: list[torch.optim.Optimizer] = [torch.optim.Adam(renamed)] if names else []
-    lacking = "codebook_scales" if names else "means, quats, scales, opacities, sh0, shN, codebook_scales"
-    callback, trainer = kind(), StandIn(module, optimizers)
-    callback.setup(trainer, module, "fit")
-    with pytest.raises(
-        ValueError, match=rf"cannot host .* {len(optimizers)} optimisers, without groups for: {lacking}"
-    ):
-        callback.on_train_start(trainer, module)
+def play(callback: Acting, steps: int, first: int = 0, micro_batches: int = 3) -> None:
+    """Batches as Lightning hands them on with gradient accumulation."""
+    trainer: Any = SimpleNamespace(global_step=first)
+    for _ in range(steps):
+        for batch in range(micro_batches):
+            callback.on_train_batch_start(trainer, None, None, batch)  # type: ignore[arg-type]
+            trainer.global_step += batch == micro_batches - 1
+            callback.on_train_batch_end(trainer, None, {}, None, batch)  # type: ignore[arg-type]
+
+
+def test_hooks_run_once_an_iteration_also_with_accumulation_and_after_a_resume() -> None:
+    whole, stopped, resumed = Acting(), Acting(), Acting()
+    play(whole, 3)
+    assert whole.noted == [(hook, iteration) for iteration in (1, 2, 3) for hook in ("before", "after")]
+    play(stopped, 2)
+    # A checkpoint may have been written when the next iteration had begun.
+    stopped.on_train_batch_start(SimpleNamespace(global_step=2), None, None, 0)  # type: ignore[arg-type]
+    resumed.load_state_dict(stopped.state_dict())
+    play(resumed, 1, first=2)
+    assert resumed.noted == [("after", 3)]
+    assert resumed.state_dict() == whole.state_dict()
+
+
+def test_a_fit_starts_without_what_an_earlier_one_has_reached() -> None:
+    callback = Acting()
+    play(callback, 3)
+    assert callback.count == 3
+    callback.setup(None, SplatModule(codebooks=None), "fit")  # type: ignore[arg-type]
+    assert callback.state_dict() == Acting().state_dict()
+
+
+OUT_OF_RANGE = [
+    (PhaseSchedule, {"warmup_end": 30_000}, "phase ends must satisfy"),
+    (PhaseSchedule, {"iterations_per_photo": 0}, "iterations_per_photo must be at least 1, got 0"),
+    (ShDegreeSchedule, {"every": 0}, "every must be at least 1, got 0"),
+    (LearningRateDecay, {"final": 0.0}, r"final must be in \(0, 1\], got 0.0"),
+    (SplatBudget, {"splats": 5, "bytes": 5}, "splats and bytes both say how large the scene is to be"),
+    (SplatBudget, {"bytes": 0}, "bytes must be above 0, got 0"),
+    (DensityControl, {"every": 0}, "every must be at least 1, got 0"),
+    (DensityControl, {"min_opacity": 0.0}, "min_opacity must be between 0 and 1, got 0.0"),
+    (DensityControl, {"shrink": 0.0}, "shrink must be above 0, got 0.0"),
+    (DensityControl, {"grad_threshold": -1.0}, "grad_threshold must be at least 0, got -1.0"),
+    (DensityControl, {"max_splats": 3}, "max_splats must be at least min_splats=10, got 3"),
+    (BudgetedGrowth, {"start": -1}, "start must be at least 0, got -1"),
+    (BudgetedGrowth, {"grad_threshold": math.nan}, "grad_threshold must be at least 0, got nan"),
+    (BudgetedGrowth, {"start": 900, "full": 900}, "growth must be full after its start=900, got full=900"),
+    (BudgetedGrowth, {"recovery_share": 1.0}, r"recovery_share must be in \[0, 1\), got 1.0"),
+    (BudgetedGrowth, {"budget": 1}, "budget must be at least min_splats=10, got 1"),
+    (BudgetedGrowth, {"overshoot": 0.9}, "overshoot must be at least 1, got 0.9"),
+    (OpacitySelection, {"budget": 0}, "budget must be at least 1, got 0"),
+    (OpacitySelection, {"strength": -1.0}, "strength must be above 0, got -1.0"),
+    (OpacitySelection, {"gentle": 1.0}, r"gentle must be in \[0, 1\), got 1.0"),
+    (OpacityRegularization, {"weight": -1.0}, "weight must be at least 0, got -1.0"),
+    (ContributionPruning, {"share": 1.0}, r"share must be in \[0, 1\), got 1.0"),
+    (ContributionPruning, {"at": 0}, "at must be at least 1, got 0"),
+    (CanonicalCovariance, {"mode": "sorted"}, "mode must be one of none, sign, full, auto, got 'sorted'"),
+    (CanonicalCovariance, {"floor": -1.0}, "floor must be at least 0, got -1.0"),
+    (CodebookInit, {"weights": "area"}, "weights must be 'none' or 'contribution', got 'area'"),
+    (CodebookInit, {"weighted": ["means"]}, "weighted must be among scales, quats, sh0, shN, got means"),
+    (CodebookInit, {"values_per_splat": math.inf}, "values_per_splat must be above 0, got inf"),
+    (CodebookRefit, {"steps": 0}, "steps must be at least 1, got 0"),
+    (CodebookReplacement, {"early_end": 100}, "replacement needs start <= early_end <= end, got 10700, 100 and 12000"),
+    (CodebookReplacement, {"late_every": 0}, "late_every must be at least 1, got 0"),
+    (CodebookReplacement, {"jitter": 0.0}, r"jitter must be in \(0, 1\], got 0.0"),
+    (FiniteCodes, {"every": 0}, "every must be at least 1, got 0"),
+    (RateDistortion, {"strength": math.nan}, "strength must be above 0, got nan"),
+    (RateDistortion, {"attributes": ["means"]}, "attributes must be among scales, quats, sh0, shN, got means"),
+    (MetricReport, {"every": -1}, "every must be at least 0, got -1"),
+    (RunCheckpoint, {"every": -1}, "every must be at least 0, got -1"),
+    (ExposureCompensation, {"rate": math.inf}, "rate must be above 0, got inf"),
+    (FrequencyLimit, {"pixels": 0.0}, "pixels must be above 0, got 0.0"),
+]
+
+
+@pytest.mark.parametrize(("kind", "settings", "message"), OUT_OF_RANGE)
+def test_settings_out_of_range_are_refused(kind: type[Callback], settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        kind(**settings)

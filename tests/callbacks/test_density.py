@@ -14,17 +14,7 @@ from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.callbacks import DensityControl
-from nsvq_lightning.callbacks.density import (
-    DensityRules,
-    add_view,
-    clone_mask,
-    limit_growth,
-    lower_opacities,
-    prune_mask,
-    screen_gradient,
-    split,
-    split_mask,
-)
+from nsvq_lightning.callbacks.density import add_view, limit_growth, split
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
@@ -35,46 +25,17 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.training.schedule import Schedule
 
-RULES = DensityRules()
-
-
-def log_scales(*largest: float) -> torch.Tensor:
-    """Log-scales whose longest axis is given; the others are shorter."""
-    return torch.tensor([[math.log(s / 3), math.log(s), math.log(s / 2)] for s in largest])
-
-
-def test_the_statistic_is_in_normalised_device_coordinates() -> None:
-    # A shift of one pixel is a shift of 2 / width; the gradient by it is width / 2 times larger.
-    norm = screen_gradient(torch.tensor([[3e-6, 0.0], [0.0, 4e-6], [3e-6, 4e-6]]), width=800, height=600)
-    expected = [3e-6 * 400, 4e-6 * 300, math.hypot(3e-6 * 400, 4e-6 * 300)]
-    assert norm.tolist() == pytest.approx(expected)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_only_splats_that_were_seen_enter_the_statistic(dtype: torch.dtype) -> None:
+def test_only_splats_that_were_seen_enter_the_statistic_in_device_coordinates(dtype: torch.dtype) -> None:
     draw = torch.Generator().manual_seed(0)
     grad, start = torch.randn(57, 2, generator=draw).to(dtype), torch.rand(57, generator=draw).to(dtype)
     radii = torch.randint(0, 3, (57,), generator=draw, dtype=torch.int32)
     sums, views = start.clone(), torch.full((57,), 2.0, dtype=dtype)
     add_view(sums, views, grad, radii, width=80, height=60)
     seen = radii > 0
-    torch.testing.assert_close(sums, torch.where(seen, start + screen_gradient(grad, 80, 60), start))
+    # A shift of one pixel is a shift of 2 / width; the gradient by it is width / 2 times larger.
+    torch.testing.assert_close(sums, torch.where(seen, start + torch.hypot(grad[:, 0] * 40, grad[:, 1] * 30), start))
     assert torch.equal(views, torch.where(seen, 3.0, 2.0).to(dtype))
-
-
-def test_small_splats_are_cloned_and_large_ones_split() -> None:
-    statistic = torch.tensor([2e-4, 2e-4, 1.9e-4, 1.0])
-    scales = log_scales(0.0199, 0.0201, 0.5, 0.02)  # the limit is 0.01 · extent = 0.02
-    scales[3, 1] = math.log(0.02) - 1e-6
-    assert clone_mask(statistic, scales, 2.0, RULES).tolist() == [True, False, False, True]
-    assert split_mask(statistic, scales, 2.0, RULES).tolist() == [False, True, False, False]
-
-
-def test_transparent_splats_are_pruned_and_huge_ones_only_when_size_counts() -> None:
-    logits = torch.tensor([0.0049, 0.0051, 0.9]).logit()
-    scales = log_scales(0.1, 0.1, 0.21)  # the limit is 0.1 · extent = 0.2
-    assert prune_mask(logits, scales, 2.0, RULES, huge=False).tolist() == [True, False, False]
-    assert prune_mask(logits, scales, 2.0, RULES, huge=True).tolist() == [True, False, True]
 
 
 def test_children_follow_the_parents_own_gaussian() -> None:
@@ -89,7 +50,7 @@ def test_children_follow_the_parents_own_gaussian() -> None:
         sh0=torch.rand(count, 1, 3),
         shN=torch.rand(count, 15, 3),
     )
-    children = split(parents, RULES, generator(0, 0, "split"))
+    children = split(parents, 2, 1.6, generator(0, 0, "split"))
     assert children.means.shape == (2 * count, 3)
     rotation = Rotation.from_quat(quat[[1, 2, 3, 0]].numpy()).as_matrix()
     covariance = rotation @ np.diag(np.exp(2 * scales.numpy())) @ rotation.T
@@ -122,19 +83,6 @@ def test_growth_counts_what_each_splat_adds() -> None:
     assert kept[8] == mask.tolist()
 
 
-def test_reset_lowers_opacities_and_never_raises_them() -> None:
-    lowered = lower_opacities(torch.tensor([0.9, 0.01, 0.002]).logit(), 0.01)
-    assert lowered.sigmoid().tolist() == pytest.approx([0.01, 0.01, 0.002], rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    "bad", [{"every": 0}, {"min_opacity": 0.0}, {"shrink": 0.0}, {"children": 0}, {"grad_threshold": -1.0}]
-)
-def test_impossible_rules_are_refused(bad: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=next(iter(bad))):
-        DensityRules(**bad)  # type: ignore[arg-type]
-
-
 EXTENT = 2.0
 SMALL, LARGE = 0.01, 0.05  # below and above 0.01 · extent
 
@@ -161,49 +109,50 @@ def view(gradients: list[float], seen: list[bool], width: int = 40, height: int 
 
 
 class Stage:
-    """Host and trainer in one run of the paper's length."""
+    """Module and trainer in one run of the paper's length."""
 
     def __init__(self, splats: Splats, control: DensityControl, background: str = "black", micro: int = 1) -> None:
         self.control = control
         optimizer = build_adam(param_groups(splats, {}, LearningRates(), EXTENT))
-        self.host: Any = SimpleNamespace(
+        self.module: Any = SimpleNamespace(
             splats=splats,
             quantizers={},
             schedule=Schedule(),
             extent=EXTENT,
             seed=0,
             background=background,
-            wants_screen_gradients=True,
         )
         self.trainer: Any = SimpleNamespace(
             optimizers=[optimizer], global_step=0, world_size=1, accumulate_grad_batches=micro
         )
 
     def end_batch(self, iteration: int, render: Render | None = None, **beside: Any) -> None:
-        """End a step with a view and what the step returns beside it, or one without an update."""
+        """A step with a view and what it returns beside it, or one without an update."""
+        self.trainer.global_step = iteration - 1
+        self.control.on_train_batch_start(self.trainer, self.module, None, 0)  # type: ignore[arg-type]
         self.trainer.global_step = iteration
-        for parameter in self.host.splats.parameters():
+        for parameter in self.module.splats.parameters():
             parameter.grad = None if render is None else torch.zeros_like(parameter)
         outputs = {} if render is None else {"loss": torch.tensor(0.0), "render": render, **beside}
-        self.control.on_train_batch_end(self.trainer, self.host, outputs, None, 0)
+        self.control.on_train_batch_end(self.trainer, self.module, outputs, None, 0)
 
     @property
     def count(self) -> int:
-        return len(self.host.splats)
+        return len(self.module.splats)
 
 
 def test_the_statistic_is_the_mean_over_the_views_that_saw_the_splat() -> None:
     stage = Stage(make_splats([SMALL] * 3, [0.5] * 3), DensityControl())
     stage.end_batch(1, view([4e-4, 1e-4, 0.0], [True, True, False]))
     stage.end_batch(2, view([2e-4, 0.0, 0.0], [True, False, False]))
-    tables = stage.host.splats.tables()
+    tables = stage.module.splats.tables()
     assert tables["gradient_sum"].tolist() == pytest.approx([6e-4, 1e-4, 0.0])
     assert tables["view_count"].tolist() == [2.0, 1.0, 0.0]
 
 
 def swap_first(stage: Stage) -> None:
     """Remove the first splat and add one at the end."""
-    splats, optimizer = stage.host.splats, stage.trainer.optimizers[0]
+    splats, optimizer = stage.module.splats, stage.trainer.optimizers[0]
     keep_rows(splats, optimizer, torch.arange(len(splats)) > 0)
     append_rows(splats, optimizer, {name: value.detach()[:1] for name, value in splats.attributes().items()})
 
@@ -220,14 +169,14 @@ def test_a_view_of_splats_that_changed_since_is_left_out_with_one_warning(
     with caplog.at_level(logging.WARNING):
         for iteration in (2, 3):
             stage.end_batch(iteration, view([9e-4] * rendered, [True] * rendered), edits=0)
-    tables = stage.host.splats.tables()
+    tables = stage.module.splats.tables()
     sums = [1e-4, 2e-4, 0.0] if edit == "swapped" else [4e-4, 1e-4, 2e-4]  # rows take theirs along
     assert tables["gradient_sum"].tolist() == pytest.approx(sums)
     assert tables["view_count"].tolist() == [float(value > 0) for value in sums]
     assert [record.message.partition(":")[0] for record in caplog.records] == ["iteration 2"]
     assert f"({rendered} were rendered, now 3)" in caplog.text
     assert "List that callback after DensityControl" in caplog.text
-    stage.end_batch(4, view([1e-4] * 3, [True] * 3), edits=stage.host.splats.edits)
+    stage.end_batch(4, view([1e-4] * 3, [True] * 3), edits=stage.module.splats.edits)
     assert tables["gradient_sum"].tolist() == pytest.approx([value + 1e-4 for value in sums])
 
 
@@ -238,12 +187,12 @@ def test_clone_split_and_prune_at_the_scheduled_iteration() -> None:
     assert stage.count == 4
     stage.end_batch(600, view([3e-4, 3e-4, 0.0, 1e-4], [True] * 4))
     # 0 is there twice, 1 became two children, 2 was transparent, 3 stays.
-    means = stage.host.splats.means.detach()
+    means = stage.module.splats.means.detach()
     assert stage.count == 5
     assert means[:3].tolist() == [[0, 1, 2], [9, 10, 11], [0, 1, 2]]
-    assert stage.host.splats.scales.exp()[3:].tolist() == [[pytest.approx(LARGE / 1.6)] * 3] * 2
+    assert stage.module.splats.scales.exp()[3:].tolist() == [[pytest.approx(LARGE / 1.6)] * 3] * 2
     assert (means[3:] - torch.tensor([3.0, 4.0, 5.0])).abs().max() < 6 * LARGE
-    assert not any(table.any() for table in stage.host.splats.tables().values())  # the statistics start anew
+    assert not any(table.any() for table in stage.module.splats.tables().values())  # the statistics start anew
 
 
 def test_gradient_accumulation_neither_repeats_an_edit_nor_weakens_the_statistic() -> None:
@@ -256,9 +205,8 @@ def test_gradient_accumulation_neither_repeats_an_edit_nor_weakens_the_statistic
 
 
 def test_huge_splats_go_only_after_iteration_3000() -> None:
-    rules = DensityRules(min_splats=1)
     for iteration, left in ((2900, 2), (3000, 2), (3100, 1)):
-        stage = Stage(make_splats([0.1 * EXTENT + 0.01, SMALL], [0.5, 0.5]), DensityControl(rules))
+        stage = Stage(make_splats([0.1 * EXTENT + 0.01, SMALL], [0.5, 0.5]), DensityControl(min_splats=1))
         stage.end_batch(iteration, view([0.0, 0.0], [True, True]))
         assert stage.count == left
 
@@ -266,10 +214,10 @@ def test_huge_splats_go_only_after_iteration_3000() -> None:
 def test_opacities_are_reset_with_their_moments() -> None:
     stage = Stage(make_splats([SMALL] * 3, [0.9, 0.5, 0.008]), DensityControl(min_splats=1))
     optimizer = stage.trainer.optimizers[0]
-    stage.host.splats.opacities.sum().backward()
+    stage.module.splats.opacities.sum().backward()
     optimizer.step()
     stage.end_batch(3000, view([0.0] * 3, [True] * 3))
-    opacities = stage.host.splats.opacities
+    opacities = stage.module.splats.opacities
     assert opacities.sigmoid().tolist() == pytest.approx([0.01, 0.01, 0.008], rel=0.1)
     assert not optimizer.state[opacities]["exp_avg"].any()
     assert float(optimizer.state[opacities]["step"]) == 1.0
@@ -279,7 +227,7 @@ def test_a_white_background_is_reset_once_more() -> None:
     for background, opacity in (("white", 0.01), ("black", 0.9)):
         stage = Stage(make_splats([SMALL] * 12, [0.9] * 12), DensityControl(), background)
         stage.end_batch(500, view([0.0] * 12, [True] * 12))
-        assert float(stage.host.splats.opacities[0].detach().sigmoid()) == pytest.approx(opacity, rel=1e-4)
+        assert float(stage.module.splats.opacities[0].detach().sigmoid()) == pytest.approx(opacity, rel=1e-4)
 
 
 def test_the_prune_phase_prunes_and_never_grows() -> None:
@@ -304,7 +252,7 @@ def test_growth_stops_at_the_cap() -> None:
     stage.end_batch(600, view([3e-4, 4e-4, 5e-4, 9e-4], [True] * 4))
     assert stage.count == 5
     # The one with the largest statistic, the last, was split.
-    assert stage.host.splats.means.detach()[:3].tolist() == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
+    assert stage.module.splats.means.detach()[:3].tolist() == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
 
 
 def test_growth_into_many_children_stops_at_the_cap() -> None:
@@ -318,7 +266,7 @@ def test_growth_into_many_children_stops_at_the_cap() -> None:
 def test_a_non_finite_splat_is_dropped_as_soon_as_the_loss_shows_it(caplog: pytest.LogCaptureFixture) -> None:
     stage = Stage(make_splats([SMALL] * 3, [0.5] * 3), DensityControl())
     with torch.no_grad():
-        stage.host.splats.quats[1] = math.nan
+        stage.module.splats.quats[1] = math.nan
     stage.end_batch(7, None)  # the step was skipped: no outputs
     assert stage.count == 2
     assert "step 7: dropped 1 of 3 splats with non-finite values: quats in 1 rows" in caplog.text
@@ -328,11 +276,11 @@ def test_frozen_codes_go_with_the_splats_that_are_dropped_in_fine_tuning() -> No
     stage = Stage(make_splats([SMALL] * 4, [0.5] * 4), DensityControl())
     frozen, free = NSVQ(3, 3), NSVQ(3, 3)
     frozen.freeze(torch.tensor([2, 0, 1, 2]))
-    stage.host.quantizers = {"scales": frozen, "sh0": free}
+    stage.module.quantizers = {"scales": frozen, "sh0": free}
     with torch.no_grad():
-        stage.host.splats.sh0[1] = math.inf
+        stage.module.splats.sh0[1] = math.inf
     stage.end_batch(44_000, view([0.0] * 4, [True] * 4))
-    assert stage.host.splats.means.detach().tolist() == [[0, 1, 2], [6, 7, 8], [9, 10, 11]]
+    assert stage.module.splats.means.detach().tolist() == [[0, 1, 2], [6, 7, 8], [9, 10, 11]]
     assert frozen.codes.tolist() == [2, 1, 2]
     assert not free.frozen
 
@@ -354,10 +302,3 @@ def test_ddp_is_refused_with_the_reason() -> None:
         control.setup(SimpleNamespace(strategy=DDPStrategy()), host, "fit")  # type: ignore[arg-type]
     control.setup(SimpleNamespace(strategy=SingleDeviceStrategy()), host, "fit")  # type: ignore[arg-type]
     control.setup(SimpleNamespace(strategy=ViewParallelStrategy()), host, "fit")  # type: ignore[arg-type]
-
-
-def test_impossible_arguments_are_refused() -> None:
-    with pytest.raises(ValueError, match="max_splats must be at least"):
-        DensityControl(max_splats=3)
-    with pytest.raises(ValueError, match="finite_every"):
-        DensityControl(finite_every=0)

@@ -1,4 +1,4 @@
-"""Short runs of training in tests, and the types of the fixtures that train (``training/conftest.py``)."""
+"""Short runs of training in tests, the paper's settings, and the types of fixtures that train (``training/conftest.py``)."""
 
 from __future__ import annotations
 
@@ -7,17 +7,45 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
 from lightning.pytorch import Callback, LightningDataModule, LightningModule, Trainer
 
+from nsvq_lightning.callbacks import CodebookReplacement, PhaseSchedule
 from nsvq_lightning.commands.fit import default_loggers
+from nsvq_lightning.quantize import NSVQ
+from nsvq_lightning.top_level import folder_of
 from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.optim import LearningRates
 
-__all__ = ["Recipe", "RunFactory", "fit", "quiet_trainer"]
+__all__ = [
+    "PAPER",
+    "PAPER_MODULE",
+    "Recipe",
+    "RunFactory",
+    "fit",
+    "paper_phases",
+    "paper_replacement",
+    "quiet_trainer",
+]
+
+PAPER: dict[str, Any] = yaml.safe_load((folder_of("configs") / "paper.yaml").read_text())
+PAPER_MODULE: dict[str, Any] = {"quantizer": NSVQ, "rates": LearningRates(**PAPER["model"]["rates"])}
+"""What the paper's run gives the module, but for the size of its codebooks."""
 
 Recipe = Callable[..., dict[str, Callback]]
 """``recipe(**replaced)``: the callbacks of a full run by name."""
 RunFactory = Callable[..., tuple[Trainer, SplatModule]]
 """``run(callbacks, ckpt_path=…, module={…}, scene=…, **trainer)`` fits."""
+
+
+def paper_phases(**replaced: Any) -> PhaseSchedule:
+    """The phases of the paper's run."""
+    return PhaseSchedule(**PAPER["callbacks"]["phases"] | replaced)
+
+
+def paper_replacement(**replaced: Any) -> CodebookReplacement:
+    """The replacement of codes of the paper's run."""
+    return CodebookReplacement(**PAPER["callbacks"]["codebook_replacement"] | replaced)
 
 
 def fit(module: LightningModule, data: LightningDataModule, callbacks: Sequence[Callback], steps: int) -> None:

@@ -1,4 +1,4 @@
-"""A run through all four phases that takes seconds: 9 views of 48×36, some hundred splats, codebooks of a few codes."""
+"""The paper's run through all four phases in seconds: 9 views of 48×36, some hundred splats, codebooks of a few codes."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import Checkpoint
-from runs import Recipe, RunFactory, quiet_trainer
+from runs import PAPER, PAPER_MODULE, Recipe, RunFactory, paper_phases, quiet_trainer
 
-from nsvq_lightning.callbacks import STANDARD, DensityControl, MetricReport, PhaseSchedule, standard
+from nsvq_lightning.callbacks import OPTIONAL, STANDARD, DensityControl, MetricReport, standard
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.training.module import SplatModule
 
@@ -19,13 +19,13 @@ STEPS = 60
 CODES = {"scales": 24, "quats": 24, "sh0": 16, "shN": 16}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def recipe() -> Recipe:
-    """``recipe(**replaced)``: the callbacks of a full run, with intervals that fit 60 steps."""
+    """``recipe(**replaced)``: the callbacks of the paper's run, with intervals that fit 60 steps."""
 
     def build(**replaced: Callback) -> dict[str, Callback]:
         chosen: dict[str, Callback | None] = {
-            "phases": PhaseSchedule(
+            "phases": paper_phases(
                 min_density_interval=4, min_reset_interval=11, min_replacement_interval=5, min_finetune=1
             ),
             "density": DensityControl(grad_threshold=5e-6),
@@ -33,13 +33,14 @@ def recipe() -> Recipe:
             **dict.fromkeys(("predictions", "checkpoint", "kernels", "progress")),
             **replaced,
         }
-        names = [name for name in STANDARD if name not in chosen or chosen[name] is not None]
-        return dict(zip(names, standard(**chosen), strict=True))
+        given = dict.fromkeys(OPTIONAL) | PAPER["callbacks"] | chosen
+        names = [name for name in STANDARD if given.get(name, STANDARD) is not None]
+        return dict(zip(names, standard("paper", **chosen), strict=True))
 
     return build
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFactory:
     """``run(callbacks, ckpt_path=…, module={…}, scene=…, **trainer)`` fits and returns trainer and module."""
 
@@ -59,7 +60,7 @@ def run(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFactor
             callbacks=callbacks,
             **trainer_arguments,
         )
-        splat_module = SplatModule(**{"sh_degree": 1, "codebooks": CODES, **(module or {})})
+        splat_module = SplatModule(**PAPER_MODULE | {"sh_degree": 1, "codebooks": CODES} | (module or {}))
         trainer.fit(splat_module, datamodule=ColmapDataModule(str(scene), factor=2), ckpt_path=ckpt_path)
         return trainer, splat_module
 

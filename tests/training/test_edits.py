@@ -12,7 +12,6 @@ from runs import Recipe, RunFactory
 
 from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.training.edit import append_rows, keep_rows
-from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.optim import raw_optimizer
 
 STEPS = 60
@@ -31,7 +30,7 @@ class EditRows(Callback):
     ) -> None:
         if trainer.global_step % 3 or trainer.global_step == STEPS:
             return
-        splats, optimizer = as_host(pl_module).splats, raw_optimizer(trainer)
+        splats, optimizer = pl_module.splats, raw_optimizer(trainer)
         self.edits += 1
         if self.kind != "add":
             keep_rows(splats, optimizer, torch.arange(len(splats)) >= AMOUNT)

@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 from lightning.pytorch import Callback, LightningModule, Trainer
-from nsvq_lightning.training.host import as_host
 from runs import Recipe, RunFactory
 
 from nsvq_lightning.callbacks import DensityControl
@@ -22,7 +21,7 @@ class Counts(Callback):
         self.seen: list[int] = []
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        self.seen.append(len(as_host(pl_module).splats))
+        self.seen.append(len(pl_module.splats))
 
 
 def limited(most: int | None) -> DensityControl:

@@ -14,7 +14,6 @@ from torch import Tensor
 from nsvq_lightning.callbacks import DensityControl, RateDistortion, RunCheckpoint
 from nsvq_lightning.quantize import TrainedStraightThrough
 from nsvq_lightning.quantize.nearest import code_rates
-from nsvq_lightning.training.host import as_host
 from nsvq_lightning.training.module import SplatModule
 
 MODULE = {"quantizer": TrainedStraightThrough}
@@ -62,7 +61,7 @@ def test_other_attributes_keep_their_nearest_codes(run: RunFactory, recipe: Reci
 
     class Watch(Callback):
         def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-            held.update({name: len(q.held) for name, q in as_host(pl_module).quantizers.items() if len(q.held)})  # type: ignore[attr-defined]
+            held.update({name: len(q.held) for name, q in pl_module.quantizers.items() if len(q.held)})  # type: ignore[attr-defined]
 
     callbacks = recipe(rate_distortion=RateDistortion(0.02, ["shN", "scales"])).values()
     run([*callbacks, Watch()], module=MODULE)
@@ -74,7 +73,7 @@ def test_dropped_splats_are_measured_anew(run: RunFactory, recipe: Recipe) -> No
 
     class Spoil(Callback):
         def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-            host = as_host(pl_module)
+            host = pl_module
             if trainer.global_step == 35:
                 host.splats.means.data[:7] = torch.nan
             counts.append(len(host.splats))
