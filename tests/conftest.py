@@ -55,7 +55,7 @@ def ctrl_c() -> None:
 
 
 WHOLE_RUNS = {"benchmark", "sweep", "training"}
-"""Folders whose tests train: ``training/test_guarded_run.py`` does so for all of them between guard words."""
+"""Folders whose tests train: ``training/test_skips.py`` does so for all of them between guard words."""
 
 
 @pytest.fixture(autouse=True)

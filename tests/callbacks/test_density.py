@@ -25,6 +25,7 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.training.schedule import Schedule
 
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_only_splats_that_were_seen_enter_the_statistic_in_device_coordinates(dtype: torch.dtype) -> None:
     draw = torch.Generator().manual_seed(0)

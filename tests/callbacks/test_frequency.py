@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
-import pytest
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 

@@ -9,7 +9,6 @@ from typing import Any
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 
-
 class ReplicaWitness(Callback):
     """Writes one line a step into ``folder/<rank>.txt``: iteration, phase, splats, SHA-256 of all parameters."""
 
@@ -30,5 +29,5 @@ class ReplicaWitness(Callback):
         digest = hashlib.sha256()
         for name, parameter in sorted(module.named_parameters()):
             digest.update(name.encode() + parameter.detach().numpy().tobytes())
-        host = module
-        self.lines.append(f"{trainer.global_step} {host.phase.name} {len(host.splats)} {digest.hexdigest()}")
+        phase: Any = module.phase
+        self.lines.append(f"{trainer.global_step} {phase.name} {len(module.splats)} {digest.hexdigest()}")

@@ -1,4 +1,4 @@
-"""The paper's run through all four phases in seconds: 9 views of 48×36, some hundred splats, codebooks of a few codes."""
+"""Runs through all four phases in seconds, finished once for all tests: 9 views of 48×36, some hundred splats."""
 
 from __future__ import annotations
 
@@ -9,9 +9,20 @@ from typing import Any
 import pytest
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import Checkpoint
-from runs import PAPER, PAPER_MODULE, Recipe, RunFactory, paper_phases, quiet_trainer
+from runs import (
+    PAPER,
+    PAPER_MODULE,
+    RECIPE_MODULE,
+    Recipe,
+    RunFactory,
+    Whole,
+    Witness,
+    paper_phases,
+    quiet_trainer,
+    recipe_options,
+)
 
-from nsvq_lightning.callbacks import OPTIONAL, STANDARD, DensityControl, MetricReport, standard
+from nsvq_lightning.callbacks import OPTIONAL, STANDARD, DensityControl, MetricReport, RunCheckpoint, standard
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.training.module import SplatModule
 
@@ -65,3 +76,21 @@ def run(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFactor
         return trainer, splat_module
 
     return fit
+
+
+def finished(run: RunFactory, callbacks: dict[str, Callback], module: dict[str, Any]) -> Whole:
+    witness = Witness()
+    trainer, trained = run([*callbacks.values(), witness], module=module)
+    return Whole(trainer, trained, witness)
+
+
+@pytest.fixture(scope="session")
+def paper(run: RunFactory, recipe: Recipe) -> Whole:
+    """The paper's run."""
+    return finished(run, recipe(checkpoint=RunCheckpoint(every=2, keep=True)), {})
+
+
+@pytest.fixture(scope="session")
+def fast(run: RunFactory, recipe: Recipe) -> Whole:
+    """The recipe's run."""
+    return finished(run, recipe(**recipe_options(), checkpoint=RunCheckpoint(every=2, keep=True)), RECIPE_MODULE)

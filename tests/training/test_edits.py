@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
-from runs import Recipe, RunFactory
+from runs import Recipe, RunFactory, paper_phases
 
-from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.training.edit import append_rows, keep_rows
 from nsvq_lightning.training.optim import raw_optimizer
 
@@ -45,7 +44,7 @@ def test_splats_may_change_at_the_end_of_a_step(
 ) -> None:
     edit = EditRows(kind)
     # A fine-tune phase from iteration 48 on, in which splats change, too.
-    phases = PhaseSchedule(quantize_end=35_000, min_density_interval=4, min_replacement_interval=5, min_finetune=1)
+    phases = paper_phases(quantize_end=35_000, min_density_interval=4, min_replacement_interval=5, min_finetune=1)
     callbacks = list(recipe(phases=phases).values())
     callbacks.insert(0 if place == "first" else len(callbacks), edit)
     with caplog.at_level(logging.WARNING):

@@ -19,27 +19,17 @@ from checkpoints import assert_same, assert_same_end, iteration_of, read
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import SIGTERMException
-from runs import Recipe, RunFactory
+from runs import RECIPE_MODULE, Recipe, RunFactory, Whole, paper_phases, recipe_options
 
-from nsvq_lightning.callbacks import (
-    CanonicalCovariance,
-    CodebookInit,
-    CodebookRefit,
-    CodebookReplacement,
-    ContributionPruning,
-    MetricReport,
-    PhaseSchedule,
-    RunCheckpoint,
-)
+from nsvq_lightning.callbacks import MetricReport, OpacitySelection, RunCheckpoint
 from nsvq_lightning.commands.fit import continuation
 from nsvq_lightning.commands.main import main
-from nsvq_lightning.quantize import StraightThrough
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import run_folder
 from nsvq_lightning.training.schedule import Schedule
 
-PHASES = {"warmup": 13, "prune": 24, "quantize": 41, "finetune": 59}
-"""An iteration of each phase, of the recipe's 60; none of them has a periodic checkpoint."""
+PHASES = {"warmup": 13, "prune": 26, "quantize": 43, "finetune": 59}
+"""An iteration of each phase, of the 60 of either run."""
 
 FIRST_OF_PHASE = {"prune": 21, "quantize": 28, "finetune": 58}
 
@@ -87,19 +77,9 @@ KINDS: dict[str, tuple[Callable[[], None], type[BaseException], int]] = {
 """What happens between backward pass and update, what it ends with, and how many more iterations are complete then."""
 
 
-def every_option() -> dict[str, Callback]:
-    return {
-        "canonical": CanonicalCovariance("full", floor=1.0),
-        "contribution": ContributionPruning(share=0.02),
-        "codebook_init": CodebookInit(weights="contribution"),
-        "codebook_refit": CodebookRefit(),
-        "codebook_replacement": CodebookReplacement(jitter=0.5, reset_moments=True),
-    }
-
-
-SETTINGS: dict[str, tuple[Callable[[], dict[str, Callback]], dict[str, Any]]] = {
-    "defaults": (dict, {}),
-    "options": (every_option, {"quantizer": StraightThrough}),
+SETTINGS: dict[str, tuple[Callable[[], dict[str, Any]], dict[str, Any]]] = {
+    "paper": (dict, {}),
+    "fast": (recipe_options, RECIPE_MODULE),
 }
 
 
@@ -114,9 +94,6 @@ class Runner:
         callbacks = self.recipe(**self.options(), checkpoint=checkpoint).values()
         trainer, _ = self.run([*callbacks, *more], ckpt_path, self.module, **self.trainer)
         return run_folder(trainer)
-
-    def whole(self) -> Path:
-        return self(checkpoint=RunCheckpoint(every=10, keep=True))
 
     def stopped(
         self, ends_with: type[BaseException], trouble: Callback, every: int = 0, start: Path | None = None
@@ -133,17 +110,10 @@ class Runner:
         return self(checkpoint=RunCheckpoint(every=0), ckpt_path=path)
 
 
-@pytest.fixture(scope="module")
-def whole(run: RunFactory, recipe: Recipe) -> Callable[[str], Path]:
+@pytest.fixture(scope="session")
+def whole(paper: Whole, fast: Whole) -> Callable[[str], Path]:
     """Folder of the run that nothing interrupts, by the name of its settings."""
-    folders: dict[str, Path] = {}
-
-    def get(name: str) -> Path:
-        if name not in folders:
-            folders[name] = Runner(run, recipe, name).whole()
-        return folders[name]
-
-    return get
+    return {"paper": paper.folder, "fast": fast.folder}.__getitem__
 
 
 def shortly_before(whole: Path, iteration: int) -> Path:
@@ -158,7 +128,7 @@ def check(runner: Runner, whole: Path, kind: str, iteration: int) -> None:
     assert_same_end(runner.continued(path), whole)
 
 
-FAST = {("defaults", "SIGINT", "warmup"), ("options", "exception", "quantize"), ("options", "SIGTERM", "finetune")}
+FAST = {("paper", "SIGINT", "warmup"), ("fast", "exception", "quantize"), ("fast", "SIGTERM", "finetune")}
 CASES = [
     pytest.param(*case, marks=[] if case in FAST else pytest.mark.slow)
     for case in ((name, kind, phase) for name in SETTINGS for kind in KINDS for phase in PHASES)
@@ -178,40 +148,40 @@ def test_a_stopped_run_continues_to_the_same_bits(
 def test_an_exception_in_the_first_iteration_of_a_phase_leaves_a_checkpoint_of_the_phase_before(
     phase: str, run: RunFactory, recipe: Recipe, whole: Callable[[str], Path]
 ) -> None:
-    runner, iteration = Runner(run, recipe, "defaults"), FIRST_OF_PHASE[phase]
-    start = shortly_before(whole("defaults"), iteration - 1)
+    runner, iteration = Runner(run, recipe, "paper"), FIRST_OF_PHASE[phase]
+    start = shortly_before(whole("paper"), iteration - 1)
     path = runner.stopped(Broken, Trouble(iteration, fail), every=100, start=start)
     # Once codebooks are placed or codes frozen there is no way back; the checkpoint is that of the end of the phase.
     assert iteration_of(path) == iteration - 1
-    assert_same_end(runner.continued(path), whole("defaults"))
+    assert_same_end(runner.continued(path), whole("paper"))
 
 
 def test_an_exception_after_the_update_leaves_the_periodic_checkpoint(
     run: RunFactory, recipe: Recipe, whole: Callable[[str], Path], caplog: pytest.LogCaptureFixture
 ) -> None:
-    runner = Runner(run, recipe, "defaults")
-    start = shortly_before(whole("defaults"), 40)
+    runner = Runner(run, recipe, "paper")
+    start = shortly_before(whole("paper"), 40)
     path = runner.stopped(Broken, Trouble(47, fail_late, "on_train_batch_end"), every=20, start=start)
     assert iteration_of(path) == 40
     assert f"stopped; the last checkpoint is of iteration 40: {path}" in caplog.messages
-    assert_same_end(runner.continued(path), whole("defaults"))
+    assert_same_end(runner.continued(path), whole("paper"))
 
 
 def test_a_callback_that_fails_half_way_acts_again(
     run: RunFactory, recipe: Recipe, whole: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Contribution pruning notes that it has acted before it has; the checkpoint must not.
-    runner = Runner(run, recipe, "options")
+    # That it has acted is noted before it has; the checkpoint must not know of it.
+    runner = Runner(run, recipe, "fast")
     with monkeypatch.context() as patch:
-        patch.setattr(ContributionPruning, "_prune", lambda *_: fail())
-        path = runner.stopped(Broken, Callback(), start=shortly_before(whole("options"), 25))
-    assert iteration_of(path) == 25
-    assert_same_end(runner.continued(path), whole("options"))
+        patch.setattr(OpacitySelection, "before_step", lambda *_: fail())
+        path = runner.stopped(Broken, Callback(), start=shortly_before(whole("fast"), 24))
+    assert iteration_of(path) == 24
+    assert_same_end(runner.continued(path), whole("fast"))
 
 
 def test_signals_wait_for_the_last_micro_batch(run: RunFactory, recipe: Recipe) -> None:
-    runner = Runner(run, recipe, "defaults", accumulate_grad_batches=3, max_steps=15)
-    reference = Runner(run, recipe, "defaults", accumulate_grad_batches=3, max_steps=15).whole()
+    runner = Runner(run, recipe, "paper", accumulate_grad_batches=3, max_steps=15)
+    reference = runner(checkpoint=RunCheckpoint(every=0))
     path = runner.stopped(SIGTERMException, Trouble(8, terminate))  # in the first of three
     assert iteration_of(path) == 8
     assert (runner.continued(path) / "scene.nsvq").read_bytes() == (reference / "scene.nsvq").read_bytes()
@@ -222,14 +192,14 @@ def test_a_second_signal_stops_at_once(run: RunFactory, recipe: Recipe) -> None:
         interrupt()
         interrupt()
 
-    path = Runner(run, recipe, "defaults").stopped(SystemExit, Trouble(7, twice))
+    path = Runner(run, recipe, "paper").stopped(SystemExit, Trouble(7, twice))
     assert iteration_of(path) == 6
 
 
 def test_handlers_of_signals_are_given_back(run: RunFactory, recipe: Recipe) -> None:
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
-    runner = Runner(run, recipe, "defaults", max_steps=8)
-    runner.whole()
+    runner = Runner(run, recipe, "paper", max_steps=8)
+    runner(checkpoint=RunCheckpoint(every=0))
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
     runner.stopped(Broken, Trouble(3, fail))
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
@@ -238,9 +208,9 @@ def test_handlers_of_signals_are_given_back(run: RunFactory, recipe: Recipe) -> 
 def test_a_signal_in_the_last_evaluation_waits_for_the_last_checkpoint(
     run: RunFactory, recipe: Recipe, whole: Callable[[str], Path]
 ) -> None:
-    start = shortly_before(whole("defaults"), 60)
-    path = Runner(run, recipe, "defaults").stopped(SystemExit, Trouble(61, interrupt, "on_train_end"), start=start)
-    last = whole("defaults") / "checkpoints" / "last.ckpt"
+    start = shortly_before(whole("paper"), 60)
+    path = Runner(run, recipe, "paper").stopped(SystemExit, Trouble(61, interrupt, "on_train_end"), start=start)
+    last = whole("paper") / "checkpoints" / "last.ckpt"
     assert_same(read(path), read(last))
 
 
@@ -248,13 +218,13 @@ def test_a_signal_in_the_last_evaluation_waits_for_the_last_checkpoint(
 def test_a_run_that_broke_in_its_last_evaluation_makes_up_for_it(
     run: RunFactory, recipe: Recipe, whole: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch, hook: str
 ) -> None:
-    runner, start = Runner(run, recipe, "defaults"), shortly_before(whole("defaults"), 60)
+    runner, start = Runner(run, recipe, "paper"), shortly_before(whole("paper"), 60)
     with monkeypatch.context() as patch:
         patch.setattr(MetricReport, hook, lambda *_: fail())
         path = runner.stopped(Broken, Callback(), start=start)
     assert iteration_of(path) == 60
     folder = runner.continued(path)
-    assert (folder / "scene.nsvq").read_bytes() == (whole("defaults") / "scene.nsvq").read_bytes()
+    assert (folder / "scene.nsvq").read_bytes() == (whole("paper") / "scene.nsvq").read_bytes()
     assert [line.split(",")[0] for line in (folder / "curve.csv").read_text().splitlines()[1:]][-1] == "60"
     assert (folder / "curve.png").exists()
 
@@ -272,7 +242,7 @@ def test_a_checkpoint_that_cannot_be_written_hides_no_error_and_harms_no_other(
         good.append(trainer.global_step)
 
     monkeypatch.setattr(Trainer, "save_checkpoint", full_disk)
-    path = Runner(run, recipe, "defaults").stopped(Broken, Trouble(8, fail), every=5)
+    path = Runner(run, recipe, "paper").stopped(Broken, Trouble(8, fail), every=5)
     assert (iteration_of(path), good) == (5, [5])
     assert "the checkpoint of iteration 7 could not be written: No space left on device" in caplog.messages
 
@@ -281,18 +251,18 @@ def test_lightnings_own_checkpoints_continue_to_the_same_bits(
     run: RunFactory, recipe: Recipe, whole: Callable[[str], Path], tmp_path: Path
 ) -> None:
     own = ModelCheckpoint(tmp_path, "{step}", every_n_train_steps=12, save_top_k=-1)
-    runner = Runner(run, recipe, "defaults")
+    runner, start = Runner(run, recipe, "paper"), shortly_before(whole("paper"), 32)
     with pytest.raises(Broken):
-        runner(own, Trouble(37, fail), checkpoint=RunCheckpoint(every=0))
-    assert sorted(os.listdir(tmp_path)) == ["step=12.ckpt", "step=24.ckpt", "step=36.ckpt"]
-    assert_same_end(runner.continued(tmp_path / "step=36.ckpt"), whole("defaults"))
+        runner(own, Trouble(37, fail), checkpoint=RunCheckpoint(every=0), ckpt_path=start)
+    assert os.listdir(tmp_path) == ["step=36.ckpt"]
+    assert_same_end(runner.continued(tmp_path / "step=36.ckpt"), whole("paper"))
 
 
 def test_a_run_continued_with_another_length_says_what_follows_from_it(
     run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
 ) -> None:
-    path = Runner(run, recipe, "defaults", max_steps=8).stopped(Broken, Trouble(3, fail))
-    Runner(run, recipe, "defaults", max_steps=9).continued(path)
+    path = Runner(run, recipe, "paper", max_steps=8).stopped(Broken, Trouble(3, fail))
+    Runner(run, recipe, "paper", max_steps=9).continued(path)
     (message,) = [message for message in caplog.messages if message.startswith("the checkpoint is of a run of 8 ")]
     assert "this one has 9" in message
     assert "pass --trainer.max_steps=8" in message
@@ -300,7 +270,7 @@ def test_a_run_continued_with_another_length_says_what_follows_from_it(
 
 def test_a_run_that_goes_on_past_its_schedule_keeps_its_checkpoints(run: RunFactory, recipe: Recipe) -> None:
     def fit(checkpoint: RunCheckpoint, ckpt_path: Path | None = None) -> Path:
-        callbacks = recipe(phases=PhaseSchedule(total=20, min_finetune=1), checkpoint=checkpoint)
+        callbacks = recipe(phases=paper_phases(total=20, min_finetune=1), checkpoint=checkpoint)
         trainer, _ = run(callbacks.values(), ckpt_path, max_steps=27)
         return run_folder(trainer)
 
@@ -391,10 +361,10 @@ main(sys.argv[1:])
 
 def test_checkpoints_of_an_earlier_fit_hide_none_of_the_next(run: RunFactory, recipe: Recipe) -> None:
     checkpoint = RunCheckpoint(every=0)
-    Runner(run, recipe, "defaults", max_steps=12)(checkpoint=checkpoint)
+    Runner(run, recipe, "paper", max_steps=12)(checkpoint=checkpoint)
     first = checkpoint.last_path
     with pytest.raises(Broken):
-        Runner(run, recipe, "defaults", max_steps=20)(Trouble(13, fail), checkpoint=checkpoint)
+        Runner(run, recipe, "paper", max_steps=20)(Trouble(13, fail), checkpoint=checkpoint)
     assert checkpoint.last_path is not None
     assert checkpoint.last_path != first
     assert iteration_of(checkpoint.last_path) == 12

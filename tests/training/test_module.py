@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import torch
 from lightning.pytorch import Trainer
-from nsvq_lightning.training.host import SplatHost, splat_host
 from runs import fit
 from torch import Tensor, nn
 
@@ -28,7 +27,6 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.resume import plain
 from nsvq_lightning.training.schedule import Phase
-from nsvq_lightning.training.stopwatch import RunState, Stopwatch
 
 CODES = {"scales": 6, "quats": 5, "sh0": 4, "shN": 3}
 
@@ -78,7 +76,7 @@ def test_quantizing_renders_the_visible_splats_with_noise_of_the_right_length(
         seen.append(splats)
         return render(splats, view, **settings)
 
-    monkeypatch.setattr("nsvq_lightning.training.module.render", spy)
+    monkeypatch.setattr("nsvq_lightning.training.scene_module.render", spy)
     module.phase = Phase.QUANTIZE
     module(camera())
     rows = visible(module.splats.raw(), camera())
@@ -145,22 +143,30 @@ def test_a_loss_that_is_not_finite_skips_the_update(
     assert "the loss of a.png is nan, no update" in caplog.text
 
 
-def test_the_loss_adds_lambda_times_the_sum_of_opacities(module: SplatModule) -> None:
+def test_terms_of_the_loss_are_added(module: SplatModule) -> None:
     view = View("a.png", 0, camera(), torch.zeros(30, 40, 3, dtype=torch.uint8))
-    plain_step = module.training_step(view, 0)
-    module.opacity_weight = 0.01
-    weighted = module.training_step(view, 0)
-    assert plain_step is not None
-    assert weighted is not None
-    total = float(module.splats.opacities.detach().sigmoid().sum())
-    assert (weighted["loss"] - plain_step["loss"]).item() == pytest.approx(0.01 * total, rel=1e-4)
+    alone = module.training_step(view, 0)
+    module.loss_terms["more"] = lambda rendered, seen: 0.01 * rendered.alpha.sum() + seen.index
+    more = module.training_step(view, 0)
+    assert alone is not None
+    assert more is not None
+    total = float(alone["render"].alpha.detach().sum())
+    assert (more["loss"] - alone["loss"]).item() == pytest.approx(0.01 * total, rel=1e-4)
 
 
-def test_the_module_is_a_host_and_others_are_told_what_they_lack(module: SplatModule) -> None:
-    assert splat_host(module) is module
-    with pytest.raises(TypeError, match=r"lacks: .*splats"):
-        splat_host(Trainer)  # type: ignore[arg-type]
-    assert SplatHost is not None
+def test_the_phase_and_its_numbers_are_in_the_state_and_an_optimiser_of_other_groups_is_refused(
+    module: SplatModule,
+) -> None:
+    module.phase, module.active_sh_degree, module.extent, module.stopwatch.seconds = Phase.PRUNE, 1, 1.5, 12.25
+    other = SplatModule(sh_degree=1, codebooks=CODES, splats=make_splats())
+    other.load_state_dict(module.state_dict())
+    assert (other.phase, other.active_sh_degree, other.extent, other.stopwatch.seconds) == (Phase.PRUNE, 1, 1.5, 12.25)
+    groups = module.configure_optimizers().param_groups
+    renamed = [group | {"name": group["name"].replace("codebook_scales", "codebook")} for group in groups]
+    for optimizers, missing in (([], "means, quats"), ([torch.optim.Adam(renamed)], "codebook_scales")):
+        module.trainer.optimizers = optimizers
+        with pytest.raises(ValueError, match=rf"there are {len(optimizers)} optimisers, without groups for: {missing}"):
+            module.on_train_start()
 
 
 def test_what_is_not_a_quantizer_is_refused() -> None:
@@ -181,30 +187,6 @@ def test_without_higher_coefficients_there_is_no_codebook_for_them() -> None:
 def test_hyper_parameters_become_plain_data() -> None:
     stored = plain({"a": 1, "rates": LearningRates(), "quantizer": NSVQ, "t": torch.zeros(1), "n": [None, {"x": 0.5}]})
     assert stored == {"a": 1, "rates": LearningRates().__dict__, "n": [None, {"x": 0.5}]}
-
-
-def test_a_loaded_state_refreshes_the_mirrors() -> None:
-    state, other = RunState(), RunState()
-    state.phase, state.sh_degree, state.extent, state.train_seconds = Phase.PRUNE, 2, 1.5, 12.25
-    other.load_state_dict(state.state_dict())
-    assert (other.phase, other.sh_degree, other.extent, other.train_seconds) == (Phase.PRUNE, 2, 1.5, 12.25)
-
-
-def test_a_paused_stopwatch_stands_still(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [0.0]
-    monkeypatch.setattr("nsvq_lightning.training.stopwatch.time.perf_counter", lambda: now[0])
-    state = RunState()
-    watch = Stopwatch(state)
-    watch.lap()
-    watch.start()
-    now[0] = 2.0
-    with watch.paused(torch.device("cpu")):
-        now[0] = 10.0
-    now[0] = 13.0
-    watch.stop()
-    now[0] = 20.0
-    watch.lap()
-    assert state.train_seconds == 5.0
 
 
 def test_a_trained_module_cannot_be_trained_from_the_start(module: SplatModule) -> None:
@@ -237,7 +219,7 @@ def test_splats_of_a_file_that_are_not_finite_are_left_out(
 ) -> None:
     start = make_splats()
     start.quats.data[7, 2] = torch.nan
-    monkeypatch.setattr("nsvq_lightning.training.module.load", lambda _: start)
+    monkeypatch.setattr("nsvq_lightning.training.start.load", lambda _: start)
     data = ColmapDataModule(str(demo_scene), factor=4)
 
     def fitted() -> SplatModule:

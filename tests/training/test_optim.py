@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
+from runs import PAPER_MODULE
 from torch import nn
 
 from nsvq_lightning.compute.rows import take_rows
@@ -19,6 +21,8 @@ from nsvq_lightning.training.optim import (
     position_lr,
 )
 
+PAPER: LearningRates = PAPER_MODULE["rates"]
+
 
 class Codebook(nn.Module):
     def __init__(self) -> None:
@@ -31,7 +35,7 @@ def splats() -> Splats:
 
 
 def test_every_attribute_and_codebook_has_its_group_and_rate() -> None:
-    rates = LearningRates(codebook_factor=2.0)
+    rates = replace(PAPER, codebook_factor=2.0)
     groups = param_groups(splats(), {"scales": Codebook(), "shN": Codebook()}, rates, extent=3.0)
     assert {group["name"]: group["lr"] for group in groups} == {
         "means": pytest.approx(4.8e-4),
@@ -46,7 +50,7 @@ def test_every_attribute_and_codebook_has_its_group_and_rate() -> None:
 
 
 def test_the_position_rate_falls_log_linearly_and_then_stays() -> None:
-    rates = LearningRates()
+    rates = PAPER
     assert position_lr(0, 2.0, rates, 30_000) == pytest.approx(3.2e-4)
     assert position_lr(15_000, 2.0, rates, 30_000) == pytest.approx(2.0 * math.sqrt(1.6e-4 * 1.6e-6))
     assert position_lr(30_000, 2.0, rates, 30_000) == pytest.approx(3.2e-6)
@@ -75,7 +79,7 @@ def test_scaled_steps_of_four_views_move_as_four_steps_of_one() -> None:
 
 
 def test_adams_numbers_follow_the_number_of_views() -> None:
-    rates = LearningRates(scale_with_views=True)
+    rates = replace(PAPER, scale_with_views=True)
     optimizer = build_adam(param_groups(splats(), {"scales": Codebook()}, rates, extent=3.0))
     apply_rates(optimizer, rates, extent=3.0, views=4)
     assert [group["lr"] for group in optimizer.param_groups] == [
@@ -108,37 +112,23 @@ def test_adam_is_the_textbook_one() -> None:
         torch.testing.assert_close(fast.detach(), other.detach(), rtol=1e-6, atol=1e-7)
 
 
-def scene_of(count: int, sh_degree: int = 3) -> Splats:
-    draw = torch.Generator().manual_seed(count)
-    shapes = ((3,), (4,), (3,), (), (1, 3), ((sh_degree + 1) ** 2 - 1, 3))
-    return Splats.from_tensors(*(torch.randn((count, *shape), generator=draw) for shape in shapes))
-
-
-def train(scene: Splats, optimizer: torch.optim.Optimizer, steps: int) -> None:
-    for step in range(steps):
-        draw = torch.Generator().manual_seed(step)
-        for parameter in scene.parameters():
-            parameter.grad = 1e-6 * torch.randn(parameter.shape, generator=draw)
-        optimizer.step()
-
-
-def everything(scene: Splats, optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:
-    """Weights and moments."""
-    moments = [optimizer.state[p][key] for p in scene.parameters() for key in ("exp_avg", "exp_avg_sq")]
-    return [*(p.detach() for p in scene.parameters()), *moments]
-
-
 def test_steps_have_the_same_bits_for_any_number_of_threads() -> None:
-    results = []
-    before = torch.get_num_threads()
-    for threads in (1, 2):
+    def moved(threads: int) -> list[torch.Tensor]:
         torch.set_num_threads(threads)
-        scene = scene_of(1001)
+        draw = torch.Generator().manual_seed(0)
+        scene = Splats.from_points(torch.rand(1001, 3, generator=draw), torch.rand(1001, 3, generator=draw))
         optimizer = build_adam(param_groups(scene, {}, LearningRates(), extent=1.0))
-        train(scene, optimizer, steps=3)
-        results.append(everything(scene, optimizer))
+        for _ in range(3):
+            for parameter in scene.parameters():
+                parameter.grad = 1e-6 * torch.randn(parameter.shape, generator=draw)
+            optimizer.step()
+        moments = [optimizer.state[p][key] for p in scene.parameters() for key in ("exp_avg", "exp_avg_sq")]
+        return [*(p.detach() for p in scene.parameters()), *moments]
+
+    before = torch.get_num_threads()
+    one, two = moved(1), moved(2)
     torch.set_num_threads(before)
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
 
 
 def test_a_codebook_without_gradient_is_left_alone() -> None:

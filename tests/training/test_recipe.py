@@ -1,4 +1,4 @@
-"""Growth, selection, budgets, falling rates: whole runs of 60 iterations."""
+"""The recipe in 60 iterations: growth, selection, budgets, codes by rate and distortion, falling rates."""
 
 from __future__ import annotations
 
@@ -7,123 +7,84 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from checkpoints import CheckpointAt
+import torch
+import yaml
+from checkpoints import assert_same_end
 from lightning.pytorch import Callback, LightningModule, Trainer
-from runs import Recipe, RunFactory
+from runs import BUDGET, ENDS, RECIPE_MODULE, Recipe, RunFactory, Whole, paper_replacement, recipe_options
+from torch import Tensor
 
 from nsvq_lightning.callbacks import (
     BudgetedGrowth,
-    GrowthRules,
+    CanonicalCovariance,
+    CodebookInit,
     LearningRateDecay,
     OpacitySelection,
     PhaseSchedule,
+    RateDistortion,
     RunCheckpoint,
     SplatBudget,
 )
+from nsvq_lightning.commands.main import main
+from nsvq_lightning.compression.covariance_error import covariances
 from nsvq_lightning.io.formats import load
+from nsvq_lightning.quantize import NSVQ
+from nsvq_lightning.quantize.nearest import code_rates
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import run_folder
 from nsvq_lightning.training.schedule import Phase
-
-BUDGET = 500
-ENDS = {"warmup_end": 24, "prune_end": 40, "quantize_end": 50}
-INTERRUPTED = (10, 16, 24, 30, 33, 47, 53)
-
-
-def options(**replaced: Callback) -> dict[str, Callback]:
-    """The new recipe in 60 iterations: growth in 24, selection in 16, codes in 10, 10 for the rest."""
-    intervals = {"min_density_interval": 1, "min_reset_interval": 1, "min_replacement_interval": 5, "min_finetune": 1}
-    growth = GrowthRules(
-        start=0, full=20, every=4, grad_threshold=1e-6, first_prune=3, reset_every=9, reset_last=9, recovery=3
-    )
-    return {
-        "phases": PhaseSchedule(reference_total=60, position_decay=40, **ENDS, **intervals),
-        "budget": SplatBudget(splats=BUDGET),
-        "density": BudgetedGrowth(growth),
-        "selection": OpacitySelection(strength=1e-2),
-        "rate_decay": LearningRateDecay(final=0.1),
-        **replaced,
-    }
 
 
 def scene_bytes(trainer: Trainer) -> bytes:
     return (run_folder(trainer) / "scene.nsvq").read_bytes()
 
 
-class Witness(Callback):
-    """Notes splats, rates and views of every step."""
-
-    def __init__(self) -> None:
-        self.counts: list[int] = []
-        self.rates: list[dict[str, float]] = []
-        self.views: list[int] = []
-        self._seen = 0
-
-    def on_train_batch_start(self, trainer: Trainer, *args: Any) -> None:
-        self._seen += 1
-
-    def on_before_zero_grad(self, trainer: Trainer, pl_module: LightningModule, optimizer: Any) -> None:
-        assert isinstance(pl_module, SplatModule)
-        self.counts.append(len(pl_module.splats))
-        self.rates.append({group["name"]: group["lr"] for group in optimizer.param_groups})
-        self.views.append(self._seen)
-        self._seen = 0
+def test_splats_grow_and_are_selected_down_to_the_budget(fast: Whole) -> None:
+    assert BUDGET < max(fast.witness.splats) <= 2 * BUDGET
+    assert fast.witness.splats[ENDS["prune_end"] + 1] == BUDGET
+    assert len(load(fast.folder / "scene.nsvq")) == BUDGET
+    assert all(len(quantizer.held) == 0 for quantizer in fast.module.codebooks.values())  # type: ignore[arg-type]
 
 
-@pytest.fixture(scope="module")
-def witness() -> Witness:
-    return Witness()
+@pytest.mark.parametrize("iteration", [10, 16, 24, 30, 40, 44, 46, 54])
+def test_a_resumed_run_is_the_run_not_interrupted(fast: Whole, run: RunFactory, recipe: Recipe, iteration: int) -> None:
+    callbacks = recipe(**recipe_options(checkpoint=RunCheckpoint(every=0))).values()
+    resumed, _ = run(callbacks, fast.checkpoint(iteration), RECIPE_MODULE)
+    assert_same_end(run_folder(resumed), fast.folder)
 
 
-@pytest.fixture(scope="module")
-def finished(run: RunFactory, recipe: Recipe, witness: Witness) -> Trainer:
-    trainer, _ = run([*recipe(**options(checkpoint=CheckpointAt(*INTERRUPTED))).values(), witness])
-    return trainer
-
-
-def test_splats_grow_and_are_selected_down_to_the_budget(finished: Trainer, witness: Witness) -> None:
-    assert BUDGET < max(witness.counts) <= 2 * BUDGET
-    assert witness.counts[ENDS["prune_end"] + 1] == BUDGET
-    assert len(load(run_folder(finished) / "scene.nsvq")) == BUDGET
-
-
-@pytest.mark.parametrize("interrupted_at", INTERRUPTED)
-def test_a_resumed_run_is_the_run_not_interrupted(
-    finished: Trainer, run: RunFactory, recipe: Recipe, interrupted_at: int
-) -> None:
-    path = run_folder(finished) / "checkpoints" / f"step-{interrupted_at}.ckpt"
-    resumed, _ = run(recipe(**options(checkpoint=RunCheckpoint(every=0))).values(), ckpt_path=path)
-    assert scene_bytes(resumed) == scene_bytes(finished)
-
-
-def test_rates_fall_at_the_end_and_rise_for_the_selection(finished: Trainer, witness: Witness) -> None:
-    rates = [rate["opacities"] / 0.05 for rate in witness.rates]
+def test_rates_fall_at_the_end_and_rise_for_the_selection(fast: Whole) -> None:
+    rates = [rate["opacities"] / 0.025 for rate in fast.witness.rates]
     assert rates[:24] == pytest.approx([1.0] * 24)
     assert rates[24] == pytest.approx(4.0)
     assert rates[40:50] == pytest.approx([1.0] * 10)
     assert rates[50:] == pytest.approx([0.1 ** (k / 10) for k in range(1, 11)])
-    colours = [rate["codebook_sh0"] for rate in witness.rates]
+    colours = [rate["codebook_sh0"] for rate in fast.witness.rates]
     assert colours[59] == pytest.approx(0.1 * colours[0])
 
 
-def test_neutral_options_are_the_run_without_them(run: RunFactory, recipe: Recipe) -> None:
-    neutral = {"budget": SplatBudget(), "selection": OpacitySelection(), "rate_decay": LearningRateDecay()}
-    without = recipe(**dict.fromkeys(neutral)).values()
-    present = recipe(**neutral).values()
-    assert scene_bytes(run(present)[0]) == scene_bytes(run(without)[0])
+def test_the_order_of_callbacks_matters_only_where_it_is_said_to(fast: Whole, run: RunFactory, recipe: Recipe) -> None:
+    callbacks = recipe(**recipe_options())
+    first = ["budget", "density", "canonical", "codebook_init"]  # each needs the one before, or acts at the same time
+    names = [*first, *(name for name in reversed(callbacks) if name not in first)]
+    assert scene_bytes(run([callbacks[name] for name in names], module=RECIPE_MODULE)[0]) == fast.scene
+
+
+def test_neutral_options_are_the_run_without_them(paper: Whole, run: RunFactory, recipe: Recipe) -> None:
+    neutral = {"selection": OpacitySelection(), "rate_decay": LearningRateDecay(final=1.0)}
+    assert scene_bytes(run(recipe(**neutral).values())[0]) == paper.scene
 
 
 def test_a_finished_scene_is_selected_down(
-    run: RunFactory, recipe: Recipe, finished: Trainer, caplog: pytest.LogCaptureFixture
+    run: RunFactory, recipe: Recipe, fast: Whole, caplog: pytest.LogCaptureFixture
 ) -> None:
-    source = run_folder(finished) / "scene.ply"
     callbacks = recipe(
         phases=PhaseSchedule(reference_total=60, warmup_end=0, prune_end=40, quantize_end=60),
         density=None,
         selection=OpacitySelection(budget=300, strength=1e-2),
     )
     with caplog.at_level(logging.INFO):
-        trainer, module = run(callbacks.values(), module={"init_from": str(source)})
+        trainer, module = run(callbacks.values(), module={"init_from": str(fast.folder / "scene.ply")})
     assert module.phase is Phase.QUANTIZE
     assert len(load(run_folder(trainer) / "scene.nsvq")) == 300
     assert "the selection is done, 300 splats are left" in caplog.text
@@ -148,52 +109,168 @@ def test_few_photos_shorten_the_run(run: RunFactory, recipe: Recipe, caplog: pyt
     assert "iterations: 14, 2 for each of 7 photos" in caplog.text
     assert trainer.global_step == module.schedule.total == trainer.max_steps == 14
     assert module.phase is Phase.FINETUNE  # which ends with it
-    plenty = PhaseSchedule(reference_total=60, iterations_per_photo=2, **ENDS)
-    assert run(recipe(phases=plenty).values(), max_steps=3)[0].global_step == 3
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: SplatBudget(quality=1.0, splats=5), "a budget is one number, got quality and splats"),
-        (lambda: SplatBudget(bytes=0), "bytes must be finite and above 0, got 0"),
-        (lambda: PhaseSchedule(iterations_per_photo=0), "iterations_per_photo must be at least 1, got 0"),
-        (lambda: LearningRateDecay(final=0.0), "final must be above 0 and at most 1, got 0.0"),
-    ],
-)
-def test_settings_out_of_range_are_refused(make: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
-def test_a_shorthand_replaces_the_configs_budget(tmp_path: Path, demo_scene: Path) -> None:
-    from nsvq_lightning.commands.main import main
-
-    config = tmp_path / "config.yaml"
-    config.write_text("callbacks: {budget: {quality: 1.0}}\n")
-    quiet = ("--trainer.enable_progress_bar=false", "--trainer.max_steps=2", "--callbacks.predictions=null")
-    arguments = [f"--config={config}", f"--data.root={demo_scene}", "--data.factor=2", "--model.codebooks=null"]
-    assert main(["fit", *arguments, *quiet, "--splats", "60", f"--trainer.run_folder={tmp_path / 'run'}"]) == 0
-    written = (tmp_path / "run" / "config.yaml").read_text()
-    assert "splats: 60" in written
-    assert "quality: null" in written
+    assert run(recipe(phases=phases).values(), max_steps=3)[0].global_step == 3
 
 
 def test_growth_that_has_nothing_to_split_ends_the_warm_up_and_shortens_the_run(
     run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
 ) -> None:
-    idle = GrowthRules(start=0, full=20, every=4, grad_threshold=1e3, late_threshold=1e3, first_prune=0, patience=2)
-    chosen = options(density=BudgetedGrowth(idle), checkpoint=CheckpointAt(10, 13, 30))
+    def chosen(every: int) -> dict[str, Callback]:
+        growth = BudgetedGrowth(
+            start=0, full=20, every=4, grad_threshold=1e3, late_threshold=1e3, first_prune=0, patience=2
+        )
+        return recipe(**recipe_options(density=growth, checkpoint=RunCheckpoint(every=every, keep=True)))
+
     with caplog.at_level(logging.INFO):
-        trainer, module = run(recipe(**chosen).values())
+        trainer, module = run(chosen(every=10).values(), module=RECIPE_MODULE)
     assert "iteration 12: growth ends with 500 splats" in caplog.text
     assert module.schedule.saved == 12
     assert module.schedule.ends == (12, 28, 38, 48)
-    assert trainer.global_step == 48
-    assert trainer.max_steps == 48
-    for interrupted_at in (10, 13, 30):
+    assert trainer.global_step == trainer.max_steps == 48
+    for interrupted_at in (10, 30):
         path = run_folder(trainer) / "checkpoints" / f"step-{interrupted_at}.ckpt"
-        again = options(density=BudgetedGrowth(idle), checkpoint=RunCheckpoint(every=0))
-        resumed, _ = run(recipe(**again).values(), ckpt_path=path)
+        resumed, _ = run(chosen(every=0).values(), path, RECIPE_MODULE)
         assert resumed.global_step == 48
         assert scene_bytes(resumed) == scene_bytes(trainer)
+
+
+def test_few_splats_get_few_codes(run: RunFactory, recipe: Recipe) -> None:
+    """Oracle: K·D is at most so many values a splat, K at least 1, and what was asked for where that is less."""
+    asked = {"scales": 24, "quats": 24, "sh0": 16, "shN": 16}
+    for share in (0.0005, 0.004):
+        _, module = run(recipe(codebook_init=CodebookInit(values_per_splat=share)).values(), max_steps=12)
+        for name, quantizer in module.quantizers.items():
+            most = max(1, int(share * len(module.splats) / quantizer.codebook.shape[1]))
+            assert len(quantizer.codebook) == min(most, asked[name])
+            assert int(quantizer.codes.max()) < len(quantizer.codebook)
+        assert len(module.quantizers["shN"].codebook) < asked["shN"]
+
+
+class Look(Callback):
+    """Keeps scales and quaternions before and after the last iteration before the quantize phase."""
+
+    def __init__(self, iteration: int) -> None:
+        self.iteration = iteration
+        self.seen: list[tuple[Tensor, Tensor]] = []
+
+    def _look(self, trainer: Trainer, module: LightningModule, *_: Any) -> None:
+        assert isinstance(module, SplatModule)
+        if trainer.global_step == self.iteration:
+            self.seen.append((module.splats.scales.detach().clone(), module.splats.quats.detach().clone()))
+
+    on_train_batch_end = on_before_zero_grad = _look
+
+
+def test_rows_are_canonical_when_codebooks_are_placed(run: RunFactory, recipe: Recipe) -> None:
+    look = Look(9)  # first in the list, so that it sees them before and after
+    _, module = run([look, *recipe(canonical=CanonicalCovariance()).values()], max_steps=20)
+    assert module.schedule.first_of(Phase.QUANTIZE) == 10
+    before, after = look.seen
+    first, second = (covariances(*pair).double() for pair in look.seen)
+    assert ((second - first).norm(dim=(1, 2)) / first.norm(dim=(1, 2))).max() < 1e-5
+    assert (before[0].diff(dim=1) > 0).any()
+    assert (after[0].diff(dim=1) <= 0).all()
+    torch.testing.assert_close(after[1].norm(dim=1), torch.ones(len(after[1])))
+
+
+def test_a_run_that_starts_with_codebooks_starts_canonical(
+    run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
+) -> None:
+    phases = PhaseSchedule(warmup_end=0, prune_end=0)
+    with caplog.at_level("INFO"):
+        run(recipe(phases=phases, canonical=CanonicalCovariance()).values(), max_steps=4)
+    assert caplog.text.count("iteration 0: canonical covariances") == 1
+
+
+class Recording(NSVQ):
+    """Keeps the weights it was fitted with."""
+
+    weight: Tensor | None = None
+
+    def fit(self, x: Tensor, weight: Tensor | None = None, generator: torch.Generator | None = None) -> None:
+        self.weight = weight
+        super().fit(x, weight, generator)
+
+
+def test_kmeans_gets_contributions_as_weights(run: RunFactory, recipe: Recipe) -> None:
+    for weights in ("none", "contribution"):
+        callbacks = recipe(codebook_init=CodebookInit(weights=weights)).values()  # type: ignore[arg-type]
+        _, module = run(callbacks, module={"quantizer": Recording}, max_steps=12)
+        found = {name: quantizer.weight for name, quantizer in module.quantizers.items()}  # type: ignore[attr-defined]
+        weighted = {name for name, weight in found.items() if weight is not None}
+        assert weighted == (set() if weights == "none" else {"quats", "sh0", "shN"})
+    assert found["quats"].shape == (len(module.splats),)
+    assert found["quats"].min() > 0
+    assert found["quats"].max() > 2 * found["quats"].mean()
+
+
+@pytest.mark.parametrize("reset", [False, True])
+def test_moments_of_replaced_codes_are_reset(
+    reset: bool, run: RunFactory, recipe: Recipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Codes out of use for a window of 5 views are rare here: call every third one unused.
+    monkeypatch.setattr(
+        "nsvq_lightning.quantize.codebook.inactive_codes", lambda usage, *_: torch.arange(len(usage)) % 3 == 0
+    )
+    zero_rows: list[int] = []
+
+    class Moments(Callback):
+        def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
+            groups = trainer.optimizers[0].param_groups
+            (book,) = next(group["params"] for group in groups if group["name"] == "codebook_scales")
+            if state := trainer.optimizers[0].state.get(book):
+                zero_rows.append(int((~state["exp_avg_sq"].any(1)).sum()))
+
+    replacement = paper_replacement(jitter=0.5, reset_moments=reset)
+    run([*recipe(codebook_replacement=replacement).values(), Moments()], max_steps=20)
+    assert max(zero_rows[1:]) == (8 if reset else 0)
+
+
+def bits(module: SplatModule) -> float:
+    """Bits of all codes of a splat at their entropy."""
+    rates = ((q.codes, code_rates(q.codes, len(q.codebook))) for q in module.quantizers.values())
+    return sum(float(rate[codes].mean()) for codes, rate in rates)
+
+
+def test_codes_take_fewer_bits_the_stronger_rate_and_distortion_is(run: RunFactory, recipe: Recipe) -> None:
+    found = []
+    for choice in (None, RateDistortion(0.01), RateDistortion(0.1)):
+        _, module = run(recipe(rate_distortion=choice).values(), module=RECIPE_MODULE)
+        found.append(bits(module))
+    assert found[0] > found[1] + 0.3
+    assert found[1] > found[2] + 0.3
+
+
+def test_splats_that_are_dropped_have_codes_chosen_anew(run: RunFactory, recipe: Recipe) -> None:
+    class Spoil(Callback):
+        def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
+            if trainer.global_step == 44:
+                pl_module.splats.means.data[:7] = torch.nan
+
+    density = BudgetedGrowth(start=0, full=20, every=4, grad_threshold=1e-6, finite_every=1)
+    _, module = run([Spoil(), *recipe(**recipe_options(density=density)).values()], module=RECIPE_MODULE)
+    assert len(module.splats) == BUDGET - 7
+    assert all(len(quantizer.codes) == BUDGET - 7 for quantizer in module.quantizers.values())
+
+
+def test_a_shorthand_replaces_the_configs_budget(tmp_path: Path, demo_scene: Path) -> None:
+    config = tmp_path / "config.yaml"
+    config.write_text("callbacks: {budget: {bytes: 100000}}\n")
+    quiet = ("--trainer.enable_progress_bar=false", "--trainer.max_steps=2", "--callbacks.predictions=null")
+    arguments = [f"--config={config}", f"--data.root={demo_scene}", "--data.factor=2", "--model.codebooks=null"]
+    assert main(["fit", *arguments, *quiet, "--splats", "60", f"--trainer.run_folder={tmp_path / 'run'}"]) == 0
+    written = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["callbacks"]["budget"]["init_args"]
+    assert (written["splats"], written["bytes"]) == (60, None)
+
+
+@pytest.mark.parametrize("name", ["fast", "best", "small"])
+def test_the_shipped_configs_run(
+    name: str, demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [f"--data.root={demo_scene}", "--data.factor=4", f"--trainer.default_root_dir={tmp_path}"]
+    quiet = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
+    assert main(["fit", f"--config={name}", *arguments, *quiet, "--trainer.max_steps=20", "--model.sh_degree=1"]) == 0
+    assert "rendered from the decoded file" in capsys.readouterr().out
+    config = yaml.safe_load(next(tmp_path.rglob("config.yaml")).read_text())
+    assert config["model"]["quantizer"]["class_path"].endswith(".TrainedStraightThrough")
+    assert (config["callbacks"]["rate_distortion"] is None) == (name != "small")

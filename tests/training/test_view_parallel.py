@@ -61,7 +61,7 @@ class Finished:
 def arguments(scene: Path, root: Path, *more: str) -> list[str]:
     """A fit of 60 steps through all phases, with 3 test views, which two processes cannot share evenly."""
     return [
-        *("fit", f"--data.root={scene}", "--data.factor=2", "--data.test_every=3"),
+        *("fit", "--config=paper", f"--data.root={scene}", "--data.factor=2", "--data.test_every=3"),
         *("--trainer.max_steps=60", "--trainer.accelerator=cpu", f"--trainer.default_root_dir={root}"),
         "--trainer.enable_progress_bar=false",
         *("--model.sh_degree=1", "--model.codebooks.scales=24", "--model.codebooks.quats=2000"),
