@@ -8,10 +8,11 @@ import shlex
 import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 from pkgutil import resolve_name
 from types import NoneType
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 from jsonargparse import _typehints as typehints
 from lightning.pytorch import Callback, LightningModule, Trainer
@@ -70,6 +71,9 @@ PARSER_SETTINGS["fit"]["default_config_files"] = [find_config("fast")]
 class QuietParser(LightningArgumentParser):
     """Reports errors without the usage, which has about a hundred lines, and lists options without their classes."""
 
+    arguments: ClassVar[Sequence[str]] = ()
+    """The command line."""
+
     def format_help(self, *args: Any) -> str:
         """Help of a command, see :mod:`nsvq_lightning.commands.option_help`."""
         subcommand = self.prog.rpartition(" ")[2]
@@ -90,7 +94,7 @@ class QuietParser(LightningArgumentParser):
             path = Path(missing[1])
             message = f"there is no config {path}{nearest(path.stem, names)}\nShipped ones: {', '.join(names)}"
         else:
-            message = in_plain_words(message, CLASSES)
+            message = in_plain_words(self._with_whole_option(message), CLASSES)
             parsers = getattr(self._subcommands_action, "_name_parser_map", {"": self}).values()
             options = [option for parser in parsers for option in parser._option_string_actions]
             if program == "nsvq fit":
@@ -98,6 +102,18 @@ class QuietParser(LightningArgumentParser):
             message += unknown_option(message, options)
         sys.stderr.write(f"error: {message}\nAll options: {program} --help\n")
         self.exit(2)
+
+    def _with_whole_option(self, message: str) -> str:
+        """The message with the option as it was given: the parser of a nested class knows only its last part."""
+        key = re.match(r'Parser key "(\w+)":', message)
+        if key is None or key[1] in SHORTHANDS:
+            return message
+        for argument, following in pairwise([*self.arguments, ""]):
+            option, equals, value = argument.partition("=")
+            given = value if equals else following
+            if option.endswith(f".{key[1]}") and message.endswith(f"value: {given}"):
+                return message.replace(key[1], option.removeprefix("--"), 1)
+        return message
 
 
 def _drop_settings_of_another_class(_: Any, before: Any, value: Any) -> None:
@@ -149,7 +165,7 @@ class SplatCLI(LightningCLI):
     """
 
     def __init__(self, args: list[str]) -> None:
-        self._arguments = args
+        self._arguments = QuietParser.arguments = args
         for argument in args:
             check_name(argument, "the command line", allow_outside=True)
             asked = re.fullmatch(r"--callbacks\.(\w+)\.help", argument)
