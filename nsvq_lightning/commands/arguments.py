@@ -245,7 +245,7 @@ def written_by_run(path: str) -> bool:
 
 
 def find_config(name: str) -> str:
-    """Path of a config: a given file, otherwise one shipped with the package (``nsvq_4k``, ``configs/nsvq_4k.yaml``).
+    """Path of a config: a given file, otherwise one shipped with the package (``paper``, ``configs/paper.yaml``).
 
     A name that is neither is returned unchanged, for the parser to report.
     """

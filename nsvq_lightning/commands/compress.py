@@ -148,18 +148,17 @@ def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> i
         Exit status of ``nsvq fit``, which writes a run into ``folder``.
     """
     from nsvq_lightning.commands.main import main
-    from nsvq_lightning.compression.importance import INVISIBLE
 
     codebooks = ", ".join(f"{name}: {codes}" for name, codes in candidate.rung.codebooks.items())
     return main(
         [
             "fit",
+            "--config=paper",
             f"--data.root={options.root}",
             f"--model.init_from={options.input}",
             f"--model.sh_degree={candidate.scene.sh_degree}",
             f"--model.codebooks={{{codebooks}}}",
             "--model.quantizer=TrainedStraightThrough",
-            "--model.quantizer.start=spread",
             "--model.rates.means=1.6e-6",  # the rate of a trained scene has already decayed
             f"--model.antialiased={str(candidate.scene.antialiased).lower()}",
             f"--model.seed={options.seed}",
@@ -167,8 +166,7 @@ def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> i
             *(f"--model.storage.precision.{name}={n}" for name, n in vars(candidate.storage.precision).items()),
             "--callbacks.phases.warmup_end=0",
             "--callbacks.phases.prune_end=0",
-            "--callbacks.canonical.mode=auto",
-            f"--callbacks.canonical.floor={INVISIBLE}",
+            "--callbacks.canonical=CanonicalCovariance",
             "--callbacks.codebook_init.weights=contribution",
             "--callbacks.export.formats=[nsvq]",
             f"--trainer.max_steps={3000 if options.max_steps is None else options.max_steps}",

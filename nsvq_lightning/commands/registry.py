@@ -47,8 +47,8 @@ def overview() -> str:
             "nsvq COMMAND --help    options of a command",
             "nsvq --version         version of this package",
             "",
-            "nsvq fit --config demo.yaml               train the embedded scene",
-            "nsvq fit --config nsvq_4k.yaml --data.root path/to/scene",
+            "nsvq fit --config demo                    train the embedded scene",
+            "nsvq fit --data.root path/to/scene        train yours",
             "",
         ]
     )

@@ -281,7 +281,7 @@ def finest_within(compressor: Compressor, target: int) -> Candidate:
         least = min(len(candidate.data) for candidate in (*candidates, compressor.at(LADDER[-1])))
         raise ValueError(
             f"the smallest file of this scene has {least} bytes, more than {target}; most of them are positions: "
-            "train with fewer splats (--callbacks.contribution.share, --callbacks.density.max_splats)"
+            "train with fewer splats (--splats)"
         )
     return min(within, key=_error_first)
 

@@ -5,7 +5,7 @@ of 'nsvq fit' may follow; they hold for every run: --data.factor=2 --callbacks.d
 
 Examples:
   nsvq sweep --scenes fox --codebooks 0.5k,1k,2k,4k,8k,16k --seeds 0,1,2 --max-steps 4500 --output sweeps/fox
-  nsvq sweep --scenes fox,horns --configs nsvq_4k,plain,own.yaml --output sweeps/own
+  nsvq sweep --scenes fox,horns --configs paper,plain,own.yaml --output sweeps/own
 """
 
 from __future__ import annotations
