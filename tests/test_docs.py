@@ -150,7 +150,7 @@ def test_commands_are_understood(
 def test_settings_are_accepted(block: Block, workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (workplace / "own.yaml").write_text(block.text)
     with pytest.raises(SystemExit) as stop:
-        main(["fit", "--config", "nsvq_4k.yaml", "--config", "own.yaml", "--data.root=my/scene", "--print_config"])
+        main(["fit", "--config", "paper", "--config", "own.yaml", "--data.root=my/scene", "--print_config"])
     assert stop.value.code == 0, capsys.readouterr().err
 
 

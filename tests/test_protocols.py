@@ -71,7 +71,7 @@ def test_isinstance_meets_no_protocol() -> None:
     trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sources()}
     names = [node for tree in trees.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
     protocols = {node.name for node in names if any("Protocol" in ast.unparse(base) for base in node.bases)}
-    assert {Quantizer.__name__, "SplatHost"} <= protocols
+    assert Quantizer.__name__ in protocols
     for path, tree in trees.items():
         for node in ast.walk(tree):
             if isinstance(node, ast.Call) and ast.unparse(node.func) in ("isinstance", "issubclass"):

@@ -24,7 +24,7 @@ from nsvq_lightning.skips import is_on
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
-CODES = ["--model.codebooks.scales=16", "--model.codebooks.sh0=8"]
+CODES = ["--model.quantizer=NSVQ", "--model.codebooks.scales=16", "--model.codebooks.sh0=8"]
 
 
 def fit(scene: Path, folder: Path, *more: str, steps: int = 20) -> list[str]:
@@ -45,23 +45,14 @@ def fit(scene: Path, folder: Path, *more: str, steps: int = 20) -> list[str]:
 def finished(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a run of 20 steps."""
     root = tmp_path_factory.mktemp("cli")
-    assert main(fit(demo_scene, root, *CODES, "--model.quantizer=NSVQ", "--model.quantizer.kmeans_steps=3")) == 0
+    assert main(fit(demo_scene, root, *CODES, "--model.quantizer.kmeans_steps=3")) == 0
     return root / demo_scene.name / "version_0"
 
 
 def test_a_run_leaves_scene_report_config_and_checkpoint(finished: Path) -> None:
     names = {path.name for path in finished.iterdir()}
-    assert {
-        "scene.nsvq",
-        "scene.ply",
-        "metrics.json",
-        "views.csv",
-        "curve.csv",
-        "curve.png",
-        "renders",
-        "report.html",
-    } <= names
-    assert {"config.yaml", "metrics.csv", "checkpoints"} <= names
+    assert {"scene.nsvq", "scene.ply", "viewer.html", "report.html", "renders", "config.yaml", "checkpoints"} <= names
+    assert {"metrics.json", "views.csv", "curve.csv", "curve.png", "metrics.csv"} <= names
     config = yaml.safe_load((finished / "config.yaml").read_text())
     assert config["model"]["quantizer"]["init_args"] == {"kmeans_steps": 3, "start": "sample"}
     assert config["model"]["codebooks"] == {"scales": 16, "sh0": 8}
@@ -87,12 +78,7 @@ def test_switches_are_options_that_hold_for_one_command(
 
 @pytest.mark.parametrize(
     ("options", "seeds"),
-    [
-        ([], (0, 0)),
-        (["--seed_everything=3"], (3, 3)),
-        (["--seed_everything=3", "--model.seed=4"], (4, 3)),
-        (["--model.seed=4", "--data.seed=5"], (4, 5)),
-    ],
+    [(["--seed_everything=3"], (3, 3)), (["--seed_everything=3", "--model.seed=4"], (4, 3))],
 )
 def test_the_seed_of_everything_is_that_of_every_draw(
     options: list[str], seeds: tuple[int, int], demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -107,52 +93,32 @@ def test_the_seed_of_everything_is_that_of_every_draw(
     assert seen == [seeds]
 
 
-def test_a_second_run_gets_its_own_folder_and_prints_its_summary(
-    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for _ in range(2):
-        assert main(fit(demo_scene, tmp_path, steps=5)) == 0
-    out = capsys.readouterr().out
-    assert "version_0" in out
-    assert "version_1" in out
-    assert "rendered from the decoded file" in out
-
-
 def test_checkpoints_of_the_command_line_are_plain_data_and_load(finished: Path) -> None:
     path = finished / "checkpoints" / "last.ckpt"
     stored = torch.load(path, weights_only=True)
     assert stored["hyper_parameters"]["quantizer"]["class_path"].endswith("NSVQ")
-    from nsvq_lightning.training.module import SplatModule
-
     module = SplatModule.load_from_checkpoint(path, weights_only=True)
     assert set(module.quantizers) == {"scales", "sh0"}
     assert getattr(module.quantizers["scales"], "kmeans_steps", None) == 3
 
 
-def test_options_win_over_the_checkpoint_in_fit(demo_scene: Path, finished: Path, tmp_path: Path) -> None:
-    checkpoint = finished / "checkpoints" / "last.ckpt"
-    more = ["--model.rates.opacities=0.0123", f"--ckpt_path={checkpoint}", "--callbacks.phases.total=20"]
-    assert main(fit(demo_scene, tmp_path, *CODES, *more, steps=22)) == 0
-    config = yaml.safe_load((tmp_path / demo_scene.name / "version_0" / "config.yaml").read_text())
-    assert config["model"]["rates"]["opacities"] == 0.0123
-    # Lightning restores the optimiser with its stored rates; ours must still be the new one.
-    stored = torch.load(tmp_path / demo_scene.name / "version_0" / "checkpoints" / "last.ckpt", weights_only=True)
-    rates = {group["name"]: group["lr"] for group in stored["optimizer_states"][0]["param_groups"]}
-    assert rates["opacities"] == 0.0123
-
-
-def test_the_lines_of_a_resumed_run_count_the_whole_run(
+def test_a_run_goes_on_with_the_options_given_and_counts_its_lines(
     demo_scene: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     checkpoint = finished / "checkpoints" / "last.ckpt"
-    more = ["--callbacks.phases.total=20", f"--ckpt_path={checkpoint}"]
-    shown = ["--trainer.enable_progress_bar=true", "--callbacks.progress.refresh_rate=1"]
+    more = ["--model.rates.opacities=0.0123", f"--ckpt_path={checkpoint}", "--callbacks.phases.total=20"]
+    shown = ["--trainer.enable_progress_bar=true", "--callbacks.progress.refresh_rate=1", "--callbacks.rate_decay=null"]
     assert main(fit(demo_scene, tmp_path, *CODES, *more, *shown, steps=22)) == 0
+    folder = tmp_path / demo_scene.name / "version_0"
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    assert config["model"]["rates"]["opacities"] == 0.0123
+    # Lightning restores the optimiser with its stored rates; ours must still be the new one.
+    stored = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    rates = {group["name"]: group["lr"] for group in stored["optimizer_states"][0]["param_groups"]}
+    assert rates["opacities"] == 0.0123
     out = capsys.readouterr().out
-    counts = re.findall(
-        r"^iteration (\d+) of 22 \(\d+ %\), \S+ elapsed, \S+ left: finetune \d+ splats", out, re.MULTILINE
-    )
-    assert counts == ["21", "22"]
+    said = r"^iteration (\d+) of 22 \(\d+ %\), \S+ elapsed, \S+ left: finetune \d+ splats"
+    assert re.findall(said, out, re.MULTILINE) == ["21", "22"]
     assert "\r" not in out
 
 
@@ -171,18 +137,11 @@ def test_a_checkpoint_of_another_phase_is_refused_with_the_way_out(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["export", "--ckpt_path=no.ckpt"], "no.ckpt"),
         (["fit", "--data.root=scene\udcff"], "which is not UTF-8: rename"),
         (["fit", "--model.codebooks=3k"], "choose one of 0.5k"),
         (["fit", "--trainer.max_steps=0"], "set trainer.max_steps"),
-        (["fit", "--ckpt_path=broken.ckpt"], "broken.ckpt: truncated, or not a checkpoint"),
         (["fit", "--ckpt_path=last"], "last: no such checkpoint"),
-        (["test", "--ckpt_path=best"], "best: no such checkpoint"),
-        (["test", "--ckpt_path=broken.ckpt"], "broken.ckpt: truncated, or not a checkpoint"),
-        (["export", "--ckpt_path=broken.ckpt"], "broken.ckpt: truncated, or not a checkpoint"),
-        (["fit", "--config=empty.yaml"], "config empty.yaml holds nothing: give settings by name"),
         (["test"], "--ckpt_path"),
-        (["predict"], "--ckpt_path"),
     ],
 )
 def test_errors_of_the_user_are_one_line(
@@ -194,11 +153,7 @@ def test_errors_of_the_user_are_one_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("broken.ckpt").write_bytes(b"PK\3\4")
-    Path("empty.yaml").touch()
-    if arguments[0] != "export":
-        arguments = [*arguments, f"--data.root={demo_scene}"]
-    assert main(arguments) == 1
+    assert main([*arguments, f"--data.root={demo_scene}"]) == 1
     error = capsys.readouterr().err
     assert message in error
     assert "Traceback" not in error
@@ -213,7 +168,7 @@ def damaged(whole: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("command", "what"),
     [
-        *(("fit", what) for what in ("missing", "truncated", "damaged", "foreign")),
+        *(("fit", "missing"), ("fit", "damaged")),
         *(("test", "damaged"), ("validate", "foreign"), ("export", "truncated")),
     ],
 )
@@ -253,12 +208,6 @@ def test_a_fit_goes_on_with_the_model_of_the_checkpoint_only(
     checkpoint = finished / "checkpoints" / "last.ckpt"
     assert main(fit(demo_scene, tmp_path, *CODES, option, f"--ckpt_path={checkpoint}")) == 1
     assert message in capsys.readouterr().err
-
-
-def test_an_error_can_show_its_traceback(demo_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("NSVQ_TRACEBACK", "1")
-    with pytest.raises(ValueError, match="choose one of"):
-        main(["fit", "--model.codebooks=3k", f"--data.root={demo_scene}"])
 
 
 def test_test_takes_the_model_from_the_checkpoint(demo_scene: Path, finished: Path, tmp_path: Path) -> None:
@@ -321,15 +270,13 @@ def test_predict_writes_a_picture_of_every_view(demo_scene: Path, finished: Path
     assert {path.stem for path in (tmp_path / "pictures").iterdir()} == photos
 
 
-def test_validate_scores_the_test_views(
+def test_validate_scores_the_test_views_with_the_settings_of_the_run(
     demo_scene: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    checkpoint = finished / "checkpoints" / "last.ckpt"
-    arguments = [f"--ckpt_path={checkpoint}", f"--data.root={demo_scene}", "--data.factor=2"]
-    for config in ([], [f"--config={finished / 'config.yaml'}"]):
-        output = [f"--trainer.default_root_dir={tmp_path}", "--callbacks.progress=null"]
-        assert main(["validate", *config, *arguments, *output]) == 0
-        assert "val/psnr" in capsys.readouterr().out
+    run = [f"--config={finished / 'config.yaml'}", f"--ckpt_path={finished / 'checkpoints' / 'last.ckpt'}"]
+    arguments = [*run, f"--data.root={demo_scene}", f"--trainer.default_root_dir={tmp_path}"]
+    assert main(["validate", *arguments, "--callbacks.progress=null"]) == 0
+    assert "val/psnr" in capsys.readouterr().out
 
 
 def test_a_checkpoint_of_another_scene_is_refused(
@@ -353,74 +300,59 @@ def test_a_checkpoint_of_another_scene_is_refused(
     assert main(["validate", *arguments, "--trainer.allow_other_scene=true"]) == 0
 
 
-def test_callbacks_can_be_configured_exchanged_removed_and_added(
-    capsys: pytest.CaptureFixture[str], demo_scene: Path
-) -> None:
+def settings(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    """The settings that a fit would have."""
     with pytest.raises(SystemExit) as stop:
-        main(
-            [
-                *("fit", f"--data.root={demo_scene}", "--callbacks.density.min_splats=7"),
-                *("--callbacks.density.max_splats=99", "--callbacks.opacity=null"),
-                *("--trainer.callbacks+=LearningRateMonitor", "--print_config"),
-            ]
-        )
-    assert stop.value.code == 0
-    config = yaml.safe_load(capsys.readouterr().out)
+        main(["fit", *arguments, "--print_config"])
+    printed = capsys.readouterr()
+    assert stop.value.code == 0, printed.err
+    parsed: dict[str, Any] = yaml.safe_load(printed.out)
+    return parsed
+
+
+def test_callbacks_can_be_configured_exchanged_removed_and_added(capsys: pytest.CaptureFixture[str]) -> None:
+    config = settings(
+        capsys,
+        *("--data.root=x", "--callbacks.density=DensityControl", "--callbacks.density.max_splats=99"),
+        *("--callbacks.selection=null", "--callbacks.opacity.weight=0.5", "--trainer.callbacks+=LearningRateMonitor"),
+    )
+    assert config["callbacks"]["density"]["class_path"].endswith("DensityControl")
     assert config["callbacks"]["density"]["init_args"]["max_splats"] == 99
-    assert config["callbacks"]["density"]["init_args"]["rules"]["min_splats"] == 7
-    assert config["callbacks"]["opacity"] is None
+    assert config["callbacks"]["density"]["init_args"]["grad_threshold"] == 0.0002  # not that of the class before
+    assert config["callbacks"]["selection"] is None
+    assert config["callbacks"]["opacity"]["init_args"]["weight"] == 0.5
     assert config["trainer"]["callbacks"][0]["class_path"].endswith("LearningRateMonitor")
 
 
-@pytest.mark.parametrize(
-    ("name", "codes"),
-    [("16k", 16_384), ("8k", 8192), ("4k", 4096), ("2k", 2048), ("1k", 1024), ("half_k", 512)],
-)
-def test_every_config_parses_and_has_the_codebooks_it_names(
-    name: str, codes: int, demo_scene: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from nsvq_lightning.quantize.attributes import codebook_sizes
+def test_a_fit_without_a_config_is_fast(capsys: pytest.CaptureFixture[str]) -> None:
+    plain = settings(capsys, "--data.root=x")
+    assert plain == settings(capsys, "--data.root=x", "--config=fast")
+    assert (plain["trainer"]["max_steps"], plain["callbacks"]["budget"]["init_args"]["quality"]) == (4000, 0.9)
+    assert plain["trainer"]["devices"] == 1  # whatever the machine has
+    assert plain["model"]["quantizer"]["class_path"].endswith("TrainedStraightThrough")
 
-    with pytest.raises(SystemExit):
-        main(["fit", "--config", f"nsvq_{name}", f"--data.root={demo_scene}", "--print_config"])
-    config = yaml.safe_load(capsys.readouterr().out)
-    assert codebook_sizes(config["model"]["codebooks"])["scales"] == codes
+
+def test_the_papers_config_is_the_paper_and_its_settings_survive_another_class(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = settings(capsys, "--config=paper", "--data.root=x", "--model.codebooks=4k", "--model.quantizer=PostHoc")
     assert config["trainer"]["max_steps"] == 45_000
-    assert config["trainer"]["devices"] == 1  # whatever the machine has
+    assert config["model"]["codebooks"] == "4k"
+    assert config["model"]["quantizer"]["class_path"].endswith("PostHoc")
+    assert config["model"]["rates"]["shN"] == 0.000125
+    callbacks = config["callbacks"]
+    assert [callbacks[name] for name in ("rate_decay", "budget", "selection", "canonical")] == [None] * 4
+    assert callbacks["phases"]["init_args"]["quantize_end"] == 43_000
+    assert callbacks["density"]["class_path"].endswith("DensityControl")
+    assert callbacks["density"]["init_args"]["start"] == 600
 
 
-def test_plain_and_demo_configs_parse(demo_scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["fit", "--config=plain", f"--data.root={demo_scene}", "--print_config"])
-    config = yaml.safe_load(capsys.readouterr().out)
-    assert config["model"]["codebooks"] is None
-    assert config["callbacks"]["phases"]["init_args"]["warmup_end"] == 15_000
-    with pytest.raises(SystemExit):
-        main(["fit", "--config=demo.yaml", "--print_config"])
-    assert "DemoDataModule" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("name", "quantizer"), [("straight_through", "StraightThrough"), ("diveq", "DiVeQ"), ("post_hoc", "PostHoc")]
-)
-def test_configs_of_other_quantizers_differ_from_nsvq_in_that_alone(
-    name: str, quantizer: str, demo_scene: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from nsvq_lightning import quantize
-
-    def config(name: str, *more: str) -> dict[str, Any]:
-        with pytest.raises(SystemExit):
-            main(["fit", "--config", f"{name}_4k.yaml", f"--data.root={demo_scene}", *more, "--print_config"])
-        parsed: dict[str, Any] = yaml.safe_load(capsys.readouterr().out)
-        return parsed
-
-    ours, theirs = config(name), config("nsvq", f"--model.quantizer={quantizer}")  # short names resolve
-    home = getattr(quantize, quantizer)
-    assert ours["model"]["quantizer"]["class_path"].rpartition(".")[2] == home.__name__
-    if name == "post_hoc":
-        assert ours["callbacks"]["phases"]["init_args"].pop("quantize_end") == 45_000
-        assert theirs["callbacks"]["phases"]["init_args"].pop("quantize_end") == 43_000
-    assert ours == theirs
+def test_plain_and_demo_configs_parse(capsys: pytest.CaptureFixture[str]) -> None:
+    plain = settings(capsys, "--config=plain", "--data.root=x")
+    assert plain["model"]["codebooks"] is None
+    assert plain["callbacks"]["phases"]["init_args"]["warmup_end"] == 15_000
+    assert plain["callbacks"]["density"]["init_args"]["prune_every"] == 0
+    assert settings(capsys, "--config=demo.yaml")["data"]["class_path"].endswith("DemoDataModule")
 
 
 @pytest.mark.parametrize("path", [PurePosixPath("configs/data/demo.yaml"), PureWindowsPath(r"configs\data\demo.yaml")])
@@ -438,16 +370,16 @@ def test_a_missing_opencv_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: p
 
 
 def test_configs_are_found_as_files_first_then_by_name(tmp_path: Path) -> None:
-    mine = tmp_path / "nsvq_4k.yaml"
+    mine = tmp_path / "paper.yaml"
     mine.write_text("{}")
-    shipped = find_config("nsvq_4k")
-    assert shipped.endswith("configs/nsvq_4k.yaml")
+    shipped = find_config("paper")
+    assert shipped.endswith("configs/paper.yaml")
     assert find_config(str(mine)) == str(mine)
-    assert find_config("configs/nsvq_4k.yaml").endswith("configs/nsvq_4k.yaml")
+    assert find_config("configs/paper.yaml").endswith("configs/paper.yaml")
     assert find_config("no_such_config") == "no_such_config"
-    arguments = ["fit", "--config", "nsvq_4k", "--config=nsvq_4k", "-c", str(mine), "--data.root", "nsvq_4k"]
+    arguments = ["fit", "--config", "paper", "--config=paper", "-c", str(mine), "--data.root", "paper"]
     assert resolve_configs(arguments) == [
-        *("fit", "--config", shipped, f"--config={shipped}", "-c", str(mine), "--data.root", "nsvq_4k")
+        *("fit", "--config", shipped, f"--config={shipped}", "-c", str(mine), "--data.root", "paper")
     ]
 
 
@@ -510,15 +442,21 @@ def test_wrong_settings_name_the_file_they_came_from(
         (["fit", "--data", "{folder}"], "the folder of a scene is --data.root=path/to/scene"),
         (["fit", "--data", "no.Such"], "no.Such"),
         (["fit", "--bytes=abc"], "error: bytes: expected a whole number or null, got 'abc'\n"),
-        (["fit", "--data.root=x", "--data.factor", "3"], "error: factor: expected 1, 2, 4, 8 or null, got '3'\n"),
+        (["fit", "--data.root=x", "--data.factor", "3"], "error: data.factor: expected 1, 2, 4, 8 or null, got '3'\n"),
         (["fit", "--data.root=x", "--trainer.max_steps=x"], "trainer.max_steps: expected a whole number, got 'x'\n"),
         (["fit", "--data.root=x", "--model.background=gray"], "expected auto, black, white or random, got 'gray'\n"),
-        (["fit", "--data.root=x", "--callbacks.density=NoSuch"], "density: expected Callback or null, got 'NoSuch'\n"),
+        (
+            ["fit", "--data.root=x", "--callbacks.density=NoSuch"],
+            "expected BudgetedGrowth, Callback or null, got 'NoSuch'\n",
+        ),
         (["fit", "--data.root=x", "--callbacks.density=BudgetGrowth"], "'BudgetGrowth'; did you mean BudgetedGrowth?"),
         (["fit", "--data.root=x", "--model.quantizer=NSVX"], "got 'NSVX'; did you mean NSVQ?"),
-        (["fit", "--data.root=x", "--model.quantizer=nsvq_lightning.quantize.NSVX"], "did you mean NSVQ?"),
         (["fit", "--data.root=x", "--callbacks.densty=null"], "did you mean --callbacks.density?"),
-        (["fit", "--data.root=x", "--callbacks.density.max_splat=5"], "did you mean --max_splats?"),
+        (["fit", "--data.root=x", "--callbacks.density.min_splat=5"], "did you mean --min_splats?"),
+        (
+            ["fit", "--data.root=x", "--callbacks.report.every=2", "--callbacks.sh_degree.every=abc"],
+            "error: callbacks.sh_degree.every: expected a whole number, got 'abc'\n",
+        ),
         (["fit", "--data.root=x", "--qualty=2"], "did you mean --quality?"),
         (
             ["fit", "--data.root=x", "--config", "fats.yaml"],
@@ -561,17 +499,6 @@ def test_a_run_folder_that_cannot_be_made_is_a_sentence(
     assert f"the folder of the run, {tmp_path / 'file' / 'run'}, cannot be made (" in capsys.readouterr().err
 
 
-def test_errors_are_one_line_and_name_the_option(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(["fit", "--data.root=x", "--model.shdegree=2"])
-    assert stop.value.code == 2
-    message = capsys.readouterr().err
-    assert "shdegree" in message
-    assert len(message.splitlines()) < 12
-    assert main(["fit", f"--data.root={tmp_path / 'nowhere'}", f"--trainer.default_root_dir={tmp_path}"]) == 1
-    assert "nowhere" in capsys.readouterr().err
-
-
 def test_info_starts_without_torch(finished: Path) -> None:
     code = (
         "import sys; from nsvq_lightning.commands.main import main; status = main(sys.argv[1:]); "
@@ -589,9 +516,8 @@ def test_info_starts_without_torch(finished: Path) -> None:
 
 
 def test_only_float32_trains(demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for precision in ("bf16-mixed", "64-true"):
-        assert main(fit(demo_scene, tmp_path, f"--trainer.precision={precision}")) == 1
-        assert f"trainer.precision is {precision}: " in capsys.readouterr().err
+    assert main(fit(demo_scene, tmp_path, "--trainer.precision=bf16-mixed")) == 1
+    assert "trainer.precision is bf16-mixed: " in capsys.readouterr().err
 
 
 def test_a_run_without_checkpoints_or_bar_leaves_none(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import os
 import re
@@ -17,7 +16,7 @@ import torch
 import nsvq_lightning
 from nsvq_lightning.callbacks import STANDARD
 from nsvq_lightning.commands.main import main
-from nsvq_lightning.commands.option_help import first_sentence
+from nsvq_lightning.commands.option_help import class_help, first_sentence
 from nsvq_lightning.commands.registry import COMMANDS
 from nsvq_lightning.training.trainer import SplatTrainer
 
@@ -64,13 +63,11 @@ def fit_help() -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
 
 
-def test_help_has_every_option_of_the_default_callbacks_and_none_of_torchs_classes(fit_help: str) -> None:
+def test_help_says_what_there_is_and_names_none_of_torchs_classes(fit_help: str) -> None:
     for key, kind in STANDARD.items():
-        for name in inspect.signature(kind).parameters:
-            assert f"--callbacks.{key}.{name}" in fit_help
-    assert "--callbacks.density.max_splats=null\n        " in fit_help
+        assert f"--callbacks.{key}" in fit_help or not inspect.signature(kind).parameters
     assert "--data.root\n        Scene folder" in fit_help
-    assert "--trainer.max_steps=45000" in fit_help
+    assert "--trainer.max_steps=4000" in fit_help
     assert "torch.nn" not in fit_help
     assert len(fit_help.splitlines()) < 510
     assert max(len(line) for line in fit_help.splitlines() if line.startswith("        ")) <= 80
@@ -87,7 +84,8 @@ def test_options_that_the_readme_names_are_in_the_help(fit_help: str) -> None:
         if "quantizer." not in name
     }
     assert {"data.root", "trainer.max_steps"} <= named
-    assert {name for name in named if f"--{name}" not in fit_help} == set()
+    known = fit_help + "".join(class_help(f"callbacks.{key}", kind) for key, kind in STANDARD.items())
+    assert {name for name in named if f"--{name}" not in known} == set()
 
 
 def test_one_callback_says_what_it_takes(capsys: pytest.CaptureFixture[str]) -> None:
@@ -95,8 +93,8 @@ def test_one_callback_says_what_it_takes(capsys: pytest.CaptureFixture[str]) -> 
         main(["fit", "--callbacks.density.help"])
     assert end.value.code == 0
     out = capsys.readouterr().out
-    assert out.startswith("callbacks.density:\n  Clones, splits and prunes splats")
-    assert "--callbacks.density.grad_threshold=0.0002\n" in out
+    assert out.startswith("callbacks.density:\n  Splits splats where the photos have edges")
+    assert "--callbacks.density.grad_threshold=0.0003\n" in out
 
 
 def test_the_first_sentence_is_plain_text() -> None:
@@ -114,8 +112,8 @@ SCENE = ["--data.root=no_scene", "--callbacks.progress=null"]
         ("--trainer.accelerator=tpu", "torch_xla"),
         ("--trainer.devices=0", "devices='0'"),
         ("--trainer.strategy=nothing", "strategy='nothing'"),
-        ("--callbacks.density.max_splats=1", "max_splats must be at least min_splats=10, got 1"),
-        ("--callbacks.report.every=-1", "every must be None or at least 0, got -1"),
+        ("--callbacks.density.budget=1", "budget must be at least min_splats=10, got 1"),
+        ("--callbacks.report.every=-1", "every must be at least 0, got -1"),
         ("--trainer.logger=MLFlowLogger", "mlflow"),
         ("--trainer.accelerator=gpu", "No supported gpu backend found"),
         ("--model.quantizer=nn_modules.NoQuantizer", "NoQuantizer is not a quantizer; it lacks: codebook, codes"),

@@ -313,7 +313,7 @@ def _build_config(folder: Path) -> list[Path]:
     from nsvq_lightning.commands.arguments import find_config
 
     files = []
-    for name in ("nsvq_4k", "best", "demo"):
+    for name in ("paper", "best", "demo"):
         files.append(folder / f"{name}.yaml")
         files[-1].write_bytes(Path(find_config(name)).read_bytes())
     return files

@@ -21,6 +21,7 @@ from triton.runtime.interpreter import GridExecutor
 
 import nsvq_lightning
 from nsvq_lightning.data.scene import View
+from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats.splats import Splats
@@ -96,7 +97,8 @@ def module_and_view(phase: Phase) -> tuple[SplatModule, View]:
     splats = Splats.from_tensors(
         rand(4, 3) * 0.3, rand(4, 4), rand(4, 3) * 0.2 - 2, rand(4), rand(4, 1, 3), rand(4, 15, 3)
     )
-    module = SplatModule(sh_degree=3, codebooks={"scales": 4, "quats": 4, "sh0": 4, "shN": 3}, splats=splats)
+    codes = {"scales": 4, "quats": 4, "sh0": 4, "shN": 3}
+    module = SplatModule(sh_degree=3, quantizer=NSVQ, codebooks=codes, splats=splats)
     module.backend, module.active_sh_degree, module.phase = "cuda", 3, phase
     for name, quantizer in module.quantizers.items():
         quantizer.fit(module.rows(name), generator=generator(0, 0, name))
@@ -110,7 +112,6 @@ def module_and_view(phase: Phase) -> tuple[SplatModule, View]:
 
 
 def step(module: SplatModule, view: View, optimizer: torch.optim.Optimizer) -> None:
-    module.wants_screen_gradients = module.phase is Phase.WARMUP
     outputs = module.training_step(view, 0)
     assert outputs is not None
     optimizer.zero_grad()
