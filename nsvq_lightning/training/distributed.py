@@ -84,8 +84,8 @@ class ViewParallelStrategy(DDPStrategy):
     ``DistributedDataParallel`` keeps the parameters it finds at the start, but cloning and pruning replace them. Here
     nothing is wrapped: every process starts from the first one's parameters and buffers, and after each backward pass
     the gradients of the module's current parameters are summed and divided by the number of processes. So all replicas
-    take the same update and stay equal to the bit, as long as all data that enters a decision has passed a collective
-    (:mod:`nsvq_lightning.training.host`); :func:`nsvq_lightning.training.distributed.check_replicas` compares them.
+    take the same update and stay equal to the bit, as long as all data that enters a decision has passed a collective;
+    :func:`nsvq_lightning.training.distributed.check_replicas` compares them.
 
     With gradient accumulation there is one reduction per step. A parameter that has no gradient on any process stays
     without one; a step in which any process has a non-finite loss updates nothing.

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -497,22 +495,6 @@ def test_a_run_folder_that_cannot_be_made_is_a_sentence(
     (tmp_path / "file").touch()
     assert main(fit(demo_scene, tmp_path, f"--trainer.run_folder={tmp_path / 'file' / 'run'}")) == 1
     assert f"the folder of the run, {tmp_path / 'file' / 'run'}, cannot be made (" in capsys.readouterr().err
-
-
-def test_info_starts_without_torch(finished: Path) -> None:
-    code = (
-        "import sys; from nsvq_lightning.commands.main import main; status = main(sys.argv[1:]); "
-        "assert 'torch' not in sys.modules, 'torch was imported'; sys.exit(status)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, "info", str(finished / "scene.nsvq")],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=Path(__file__).resolve().parents[2],
-    )
-    assert done.returncode == 0, done.stderr
-    assert "splats" in done.stdout
 
 
 def test_only_float32_trains(demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
