@@ -12,7 +12,7 @@ import pytest
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 ALL = ("compress_ply", "own_quantizer", "quickstart", "read_a_sweep")
 SMALL = (
-    (r"^steps = \d+", "steps = 60"),
+    (r"^steps = \d+", "steps = 24"),
     (r"DemoDataModule\(\)", "DemoDataModule(factor=4)"),
     (r"--data\.root=\{DEMO\}\"", '--data.root={DEMO}", "--data.factor=4"'),
     (r'^sizes = ".*"', 'sizes = "1k,0.5k"'),

@@ -51,19 +51,6 @@ def test_compromised_releases_of_lightning_cannot_be_installed() -> None:
     ]
 
 
-def test_building_needs_no_torch() -> None:
-    assert [Requirement(line).name for line in _project()["build-system"]["requires"]] == ["hatchling"]
-
-
-def test_version_is_stated_once() -> None:
-    assert _project()["project"]["dynamic"] == ["version"]
-    try:
-        installed = importlib.metadata.version("nsvq-lightning")
-    except importlib.metadata.PackageNotFoundError:
-        pytest.skip("the package is not installed; it is tested from the source tree")
-    assert installed == nsvq_lightning.__version__
-
-
 def test_every_dependency_is_pinned_to_an_allowed_version() -> None:
     pins = {name.lower(): version for name, version in _pins().items()}
     for name, requirement in _requirements().items():
@@ -168,16 +155,6 @@ def test_callbacks_configs_and_type_marker_are_found_in_the_package() -> None:
     assert specification.origin == str(folder_of("callbacks") / "__init__.py")
     assert (Path(nsvq_lightning.__file__).parent / "py.typed").is_file()
     assert any(entry.suffix == ".yaml" for entry in folder_of("configs").iterdir())
-
-
-def test_scripts_point_to_modules_of_the_package() -> None:
-    scripts = _project()["project"]["scripts"]
-    assert scripts == {
-        "nsvq": "nsvq_lightning.commands.main:main",
-        "lightning": "nsvq_lightning.commands.lightning_script:main",
-    }
-    for target in scripts.values():
-        assert importlib.util.find_spec(target.split(":")[0]) is not None
 
 
 @pytest.mark.parametrize("block", ["test", "demo"])

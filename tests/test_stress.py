@@ -26,7 +26,6 @@ from nsvq_lightning.commands.benchmark.render import painter, trace
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.edit import LARGEST_LOG_SCALE, drop_non_finite
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
@@ -80,20 +79,6 @@ def test_splats_without_a_place_or_shape_change_nothing(name: str) -> None:
     both = trace(scene.workload, beside("reference", scene.planted), torch.float64).image
     alone = trace(scene.workload, painter("reference"), torch.float64).image
     assert torch.equal(both, alone) == (name not in MEANS_SOMETHING)
-
-
-@pytest.mark.parametrize("attribute", ATTRIBUTES)
-def test_culprits_are_dropped_with_a_message(attribute: str, caplog: pytest.LogCaptureFixture) -> None:
-    scene = SCENES[f"{attribute} nan"]
-    splats = Splats.from_tensors(*map(torch.cat, zip(scene.planted, scene.workload.splats, strict=True)))
-    healthy, total = len(scene.workload.splats.means), len(splats)
-    optimizer = build_adam(param_groups(splats, {}, LearningRates(), extent=1.0))
-    with caplog.at_level(logging.WARNING):
-        assert int((~drop_non_finite(splats, optimizer, 12)).sum()) == BROKEN_ROWS
-    assert f"step 12: dropped {BROKEN_ROWS} of {total} splats" in caplog.text
-    assert f"{attribute} in {BROKEN_ROWS} rows" in caplog.text
-    assert torch.equal(splats.means, scene.workload.splats.means)
-    assert len(splats) == healthy
 
 
 @pytest.mark.parametrize("name", quantizers())
@@ -184,14 +169,6 @@ def test_two_points_a_hair_apart_get_the_smallest_scale() -> None:
     points = torch.tensor([[0.0, 0.0, 0.0], [1e-30, 0.0, 0.0]])
     splats = Splats.from_points(points, torch.zeros(2, 3))
     np.testing.assert_allclose(splats.scales.detach().exp().numpy(), math.sqrt(1e-7), rtol=1e-5)
-
-
-def test_scenes_are_the_same_at_every_call() -> None:
-    again = extremes()
-    assert again.keys() == SCENES.keys()
-    for name, scene in again.items():
-        pairs = zip(scene.workload.splats, SCENES[name].workload.splats, strict=True)
-        assert all(torch.equal(first, second) for first, second in pairs)
 
 
 def test_table_has_a_row_for_each_scene_and_backend() -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 import math
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from density_stage import EXTENT, Stage, make_splats
 from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from scipy.spatial.transform import Rotation
 
@@ -18,11 +18,10 @@ from nsvq_lightning.callbacks.density import add_view, limit_growth, split
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
-from nsvq_lightning.splats.splats import RawSplats, Splats
+from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.distributed import ViewParallelStrategy
 from nsvq_lightning.training.edit import append_rows, keep_rows
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.training.schedule import Schedule
 
 
@@ -84,20 +83,7 @@ def test_growth_counts_what_each_splat_adds() -> None:
     assert kept[8] == mask.tolist()
 
 
-EXTENT = 2.0
 SMALL, LARGE = 0.01, 0.05  # below and above 0.01 · extent
-
-
-def make_splats(sizes: list[float], opacities: list[float]) -> Splats:
-    n = len(sizes)
-    return Splats.from_tensors(
-        means=torch.arange(3.0 * n).view(n, 3),
-        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-        scales=torch.tensor(sizes).log()[:, None].repeat(1, 3),
-        opacities=torch.tensor(opacities).logit(),
-        sh0=torch.zeros(n, 1, 3),
-        shN=torch.zeros(n, 0, 3),
-    )
 
 
 def view(gradients: list[float], seen: list[bool], width: int = 40, height: int = 20) -> Render:
@@ -109,46 +95,12 @@ def view(gradients: list[float], seen: list[bool], width: int = 40, height: int 
     return Render(image, image[..., 0], torch.tensor(seen).int(), means2d, image[..., 0])
 
 
-class Stage:
-    """Module and trainer in one run of the paper's length."""
-
-    def __init__(self, splats: Splats, control: DensityControl, background: str = "black", micro: int = 1) -> None:
-        self.control = control
-        optimizer = build_adam(param_groups(splats, {}, LearningRates(), EXTENT))
-        self.module: Any = SimpleNamespace(
-            splats=splats,
-            quantizers={},
-            schedule=Schedule(),
-            extent=EXTENT,
-            seed=0,
-            background=background,
-        )
-        self.trainer: Any = SimpleNamespace(
-            optimizers=[optimizer], global_step=0, world_size=1, accumulate_grad_batches=micro
-        )
-
-    def end_batch(self, iteration: int, render: Render | None = None, **beside: Any) -> None:
-        """A step with a view and what it returns beside it, or one without an update."""
-        self.trainer.global_step = iteration - 1
-        self.control.on_train_batch_start(self.trainer, self.module, None, 0)  # type: ignore[arg-type]
-        self.trainer.global_step = iteration
-        for parameter in self.module.splats.parameters():
-            parameter.grad = None if render is None else torch.zeros_like(parameter)
-        outputs = {} if render is None else {"loss": torch.tensor(0.0), "render": render, **beside}
-        self.control.on_train_batch_end(self.trainer, self.module, outputs, None, 0)
-
-    @property
-    def count(self) -> int:
-        return len(self.module.splats)
-
-
-def test_the_statistic_is_the_mean_over_the_views_that_saw_the_splat() -> None:
-    stage = Stage(make_splats([SMALL] * 3, [0.5] * 3), DensityControl())
-    stage.end_batch(1, view([4e-4, 1e-4, 0.0], [True, True, False]))
-    stage.end_batch(2, view([2e-4, 0.0, 0.0], [True, False, False]))
-    tables = stage.module.splats.tables()
-    assert tables["gradient_sum"].tolist() == pytest.approx([6e-4, 1e-4, 0.0])
-    assert tables["view_count"].tolist() == [2.0, 1.0, 0.0]
+def stage_of(
+    sizes: list[float], opacities: list[float], control: DensityControl, background: str = "black", micro: int = 1
+) -> Stage:
+    """A run of the paper's length."""
+    scales = torch.tensor(sizes).log()[:, None].repeat(1, 3)
+    return Stage(make_splats(opacities, scales), control, Schedule(), micro, background)
 
 
 def swap_first(stage: Stage) -> None:
@@ -162,14 +114,14 @@ def swap_first(stage: Stage) -> None:
 def test_a_view_of_splats_that_changed_since_is_left_out_with_one_warning(
     edit: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    stage = Stage(make_splats([SMALL] * 3, [0.5] * 3), DensityControl())
-    stage.end_batch(1, view([4e-4, 1e-4, 2e-4], [True] * 3), edits=0)
+    stage = stage_of([SMALL] * 3, [0.5] * 3, DensityControl())
+    stage.step(1, view([4e-4, 1e-4, 2e-4], [True] * 3), edits=0)
     rendered = {"removed": 4, "added": 2, "swapped": 3}[edit]
     if edit == "swapped":
         swap_first(stage)
     with caplog.at_level(logging.WARNING):
         for iteration in (2, 3):
-            stage.end_batch(iteration, view([9e-4] * rendered, [True] * rendered), edits=0)
+            stage.step(iteration, view([9e-4] * rendered, [True] * rendered), edits=0)
     tables = stage.module.splats.tables()
     sums = [1e-4, 2e-4, 0.0] if edit == "swapped" else [4e-4, 1e-4, 2e-4]  # rows take theirs along
     assert tables["gradient_sum"].tolist() == pytest.approx(sums)
@@ -177,16 +129,15 @@ def test_a_view_of_splats_that_changed_since_is_left_out_with_one_warning(
     assert [record.message.partition(":")[0] for record in caplog.records] == ["iteration 2"]
     assert f"({rendered} were rendered, now 3)" in caplog.text
     assert "List that callback after DensityControl" in caplog.text
-    stage.end_batch(4, view([1e-4] * 3, [True] * 3), edits=stage.module.splats.edits)
+    stage.step(4, view([1e-4] * 3, [True] * 3), edits=stage.module.splats.edits)
     assert tables["gradient_sum"].tolist() == pytest.approx([value + 1e-4 for value in sums])
 
 
 def test_clone_split_and_prune_at_the_scheduled_iteration() -> None:
-    splats = make_splats([SMALL, LARGE, SMALL, SMALL], [0.5, 0.5, 0.004, 0.5])
-    stage = Stage(splats, DensityControl(min_splats=1))
-    stage.end_batch(599, view([3e-4, 3e-4, 0.0, 1e-4], [True] * 4))
+    stage = stage_of([SMALL, LARGE, SMALL, SMALL], [0.5, 0.5, 0.004, 0.5], DensityControl(min_splats=1))
+    stage.step(599, view([3e-4, 3e-4, 0.0, 1e-4], [True] * 4))
     assert stage.count == 4
-    stage.end_batch(600, view([3e-4, 3e-4, 0.0, 1e-4], [True] * 4))
+    stage.step(600, view([3e-4, 3e-4, 0.0, 1e-4], [True] * 4))
     # 0 is there twice, 1 became two children, 2 was transparent, 3 stays.
     means = stage.module.splats.means.detach()
     assert stage.count == 5
@@ -197,27 +148,27 @@ def test_clone_split_and_prune_at_the_scheduled_iteration() -> None:
 
 
 def test_gradient_accumulation_neither_repeats_an_edit_nor_weakens_the_statistic() -> None:
-    stage = Stage(make_splats([SMALL] * 2, [0.5] * 2), DensityControl(min_splats=1), micro=2)
+    stage = stage_of([SMALL] * 2, [0.5] * 2, DensityControl(min_splats=1), micro=2)
     # Each micro-batch sees half of the gradient, as Lightning divides the loss.
-    stage.end_batch(600, view([1.1e-4, 0.0], [True, True]))
+    stage.step(600, view([1.1e-4, 0.0], [True, True]))
     assert stage.count == 3
-    stage.end_batch(600, view([1.1e-4, 0.0, 1.1e-4], [True] * 3))
+    stage.step(600, view([1.1e-4, 0.0, 1.1e-4], [True] * 3))
     assert stage.count == 3
 
 
 def test_huge_splats_go_only_after_iteration_3000() -> None:
     for iteration, left in ((2900, 2), (3000, 2), (3100, 1)):
-        stage = Stage(make_splats([0.1 * EXTENT + 0.01, SMALL], [0.5, 0.5]), DensityControl(min_splats=1))
-        stage.end_batch(iteration, view([0.0, 0.0], [True, True]))
+        stage = stage_of([0.1 * EXTENT + 0.01, SMALL], [0.5, 0.5], DensityControl(min_splats=1))
+        stage.step(iteration, view([0.0, 0.0], [True, True]))
         assert stage.count == left
 
 
 def test_opacities_are_reset_with_their_moments() -> None:
-    stage = Stage(make_splats([SMALL] * 3, [0.9, 0.5, 0.008]), DensityControl(min_splats=1))
+    stage = stage_of([SMALL] * 3, [0.9, 0.5, 0.008], DensityControl(min_splats=1))
     optimizer = stage.trainer.optimizers[0]
     stage.module.splats.opacities.sum().backward()
     optimizer.step()
-    stage.end_batch(3000, view([0.0] * 3, [True] * 3))
+    stage.step(3000, view([0.0] * 3, [True] * 3))
     opacities = stage.module.splats.opacities
     assert opacities.sigmoid().tolist() == pytest.approx([0.01, 0.01, 0.008], rel=0.1)
     assert not optimizer.state[opacities]["exp_avg"].any()
@@ -226,31 +177,23 @@ def test_opacities_are_reset_with_their_moments() -> None:
 
 def test_a_white_background_is_reset_once_more() -> None:
     for background, opacity in (("white", 0.01), ("black", 0.9)):
-        stage = Stage(make_splats([SMALL] * 12, [0.9] * 12), DensityControl(), background)
-        stage.end_batch(500, view([0.0] * 12, [True] * 12))
+        stage = stage_of([SMALL] * 12, [0.9] * 12, DensityControl(), background)
+        stage.step(500, view([0.0] * 12, [True] * 12))
         assert float(stage.module.splats.opacities[0].detach().sigmoid()) == pytest.approx(opacity, rel=1e-4)
 
 
-def test_the_prune_phase_prunes_and_never_grows() -> None:
-    stage = Stage(make_splats([SMALL] * 3, [0.5, 0.004, 0.5]), DensityControl(min_splats=1))
-    stage.end_batch(15_500, view([1.0] * 3, [True] * 3))
-    assert stage.count == 3
-    stage.end_batch(16_000, view([1.0] * 3, [True] * 3))
-    assert stage.count == 2
-
-
 def test_pruning_everything_is_skipped_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
-    stage = Stage(make_splats([SMALL] * 12, [0.001] * 12), DensityControl())
+    stage = stage_of([SMALL] * 12, [0.001] * 12, DensityControl())
     with caplog.at_level(logging.WARNING):
-        stage.end_batch(16_000, view([0.0] * 12, [True] * 12))
+        stage.step(16_000, view([0.0] * 12, [True] * 12))
     assert stage.count == 12
     assert "pruning 12 of 12 splats would leave fewer than min_splats=10" in caplog.text
 
 
 def test_growth_stops_at_the_cap() -> None:
     control = DensityControl(min_splats=1, max_splats=5)
-    stage = Stage(make_splats([SMALL, SMALL, LARGE, LARGE], [0.5] * 4), control)
-    stage.end_batch(600, view([3e-4, 4e-4, 5e-4, 9e-4], [True] * 4))
+    stage = stage_of([SMALL, SMALL, LARGE, LARGE], [0.5] * 4, control)
+    stage.step(600, view([3e-4, 4e-4, 5e-4, 9e-4], [True] * 4))
     assert stage.count == 5
     # The one with the largest statistic, the last, was split.
     assert stage.module.splats.means.detach()[:3].tolist() == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
@@ -259,28 +202,28 @@ def test_growth_stops_at_the_cap() -> None:
 def test_growth_into_many_children_stops_at_the_cap() -> None:
     for cap, count in ((6, 5), (7, 7)):  # a clone adds 1, a split into 3 adds 2
         control = DensityControl(min_splats=1, children=3, max_splats=cap)
-        stage = Stage(make_splats([SMALL, LARGE, LARGE, SMALL], [0.5] * 4), control)
-        stage.end_batch(600, view([3e-4, 4e-4, 5e-4, 9e-4], [True] * 4))
+        stage = stage_of([SMALL, LARGE, LARGE, SMALL], [0.5] * 4, control)
+        stage.step(600, view([3e-4, 4e-4, 5e-4, 9e-4], [True] * 4))
         assert stage.count == count
 
 
 def test_a_non_finite_splat_is_dropped_as_soon_as_the_loss_shows_it(caplog: pytest.LogCaptureFixture) -> None:
-    stage = Stage(make_splats([SMALL] * 3, [0.5] * 3), DensityControl())
+    stage = stage_of([SMALL] * 3, [0.5] * 3, DensityControl())
     with torch.no_grad():
         stage.module.splats.quats[1] = math.nan
-    stage.end_batch(7, None)  # the step was skipped: no outputs
+    stage.step(7, None)  # the step was skipped: no outputs
     assert stage.count == 2
     assert "step 7: dropped 1 of 3 splats with non-finite values: quats in 1 rows" in caplog.text
 
 
 def test_frozen_codes_go_with_the_splats_that_are_dropped_in_fine_tuning() -> None:
-    stage = Stage(make_splats([SMALL] * 4, [0.5] * 4), DensityControl())
+    stage = stage_of([SMALL] * 4, [0.5] * 4, DensityControl())
     frozen, free = NSVQ(3, 3), NSVQ(3, 3)
     frozen.freeze(torch.tensor([2, 0, 1, 2]))
     stage.module.quantizers = {"scales": frozen, "sh0": free}
     with torch.no_grad():
         stage.module.splats.sh0[1] = math.inf
-    stage.end_batch(44_000, view([0.0] * 4, [True] * 4))
+    stage.step(44_000, view([0.0] * 4, [True] * 4))
     assert stage.module.splats.means.detach().tolist() == [[0, 1, 2], [6, 7, 8], [9, 10, 11]]
     assert frozen.codes.tolist() == [2, 1, 2]
     assert not free.frozen
@@ -288,12 +231,12 @@ def test_frozen_codes_go_with_the_splats_that_are_dropped_in_fine_tuning() -> No
 
 def test_resuming_right_after_an_edit_does_not_repeat_it() -> None:
     control = DensityControl(min_splats=1)
-    stage = Stage(make_splats([SMALL] * 2, [0.5] * 2), control)
-    stage.end_batch(600, view([3e-4, 0.0], [True, True]))
+    stage = stage_of([SMALL] * 2, [0.5] * 2, control)
+    stage.step(600, view([3e-4, 0.0], [True, True]))
     fresh = DensityControl(min_splats=1)
     fresh.load_state_dict(control.state_dict())
     stage.control = fresh
-    stage.end_batch(600, view([3e-4, 0.0, 3e-4], [True] * 3))
+    stage.step(600, view([3e-4, 0.0, 3e-4], [True] * 3))
     assert stage.count == 3
 
 

@@ -119,13 +119,3 @@ def test_it_does_nothing_where_there_are_few_splats_already() -> None:
     assert len(stage.module.splats) == 20
     assert torch.equal(stage.module.splats.opacities.detach()[10:], before[10:])
     assert not stage.rates
-
-
-def test_its_state_survives_a_checkpoint() -> None:
-    whole = Stage(100, OpacitySelection(budget=50))
-    whole.run(60)
-    state = whole.selection.state_dict()
-    assert state["line"] is not None
-    resumed = OpacitySelection(budget=50)
-    resumed.load_state_dict(state)
-    assert resumed.state_dict() == state

@@ -34,22 +34,6 @@ def host(**values: Any) -> Any:
     return SimpleNamespace(schedule=Schedule(), **values)
 
 
-def test_codes_are_replaced_at_the_papers_iterations() -> None:
-    callback = paper_replacement()
-    due = [i for i in range(1, 45_001) if callback.is_due(host(), i)]
-    assert due == [*range(20_100, 22_001, 100), *range(22_500, 43_001, 500)]
-
-
-def test_a_short_run_replaces_over_windows_of_several_views() -> None:
-    callback = paper_replacement()
-    short: Any = SimpleNamespace(schedule=Schedule(total=4500, min_replacement_interval=40, min_finetune=1))
-    due = [i for i in range(1, 4501) if callback.is_due(short, i)]
-    assert due[0] == 2040
-    assert {b - a for a, b in pairwise(due) if b < 2250} == {40}
-    assert due[-1] == 4300
-    assert all(short.schedule.phase_at(i) is Phase.QUANTIZE for i in due)
-
-
 @pytest.mark.parametrize("total", [500, 1000, 1500, 2000, 4500, 7000, 20_000])
 def test_no_window_of_a_short_run_is_below_the_limit(total: int) -> None:
     """The first counts from the start of the phase: codes that few views could hit are not out of use."""
@@ -69,21 +53,6 @@ def test_replacement_stops_as_long_before_codes_freeze_as_asked_for() -> None:
         short: Any = SimpleNamespace(schedule=schedule)
         last = max(i for i in range(1, total + 1) if callback.is_due(short, i))
         assert schedule.ends[Phase.QUANTIZE] - last >= round(3000 * schedule.scale)
-
-
-def test_replacement_can_stop_before_codes_freeze() -> None:
-    callback = paper_replacement(end=40_000)
-    assert [i for i in range(1, 45_001) if callback.is_due(host(), i)][-1] == 40_000
-    no_late_series = paper_replacement(end=22_000)
-    assert [i for i in range(1, 45_001) if no_late_series.is_due(host(), i)] == [*range(20_100, 22_001, 100)]
-
-
-def test_a_shorter_quantize_phase_keeps_the_papers_times() -> None:
-    schedule = paper_phases(quantize_end=30_000, reference_total=32_000).schedule(32_000)
-    assert schedule.first_of(Phase.FINETUNE) == 30_001
-    short: Any = SimpleNamespace(schedule=schedule)
-    due = [i for i in range(1, 32_001) if paper_replacement().is_due(short, i)]
-    assert due == [*range(20_100, 22_001, 100), *range(22_500, 30_001, 500)]
 
 
 @pytest.mark.parametrize(
@@ -165,16 +134,6 @@ def refit(trainer: Any, steps: int = 2) -> dict[str, Any]:
     host: Any = SimpleNamespace(schedule=Schedule(), quantizers=quantizers, rows=lambda name: ROWS)
     CodebookRefit(steps=steps).on_before_optimizer_step(trainer, host, None)  # type: ignore[arg-type]
     return quantizers
-
-
-def test_refits_scale_like_replacement() -> None:
-    def due(total: int, every: int = 100) -> list[int]:
-        host: Any = SimpleNamespace(schedule=Schedule(total=total))
-        return [i for i in range(1, total + 1) if CodebookRefit(every=every).is_due(host, i)]
-
-    assert due(45_000) == list(range(20_100, 43_001, 100))
-    assert due(4500) == list(range(2050, 4201, 50))
-    assert due(4500, 1000) == list(range(2100, 4201, 100))
 
 
 def test_only_quantizers_that_offer_it_are_refitted() -> None:

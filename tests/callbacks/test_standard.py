@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 from lightning.pytorch import Trainer
-from lightning.pytorch.callbacks import BasePredictionWriter, ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 
-from nsvq_lightning.callbacks import MetricReport, RenderWriter, RunCheckpoint, SplatProgressBar, standard
+from nsvq_lightning.callbacks import MetricReport, RunCheckpoint, SplatProgressBar, standard
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.training.module import SplatModule
 
@@ -61,7 +61,3 @@ def test_a_checkpoint_callback_of_the_users_is_the_trainers(demo_scene: Path, tm
     assert Path(best.best_model_path).is_file()
     assert isinstance(trainer.checkpoint_callbacks[-1], RunCheckpoint)
     assert trainer.checkpoint_callbacks[-1].last_path is not None
-
-
-def test_pictures_are_written_as_lightning_writes_predictions() -> None:
-    assert isinstance(RenderWriter(), BasePredictionWriter)

@@ -189,14 +189,3 @@ def test_the_same_quantizers_go_on_whatever_they_are_called() -> None:
     older = saved(module)
     del older[QUANTIZER_SETTINGS]
     check(older, quantizing())
-
-
-def test_a_fit_from_a_quantized_checkpoint_keeps_its_codebooks(run: RunFactory, recipe: Recipe) -> None:
-    trainer, module = run(recipe(checkpoint=RunCheckpoint()).values(), max_steps=12)
-    assert module.phase >= Phase.QUANTIZE
-    path = checkpoint_of(trainer)
-    loaded = SplatModule.load_from_checkpoint(path, quantizer=NSVQ)
-    assert loaded.quantizer_settings == module.quantizer_settings
-    for other in ({"codebooks": {"scales": 23, "quats": 24, "sh0": 16, "shN": 16}}, {"quantizer": StraightThrough}):
-        with pytest.raises(ValueError, match="that can change only before the quantize phase"):
-            run(recipe().values(), ckpt_path=path, module=other, max_steps=12)

@@ -187,15 +187,6 @@ def test_signals_wait_for_the_last_micro_batch(run: RunFactory, recipe: Recipe) 
     assert (runner.continued(path) / "scene.nsvq").read_bytes() == (reference / "scene.nsvq").read_bytes()
 
 
-def test_a_second_signal_stops_at_once(run: RunFactory, recipe: Recipe) -> None:
-    def twice() -> None:
-        interrupt()
-        interrupt()
-
-    path = Runner(run, recipe, "paper").stopped(SystemExit, Trouble(7, twice))
-    assert iteration_of(path) == 6
-
-
 def test_handlers_of_signals_are_given_back(run: RunFactory, recipe: Recipe) -> None:
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     runner = Runner(run, recipe, "paper", max_steps=8)

@@ -17,7 +17,6 @@ from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.formats import save
-from nsvq_lightning.quantize.nsvq import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render, visible
@@ -25,7 +24,6 @@ from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
-from nsvq_lightning.training.resume import plain
 from nsvq_lightning.training.schedule import Phase
 
 CODES = {"scales": 6, "quats": 5, "sh0": 4, "shN": 3}
@@ -178,15 +176,6 @@ def test_what_is_not_a_quantizer_is_refused() -> None:
         SplatModule(codebooks={"scales": 0})
     with pytest.raises(ValueError, match="background must be"):
         SplatModule(background="green")  # type: ignore[arg-type]
-
-
-def test_without_higher_coefficients_there_is_no_codebook_for_them() -> None:
-    assert set(SplatModule(sh_degree=0, codebooks="1k").quantizers) == {"scales", "quats", "sh0"}
-
-
-def test_hyper_parameters_become_plain_data() -> None:
-    stored = plain({"a": 1, "rates": LearningRates(), "quantizer": NSVQ, "t": torch.zeros(1), "n": [None, {"x": 0.5}]})
-    assert stored == {"a": 1, "rates": LearningRates().__dict__, "n": [None, {"x": 0.5}]}
 
 
 def test_a_trained_module_cannot_be_trained_from_the_start(module: SplatModule) -> None:

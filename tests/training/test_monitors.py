@@ -41,9 +41,8 @@ def test_a_checkpoint_keeps_the_best_evaluation_and_continues_to_the_same_bits(
     assert stored == pytest.approx(scores, abs=1e-3)
     assert Path(best.best_model_path).stem == f"step={max(scores, key=scores.__getitem__)}"
     expected = (run_folder(trainer) / "scene.nsvq").read_bytes()
-    for step in (20, 27, 57):
-        resumed, _ = run(recipe(checkpoint=RunCheckpoint(every=0)).values(), tmp_path / f"step={step}.ckpt")
-        assert (run_folder(resumed) / "scene.nsvq").read_bytes() == expected
+    resumed, _ = run(recipe(checkpoint=RunCheckpoint(every=0)).values(), tmp_path / "step=27.ckpt")
+    assert (run_folder(resumed) / "scene.nsvq").read_bytes() == expected
 
 
 @pytest.mark.parametrize("at_epochs", [None, False])

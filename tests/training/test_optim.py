@@ -16,7 +16,6 @@ from nsvq_lightning.training.optim import (
     LearningRates,
     apply_rates,
     build_adam,
-    find_group,
     param_groups,
     position_lr,
 )
@@ -94,24 +93,6 @@ def test_adams_numbers_follow_the_number_of_views() -> None:
         apply_rates(optimizer, rates, extent=3.0, views=16)
 
 
-def test_adam_is_the_textbook_one() -> None:
-    scene = splats()
-    optimizer = build_adam(param_groups(scene, {}, LearningRates(), extent=1.0))
-    reference = [p.detach().clone().requires_grad_() for p in scene.attributes().values()]
-    rates = [group["lr"] for group in optimizer.param_groups]
-    slow = torch.optim.Adam(
-        [{"params": [p], "lr": lr} for p, lr in zip(reference, rates, strict=True)], eps=1e-15, foreach=False
-    )
-    for step in range(5):
-        for fast, other in zip(scene.attributes().values(), reference, strict=True):
-            grad = torch.randn(fast.shape, generator=torch.Generator().manual_seed(step))
-            fast.grad, other.grad = grad, grad.clone()
-        optimizer.step()
-        slow.step()
-    for fast, other in zip(scene.attributes().values(), reference, strict=True):
-        torch.testing.assert_close(fast.detach(), other.detach(), rtol=1e-6, atol=1e-7)
-
-
 def test_steps_have_the_same_bits_for_any_number_of_threads() -> None:
     def moved(threads: int) -> list[torch.Tensor]:
         torch.set_num_threads(threads)
@@ -136,13 +117,6 @@ def test_a_codebook_without_gradient_is_left_alone() -> None:
     optimizer = build_adam(param_groups(splats(), {"scales": book}, LearningRates(), extent=1.0))
     optimizer.step()
     assert book.codebook not in optimizer.state
-
-
-def test_groups_are_found_by_name() -> None:
-    optimizer = build_adam(param_groups(splats(), {}, LearningRates(), extent=1.0))
-    assert find_group(optimizer, "means") is optimizer.param_groups[0]
-    with pytest.raises(ValueError, match="no parameter group 'albedo', only: means"):
-        find_group(optimizer, "albedo")
 
 
 @pytest.mark.parametrize("bad", [{"means": 0.0}, {"opacities": -1.0}, {"shN": math.nan}])

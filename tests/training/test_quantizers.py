@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -156,15 +155,9 @@ def test_post_hoc_stores_kmeans_of_the_final_rows(run: RunFactory, recipe: Recip
     assert scene_path(fit(MetricReport(every=7))[0]).read_bytes() == scene_path(trainer).read_bytes()
 
 
-def test_the_quantizer_of_the_docs_trains(run: RunFactory, quantized_recipe: Recipe) -> None:
+def test_the_table_of_the_docs_is_complete() -> None:
     path = Path(__file__).resolve().parents[2] / "docs" / "quantizers.md"
     if not path.exists():
         pytest.skip("a source distribution has no docs")
     page = path.read_text()
-    (source,) = re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
-    namespace: dict[str, Any] = {}
-    exec(compile(source, "docs/quantizers.md", "exec"), namespace)
-    trainer, _ = run(quantized_recipe().values(), module={"quantizer": namespace["Halfway"]}, max_steps=20)
-    assert read_nsvq(scene_path(trainer)).config["quantizers"]["scales"] == "Halfway"
-    for kind in KINDS:  # and its table is complete
-        assert f"| `{kind.__name__}` |" in page
+    assert all(f"| `{kind.__name__}` |" in page for kind in KINDS)

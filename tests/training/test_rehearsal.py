@@ -20,8 +20,13 @@ from nsvq_lightning.training.module import SplatModule
 CODES = {"scales": 24, "quats": 24, "sh0": 16, "shN": 16}
 
 
-@pytest.mark.parametrize("quantizer", [NSVQ, DiVeQ, PostHoc, StraightThrough, TrainedStraightThrough])
-@pytest.mark.parametrize(("degree", "codebooks"), [(1, CODES), (0, {"scales": 700})])
+@pytest.mark.parametrize(
+    ("quantizer", "degree", "codebooks"),
+    [
+        (NSVQ, 0, {"scales": 700}),
+        *((kind, 1, CODES) for kind in (DiVeQ, PostHoc, StraightThrough, TrainedStraightThrough)),
+    ],
+)
 def test_every_quantizer_can_be_rehearsed(quantizer: type[CodebookQuantizer], degree: int, codebooks: Any) -> None:
     settings = rehearsal.settings_of(SplatModule(degree, quantizer, codebooks))
     assert settings is not None

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import CSVLogger, Logger
-from runs import RunFactory, quiet_trainer
+from runs import RunFactory
 
 from nsvq_lightning.callbacks import ExportScene, MetricReport, PhaseSchedule, RenderWriter, RunCheckpoint
 from nsvq_lightning.commands.main import main
@@ -168,12 +168,6 @@ def test_nobody_continues_a_run_in_its_folder_while_it_trains(tmp_path: Path) ->
     assert "another run is writing" in message
     let_go(tmp_path)
     assert taken_by(tmp_path, 1, checkpoint=tmp_path / "checkpoints" / "last.ckpt") == ["taken"]
-
-
-def test_one_trainer_has_one_folder(tmp_path: Path) -> None:
-    trainer = quiet_trainer(tmp_path, 1)
-    assert run_folder(trainer) == run_folder(trainer) == tmp_path / "scene" / "version_0"
-    assert run_folder(quiet_trainer(tmp_path, 1)) == tmp_path / "scene" / "version_1"
 
 
 @pytest.mark.parametrize(

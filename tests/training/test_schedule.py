@@ -58,13 +58,6 @@ def test_a_shorter_run_is_the_same_run_scaled() -> None:
     assert schedule.position_decay_end == 3000
 
 
-def test_intervals_of_short_runs_have_a_lower_limit_and_paper_runs_have_none() -> None:
-    short = Schedule(total=3000, min_density_interval=40)
-    times = short.density_times(600, 14_900, 100)
-    assert times[:3] == (40, 80, 120)  # 600 / 15
-    assert Schedule(min_density_interval=400).density_times(600, 14_900, 100)[:2] == (600, 700)
-
-
 @pytest.mark.parametrize("total", [*range(100, 2000, 37), *range(2500, 50_000, 2500), 70_001])
 def test_rounding_loses_none_of_a_series(total: int) -> None:
     """As a rounded interval would, added up: whoever prunes five times in the paper's run does so in any."""
@@ -114,17 +107,13 @@ def test_equal_ends_leave_phases_out() -> None:
         ({"warmup_end": 30_000}, "phase ends must satisfy"),
         ({"quantize_end": 50_000}, "phase ends must satisfy"),
         ({"quantize_end": 20_000}, "quantize phase of at least one iteration"),
+        ({"total": 4500, "saved": 1500}, "a run cannot save 1500 iterations of its warm-up phase"),
         ({"min_density_interval": 0}, "min_density_interval must be at least 1"),
     ],
 )
 def test_impossible_schedules_are_refused(settings: dict[str, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Schedule(**settings)
-
-
-def test_terms_that_add_up_are_stronger_in_a_shorter_run() -> None:
-    assert Schedule().strength(1e-7) == 1e-7
-    assert Schedule(total=4500).strength(1e-7) == pytest.approx(1e-6)
 
 
 def test_what_the_warm_up_saves_moves_all_that_follows() -> None:
@@ -137,9 +126,3 @@ def test_what_the_warm_up_saves_moves_all_that_follows() -> None:
     replaced = whole.replacement_times(20_100, 22_000, 100, 40_000, 500)
     assert shorter.replacement_times(20_100, 22_000, 100, 40_000, 500) == tuple(time - 300 for time in replaced)
     assert [shorter.sh_degree_at(iteration, 1000, 3) for iteration in (99, 100, 300)] == [0, 1, 3]
-
-
-@pytest.mark.parametrize("saved", [-1, 1500])
-def test_a_run_cannot_save_more_than_its_warm_up(saved: int) -> None:
-    with pytest.raises(ValueError, match=f"a run cannot save {saved} iterations of its warm-up phase"):
-        Schedule(total=4500, saved=saved)

@@ -31,11 +31,6 @@ def test_before_the_codebooks_everything_is_stored_as_it_is(caplog: pytest.LogCa
         assert torch.equal(getattr(decoded, name), getattr(module.splats, name)), name
 
 
-def test_nothing_to_store_names_the_checkpoint() -> None:
-    with pytest.raises(ValueError, match="--ckpt_path"):
-        SplatModule().compressed()
-
-
 def test_the_sizes_of_codebooks_that_storing_places_are_those_that_it_placed() -> None:
     module = SplatModule(codebooks={"scales": 4096, "sh0": 8}, quantizer=PostHoc, splats=splats())
     module.phase = Phase.QUANTIZE

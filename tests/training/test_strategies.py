@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from lightning.pytorch import LightningModule
-from lightning.pytorch.strategies import DDPStrategy, StrategyRegistry
+from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor, nn
 
 import nsvq_lightning.training.distributed as strategies
@@ -100,10 +100,6 @@ def test_accumulated_gradients_travel_once_and_remember_a_loss_that_was_not_fini
     strategy.post_backward(LOSS)
     assert len(sent) == 1
     assert scene.first.grad is None
-
-
-def test_the_strategy_has_a_name() -> None:
-    assert isinstance(StrategyRegistry.get("view_parallel"), ViewParallelStrategy)
 
 
 class WithHarmonics(LightningModule):
