@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +14,6 @@ from numba import njit
 
 from nsvq_lightning.callbacks import progress
 from nsvq_lightning.callbacks.progress import SplatProgressBar
-from nsvq_lightning.compute import compilation
 from nsvq_lightning.compute.compilation import compile_seconds, compile_watcher
 from nsvq_lightning.training.stopwatch import Stopwatch
 
@@ -76,11 +73,3 @@ def test_a_bar_of_the_longest_run_fits_80_columns(hours: int) -> None:
     assert len(line.rstrip()) <= 80
     assert line.rstrip().endswith("quantize 1.23M splats 31.3 dB test 31.64")
     bar.close()
-
-
-def test_what_is_no_terminal_gets_lines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    with open(tmp_path / "log.txt", "w") as file:
-        monkeypatch.setattr(sys, "stdout", file)
-        assert not progress._shows_bars()
-        monkeypatch.setitem(sys.modules, "ipykernel", compilation)
-        assert progress._shows_bars()

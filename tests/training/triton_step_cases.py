@@ -137,7 +137,7 @@ READS = {"projection.project": 1, "binning.list_tiles": 1, "devices.read": 1}
             Phase.QUANTIZE,
             ["project_kernel", *4 * SEARCH, *RENDER, *LOSS, *BACK, *4 * ["radial_kernel", *SUMS]],
             # Which splats are in view is asked before their codes are; the seeds of the noise are drawn on the host.
-            READS | {"rasterizer.visible_cuda": 1, "nsvq.noise_substitution": 4},
+            READS | {"rasterizer.visible": 1, "nsvq.noise_substitution": 4},
             122,
         ),
         (Phase.FINETUNE, [*RENDER, *LOSS, *BACK, *(4 * SUMS)], READS, 58),
