@@ -124,7 +124,6 @@ OUT_OF_RANGE = [
     (CodebookReplacement, {"jitter": 0.0}, r"jitter must be in \(0, 1\], got 0.0"),
     (FiniteCodes, {"every": 0}, "every must be at least 1, got 0"),
     (RateDistortion, {"strength": math.nan}, "strength must be above 0, got nan"),
-    (RateDistortion, {"attributes": ["means"]}, "attributes must be among scales, quats, sh0, shN, got means"),
     (MetricReport, {"every": -1}, "every must be at least 0, got -1"),
     (RunCheckpoint, {"every": -1}, "every must be at least 0, got -1"),
     (ExposureCompensation, {"rate": math.inf}, "rate must be above 0, got inf"),
