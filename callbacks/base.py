@@ -8,9 +8,8 @@ from typing import Any, ClassVar
 from lightning.pytorch import Callback, Trainer
 
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.training.edit import drop_non_finite
+from nsvq_lightning.training import edit
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.run_folder import hold, is_trial, let_go, run_folder, take
 from nsvq_lightning.training.schedule import next_iteration
 
@@ -161,7 +160,7 @@ def finite_search_is_due(trainer: Trainer, every: int) -> bool:
         trainer: The trainer.
         every: Iterations between two searches; a step without an update always causes one.
     """
-    groups = raw_optimizer(trainer).param_groups
+    groups = trainer.optimizers[0].param_groups
     updated = any(parameter.grad is not None for group in groups for parameter in group["params"])
     return trainer.global_step % every == 0 or not updated
 
@@ -175,7 +174,7 @@ def keep_finite_splats(trainer: Trainer, module: SplatModule) -> None:
     Raises:
         FloatingPointError: No finite splat is left.
     """
-    kept = drop_non_finite(module.splats, raw_optimizer(trainer), trainer.global_step)
+    kept = edit.drop_non_finite(module.splats, trainer.optimizers[0], trainer.global_step)
     if len(module.splats) == len(kept):
         return
     for quantizer in module.quantizers.values():

@@ -20,7 +20,6 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import atomic_path
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.run_folder import is_trial, run_folder
 from nsvq_lightning.training.schedule import Phase, Schedule
 
@@ -174,7 +173,7 @@ class StepSnapshot:
 def _fingerprint(trainer: Trainer, module: SplatModule) -> Fingerprint:
     """Identity, address and version of every tensor that an iteration must not change before its update."""
     changing = {id(tensor) for tensor in _counters(module)}
-    tensors: list[object] = [value for state in raw_optimizer(trainer).state.values() for value in state.values()]
+    tensors: list[object] = [value for state in trainer.optimizers[0].state.values() for value in state.values()]
     # Not module.parameters() and module.buffers(), which take three times as long, and this runs in every step.
     parts: list[nn.Module | None] = [module]
     for part in parts:

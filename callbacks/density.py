@@ -19,12 +19,8 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training.distributed import check_replicas, sum_over_processes
-from nsvq_lightning.training.edit import append_rows, keep_rows, replace_attribute, reset_moments
-from nsvq_lightning.training.memory_estimate import say_footprint
+from nsvq_lightning.training import distributed, edit, memory_estimate, scene_access
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.optim import raw_optimizer
-from nsvq_lightning.training.scene_access import train_contributions
 from nsvq_lightning.training.schedule import Phase, next_iteration
 
 from .base import SplatCallback, finite_search_is_due, keep_finite_splats
@@ -104,15 +100,15 @@ class Densification(SplatCallback, ABC):
         if limit is None:
             return
         if module.device.type == "cpu" and trainer.is_global_zero:
-            say_footprint(trainer, limit)
+            memory_estimate.say_footprint(trainer, limit)
         if count > limit and module.phase > Phase.PRUNE:
             log.warning(
                 "%s=%d comes too late for %d splats with codebooks; all are kept", self.limit_name, limit, count
             )
         elif count > limit:
-            kept = most_contributing(train_contributions(trainer, module), limit)
-            keep_rows(module.splats, raw_optimizer(trainer), kept)
-            check_replicas(trainer, "the limit of splats")
+            kept = most_contributing(scene_access.train_contributions(trainer, module), limit)
+            edit.keep_rows(module.splats, trainer.optimizers[0], kept)
+            distributed.check_replicas(trainer, "the limit of splats")
             log.info("kept %d of %d splats, those that contribute most to the train views", limit, count)
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
@@ -145,16 +141,16 @@ class Densification(SplatCallback, ABC):
                 "rates, or check the camera poses"
             )
             return 0
-        keep_rows(module.splats, raw_optimizer(trainer), ~mask)
+        edit.keep_rows(module.splats, trainer.optimizers[0], ~mask)
         return count
 
     @torch.no_grad()
     def reset_opacities(self, trainer: Trainer, module: SplatModule, ceiling: float) -> None:
         """Lower all opacities to at most ``ceiling``, and forget their moments."""
-        optimizer = raw_optimizer(trainer)
+        optimizer = trainer.optimizers[0]
         lowered = module.splats.opacities.clamp(max=math.log(ceiling / (1.0 - ceiling)))
-        replace_attribute(module.splats, optimizer, "opacities", lowered)
-        reset_moments(optimizer, "opacities")
+        edit.replace_attribute(module.splats, optimizer, "opacities", lowered)
+        edit.reset_moments(optimizer, "opacities")
 
     def _view(self, trainer: Trainer, module: SplatModule, outputs: dict[str, Any]) -> Render | None:
         """The step's rendering; None if there is none, its loss is not finite, or the splats have changed since."""
@@ -184,7 +180,7 @@ class Densification(SplatCallback, ABC):
         if render is not None:
             self.add(own.unbind(), render, micro_batches)
         # A collective: every process must call it, even with nothing to add.
-        for table, total in zip(tables, sum_over_processes(trainer, own), strict=True):
+        for table, total in zip(tables, distributed.sum_over_processes(trainer, own), strict=True):
             table.add_(total)
 
 
@@ -303,24 +299,24 @@ class DensityControl(Densification):
             if iteration in schedule.density_times(self.start, self.last, self.every):
                 added = self._grow(trainer, module, iteration)
                 pruned = self._prune(trainer, module, huge=iteration > schedule.iteration(self.huge_after))
-                check_replicas(trainer, "density control")
+                distributed.check_replicas(trainer, "density control")
                 log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(module.splats))
             on_white = module.background == "white" and self.white_reset
             first = bool(on_white) and iteration == schedule.iteration(self.white_reset)
             if first or iteration in schedule.reset_times(self.reset_last, self.reset_every):
                 self.reset_opacities(trainer, module, self.reset_opacity)
-                check_replicas(trainer, "the opacity reset")
+                distributed.check_replicas(trainer, "the opacity reset")
         prune_times = schedule.times(self.prune_start, self.prune_last, self.prune_every) if self.prune_every else ()
         if phase is Phase.PRUNE and iteration in prune_times:
             pruned = self._prune(trainer, module, huge=False)
-            check_replicas(trainer, "pruning")
+            distributed.check_replicas(trainer, "pruning")
             level = logging.INFO if pruned else logging.DEBUG
             log.log(level, "iteration %d: pruned %d splats, %d remain", iteration, pruned, len(module.splats))
 
     @torch.no_grad()
     def _grow(self, trainer: Trainer, module: SplatModule, iteration: int) -> int:
         """Clone and split; returns how many splats were added. Resets the statistics."""
-        splats, optimizer = module.splats, raw_optimizer(trainer)
+        splats, optimizer = module.splats, trainer.optimizers[0]
         gradient_sum, views = (splats.add_table(name) for name in self.tables)
         statistic = gradient_sum / views.clamp(min=1)
         large = splats.scales.amax(1).exp() > self.dense_fraction * module.extent
@@ -334,8 +330,8 @@ class DensityControl(Densification):
         )
         children = split(parents, self.children, self.shrink, generator(module.seed, iteration, "split"))
         new = (torch.cat(pair) for pair in zip(clones, children, strict=True))
-        append_rows(splats, optimizer, RawSplats(*new)._asdict())
-        keep_rows(splats, optimizer, torch.cat([~divided, divided.new_ones(len(splats) - before)]))
+        edit.append_rows(splats, optimizer, RawSplats(*new)._asdict())
+        edit.keep_rows(splats, optimizer, torch.cat([~divided, divided.new_ones(len(splats) - before)]))
         for name in self.tables:
             splats.add_table(name).zero_()
         return len(splats) - before

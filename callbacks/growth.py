@@ -17,11 +17,8 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training.distributed import check_replicas
-from nsvq_lightning.training.edit import append_rows, keep_rows
+from nsvq_lightning.training import distributed, edit, scene_access
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.optim import raw_optimizer
-from nsvq_lightning.training.scene_access import needed_scene
 from nsvq_lightning.training.schedule import Phase
 
 from .base import SplatCallback
@@ -80,7 +77,7 @@ class SplatBudget(SplatCallback):
             )
             reason = f"for a file of {self.bytes} bytes"
         elif self.splats is None:
-            scene = needed_scene(
+            scene = scene_access.needed_scene(
                 trainer,
                 "a budget from the photos needs them",
                 "give a number of splats (--splats) or bytes (--bytes)",
@@ -323,7 +320,7 @@ class BudgetedGrowth(Densification):
             pruned = 0
             if iteration != times[-1]:
                 pruned = self.prune(trainer, module, module.splats.opacities.sigmoid() < self.min_opacity)
-            check_replicas(trainer, "growth")
+            distributed.check_replicas(trainer, "growth")
             log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(module.splats))
             self.idle = self.idle + 1 if added <= IDLE * min(room, len(module.splats)) else 0
             if self.idle >= self.patience > 0:
@@ -335,7 +332,7 @@ class BudgetedGrowth(Densification):
         resets = schedule.reset_times(self.reset_last, self.reset_every)
         if iteration in resets:
             self.reset_opacities(trainer, module, self.reset_opacity)
-            check_replicas(trainer, "the opacity reset")
+            distributed.check_replicas(trainer, "the opacity reset")
         if iteration in (reset + schedule.interval(self.recovery) for reset in resets[: self.recoveries]):
             self.prune(trainer, module, lowest_share(module.splats.opacities, self.recovery_share))
 
@@ -354,8 +351,8 @@ class BudgetedGrowth(Densification):
         divided = draw_rows(candidates, room, generator(module.seed, iteration, "grow"))
         before = len(splats)
         parents = RawSplats(*(tensor.detach()[divided] for tensor in splats.raw()))
-        append_rows(splats, raw_optimizer(trainer), split_longest(parents)._asdict())
-        keep_rows(splats, raw_optimizer(trainer), torch.cat([~divided, divided.new_ones(len(splats) - before)]))
+        edit.append_rows(splats, trainer.optimizers[0], split_longest(parents)._asdict())
+        edit.keep_rows(splats, trainer.optimizers[0], torch.cat([~divided, divided.new_ones(len(splats) - before)]))
         for name in self.tables:
             splats.add_table(name).zero_()
         return room, len(splats) - before

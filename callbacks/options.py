@@ -12,10 +12,8 @@ from torch import Tensor
 from nsvq_lightning.compression.importance import pixel_sizes
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.rendering.rasterize import Render
-from nsvq_lightning.training.distributed import sum_over_processes
-from nsvq_lightning.training.edit import raise_scales
+from nsvq_lightning.training import distributed, edit, scene_access
 from nsvq_lightning.training.module import LossTerm, SplatModule
-from nsvq_lightning.training.scene_access import needed_scene, train_cameras
 from nsvq_lightning.training.schedule import Phase, next_iteration
 
 from .base import SplatCallback
@@ -68,7 +66,9 @@ class ExposureCompensation(SplatCallback):
             ValueError: The trainer has no data module with a scene, or the checkpoint is of another number of photos.
         """
         super().on_train_start(trainer, module)
-        scene = needed_scene(trainer, "exposures are those of the train photos", "leave out ExposureCompensation")
+        scene = scene_access.needed_scene(
+            trainer, "exposures are those of the train photos", "leave out ExposureCompensation"
+        )
         self._row = {view: row for row, view in enumerate(scene.train)}
         start = torch.zeros(len(scene.train), 3, 4)
         if self._loaded is not None:
@@ -99,7 +99,7 @@ class ExposureCompensation(SplatCallback):
         share = next_iteration(trainer) / max(1, module.schedule.total)
         self._adam.param_groups[0]["lr"] = self.rate * self.final ** min(1.0, share)
         gradient = torch.zeros_like(self._changes) if self._changes.grad is None else self._changes.grad
-        self._changes.grad = sum_over_processes(trainer, gradient.nan_to_num_(0.0, 0.0, 0.0))
+        self._changes.grad = distributed.sum_over_processes(trainer, gradient.nan_to_num_(0.0, 0.0, 0.0))
         self._adam.step()
         self._adam.zero_grad()
 
@@ -186,9 +186,11 @@ class FrequencyLimit(SplatCallback):
             if iteration % EVERY == 0:
                 sizes.zero_()
             new = (sizes == 0).nonzero()[:, 0]
-            sizes[new] = pixel_sizes(splats.means.detach()[new], train_cameras(trainer)).nan_to_num(posinf=NO_LIMIT)
+            sizes[new] = pixel_sizes(splats.means.detach()[new], scene_access.train_cameras(trainer)).nan_to_num(
+                posinf=NO_LIMIT
+            )
             self._floor, self._edits = (self.pixels * sizes).log()[:, None], splats.edits
-        raise_scales(splats, self._floor)
+        edit.raise_scales(splats, self._floor)
 
     def on_train_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Forget the limits."""

@@ -15,9 +15,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import FORMATS, save
 from nsvq_lightning.io.nsvq.file import as_stored
 from nsvq_lightning.io.nsvq.precision import Storage
-from nsvq_lightning.report.pictures import file_stem, write_png
-from nsvq_lightning.report.viewer import BACKGROUNDS, some_cameras, write_viewer
-from nsvq_lightning.training import live_preview
+from nsvq_lightning.report import pictures, viewer
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_trial, run_folder
 from nsvq_lightning.training.scene_access import scene_of
@@ -80,8 +78,8 @@ class ExportScene(WritingCallback):
         if "nsvq" in self.formats and photos is not None:
             page = folder / "viewer.html"
             title = page.resolve().parent.parent.name
-            background = BACKGROUNDS.get(module.background, BACKGROUNDS["black"])
-            size = write_viewer(page, folder / "scene.nsvq", some_cameras(photos), title, background)
+            background = viewer.BACKGROUNDS.get(module.background, viewer.BACKGROUNDS["black"])
+            size = viewer.write_viewer(page, folder / "scene.nsvq", viewer.some_cameras(photos), title, background)
             log.info("wrote %s (%d bytes)", page, size)
 
 
@@ -124,8 +122,8 @@ class RenderWriter(BasePredictionWriter):
         if is_trial(trainer):
             return
         scene = scene_of(trainer)
-        stem = file_stem(prediction["name"], scene.names if scene is not None else ())
-        write_png(self._target / f"{stem}.png", prediction["image"])
+        stem = pictures.file_stem(prediction["name"], scene.names if scene is not None else ())
+        pictures.write_png(self._target / f"{stem}.png", prediction["image"])
 
     def on_predict_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Say where the pictures are."""
@@ -161,7 +159,7 @@ class LiveScene(WritingCallback):
         """Forget who asked an earlier part of the run."""
         super().on_train_start(trainer, module)
         self._running = not is_trial(trainer)
-        self._answered, self._next = live_preview.asked(run_folder(trainer)), 0.0
+        self._answered, self._next = viewer.live_asked(run_folder(trainer)), 0.0
 
     def on_train_batch_end(
         self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, batch_idx: int
@@ -171,7 +169,7 @@ class LiveScene(WritingCallback):
         if not (self._running and due and trainer.is_global_zero):
             return
         folder = run_folder(trainer)
-        asked = live_preview.asked(folder)
+        asked = viewer.live_asked(folder)
         if asked == self._answered:
             return
         began = time.monotonic()
@@ -182,14 +180,14 @@ class LiveScene(WritingCallback):
                 state["psnr"] = f"{module.history[-1]['psnr']:.2f}"
             config = {"antialiased": module.antialiased, "live": state}
             scene = CompressedScene.from_splats(splats, config=config)
-            save(scene, folder / live_preview.LIVE_SCENE, Storage("paper"))
+            save(scene, folder / viewer.LIVE_SCENE, Storage("paper"))
         self._answered, ended = asked, time.monotonic()
         self._next = ended + (ended - began) / SHARE
 
     def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Leave the finished scene alone."""
         if self._running and trainer.is_global_zero:
-            live_preview.end(run_folder(trainer))
+            viewer.end_live(run_folder(trainer))
         self._running = False
 
     def on_exception(self, trainer: Trainer, module: SplatModule, exception: BaseException) -> None:

@@ -10,10 +10,8 @@ from torch import Tensor
 from nsvq_lightning.compression.importance import most_contributing
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import generator
-from nsvq_lightning.training.distributed import check_replicas
-from nsvq_lightning.training.edit import keep_rows
+from nsvq_lightning.training import distributed, edit
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.optim import raw_optimizer
 from nsvq_lightning.training.schedule import Phase, next_iteration
 
 from .base import SplatCallback
@@ -171,12 +169,12 @@ class OpacitySelection(SplatCallback):
         since, length = self._place(module, iteration)
         budget = self.limit(module)
         assert budget is not None
-        optimizer, opacities = raw_optimizer(trainer), module.splats.opacities.detach()
+        optimizer, opacities = trainer.optimizers[0], module.splats.opacities.detach()
         if since >= self.gentle * length and (since + 1) % self._every(length) == 0:
             kept = opacities.sigmoid() >= self.min_opacity
             # Never below the budget: the pressure may have been too strong.
             if int(kept.sum()) >= min(budget, len(kept)):
-                keep_rows(module.splats, optimizer, kept)
+                edit.keep_rows(module.splats, optimizer, kept)
         count = len(module.splats)
         if count >= self.close * budget and since + 1 < length:
             return
@@ -186,9 +184,9 @@ class OpacitySelection(SplatCallback):
             few = count < self.close * budget
             draws = generator(module.seed, iteration, "select")
             kept = most_contributing(weight, budget) if few else draw_rows(weight, budget, draws)
-            keep_rows(module.splats, optimizer, kept)
+            edit.keep_rows(module.splats, optimizer, kept)
         self.done = True
-        check_replicas(trainer, "the selection")
+        distributed.check_replicas(trainer, "the selection")
         log.info("iteration %d: the selection is done, %d splats are left", iteration, len(module.splats))
 
     def _is_selecting(self, module: SplatModule, iteration: int) -> bool:

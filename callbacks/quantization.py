@@ -14,25 +14,12 @@ from nsvq_lightning.compression.importance import row_weights, sensitivity
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import eight_bit
-from nsvq_lightning.quantize.attributes import QUANTIZED, codes_of
-from nsvq_lightning.quantize.base import (
-    Holding,
-    Quantizer,
-    Refittable,
-    held_codes,
-    is_holding,
-    is_limitable,
-    is_mendable,
-    is_refittable,
-)
-from nsvq_lightning.quantize.nearest import cheapest, code_rates
+from nsvq_lightning.quantize import attributes, nearest
+from nsvq_lightning.quantize import base as quantizer_base
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.canonical_covariance import canonical
-from nsvq_lightning.training.distributed import check_replicas, follow_first, from_first_process, sum_over_processes
-from nsvq_lightning.training.edit import change_coordinates, reset_moments
+from nsvq_lightning.training import distributed, edit, optim, scene_access
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.optim import codebook_group, raw_optimizer
-from nsvq_lightning.training.scene_access import needed_scene, train_contributions
 from nsvq_lightning.training.schedule import Phase, next_iteration
 
 from .base import SplatCallback, finite_search_is_due, keep_finite_splats
@@ -71,10 +58,10 @@ class CanonicalCovariance(SplatCallback):
         first, quantized = module.schedule.first_of(Phase.QUANTIZE), {"scales", "quats"} & set(module.quantizers)
         if not quantized or first is None or iteration != first - 1:
             return
-        optimizer, splats = raw_optimizer(trainer), module.splats
+        optimizer, splats = trainer.optimizers[0], module.splats
         new = canonical(splats.scales.detach(), splats.quats.detach(), "full")
-        change_coordinates(splats, optimizer, "scales", new.scales, new.scale_maps)
-        change_coordinates(splats, optimizer, "quats", new.quats, new.quat_maps)
+        edit.change_coordinates(splats, optimizer, "scales", new.scales, new.scale_maps)
+        edit.change_coordinates(splats, optimizer, "quats", new.quats, new.quat_maps)
         log.info("iteration %d: canonical covariances", iteration)
 
 
@@ -123,16 +110,18 @@ class CodebookInit(SplatCallback):
         if iteration != module.schedule.first_of(Phase.QUANTIZE):
             return
         keep_finite_splats(trainer, module)
-        weights = row_weights(train_contributions(trainer, module)) if self.weights == "contribution" else None
+        weights = (
+            row_weights(scene_access.train_contributions(trainer, module)) if self.weights == "contribution" else None
+        )
         for name, quantizer in module.quantizers.items():
             if trainer.is_global_zero:
-                if self.values_per_splat is not None and is_limitable(quantizer):
+                if self.values_per_splat is not None and quantizer_base.is_limitable(quantizer):
                     values = self.values_per_splat * len(module.splats)
                     quantizer.limit(max(1, int(values / quantizer.codebook.shape[1])))
                 weight = None if name == "scales" else weights
                 quantizer.fit(module.rows(name), weight, generator=generator(module.seed, iteration, "kmeans", name))
             if trainer.world_size > 1:  # a fit may leave fewer codes, so counters and all other buffers must follow
-                follow_first(trainer.strategy, cast(nn.Module, quantizer))
+                distributed.follow_first(trainer.strategy, cast(nn.Module, quantizer))
         sizes = ", ".join(f"{name} {q.codebook.shape[0]}" for name, q in module.quantizers.items())
         if sizes:
             log.info("iteration %d: codebooks for %d splats: %s", iteration, len(module.splats), sizes)
@@ -180,7 +169,7 @@ class CodebookReplacement(SplatCallback):
     end: int = 12_000
     late_every: int = 200
     jitter: float | None = 0.5
-    reset_moments: bool = True
+    edit.reset_moments: bool = True
 
     def __post_init__(self) -> None:
         self.check({"in (0, 1]": ("jitter",), "at least 1": ("start", "early_every", "late_every")})
@@ -215,9 +204,9 @@ class CodebookReplacement(SplatCallback):
                 replaced = quantizer.replace_unused(draws, rows=module.rows(name), jitter=self.jitter)
             values[f"codebook/{name}_replaced"] = float(len(replaced))
             if self.reset_moments:
-                reset_moments(raw_optimizer(trainer), codebook_group(name), replaced)
+                edit.reset_moments(trainer.optimizers[0], optim.codebook_group(name), replaced)
             log.debug("iteration %d: replaced %d codes of %s", iteration, len(replaced), name)
-        check_replicas(trainer, "the replacement of codes")
+        distributed.check_replicas(trainer, "the replacement of codes")
         module.log_dict(dict(values), batch_size=1)
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
@@ -236,10 +225,10 @@ class CodebookReplacement(SplatCallback):
             _forget_usage(module)
 
 
-def _sum_usage(trainer: Trainer, quantizer: Quantizer) -> None:
+def _sum_usage(trainer: Trainer, quantizer: quantizer_base.Quantizer) -> None:
     """Sum the counts of all processes in the buffers of each."""
     for counter in (quantizer.usage, quantizer.window):
-        counter.copy_(sum_over_processes(trainer, counter))
+        counter.copy_(distributed.sum_over_processes(trainer, counter))
 
 
 def _forget_usage(module: SplatModule) -> None:
@@ -301,13 +290,13 @@ class CodebookRefit(SplatCallback):
         for name, quantizer in _refittable(module).items():
             if trainer.is_global_zero:
                 quantizer.refit(module.rows(name), self.steps)
-            quantizer.codebook.data = from_first_process(trainer, quantizer.codebook.data)
+            quantizer.codebook.data = distributed.from_first_process(trainer, quantizer.codebook.data)
             log.debug("iteration %d: refitted the codebook of %s", iteration, name)
 
 
-def _refittable(module: SplatModule) -> dict[str, Refittable]:
+def _refittable(module: SplatModule) -> dict[str, quantizer_base.Refittable]:
     """The quantizers that support it, by attribute."""
-    return {name: quantizer for name, quantizer in module.quantizers.items() if is_refittable(quantizer)}
+    return {name: quantizer for name, quantizer in module.quantizers.items() if quantizer_base.is_refittable(quantizer)}
 
 
 # How often sensitivities are measured in the phase.
@@ -385,10 +374,10 @@ class RateDistortion(SplatCallback):
         return all(len(price) == len(module.splats) for price in (self.prices or {}).values())
 
     def _measure(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
-        scene = needed_scene(
+        scene = scene_access.needed_scene(
             trainer, "codes are to be chosen by what shows in the train views", "leave RateDistortion out"
         )
-        taking_part = [name for name, q in module.quantizers.items() if is_holding(q)]
+        taking_part = [name for name, q in module.quantizers.items() if quantizer_base.is_holding(q)]
         splats = module.hard_splats(Phase.QUANTIZE)
         shown = {name: torch.zeros_like(splats.opacities) for name in taking_part}
         error = torch.zeros((), dtype=torch.float64, device=module.device)
@@ -398,20 +387,20 @@ class RateDistortion(SplatCallback):
             squares, image = sensitivity(splats, view.camera, module.render_splats, signs)
             error += (apply_mask(image, view.mask) - eight_bit(view.image)).square().sum(dtype=torch.float64)
             for name, total in shown.items():
-                total += QUANTIZED[name].rows(getattr(squares, name)).mean(1)
-        error = sum_over_processes(trainer, error)
+                total += attributes.QUANTIZED[name].rows(getattr(squares, name)).mean(1)
+        error = distributed.sum_over_processes(trainer, error)
         a_bit = self.strength * float(error) / (BITS_A_SPLAT * len(module.splats))
         self.prices = {}
         for name, total in shown.items():
-            self.prices[name] = a_bit / row_weights(sum_over_processes(trainer, total), LEAST)
+            self.prices[name] = a_bit / row_weights(distributed.sum_over_processes(trainer, total), LEAST)
 
     def _choose(self, module: SplatModule, part: slice) -> None:
         for name, price in (self.prices or {}).items():
             quantizer, rows = module.quantizers[name], module.rows(name)
-            codes = codes_of(module.splats.raw(), name, quantizer).clone()
-            rates = code_rates(codes, len(quantizer.codebook))
-            codes[part] = cheapest(rows[part], quantizer.codebook, rates, price[part])
-            cast(Holding, quantizer).hold(codes)
+            codes = attributes.codes_of(module.splats.raw(), name, quantizer).clone()
+            rates = nearest.code_rates(codes, len(quantizer.codebook))
+            codes[part] = nearest.cheapest(rows[part], quantizer.codebook, rates, price[part])
+            cast(quantizer_base.Holding, quantizer).hold(codes)
 
 
 @dataclass(eq=False)
@@ -456,10 +445,10 @@ class FiniteCodes(SplatCallback):
             if len(broken) == 0:
                 continue
             found = f"step {iteration}: {len(broken)} of {len(quantizer.codebook)} codes of {name} are non-finite"
-            if len(broken) == len(quantizer.codebook) or not is_mendable(quantizer):
+            if len(broken) == len(quantizer.codebook) or not quantizer_base.is_mendable(quantizer):
                 raise FloatingPointError(f"{found}; lower the learning rates")
             quantizer.mend(broken, module.rows(name), generator(module.seed, iteration, "mend", name))
-            reset_moments(raw_optimizer(trainer), codebook_group(name), broken)
+            edit.reset_moments(trainer.optimizers[0], optim.codebook_group(name), broken)
             rows = ", ".join(map(str, broken[:5].tolist())) + ", …" * (len(broken) > 5)
             log.warning("%s (rows %s); mended", found, rows)
 
@@ -526,7 +515,7 @@ class FreezeCodes(SplatCallback):
         keep_finite_splats(trainer, module)
         for name in names:
             quantizer = module.quantizers[name]
-            held = held_codes(quantizer, len(module.splats))
+            held = quantizer_base.held_codes(quantizer, len(module.splats))
             codes = quantizer.encode(module.rows(name)) if held is None else held
             # Only now: some quantizers place their codebooks when rows are encoded.
             if not getattr(quantizer, "fitted", True):
@@ -534,5 +523,5 @@ class FreezeCodes(SplatCallback):
                     f"iteration {next_iteration(trainer)}: the codebook of {name} has never been placed, so its codes "
                     "cannot be frozen; add CodebookInit to the callbacks"
                 )
-            quantizer.freeze(from_first_process(trainer, codes))
-        check_replicas(trainer, "freezing the codes")
+            quantizer.freeze(distributed.from_first_process(trainer, codes))
+        distributed.check_replicas(trainer, "freezing the codes")

@@ -4,7 +4,7 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -24,11 +24,8 @@ from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_bit, psnr
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.report.evaluation import ViewScore, evaluate
-from nsvq_lightning.report.figures import write_csv
-from nsvq_lightning.report.files import paper_level, summarize, write_curve, write_metrics
-from nsvq_lightning.report.page import RunPage
-from nsvq_lightning.report.pictures import comparison, file_stem, log_pictures, write_png
+from nsvq_lightning.report import figures, files, pictures
+from nsvq_lightning.report.page import write_page
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_trial, run_folder
@@ -99,7 +96,7 @@ class MetricReport(WritingCallback):
         self.check({"at least 0": ("every",)})
         self._scene: CompressedScene | None = None
         self._paper_level: dict[str, Any] = {}
-        self._scores: list[ViewScore] = []
+        self._scores: list[files.ViewScore] = []
         self._folder = Path()
         self._lpips: Metric | None = None
         self._lpips_reason: str | None = None
@@ -130,8 +127,8 @@ class MetricReport(WritingCallback):
         folder = run_folder(trainer)
         if trainer.is_global_zero and module.history and not is_trial(trainer):
             with module.stopwatch.paused(module.device):
-                write_csv(folder / "curve.csv", module.history)
-                write_curve(folder / "curve.png", module.history, module.schedule)
+                figures.write_csv(folder / "curve.csv", module.history)
+                figures.write_figure(folder / "curve.png", files.curve_figure(module.history, module.schedule))
 
     def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Catch up for a run that was stopped after its last iteration: when continued, it trains no further."""
@@ -160,27 +157,27 @@ class MetricReport(WritingCallback):
 
         folder = run_folder(trainer)
         show = partial(_preview, folder / "preview.png") if self.pictures and trainer.is_global_zero else None
-        quality = evaluate(render_image, views, module.device, show)
+        mean_psnr, mean_ssim = files.evaluate(render_image, views, module.device, show)
         entry: dict[str, Any] = {
             "iteration": iteration,
             "phase": phase.name.lower(),
             "splats": len(module.splats),
-            "psnr": quality.psnr,
-            "ssim": quality.ssim,
+            "psnr": mean_psnr,
+            "ssim": mean_ssim,
             "seconds": module.stopwatch.seconds,
         }
         module.history.append(entry)
         if trainer.is_global_zero:
-            write_csv(folder / "curve.csv", module.history)
-            self._page(folder, module).write()
+            figures.write_csv(folder / "curve.csv", module.history)
+            write_page(folder, module.history, module.schedule, self._other_seconds())
         values = {f"report/{name}": float(entry[name]) for name in ("psnr", "ssim", "splats")}
         trainer.callback_metrics.update({name: torch.tensor(value) for name, value in values.items()})
         for logger in trainer.loggers:
             logger.log_metrics(values, iteration)
 
-    def _page(self, folder: Path, module: SplatModule) -> RunPage:
-        seconds = {"kernels compiled": compile_seconds(), **self._seconds}
-        return RunPage(folder, module.history, module.schedule, seconds)
+    def _other_seconds(self) -> dict[str, float]:
+        """Seconds that went into anything but training steps, by what it was."""
+        return {"kernels compiled": compile_seconds(), **self._seconds}
 
     @contextmanager
     def _timed(self, part: str) -> Iterator[None]:
@@ -203,7 +200,7 @@ class MetricReport(WritingCallback):
             if trainer.is_global_zero:
                 scene = module.compressed()
                 save(scene, path, module.storage)
-                self._paper_level = paper_level(scene)
+                self._paper_level = files.paper_level(scene)
             trainer.strategy.barrier("scene.nsvq")
             self._scene = read_nsvq(path)
         # Detached tensors, not the module: a submodule would enter checkpoints.
@@ -232,16 +229,16 @@ class MetricReport(WritingCallback):
         corrected = apply_mask(eight_bit(color_corrected(image, photo, batch.mask)), batch.mask)
         corrected_scores = float(psnr(corrected, photo, batch.mask)), float(ssim(corrected, photo, batch.mask))
         scores = float(outputs["psnr"]), float(outputs["ssim"])
-        self._scores.append(ViewScore(batch.name, *scores, lpips, *corrected_scores))
+        self._scores.append(files.ViewScore(batch.name, *scores, lpips, *corrected_scores))
         if self.pictures:
             path = self._picture(trainer, batch.name)
             path.parent.mkdir(exist_ok=True)
-            write_png(path, comparison(image, photo))
+            pictures.write_png(path, pictures.comparison(image, photo))
 
     def _picture(self, trainer: Trainer, view: str) -> Path:
         """File of the picture of a view."""
         scene = scene_of(trainer)
-        return self._folder / "renders" / f"{file_stem(view, scene.names if scene is not None else ())}.png"
+        return self._folder / "renders" / f"{pictures.file_stem(view, scene.names if scene is not None else ())}.png"
 
     def on_test_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Write the figures."""
@@ -253,26 +250,27 @@ class MetricReport(WritingCallback):
             lpips: tuple[float | None, str | None] = (None, self._lpips_reason)
             if self._lpips is not None:
                 lpips = fmean(score.lpips for score in scores if score.lpips is not None), None
-            metrics = summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper_level)
-            write_metrics(folder / "metrics.json", metrics)
-            write_csv(folder / "views.csv", [asdict(score) for score in scores])
-            pictures = [self._picture(trainer, score.name) for score in scores]
-            views = [asdict(score) | {"picture": path.name} for score, path in zip(scores, pictures, strict=True)]
-            log.info("report: %s", replace(self._page(folder, module), metrics=metrics, views=views).write())
+            metrics = files.summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper_level)
+            files.write_metrics(folder / "metrics.json", metrics)
+            figures.write_csv(folder / "views.csv", [asdict(score) for score in scores])
+            paths = [self._picture(trainer, score.name) for score in scores]
+            views = [asdict(score) | {"picture": path.name} for score, path in zip(scores, paths, strict=True)]
+            page = write_page(folder, module.history, module.schedule, self._other_seconds(), metrics, views)
+            log.info(f"report: {page}")
             if self.pictures:
-                log_pictures(trainer.loggers, pictures, trainer.global_step)
+                pictures.log_pictures(trainer.loggers, paths, trainer.global_step)
         self._scene, self._lpips = None, None
 
 
 def _preview(path: Path, image: Tensor, photo: Tensor) -> None:
     """Write the photo beside the render."""
-    write_png(path, torch.cat([eight_bit(photo), image], dim=1))
+    pictures.write_png(path, torch.cat([eight_bit(photo), image], dim=1))
 
 
-def _gathered(trainer: Trainer, scores: list[ViewScore]) -> list[ViewScore]:
+def _gathered(trainer: Trainer, scores: list[files.ViewScore]) -> list[files.ViewScore]:
     """The scores of all processes, by name of the view."""
     if trainer.world_size > 1:
-        gathered: list[list[ViewScore]] = [[] for _ in range(trainer.world_size)]
+        gathered: list[list[files.ViewScore]] = [[] for _ in range(trainer.world_size)]
         torch.distributed.all_gather_object(gathered, scores)
         scores = [score for part in gathered for score in part]
     return sorted(scores, key=lambda score: score.name)

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field, fields
 from lightning.pytorch import Trainer
 
 from nsvq_lightning.data.scene import View
+from nsvq_lightning.training import scene_access
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.optim import raw_optimizer
-from nsvq_lightning.training.scene_access import needed_scene
 from nsvq_lightning.training.schedule import Phase, Schedule, next_iteration
 
 from .base import SplatCallback
@@ -85,7 +84,7 @@ class PhaseSchedule(SplatCallback):
             return
         if self.iterations_per_photo is not None and self.total is None:
             need = "a number of iterations for each photo needs the photos"
-            photos = len(needed_scene(trainer, need, "leave iterations_per_photo unset").train)
+            photos = len(scene_access.needed_scene(trainer, need, "leave iterations_per_photo unset").train)
             limit = self.iterations_per_photo * photos
             if not 0 < trainer.max_steps <= limit:
                 trainer.fit_loop.epoch_loop.max_steps = limit
@@ -202,6 +201,6 @@ class LearningRateDecay(SplatCallback):
         end = ends[Phase.FINETUNE]
         progress = min(max((iteration - start) / max(end - start, 1), 0.0), 1.0)
         if progress > 0.0:
-            for group in raw_optimizer(trainer).param_groups:
+            for group in trainer.optimizers[0].param_groups:
                 if group["name"] != "means":
                     module.scale_rate(group["name"], self.final**progress)

@@ -7,47 +7,31 @@ from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint, ProgressBar
 
 from nsvq_lightning.top_level import folder_of
 
-from .checkpoint import RunCheckpoint
-from .growth import BudgetedGrowth, SplatBudget
-from .outputs import ExportScene, LiveScene, RenderWriter
-from .precompile import CompileAhead
-from .progress import SplatProgressBar
-from .pruning import OpacityRegularization, OpacitySelection
-from .quantization import (
-    CanonicalCovariance,
-    CodebookInit,
-    CodebookRefit,
-    CodebookReplacement,
-    FiniteCodes,
-    FreezeCodes,
-    RateDistortion,
-)
-from .report import MetricReport
-from .schedule import LearningRateDecay, PhaseSchedule, ShDegreeSchedule
+from . import checkpoint, growth, outputs, precompile, progress, pruning, quantization, report, schedule
 
 # Callback by name. Density control comes before the canonical form, which may act after the same iteration.
 STANDARD: dict[str, type[Callback]] = {
-    "phases": PhaseSchedule,
-    "sh_degree": ShDegreeSchedule,
-    "rate_decay": LearningRateDecay,
-    "budget": SplatBudget,
-    "density": BudgetedGrowth,
-    "selection": OpacitySelection,
-    "opacity": OpacityRegularization,
-    "canonical": CanonicalCovariance,
-    "codebook_init": CodebookInit,
-    "codebook_refit": CodebookRefit,
-    "codebook_replacement": CodebookReplacement,
-    "codebook_finite": FiniteCodes,
-    "rate_distortion": RateDistortion,
-    "freeze": FreezeCodes,
-    "report": MetricReport,
-    "live": LiveScene,
-    "export": ExportScene,
-    "predictions": RenderWriter,
-    "checkpoint": RunCheckpoint,
-    "kernels": CompileAhead,
-    "progress": SplatProgressBar,
+    "phases": schedule.PhaseSchedule,
+    "sh_degree": schedule.ShDegreeSchedule,
+    "rate_decay": schedule.LearningRateDecay,
+    "budget": growth.SplatBudget,
+    "density": growth.BudgetedGrowth,
+    "selection": pruning.OpacitySelection,
+    "opacity": pruning.OpacityRegularization,
+    "canonical": quantization.CanonicalCovariance,
+    "codebook_init": quantization.CodebookInit,
+    "codebook_refit": quantization.CodebookRefit,
+    "codebook_replacement": quantization.CodebookReplacement,
+    "codebook_finite": quantization.FiniteCodes,
+    "rate_distortion": quantization.RateDistortion,
+    "freeze": quantization.FreezeCodes,
+    "report": report.MetricReport,
+    "live": outputs.LiveScene,
+    "export": outputs.ExportScene,
+    "predictions": outputs.RenderWriter,
+    "checkpoint": checkpoint.RunCheckpoint,
+    "kernels": precompile.CompileAhead,
+    "progress": progress.SplatProgressBar,
 }
 
 # Those that a run has only if a config or the user asks for them.

@@ -147,7 +147,7 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     from nsvq_lightning.compression.floaters import floaters
     from nsvq_lightning.data.scene import load_scene
     from nsvq_lightning.rendering.rasterize import render
-    from nsvq_lightning.report.evaluation import evaluate
+    from nsvq_lightning.report.files import evaluate
 
     photos = load_scene(root)
     splats = scene.decode().raw()
@@ -159,7 +159,7 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     def psnr(keep: torch.Tensor) -> float:
         kept = type(splats)(*(tensor[keep] for tensor in splats))
         tests = (photos.view(index) for index in photos.test)
-        return evaluate(lambda camera: look(kept, camera).image, tests, torch.device("cpu")).psnr
+        return evaluate(lambda camera: look(kept, camera).image, tests, torch.device("cpu"))[0]
 
     removed = floaters(splats, views, look)
     sys.stdout.write(

@@ -65,7 +65,7 @@ class Source(NamedTuple):
 
     def current(self) -> Path | None:
         """The file to show now; None if the fit has not written one yet."""
-        from nsvq_lightning.training.live_preview import LIVE_SCENE
+        from nsvq_lightning.report.viewer import LIVE_SCENE
 
         files = [self.file] if self.run is None else [self.run / LIVE_SCENE, self.file]
         return next((file for file in files if file.is_file()), None)
@@ -198,11 +198,11 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(404, b"there is no such page")
 
     def _scene(self, is_question: bool) -> None:
-        from nsvq_lightning.training import live_preview
+        from nsvq_lightning.report import viewer
 
         if is_question and self.source.run is not None:
             # What was asked of a run that has ended in between is taken back.
-            (live_preview.end if self.source.file.exists() else live_preview.ask)(self.source.run)
+            (viewer.end_live if self.source.file.exists() else viewer.ask_live)(self.source.run)
         file = self.source.current()
         try:
             if file is None and self.followed:

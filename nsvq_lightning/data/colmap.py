@@ -244,8 +244,9 @@ def _read(files: Mapping[str, Path]) -> Any:
             path = folder / f"{table}.bin"
             if table in TABLES or path.is_file():
                 _check_table(table, path, params)
+    read = reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text
     try:
-        (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))
+        read(str(folder))
     # pycolmap's own checks give ValueError, its C++ library the others.
     except (ValueError, RuntimeError, IndexError, KeyError, OSError, MemoryError) as error:
         raise SceneError(

@@ -17,10 +17,17 @@ def new_figure(width: float, height: float) -> Any:
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def figure_png(figure: Any) -> bytes:
+    """A figure as a PNG file, cropped to its content."""
+    data = io.BytesIO()
+    figure.savefig(data, format="png", bbox_inches="tight")
+    return data.getvalue()
+
+
 def write_figure(path: Path, figure: Any) -> None:
-    """Write a figure as PNG, cropped to its content, atomically."""
+    """Write a figure as PNG, atomically."""
     with atomic_write(path) as file:
-        figure.savefig(file, format="png", bbox_inches="tight")
+        file.write(figure_png(figure))
 
 
 def colours_of(names: Sequence[str]) -> dict[str, Any]:

@@ -1,26 +1,77 @@
-"""The numbers of a report, ``metrics.json``, and its curve, ``curve.png``."""
+"""The numbers of a report, from the scores of views to ``metrics.json``, and the curve of ``curve.png``."""
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from nsvq_lightning.compression.stored import formula_bytes
+from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.header import read_header
 from nsvq_lightning.io.nsvq.paper import paper_header
 from nsvq_lightning.io.ply import plain_ply_bytes
-from nsvq_lightning.report.evaluation import ViewScore
-from nsvq_lightning.report.figures import new_figure, write_figure
+from nsvq_lightning.quality.loss import apply_mask
+from nsvq_lightning.quality.metrics import image_metrics
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.report.figures import new_figure
 from nsvq_lightning.training.resume import ResumedModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 
-PHASE_COLOURS = {Phase.WARMUP: "#dfe8f5", Phase.PRUNE: "#f8e6d0", Phase.QUANTIZE: "#dcefdc", Phase.FINETUNE: "#efe0f0"}
+
+@dataclass(frozen=True)
+class ViewScore:
+    """Quality of one view: PSNR in dB, SSIM, LPIPS where it was measured.
+
+    ``cc_psnr`` and ``cc_ssim`` are those after a colour correction to the photo, where that was measured.
+    """
+
+    name: str
+    psnr: float
+    ssim: float
+    lpips: float | None = None
+    cc_psnr: float | None = None
+    cc_ssim: float | None = None
+
+
+@torch.no_grad()
+def evaluate(
+    render_image: Callable[[Camera], Tensor],
+    views: Iterable[View],
+    device: torch.device,
+    show: Callable[[Tensor, Tensor], None] | None = None,
+) -> tuple[float, float]:
+    """Mean PSNR, dB, and SSIM of rendered views against their photos, over the views of all processes.
+
+    Args:
+        render_image: Image ``[H, W, 3]`` of a camera.
+        views: What to compare with.
+        device: Where the splats are.
+        show: Called with the first image and its photo.
+
+    Raises:
+        ValueError: There are no views.
+    """
+    metrics, shown = image_metrics().to(device), False
+    for view in views:
+        photo = view.to(device)
+        image = apply_mask(render_image(photo.camera), photo.mask)
+        if show is not None and not shown:
+            show(image, photo.image)
+        shown = True
+        metrics.update(image, photo.image, photo.mask)
+    if not shown:
+        raise ValueError("there are no views to evaluate; the scene needs at least one test view")
+    mean = metrics.compute()
+    return float(mean["psnr"]), float(mean["ssim"])
 
 
 def summarize(
@@ -87,16 +138,16 @@ def write_metrics(path: Path, metrics: Mapping[str, Any]) -> None:
     write_text(path, json.dumps(_json_value(metrics), indent=2, allow_nan=False) + "\n")
 
 
-def write_curve(path: Path, history: Sequence[Mapping[str, Any]], schedule: Schedule) -> None:
-    """Plot PSNR and number of splats over the iterations, with phases shaded, atomically."""
+def curve_figure(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> Any:
+    """PSNR and number of splats over the iterations, with phases shaded, as a Matplotlib figure."""
     figure = new_figure(8, 4)
     quality = figure.add_subplot()
     count = quality.twinx()
     iterations = [entry["iteration"] for entry in history]
-    start = 0
-    for phase, end in zip(Phase, schedule.ends, strict=True):
+    start, colours = 0, ("#dfe8f5", "#f8e6d0", "#dcefdc", "#efe0f0")
+    for phase, end, colour in zip(Phase, schedule.ends, colours, strict=True):
         if end > start:
-            quality.axvspan(start, end, color=PHASE_COLOURS[phase], label=phase.name.lower(), linewidth=0)
+            quality.axvspan(start, end, color=colour, label=phase.name.lower(), linewidth=0)
         start = end
     quality.plot(iterations, [entry["psnr"] for entry in history], "o-", color="#1f4e9c", markersize=3)
     count.plot(iterations, [entry["splats"] for entry in history], "-", color="#b5651d")
@@ -105,7 +156,7 @@ def write_curve(path: Path, history: Sequence[Mapping[str, Any]], schedule: Sche
     count.set_ylabel("splats", color="#b5651d")
     count.set_ylim(bottom=0)
     quality.legend(loc="lower right", fontsize="small")
-    write_figure(path, figure)
+    return figure
 
 
 def _codes_in_use(codes: NDArray[np.integer], size: int) -> dict[str, Any]:

@@ -1,10 +1,8 @@
 """``report.html``: what a run has come to, on one page that needs no other file."""
 
 import base64
-import math
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from html import escape
 from importlib.metadata import version
 from importlib.resources import files
@@ -17,79 +15,23 @@ import torch
 from cv2.typing import MatLike
 
 from nsvq_lightning.io.atomic import write_text
-from nsvq_lightning.training.schedule import Phase, Schedule
+from nsvq_lightning.report.figures import figure_png
+from nsvq_lightning.report.files import curve_figure
+from nsvq_lightning.training.schedule import Schedule
 from nsvq_lightning.version import __version__
 
-from .files import PHASE_COLOURS
 
-
-def curve_svg(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> str:
-    """PSNR and number of splats over the iterations, with phases shaded.
+def write_page(
+    folder: Path,
+    history: Sequence[Mapping[str, Any]],
+    schedule: Schedule,
+    seconds: Mapping[str, float],
+    metrics: Mapping[str, Any] | None = None,
+    views: Sequence[Mapping[str, Any]] = (),
+) -> Path:
+    """Write the page of a run, atomically; without ``metrics``, browsers read it again every few seconds.
 
     Args:
-        history: The evaluations, at least one.
-        schedule: Phases of the run.
-    """
-    width, height = 800, 340
-    left, right, top, bottom = 48, 84, 28, 52  # pixels around the axes
-    last = max(schedule.total, int(history[-1]["iteration"]))
-    finite = [entry["psnr"] for entry in history if math.isfinite(entry["psnr"])] or [0.0]
-    low, high = math.floor(min(finite)), math.ceil(max(finite) + 0.1)
-    most = 1.05 * max(entry["splats"] for entry in history)
-
-    def x(iteration: float) -> float:
-        return left + (width - left - right) * iteration / last
-
-    def y(share: float) -> float:
-        return height - bottom - (height - top - bottom) * share
-
-    def line(points: Sequence[tuple[float, float]], colour: str) -> str:
-        listed = " ".join(f"{x(iteration):.1f},{y(share):.1f}" for iteration, share in points)
-        return f'<polyline points="{listed}" fill="none" stroke="var(--{colour})" stroke-width="2"/>'
-
-    def label(at: tuple[float, float], text: str, anchor: str, colour: str = "") -> str:
-        style = f' style="fill:var(--{colour})"' if colour else ""
-        return f'<text x="{at[0]:.1f}" y="{at[1]:.1f}" text-anchor="{anchor}"{style}>{text}</text>'
-
-    parts, start = [], 0
-    for phase, end in zip(Phase, schedule.ends, strict=True):
-        if end > start:
-            box = f'x="{x(start):.1f}" y="{top}" width="{x(end) - x(start):.1f}" height="{height - top - bottom}"'
-            parts.append(f'<rect {box} fill="{PHASE_COLOURS[phase]}" fill-opacity="0.6"/>')
-            parts.append(label(((x(start) + x(end)) / 2, top - 8), phase.name.lower(), "middle"))
-        start = end
-    for value in _ticks(0, last):
-        parts.append(label((x(value), height - bottom + 20), f"{value:,.0f}", "middle"))
-    for value in _ticks(low, high):
-        at = y((value - low) / (high - low))
-        parts.append(f'<line x1="{left}" x2="{width - right}" y1="{at:.1f}" y2="{at:.1f}" stroke="#8884"/>')
-        parts.append(label((left - 6, at + 4), f"{value:g}", "end", "blue"))
-    for value in _ticks(0, most):
-        parts.append(label((width - right + 6, y(value / most) + 4), f"{value:,.0f}", "start", "brown"))
-    parts.append(label((left, height - 4), "test PSNR, dB", "start", "blue"))
-    parts.append(label((width / 2, height - 4), "iteration", "middle"))
-    parts.append(label((width - right, height - 4), "splats", "end", "brown"))
-    parts.append(line([(entry["iteration"], entry["splats"] / most) for entry in history], "brown"))
-    quality = [(entry["iteration"], (entry["psnr"] - low) / (high - low)) for entry in history]
-    quality = [(iteration, share) for iteration, share in quality if math.isfinite(share)]
-    parts.append(line(quality, "blue"))
-    parts += [f'<circle cx="{x(at):.1f}" cy="{y(share):.1f}" r="3" fill="var(--blue)"/>' for at, share in quality]
-    return f'<svg viewBox="0 0 {width} {height}" role="img">{"".join(parts)}</svg>'
-
-
-def _ticks(low: float, high: float) -> list[float]:
-    """Round numbers from ``low`` to ``high``, a step of 1, 2 or 5 times a power of ten apart."""
-    rough = (high - low) / 5
-    power = 10.0 ** math.floor(math.log10(rough))
-    step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough)
-    return [index * step for index in range(math.ceil(low / step), math.floor(high / step) + 1)]
-
-
-@dataclass(frozen=True)
-class RunPage:
-    """The page of a run.
-
-    Attributes:
         folder: Folder of the run, where the page goes; ``config.yaml``, ``preview.png`` and ``renders/`` in it are
             shown where they are.
         history: The evaluations so far.
@@ -98,109 +40,114 @@ class RunPage:
         metrics: The content of ``metrics.json``, see :func:`nsvq_lightning.report.files.summarize`; None before it
             is known.
         views: One row for each test view, as in ``views.csv``, with ``picture``, the name of its file in ``renders/``.
+
+    Returns:
+        The file.
     """
+    title = escape(f"{folder.resolve().parent.name} / {folder.resolve().name}")
+    refresh = "" if metrics else '<meta http-equiv="refresh" content="5">'
+    template = Template(files("nsvq_lightning.report").joinpath("web", "report.html").read_text(encoding="utf-8"))
+    preview, config = folder / "preview.png", folder / "config.yaml"
+    sections: dict[str, str] = {}
+    if metrics is None and preview.exists():
+        sections["Photo and render"] = f'<img class="preview" alt="photo and render" src="{_jpeg(_read(preview))}">'
+    if history:
+        curve = _address("png", figure_png(curve_figure(history, schedule)))
+        sections["While it trained"] = f'<img class="preview" alt="PSNR and splats by iteration" src="{curve}">'
+    sections["Test views"] = _views(folder, views)
+    tables = _times(history, seconds) if metrics is None else _sizes(metrics) | _times(history, seconds)
+    sections |= {heading: _table(*table) for heading, table in tables.items()}
+    if config.exists():
+        text = escape(config.read_text(encoding="utf-8"))
+        sections["Settings"] = f"<details><summary>config.yaml</summary><pre>{text}</pre></details>"
+    shown = [f"<h2>{heading}</h2>{content}" for heading, content in sections.items() if content]
+    packages = ", ".join(f"{name} {version(name)}" for name in ("torch", "lightning", "numba"))
+    machine = f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads"
+    versions = f"nsvq-lightning {__version__}, Python {platform.python_version()}, {packages}; {machine}"
+    facts = _progress(history, schedule) if metrics is None else _results(metrics)
+    figures = "".join(f"<div>{name}<b>{value}</b></div>" for name, value in facts.items())
+    how = "measured on the decoded file" if metrics else "as a file written at that moment would decode to"
+    viewer = ' <a href="viewer.html">viewer.html</a> beside this page shows the scene.'
+    summary = f"<p>Quality on test views, {how}.{viewer if (folder / 'viewer.html').exists() else ''}</p>"
+    parts = [f"<h1>{title}</h1>", f'<div class="figures">{figures}</div>{summary}', *shown]
+    body = "\n".join([*parts, f"<footer>{escape(versions)}</footer>"])
+    path = folder / "report.html"
+    write_text(path, template.substitute(title=title, refresh=refresh, body=body))
+    return path
 
-    folder: Path
-    history: Sequence[Mapping[str, Any]]
-    schedule: Schedule
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    metrics: Mapping[str, Any] | None = None
-    views: Sequence[Mapping[str, Any]] = ()
 
-    def write(self) -> Path:
-        """Write ``report.html``, atomically; without ``metrics``, browsers read it again every few seconds.
+def _progress(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> dict[str, str]:
+    """How far a run has come."""
+    last = history[-1]
+    return {
+        "iteration": f"{last['iteration']:,} of {schedule.total:,}",
+        "phase": last["phase"],
+        "test PSNR": _decibels(last["psnr"]),
+        "SSIM": f"{last['ssim']:.4f}",
+        "splats": f"{last['splats']:,}",
+        "trained for": _duration(last["seconds"]),
+    }
 
-        Returns:
-            The file.
-        """
-        title = escape(f"{self.folder.resolve().parent.name} / {self.folder.resolve().name}")
-        refresh = "" if self.metrics else '<meta http-equiv="refresh" content="5">'
-        template = Template(files("nsvq_lightning.report").joinpath("web", "report.html").read_text(encoding="utf-8"))
-        preview, config = self.folder / "preview.png", self.folder / "config.yaml"
-        sections: dict[str, str] = {}
-        if self.metrics is None and preview.exists():
-            sections["Photo and render"] = f'<img class="preview" alt="photo and render" src="{_jpeg(_read(preview))}">'
-        if self.history:
-            sections["While it trained"] = curve_svg(self.history, self.schedule)
-        sections["Test views"] = self._views()
-        sections |= {heading: _table(*table) for heading, table in self._tables().items()}
-        if config.exists():
-            text = escape(config.read_text(encoding="utf-8"))
-            sections["Settings"] = f"<details><summary>config.yaml</summary><pre>{text}</pre></details>"
-        shown = [f"<h2>{heading}</h2>{content}" for heading, content in sections.items() if content]
-        packages = ", ".join(f"{name} {version(name)}" for name in ("torch", "lightning", "numba"))
-        machine = f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads"
-        versions = f"nsvq-lightning {__version__}, Python {platform.python_version()}, {packages}; {machine}"
-        body = "\n".join([f"<h1>{title}</h1>", self._summary(), *shown, f"<footer>{escape(versions)}</footer>"])
-        path = self.folder / "report.html"
-        write_text(path, template.substitute(title=title, refresh=refresh, body=body))
-        return path
 
-    def _summary(self) -> str:
-        if self.metrics is None:
-            last = self.history[-1]
-            facts = [
-                ("iteration", f"{last['iteration']:,} of {self.schedule.total:,}"),
-                ("phase", last["phase"]),
-                ("test PSNR", _decibels(last["psnr"])),
-                ("SSIM", f"{last['ssim']:.4f}"),
-                ("splats", f"{last['splats']:,}"),
-                ("trained for", _duration(last["seconds"])),
-            ]
-        else:
-            facts = [
-                ("test PSNR", _decibels(self.metrics["psnr"])),
-                ("SSIM", f"{self.metrics['ssim']:.4f}"),
-                ("file", f"{self.metrics['file_bytes'] / 1e6:.3f} MB"),
-                ("smaller than .ply", f"{self.metrics['ratio']:.1f} x"),
-                ("splats", f"{self.metrics['num_splats']:,}"),
-                ("trained for", _duration(self.metrics["train_seconds"])),
-            ]
-            if self.metrics["lpips"] is not None:
-                facts.insert(2, ("LPIPS", f"{self.metrics['lpips']:.4f}"))
-        shown = "".join(f"<div>{name}<b>{value}</b></div>" for name, value in facts)
-        how = "measured on the decoded file" if self.metrics else "as a file written at that moment would decode to"
-        viewer = (self.folder / "viewer.html").exists()
-        scene = ' <a href="viewer.html">viewer.html</a> beside this page shows the scene.' if viewer else ""
-        return f'<div class="figures">{shown}</div><p>Quality on test views, {how}.{scene}</p>'
+def _results(metrics: Mapping[str, Any]) -> dict[str, str]:
+    """What a run has come to."""
+    lpips = {} if metrics["lpips"] is None else {"LPIPS": f"{metrics['lpips']:.4f}"}
+    return {
+        "test PSNR": _decibels(metrics["psnr"]),
+        "SSIM": f"{metrics['ssim']:.4f}",
+        **lpips,
+        "file": f"{metrics['file_bytes'] / 1e6:.3f} MB",
+        "smaller than .ply": f"{metrics['ratio']:.1f} x",
+        "splats": f"{metrics['num_splats']:,}",
+        "trained for": _duration(metrics["train_seconds"]),
+    }
 
-    def _views(self) -> str:
-        worst = min((row["psnr"] for row in self.views), default=0.0)
-        figures = []
-        for row in self.views:
-            path = self.folder / "renders" / row["picture"]
-            if path.exists():
-                remark = ", the lowest" if row["psnr"] == worst and len(self.views) > 1 else ""
-                caption = f"{escape(row['name'])}: {_decibels(row['psnr'])}, SSIM {row['ssim']:.4f}{remark}"
-                figures.append(_figure(_read(path), caption))
-        return f'<div class="views">{"".join(figures)}</div>' if figures else ""
 
-    def _tables(self) -> dict[str, tuple[Sequence[str], list[Sequence[str]]]]:
-        """Head and rows of each table by its heading."""
-        streams: list[Sequence[str]] = []
-        codes: list[Sequence[str]] = []
-        if self.metrics is not None:
-            splats, whole = max(1, self.metrics["num_splats"]), self.metrics["file_bytes"]
-            for name, size in self.metrics["streams"].items():
-                bar = f'<i style="width:{12 * size / whole:.2f}rem"></i>'
-                streams += [(name, f"{size:,}", f"{8 * size / splats:.2f}", bar)] if size else []
-            streams.append(("whole file", f"{whole:,}", f"{8 * whole / splats:.2f}", ""))
-            for name, book in self.metrics["codes"].items():
-                codes.append((name, f"{book['codebook']:,}", f"{book['used']:,}", f"{book['entropy']:.2f}"))
-        times: list[Sequence[str]] = []
-        before, since = 0, 0.0
-        for phase in Phase:
-            entries = [entry for entry in self.history if entry["phase"] == phase.name.lower()]
-            if entries:
-                steps, seconds = entries[-1]["iteration"] - before, entries[-1]["seconds"] - since
-                times.append((phase.name.lower(), f"{steps:,}", _duration(seconds), f"{1000 * seconds / steps:.1f}"))
-                before, since = entries[-1]["iteration"], entries[-1]["seconds"]
-        times += [(name, "", _duration(seconds), "") for name, seconds in self.seconds.items() if seconds]
-        return {
-            "Bytes": (("stream", "bytes", "bits a splat", ""), streams),
-            "Codes": (("attribute", "codebook", "in use", "entropy, bits"), codes),
-            "Time": (("part", "iterations", "time", "ms an iteration"), times),
-        }
+def _views(folder: Path, views: Sequence[Mapping[str, Any]]) -> str:
+    worst = min((row["psnr"] for row in views), default=0.0)
+    figures = []
+    for row in views:
+        path = folder / "renders" / row["picture"]
+        if path.exists():
+            remark = ", the lowest" if row["psnr"] == worst and len(views) > 1 else ""
+            caption = f"{escape(row['name'])}: {_decibels(row['psnr'])}, SSIM {row['ssim']:.4f}{remark}"
+            figures.append(_figure(_read(path), caption))
+    return f'<div class="views">{"".join(figures)}</div>' if figures else ""
+
+
+# Head and rows of a table.
+_Table = tuple[Sequence[str], Sequence[Sequence[str]]]
+
+
+def _sizes(metrics: Mapping[str, Any]) -> dict[str, _Table]:
+    """The tables of the file by their headings."""
+    splats, whole = max(1, metrics["num_splats"]), metrics["file_bytes"]
+    streams = [
+        (name, f"{size:,}", f"{8 * size / splats:.2f}", f'<i style="width:{12 * size / whole:.2f}rem"></i>')
+        for name, size in metrics["streams"].items()
+        if size
+    ]
+    streams.append(("whole file", f"{whole:,}", f"{8 * whole / splats:.2f}", ""))
+    codes = [
+        (name, f"{book['codebook']:,}", f"{book['used']:,}", f"{book['entropy']:.2f}")
+        for name, book in metrics["codes"].items()
+    ]
+    return {
+        "Bytes": (("stream", "bytes", "bits a splat", ""), streams),
+        "Codes": (("attribute", "codebook", "in use", "entropy, bits"), codes),
+    }
+
+
+def _times(history: Sequence[Mapping[str, Any]], seconds: Mapping[str, float]) -> dict[str, _Table]:
+    """The table of times by its heading."""
+    rows = []
+    before, since = 0, 0.0
+    for last in {entry["phase"]: entry for entry in history}.values():
+        steps, taken = last["iteration"] - before, last["seconds"] - since
+        rows.append((last["phase"], f"{steps:,}", _duration(taken), f"{1000 * taken / steps:.1f}"))
+        before, since = last["iteration"], last["seconds"]
+    rows += [(name, "", _duration(taken), "") for name, taken in seconds.items() if taken]
+    return {"Time": (("part", "iterations", "time", "ms an iteration"), rows)}
 
 
 def _figure(comparison: MatLike, caption: str) -> str:
@@ -236,8 +183,12 @@ def _jpeg(picture: MatLike) -> str:
     factor = min(1.0, 1000 / max(picture.shape[:2]))
     if factor < 1.0:
         picture = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes()
-    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
+    return _address("jpeg", cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
+
+
+def _address(kind: str, data: bytes) -> str:
+    """The content of a picture file as an address that holds it."""
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
 def _decibels(psnr: float | None) -> str:

@@ -150,3 +150,28 @@ def page_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
 def _source(name: str) -> str:
     """Text of a file of the page."""
     return files("nsvq_lightning.report").joinpath("web", name).read_text(encoding="utf-8")
+
+
+# The splats of a running fit, while somebody looks.
+LIVE_SCENE = "live.nsvq"
+# File whose time of modification says when a viewer last asked.
+REQUEST = "live.request"
+
+
+def ask_live(folder: Path) -> None:
+    """Ask the fit that writes to a folder for its splats."""
+    write_text(folder / REQUEST, "a viewer would like to see the splats of this run\n")
+
+
+def live_asked(folder: Path) -> int:
+    """When somebody last asked, as a number that changes with each time; 0 for never."""
+    try:
+        return (folder / REQUEST).stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+def end_live(folder: Path) -> None:
+    """Remove both files: the run has ended."""
+    for name in (REQUEST, LIVE_SCENE):
+        (folder / name).unlink(missing_ok=True)

@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from torch.distributed import all_reduce, broadcast
 
 from nsvq_lightning.compute.devices import to_device
-from nsvq_lightning.training.optim import raw_optimizer
 
 
 def follow_first(strategy: Strategy, module: nn.Module) -> None:
@@ -46,7 +45,7 @@ def check_replicas(trainer: Trainer, event: str) -> None:
     """
     if trainer.world_size == 1:
         return
-    parameters: dict[str, Tensor] = {group["name"]: group["params"][0] for group in raw_optimizer(trainer).param_groups}
+    parameters: dict[str, Tensor] = {group["name"]: group["params"][0] for group in trainer.optimizers[0].param_groups}
     own = torch.stack([checksum(parameter) for parameter in parameters.values()])
     differ = sum_over_processes(trainer, (own != from_first_process(trainer, own)).long())
     different = [name for name, processes in zip(parameters, differ.tolist(), strict=True) if processes]

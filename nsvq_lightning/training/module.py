@@ -8,6 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from nsvq_lightning.compute.compilation import Stopwatch
 from nsvq_lightning.compute.devices import AsyncScalar, to_device
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.nsvq.precision import Storage
@@ -20,12 +21,9 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, visible
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.splats import RawSplats, Splats
-from nsvq_lightning.training import optim
+from nsvq_lightning.training import optim, scene_access
 from nsvq_lightning.training.resume import ResumedModule
-from nsvq_lightning.training.scene_access import scene_of
-from nsvq_lightning.training.schedule import Phase, Schedule, log_interval
-from nsvq_lightning.training.start import background_of, check_precision, extent_of, first_splats, warn_of_device
-from nsvq_lightning.training.stopwatch import Stopwatch
+from nsvq_lightning.training.schedule import Phase, Schedule
 
 log = logging.getLogger(__name__)
 
@@ -175,29 +173,31 @@ class SplatModule(ResumedModule):
         Raises:
             ValueError: There is nothing to start from, or the trainer has another precision than ``32-true``.
         """
-        check_precision(self.trainer.precision)
+        if self.trainer.precision != "32-true":
+            raise ValueError(
+                f"splats train in float32, trainer.precision is {self.trainer.precision}: kernels compute in float32 "
+                "whatever it says, and a scaled loss would grow splats needlessly; leave it at 32-true"
+            )
         self.evaluation_splats = None  # an interrupted evaluation may have left some
-        scene = scene_of(self.trainer)
+        scene = scene_access.scene_of(self.trainer)
         if scene is not None:
-            self.background = background_of(scene, self.background)
+            self.background = scene_access.background_of(scene, self.background)
         if stage != "fit":
             return
         if self.extent == 0.0:
-            self.extent = extent_of(scene)
+            self.extent = scene_access.extent_of(scene)
         if len(self.splats) == 0:
-            self.splats = first_splats(self.init_from, scene, self.splats.sh_degree).to(self.device)
+            splats = scene_access.first_splats(self.init_from, scene, self.splats.sh_degree)
+            self.splats = splats.to(self.device)
             self.active_sh_degree = 0 if self.init_from is None else self.splats.sh_degree
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """One Adam optimiser with one named group for each attribute and codebook."""
         return optim.build_adam(optim.param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
 
-    def on_fit_start(self) -> None:
-        """Warn about what the user should know of this device."""
-        warn_of_device(self.device)
-
     def on_train_start(self) -> None:
         """Set the learning rates of this run, not those of a checkpoint; start measuring the training time."""
+        scene_access.warn_of_device(self.device)
         views = self.trainer.world_size * self.trainer.accumulate_grad_batches
         optim.check_groups(self.trainer.optimizers, self.quantizers)
         optim.apply_rates(self.trainer.optimizers[0], self.rates, self.extent, views)
@@ -237,7 +237,7 @@ class SplatModule(ResumedModule):
             rendered.means2d.retain_grad()
         first, *others = (term(rendered, batch) for term in self.loss_terms.values())
         loss = sum(others, start=first)
-        if (self.global_step + 1) % log_interval(self.trainer) == 0 or not is_on("metrics"):
+        if (self.global_step + 1) % max(1, self.trainer.log_every_n_steps) == 0 or not is_on("metrics"):
             quality = psnr(eight_bit(rendered.image.detach()), eight_bit(batch.image), batch.mask).float()
             values = {"train/loss": loss.detach(), "train/psnr": quality, "train/splats": float(len(self.splats))}
             self.log_dict(values, batch_size=1)  # type: ignore[arg-type]  # a number among tensors

@@ -8,7 +8,6 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
-from lightning.pytorch import Trainer
 from torch import Tensor, nn
 
 from nsvq_lightning.splats.attributes import ATTRIBUTES
@@ -185,8 +184,3 @@ def check_groups(optimizers: Sequence[torch.optim.Optimizer], quantized: Iterabl
             f"there are {len(optimizers)} optimisers, without groups for: {', '.join(missing) or 'none'}. Build the "
             "groups with nsvq_lightning.training.optim.param_groups"
         )
-
-
-def raw_optimizer(trainer: Trainer) -> torch.optim.Optimizer:
-    """The trainer's only optimiser, unwrapped."""
-    return trainer.optimizers[0]

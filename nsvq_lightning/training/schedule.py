@@ -243,8 +243,3 @@ def _times(schedule: Schedule, start: float, last: float, stride: float) -> tupl
 def next_iteration(trainer: Trainer) -> int:
     """1-based number of the iteration that starts (or runs) now; at the end of a step, that of the next one."""
     return trainer.global_step + 1
-
-
-def log_interval(trainer: Trainer) -> int:
-    """Iterations between two log entries."""
-    return max(1, int(getattr(trainer, "log_every_n_steps", 50)))

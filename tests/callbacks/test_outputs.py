@@ -13,7 +13,7 @@ from nsvq_lightning.callbacks import outputs as live_callback
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io import load
 from nsvq_lightning.io.nsvq.header import read_header
-from nsvq_lightning.training import live_preview
+from nsvq_lightning.report.viewer import LIVE_SCENE, REQUEST, ask_live
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import run_folder
 
@@ -33,10 +33,10 @@ class Viewer(Callback):
     def on_train_batch_start(self, trainer: Any, pl_module: Any, batch: Any, batch_idx: int) -> None:
         self.folder = run_folder(trainer)
         if batch_idx in self.asking:
-            live_preview.ask(self.folder)
+            ask_live(self.folder)
 
     def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
-        path = self.folder / live_preview.LIVE_SCENE
+        path = self.folder / LIVE_SCENE
         if path.exists():
             self.seen[batch_idx] = load(path)
             self.said[batch_idx] = read_header(path).config["live"]
@@ -66,7 +66,7 @@ def test_splats_are_written_when_somebody_asks(demo_scene: Path, tmp_path: Path)
     for index, splats in viewer.seen.items():
         for name, tensor in viewer.expected[index]._asdict().items():
             assert torch.equal(getattr(splats, name).detach(), tensor), (index, name)
-    assert not (viewer.folder / live_preview.REQUEST).exists()
+    assert not (viewer.folder / REQUEST).exists()
 
 
 def test_nobody_costs_no_file_and_changes_no_bit(demo_scene: Path, tmp_path: Path) -> None:

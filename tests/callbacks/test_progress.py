@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import io
 import re
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks.progress.tqdm_progress import Tqdm
 from numba import njit
 
 from nsvq_lightning.callbacks import progress
 from nsvq_lightning.callbacks.progress import SplatProgressBar
-from nsvq_lightning.compute.compilation import compile_seconds, compile_watcher
-from nsvq_lightning.training.stopwatch import Stopwatch
+from nsvq_lightning.compute import compilation
+from nsvq_lightning.compute.compilation import Stopwatch, compile_seconds, compile_watcher
+from nsvq_lightning.training.module import SplatModule
 
 
 def compiled() -> Callable[[float], float]:
@@ -48,8 +52,8 @@ def test_the_clock_counts_compilation_and_tells_those_who_watch() -> None:
 
 def test_training_time_leaves_compilation_out(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0, 0.0]
-    monkeypatch.setattr("nsvq_lightning.training.stopwatch.time.perf_counter", lambda: now[0])
-    monkeypatch.setattr("nsvq_lightning.training.stopwatch.compile_seconds", lambda: now[1])
+    monkeypatch.setattr("nsvq_lightning.compute.compilation.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("nsvq_lightning.compute.compilation.compile_seconds", lambda: now[1])
     watch = Stopwatch()
     watch.start()
     now[:] = [100.0, 93.0]
@@ -73,3 +77,14 @@ def test_a_bar_of_the_longest_run_fits_80_columns(hours: int) -> None:
     assert len(line.rstrip()) <= 80
     assert line.rstrip().endswith("quantize 1.23M splats 31.3 dB test 31.64")
     bar.close()
+
+
+def test_what_is_no_terminal_gets_lines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    with open(tmp_path / "log.txt", "w") as file:
+        monkeypatch.setattr(sys, "stdout", file)
+        bar = SplatProgressBar()
+        bar.setup(Trainer(logger=False, max_steps=9), SplatModule(), "test")
+        assert bar.is_disabled
+        monkeypatch.setitem(sys.modules, "ipykernel", compilation)
+        bar.setup(Trainer(logger=False, max_steps=9), SplatModule(), "test")
+        assert not bar.is_disabled

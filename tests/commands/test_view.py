@@ -20,8 +20,7 @@ from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import read_nsvq, save
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.precision import Storage
-from nsvq_lightning.report.viewer import some_cameras, viewer_page
-from nsvq_lightning.training import live_preview
+from nsvq_lightning.report import viewer
 
 
 def _get(address: str) -> tuple[int, bytes]:
@@ -42,7 +41,7 @@ def run(tmp_path: Path) -> Path:
 @pytest.fixture
 def address(run: Path, demo_scene: Path) -> Iterator[str]:
     """A server that follows the run."""
-    page = viewer_page(some_cameras(load_scene(demo_scene)), "run", live=0.2).encode()
+    page = viewer.viewer_page(viewer.some_cameras(load_scene(demo_scene)), "run", live=0.2).encode()
     attributes = {"page": page, "source": Source(run / "scene.nsvq", run), "host": "127.0.0.1", "timeout": 0.5}
     with _Server(("127.0.0.1", 0), type("Handler", (_Handler,), attributes)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -51,23 +50,23 @@ def address(run: Path, demo_scene: Path) -> Iterator[str]:
 
 
 def test_a_running_fit_is_asked_until_its_scene_is_there(run: Path, address: str) -> None:
-    assert not live_preview.asked(run)
+    assert not viewer.live_asked(run)
     assert _get(f"{address}/scene.nsvq") == (503, b"waiting for the run to show its splats")
-    assert not live_preview.asked(run)
+    assert not viewer.live_asked(run)
     assert _get(f"{address}/version")[0] == 503
-    first = live_preview.asked(run)
+    first = viewer.live_asked(run)
     assert first
-    save(random_splats(5), run / live_preview.LIVE_SCENE, Storage("paper"))
+    save(random_splats(5), run / viewer.LIVE_SCENE, Storage("paper"))
     status, version = _get(f"{address}/version")
     assert status == 200
-    assert live_preview.asked(run) > first
-    assert _get(f"{address}/scene.nsvq") == (200, (run / live_preview.LIVE_SCENE).read_bytes())
-    live_preview.end(run)
+    assert viewer.live_asked(run) > first
+    assert _get(f"{address}/scene.nsvq") == (200, (run / viewer.LIVE_SCENE).read_bytes())
+    viewer.end_live(run)
     assert _get(f"{address}/version") == (503, b"the run trains no more; its scene is not there yet")
     save(random_splats(6), run / "scene.nsvq")
     status, last = _get(f"{address}/version")
     assert (status, last != version) == (200, True)
-    assert not live_preview.asked(run)
+    assert not viewer.live_asked(run)
     assert _get(f"{address}/scene.nsvq") == (200, (run / "scene.nsvq").read_bytes())
     assert _get(f"{address}/")[1].startswith(b"<!doctype html>")
     assert _get(f"{address}/../secret")[0] == 404
@@ -142,7 +141,7 @@ def test_a_client_that_hangs_up_is_no_traceback(run: Path, address: str, capsys:
 
 @needs_chromium
 def test_the_page_shows_each_version(run: Path, address: str, tmp_path: Path) -> None:
-    save(random_splats(40, seed=1), run / live_preview.LIVE_SCENE, Storage("paper"))
+    save(random_splats(40, seed=1), run / viewer.LIVE_SCENE, Storage("paper"))
     with chromium(tmp_path / "profile") as tab:
         tab.open(address, 320, 240)
         tab.run("nsvqReady")
@@ -151,7 +150,7 @@ def test_the_page_shows_each_version(run: Path, address: str, tmp_path: Path) ->
         camera = tab.run("nsvqViewer.camera()")
         state = {"iteration": 40, "of": 90, "phase": "quantize", "psnr": "21.50"}
         scene = CompressedScene.from_splats(random_splats(55, seed=2), config={"live": state})
-        save(scene, run / live_preview.LIVE_SCENE, Storage("paper"))
+        save(scene, run / viewer.LIVE_SCENE, Storage("paper"))
         wait = """new Promise((resolve, reject) => {
             const seen = () => document.getElementById("facts").textContent.startsWith("55 splats");
             setInterval(() => seen() && nsvqViewer.camera(nsvqViewer.camera()).then(resolve), 50);
@@ -163,7 +162,7 @@ def test_the_page_shows_each_version(run: Path, address: str, tmp_path: Path) ->
         facts = tab.run("document.getElementById('facts').textContent")
         assert facts.endswith(" · iteration 40 of 90 · quantize · test PSNR 21.50 dB")
         save(random_splats(60, seed=2), run / "scene.nsvq")
-        live_preview.end(run)
+        viewer.end_live(run)
         tab.run(wait.replace("55", "60"))
         assert tab.run("document.getElementById('facts').textContent").endswith(" MB · the run has ended")
 

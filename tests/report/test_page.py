@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 import torch
 
-from nsvq_lightning.report.page import RunPage, curve_svg
+from nsvq_lightning.report.files import curve_figure
+from nsvq_lightning.report.page import write_page
 from nsvq_lightning.report.pictures import comparison, file_stem, write_png
 from nsvq_lightning.training.schedule import Schedule
 
@@ -82,17 +83,17 @@ def run(tmp_path: Path) -> Path:
 
 def _picture(address: str) -> Any:
     kind, data = address.split(",", 1)
-    assert kind == "data:image/jpeg;base64"
+    assert kind in ("data:image/jpeg;base64", "data:image/png;base64")
     return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
 
 
 def test_page_of_a_finished_run_needs_no_other_file(run: Path) -> None:
-    path = RunPage(run, HISTORY, SCHEDULE, {"evaluations": 12.0, "kernels compiled": 0.0}, METRICS, VIEWS).write()
+    path = write_page(run, HISTORY, SCHEDULE, {"evaluations": 12.0, "kernels compiled": 0.0}, METRICS, VIEWS)
     text = path.read_text(encoding="utf-8")
     page = Tags(text)
     assert "http-equiv" not in text
     assert not re.search(r"https?://|url\(|@import", text)
-    photo, render, error, *same = map(_picture, page.addresses)
+    _, photo, render, error, *same = map(_picture, page.addresses)
     for picture, left, right in ((photo, (0, 0, 0), (0, 0, 255)), (render, (255,) * 3, (255,) * 3)):
         assert picture.shape == (30, 40, 3)
         assert np.abs(picture[15, 5].astype(int) - left).max() < 8
@@ -112,13 +113,12 @@ def test_page_of_a_finished_run_needs_no_other_file(run: Path) -> None:
 
 def test_page_of_a_running_fit_shows_a_view_and_is_read_again(run: Path) -> None:
     write_png(run / "preview.png", torch.cat([torch.zeros(20, 1100, 3), torch.ones(20, 1100, 3)], dim=1))
-    page = RunPage(run, HISTORY[:2], SCHEDULE)
-    text = page.write().read_text(encoding="utf-8")
+    text = write_page(run, HISTORY[:2], SCHEDULE, {}).read_text(encoding="utf-8")
     tags = Tags(text)
     assert '<meta http-equiv="refresh" content="5">' in text
     assert "150 of 450" in tags.words
     assert "21.00 dB" in tags.words
-    (preview,) = map(_picture, tags.addresses)
+    preview, _ = map(_picture, tags.addresses)
     assert preview.shape[1] == 1000
     assert preview[:, 450].max() < 8
     assert preview[:, 550].min() > 247
@@ -127,31 +127,16 @@ def test_page_of_a_running_fit_shows_a_view_and_is_read_again(run: Path) -> None
 def test_a_picture_that_is_none_any_more_is_named(run: Path) -> None:
     (run / "renders" / "a.png").write_bytes(b"nothing")
     with pytest.raises(OSError, match=r"a\.png is not a picture any more; run 'nsvq test' again"):
-        RunPage(run, HISTORY, SCHEDULE, {}, METRICS, VIEWS).write()
+        write_page(run, HISTORY, SCHEDULE, {}, METRICS, VIEWS)
     assert not (run / "report.html").exists()
 
 
-@pytest.mark.parametrize("psnr", [[31.0], [20.0, 20.0], [20.0, math.inf, 99.0], [math.inf]])
-def test_curve_stays_within_its_axes(psnr: list[float]) -> None:
-    history = [_entry(100 * (index + 1), "warmup", value, 1.0) for index, value in enumerate(psnr)]
-    text = curve_svg(history, SCHEDULE)
-    dots = [(float(x), float(y)) for x, y in re.findall(r'<circle cx="([\d.]+)" cy="([\d.]+)"', text)]
-    assert len(dots) == sum(map(math.isfinite, psnr))
-    xs, heights = ([dot[axis] for dot in dots] for axis in (0, 1))
-    assert xs == sorted(set(xs))
-    assert all(48 <= x <= 716 and 28 <= y <= 288 for x, y in dots)
-    finite = [value for value in psnr if math.isfinite(value)]
-    assert np.argsort(heights, stable=True).tolist() == np.argsort(np.negative(finite), stable=True).tolist()
-    assert "nan" not in text
-    assert "inf" not in text
-
-
 def test_curve_shades_the_phases_where_they_are() -> None:
-    text = curve_svg(HISTORY, SCHEDULE)
-    boxes = [(float(x), float(width)) for x, width in re.findall(r'<rect x="([\d.]+)" y="28" width="([\d.]+)"', text)]
-    ends = [round((x + width - 48) / (716 - 48) * 450) for x, width in boxes]
-    assert tuple(ends) == SCHEDULE.ends
-    assert re.findall(r"(warmup|prune|quantize|finetune)</text>", text) == ["warmup", "prune", "quantize", "finetune"]
+    quality, count = curve_figure([*HISTORY, _entry(450, "finetune", math.inf, 1.0)], SCHEDULE).axes
+    assert tuple(patch.get_x() + patch.get_width() for patch in quality.patches) == SCHEDULE.ends
+    assert [patch.get_label() for patch in quality.patches] == ["warmup", "prune", "quantize", "finetune"]
+    assert quality.lines[0].get_ydata()[-2] == HISTORY[-1]["psnr"]
+    assert count.lines[0].get_ydata()[0] == HISTORY[0]["splats"]
 
 
 def test_files_of_different_views_differ_and_fit_any_file_system(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import Recipe, RunFactory, paper_phases
 
 from nsvq_lightning.training.edit import append_rows, keep_rows
-from nsvq_lightning.training.optim import raw_optimizer
 
 STEPS = 60
 AMOUNT = 7
@@ -29,7 +28,7 @@ class EditRows(Callback):
     ) -> None:
         if trainer.global_step % 3 or trainer.global_step == STEPS:
             return
-        splats, optimizer = pl_module.splats, raw_optimizer(trainer)
+        splats, optimizer = pl_module.splats, trainer.optimizers[0]
         self.edits += 1
         if self.kind != "add":
             keep_rows(splats, optimizer, torch.arange(len(splats)) >= AMOUNT)

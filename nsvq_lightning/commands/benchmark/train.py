@@ -32,7 +32,7 @@ from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.report.evaluation import evaluate
+from nsvq_lightning.report.files import evaluate
 from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training import optim
 from nsvq_lightning.training.module import SplatModule
@@ -246,7 +246,7 @@ def run_rows(scope: Scope) -> Iterator[timing.Measurement]:
 def _test_psnr(module: SplatModule) -> float:
     data: ColmapDataModule = module.trainer.datamodule  # type: ignore[attr-defined]  # Lightning does not type it
     splats, views = module.hard_splats(module.phase), data.test_dataloader()
-    return evaluate(lambda camera: module.render_splats(splats, camera).image, views, module.device).psnr
+    return evaluate(lambda camera: module.render_splats(splats, camera).image, views, module.device)[0]
 
 
 def different_numbers(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> int:
