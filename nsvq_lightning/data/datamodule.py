@@ -12,7 +12,7 @@ from lightning.pytorch import LightningDataModule
 from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
 from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, IterableDataset, Sampler
+from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.images import Picture
@@ -20,7 +20,7 @@ from nsvq_lightning.data.scene import Factor, Scene, View, load_scene
 from nsvq_lightning.random import generator
 
 
-class ViewSampler(Sampler[int]):
+def view_order(n_views: int, seed: int, rank: int = 0, world_size: int = 1, start: int = 0) -> Iterator[int]:
     """Endless sequence of views: all in random order without replacement, then all again in a new order.
 
     Epoch ``e`` of the sequence is a permutation drawn from ``generator(seed, e, "views")``. Draw ``d`` of rank ``r`` of
@@ -33,32 +33,13 @@ class ViewSampler(Sampler[int]):
         rank: This process.
         world_size: Number of processes.
         start: Draw at which iteration starts.
-
-    Raises:
-        ValueError: A number is out of range.
     """
-
-    def __init__(self, n_views: int, seed: int = 0, rank: int = 0, world_size: int = 1, start: int = 0) -> None:
-        if n_views < 1:
-            raise ValueError(f"n_views must be at least 1, got {n_views}")
-        if not 0 <= rank < world_size:
-            raise ValueError(f"rank must be in [0, world_size), got rank {rank} of {world_size}")
-        if start < 0:
-            raise ValueError(f"start must be at least 0, got {start}")
-        self.n_views, self.seed, self.rank, self.world_size, self.start = n_views, seed, rank, world_size, start
-        self._epoch = -1
-        self._order = torch.empty(0, dtype=torch.int64)
-
-    def view_at(self, draw: int) -> int:
-        """View of draw ``draw`` on this rank, in ``[0, n_views)``."""
-        epoch, position = divmod(draw * self.world_size + self.rank, self.n_views)
-        if epoch != self._epoch:
-            self._order = torch.randperm(self.n_views, generator=generator(self.seed, epoch, "views"))
-            self._epoch = epoch
-        return int(self._order[position])
-
-    def __iter__(self) -> Iterator[int]:
-        return map(self.view_at, count(self.start))
+    current, order = -1, torch.empty(0, dtype=torch.int64)
+    for draw in count(start):
+        epoch, position = divmod(draw * world_size + rank, n_views)
+        if epoch != current:
+            current, order = epoch, torch.randperm(n_views, generator=generator(seed, epoch, "views"))
+        yield int(order[position])
 
 
 class DevicePhotos:
@@ -109,7 +90,7 @@ class ColmapDataModule(LightningDataModule):
 
     Every 8th of the sorted image names is a test view (validated and tested on, never trained on), unless the folder
     says which are, see :func:`~nsvq_lightning.data.scene.load_scene`. The train views come
-    in the endless order of :class:`~nsvq_lightning.data.datamodule.ViewSampler`, which starts at the trainer's step: a
+    in the endless order of :func:`~nsvq_lightning.data.datamodule.view_order`, which starts at the trainer's step: a
     resumed run sees the views that the uninterrupted run would have seen. With R processes, each takes its own draws
     of that one sequence, and every R-th of the test views.
 
@@ -237,7 +218,7 @@ class _TrainViews(IterableDataset[View]):
 
     def __iter__(self) -> Iterator[View]:
         scene, (rank, world_size) = self._data.scene, self._data.process
-        order = ViewSampler(len(scene.train), self._data.seed, rank, world_size, start=self._data.draw)
+        order = view_order(len(scene.train), self._data.seed, rank, world_size, self._data.draw)
         for current, following in pairwise(order):
             scene.images.prefetch(scene.train[following])
             yield scene.view(scene.train[current])

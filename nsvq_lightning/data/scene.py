@@ -19,8 +19,7 @@ from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, larger_models
 from nsvq_lightning.data.frames import PHOTOS
 from nsvq_lightning.data.images import ROUNDED, ImageSource, ImageStore, image_head
-from nsvq_lightning.data.point_cloud import random_points
-from nsvq_lightning.data.transforms import read_poses
+from nsvq_lightning.data.transforms import random_points, read_poses
 from nsvq_lightning.data.undistort import rectify
 from nsvq_lightning.rendering.camera import Camera
 

@@ -1,6 +1,7 @@
 """The memory that a run takes, before it takes it."""
 
 import logging
+import re
 from pathlib import Path
 
 from lightning.pytorch import Trainer
@@ -10,12 +11,6 @@ from nsvq_lightning.training.scene_access import scene_of
 
 log = logging.getLogger(__name__)
 
-# Bytes for Python, torch, Lightning, compiled kernels and evaluations.
-BASE = 1.2e9
-# Bytes per splat: 59 float32, each with gradient, two moments, and copies while quantizing or editing.
-BYTES_A_SPLAT = 59 * 4 * 6
-# Bytes per pixel of a photo: buffers of the renderer, the loss and the picture itself.
-BYTES_A_PIXEL = 100
 # Default of ``--data.cache_bytes``.
 CACHE_BYTES = 4 << 30
 
@@ -28,8 +23,11 @@ def run_bytes(scene: Scene, splats: int, cache_bytes: int = CACHE_BYTES) -> floa
         splats: Most splats that it has at a time.
         cache_bytes: Memory for decoded photos.
     """
+    base = 1.2e9  # Python, torch, Lightning, compiled kernels and evaluations
+    a_splat = 59 * 4 * 6  # 59 float32, each with gradient, two moments, and copies while quantizing or editing
+    a_pixel = 100  # buffers of the renderer, the loss and the picture itself
     pixels = max(camera.width * camera.height for camera in scene.cameras)
-    return BASE + min(scene.images.nbytes, cache_bytes) + BYTES_A_SPLAT * splats + BYTES_A_PIXEL * pixels
+    return base + min(scene.images.nbytes, cache_bytes) + a_splat * splats + a_pixel * pixels
 
 
 def say_footprint(trainer: Trainer, splats: int) -> None:
@@ -56,16 +54,22 @@ def readable_bytes(count: float) -> str:
 
 def available_memory() -> int | None:
     """Bytes that this process may still allocate: of the machine, or of its control group if less."""
-    limits = [_meminfo_available(), _group_available()]
+    limits = [_kilobytes("/proc/meminfo", "MemAvailable"), _group_available()]
     return min((limit for limit in limits if limit is not None), default=None)
 
 
-def _meminfo_available() -> int | None:
+def _resident() -> int:
+    """Bytes that this process occupies already."""
+    return _kilobytes("/proc/self/status", "VmRSS") or 0
+
+
+def _kilobytes(table: str, name: str) -> int | None:
+    """An entry of a table of the system, in bytes; None where there is none."""
     try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        found = re.search(rf"^{name}:\s+(\d+)", Path(table).read_text(encoding="ascii"), re.MULTILINE)
     except OSError:
         return None
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")), None)
+    return 1024 * int(found[1]) if found else None
 
 
 def _group_available() -> int | None:
@@ -76,12 +80,3 @@ def _group_available() -> int | None:
         return None if limit == "max" else max(0, int(limit) - int(used))
     except (OSError, ValueError):
         return None
-
-
-def _resident() -> int:
-    """Bytes that this process occupies already."""
-    try:
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return 0
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("VmRSS:")), 0)

@@ -13,14 +13,8 @@ from torch import Tensor, nn
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import Splats
 
-# Adam's defaults.
-BETAS = 0.9, 0.999
-
 # Adam's epsilon in 3D Gaussian splatting: gradients of a splat are far below PyTorch's default of 1e-8.
 EPS = 1e-15
-
-# Device types for which torch has a fused Adam.
-FUSED_DEVICES = frozenset({"cpu", "cuda"})
 
 # Prefix of a codebook's parameter group, before the name of its attribute.
 CODEBOOK_PREFIX = "codebook_"
@@ -134,7 +128,7 @@ def apply_rates(optimizer: torch.optim.Optimizer, rates: LearningRates, extent: 
         ValueError: So many views that a beta would not be positive.
     """
     scale = views if rates.scale_with_views else 1
-    betas = tuple(1 - scale * (1 - beta) for beta in BETAS)
+    betas = tuple(1 - scale * (1 - beta) for beta in (0.9, 0.999))
     if min(betas) <= 0:
         raise ValueError(
             f"rates cannot scale with {views} views a step, as Adam's first beta would be {betas[0]:.2g}: train fewer "
@@ -149,7 +143,7 @@ def apply_rates(optimizer: torch.optim.Optimizer, rates: LearningRates, extent: 
 def build_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
     """Adam of the paper over ``groups``: default betas, epsilon 1e-15, no weight decay; fused where torch can."""
     parameters: list[Tensor] = [parameter for group in groups for parameter in group["params"]]
-    fused = all(p.device.type in FUSED_DEVICES and p.is_floating_point() for p in parameters)
+    fused = all(p.device.type in ("cpu", "cuda") and p.is_floating_point() for p in parameters)
     return torch.optim.Adam(groups, eps=EPS, fused=True if fused else None)
 
 

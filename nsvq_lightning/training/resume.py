@@ -30,9 +30,6 @@ from nsvq_lightning.training.schedule import Phase, Schedule
 
 log = logging.getLogger(__name__)
 
-# Settings of a schedule that have no effect before the quantize phase.
-QUANTIZE_RULES = ("quantize_end", "min_finetune", "min_replacement_interval")
-
 # Prefix of the codebooks in a module's state.
 CODEBOOKS = "codebooks."
 
@@ -112,7 +109,9 @@ def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str |
             "control and learning rates follow the new length; pass "
             f"--trainer.max_steps={stored.total} to continue that run as it was"
         )
-    own, without_effect = asdict(schedule), ("saved", *(QUANTIZE_RULES if _is_unquantized(checkpoint) else ()))
+    own = asdict(schedule)
+    of_quantize = ("quantize_end", "min_finetune", "min_replacement_interval")
+    without_effect = ("saved", *(of_quantize if _is_unquantized(checkpoint) else ()))
     changed = {name: v for name, v in asdict(stored).items() if v != own[name] and name not in without_effect}
     if not changed:
         return None
@@ -203,9 +202,6 @@ def _prefixed(codebooks: nn.ModuleDict) -> dict[str, Tensor]:
 # Key under which a checkpoint holds which scene it is of.
 SCENE = "scene"
 
-# Settings of a module whose text, whatever it is, is only text; Lightning and :func:`check_settings` know the last.
-NEVER_IMPORTED = ("init_from", "codebooks", "_instantiator")
-
 WAY_OUT = "pass a checkpoint that nsvq fit has written, …/checkpoints/last.ckpt"
 
 
@@ -277,7 +273,8 @@ def check_settings(path: Any, settings: Mapping[str, Any], named: Collection[str
     """
     if settings.get("_instantiator") not in (None, "lightning.pytorch.cli.instantiate_module"):
         raise FormatError(f"{path}: refused, it names the function {settings['_instantiator']}", WAY_OUT)
-    for option, text in _texts("model", {k: v for k, v in settings.items() if k not in NEVER_IMPORTED}):
+    only_text = ("init_from", "codebooks", "_instantiator")  # the last has been checked
+    for option, text in _texts("model", {k: v for k, v in settings.items() if k not in only_text}):
         if text not in named and not _is_harmless(text):
             raise FormatError(
                 f"{path}: refused, its {option} is {text}, and a checkpoint may not import what it names",

@@ -21,24 +21,12 @@ log = logging.getLogger(__name__)
 
 # Files that show that a folder holds a run.
 RUN_FILES = (
-    "scene.nsvq",
-    "metrics.json",
-    "metrics.csv",
-    "curve.csv",
-    "checkpoints",
-    "last.ckpt",
-    "renders",
-    "predictions",
+    *("scene.nsvq", "metrics.json", "metrics.csv", "curve.csv"),
+    *("checkpoints", "last.ckpt", "renders", "predictions"),
 )
-
-# File of Lightning's CSV logger, which removes an existing one.
-LOG = "metrics.csv"
 
 # File that the process of a run keeps locked; it names that process and its machine.
 MARKER = ".running"
-
-# On Windows, what is locked cannot be read: lock a byte beyond the text.
-_LOCKED_BYTE = 1 << 20
 
 # The locked marker of each folder that this process writes a run to.
 _HELD: dict[Path, TextIO] = {}
@@ -123,7 +111,9 @@ def take(folder: Path, checkpoint: str | Path | None) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     hold(folder)
     _refuse_other_run(folder, checkpoint)  # one that has come and gone in between
-    _set_aside(folder / LOG)
+    log_file = folder / "metrics.csv"  # of Lightning's CSV logger, which removes an existing one
+    if log_file.exists():
+        log_file.rename(next(p for n in count(1) if not (p := folder / f"metrics_{n}.csv").exists()))
 
 
 def hold(folder: Path) -> None:
@@ -187,7 +177,7 @@ def _lock(file: TextIO) -> None:
     if sys.platform == "win32":
         import msvcrt
 
-        file.seek(_LOCKED_BYTE)
+        file.seek(1 << 20)  # a byte beyond the text: what is locked cannot be read
         msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
         return
     import fcntl
@@ -224,19 +214,10 @@ def _choose(trainer: Trainer) -> Path:
         return _RESERVED.pop(trainer)
     folder = _given(trainer)
     if folder is None:
-        folder = claim_version(Path(trainer.default_root_dir) / _scene_name(trainer))
+        root = getattr(getattr(trainer, "datamodule", None), "root", None)
+        scene = (root is not None and Path(root).resolve().name) or "scene"
+        folder = claim_version(Path(trainer.default_root_dir) / scene)
         hold(folder)
         return folder
     take(folder, trainer.ckpt_path if trainer.state.fn == "fit" else None)
     return folder
-
-
-def _set_aside(path: Path) -> None:
-    """Give a file the next free name ``<stem>_<n>``."""
-    if path.exists():
-        path.rename(next(p for n in count(1) if not (p := path.with_stem(f"{path.stem}_{n}")).exists()))
-
-
-def _scene_name(trainer: Trainer) -> str:
-    root = getattr(getattr(trainer, "datamodule", None), "root", None)
-    return (root is not None and Path(root).resolve().name) or "scene"

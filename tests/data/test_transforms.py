@@ -17,8 +17,8 @@ from transforms_scenes import APPLIED, opengl_matrix, write_blender, write_nerfs
 
 from nsvq_lightning.data.colmap import SceneError, read_model
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.data.point_cloud import RANDOM_POINTS, random_points, read_points, share_seen
 from nsvq_lightning.data.scene import Scene, load_scene
+from nsvq_lightning.data.transforms import RANDOM_POINTS, random_points, read_points, share_seen
 
 SceneFactory = Callable[..., Path]
 
