@@ -14,8 +14,9 @@ from nsvq_lightning.compression.importance import row_weights, sensitivity
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import eight_bit
-from nsvq_lightning.quantize import attributes, nearest
+from nsvq_lightning.quantize import attributes
 from nsvq_lightning.quantize import base as quantizer_base
+from nsvq_lightning.quantize.nearest import cheapest, code_rates
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.canonical_covariance import canonical
 from nsvq_lightning.training import distributed, edit, optim, scene_access
@@ -169,7 +170,7 @@ class CodebookReplacement(SplatCallback):
     end: int = 12_000
     late_every: int = 200
     jitter: float | None = 0.5
-    edit.reset_moments: bool = True
+    reset_moments: bool = True
 
     def __post_init__(self) -> None:
         self.check({"in (0, 1]": ("jitter",), "at least 1": ("start", "early_every", "late_every")})
@@ -398,8 +399,8 @@ class RateDistortion(SplatCallback):
         for name, price in (self.prices or {}).items():
             quantizer, rows = module.quantizers[name], module.rows(name)
             codes = attributes.codes_of(module.splats.raw(), name, quantizer).clone()
-            rates = nearest.code_rates(codes, len(quantizer.codebook))
-            codes[part] = nearest.cheapest(rows[part], quantizer.codebook, rates, price[part])
+            rates = code_rates(codes, len(quantizer.codebook))
+            codes[part] = cheapest(rows[part], quantizer.codebook, rates, price[part])
             cast(quantizer_base.Holding, quantizer).hold(codes)
 
 

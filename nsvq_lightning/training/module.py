@@ -237,7 +237,8 @@ class SplatModule(ResumedModule):
             rendered.means2d.retain_grad()
         first, *others = (term(rendered, batch) for term in self.loss_terms.values())
         loss = sum(others, start=first)
-        if (self.global_step + 1) % max(1, self.trainer.log_every_n_steps) == 0 or not is_on("metrics"):
+        every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]  # Lightning does not type it
+        if (self.global_step + 1) % max(1, every) == 0 or not is_on("metrics"):
             quality = psnr(eight_bit(rendered.image.detach()), eight_bit(batch.image), batch.mask).float()
             values = {"train/loss": loss.detach(), "train/psnr": quality, "train/splats": float(len(self.splats))}
             self.log_dict(values, batch_size=1)  # type: ignore[arg-type]  # a number among tensors

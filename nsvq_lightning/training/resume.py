@@ -30,6 +30,9 @@ from nsvq_lightning.training.schedule import Phase, Schedule
 
 log = logging.getLogger(__name__)
 
+# Settings of a schedule that have no effect before the quantize phase.
+QUANTIZE_RULES = ("quantize_end", "min_finetune", "min_replacement_interval")
+
 # Prefix of the codebooks in a module's state.
 CODEBOOKS = "codebooks."
 
@@ -109,9 +112,7 @@ def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str |
             "control and learning rates follow the new length; pass "
             f"--trainer.max_steps={stored.total} to continue that run as it was"
         )
-    own = asdict(schedule)
-    of_quantize = ("quantize_end", "min_finetune", "min_replacement_interval")
-    without_effect = ("saved", *(of_quantize if _is_unquantized(checkpoint) else ()))
+    own, without_effect = asdict(schedule), ("saved", *(QUANTIZE_RULES if _is_unquantized(checkpoint) else ()))
     changed = {name: v for name, v in asdict(stored).items() if v != own[name] and name not in without_effect}
     if not changed:
         return None
