@@ -102,9 +102,7 @@ class Densification(SplatCallback, ABC):
         if module.device.type == "cpu" and trainer.is_global_zero:
             memory_estimate.say_footprint(trainer, limit)
         if count > limit and module.phase > Phase.PRUNE:
-            log.warning(
-                "%s=%d comes too late for %d splats with codebooks; all are kept", self.limit_name, limit, count
-            )
+            log.warning(f"{self.limit_name}={limit} comes too late for {count} splats with codebooks; all are kept")
         elif count > limit:
             kept = most_contributing(scene_access.train_contributions(trainer, module), limit)
             edit.keep_rows(module.splats, trainer.optimizers[0], kept)
