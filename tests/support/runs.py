@@ -131,7 +131,7 @@ class Witness(Callback):
 
 @dataclass
 class Whole:
-    """A finished run that several tests look at, with a checkpoint of every second iteration."""
+    """A finished run that several tests look at, with a checkpoint every fourth iteration and at ends of phases."""
 
     trainer: Trainer
     module: SplatModule

@@ -87,10 +87,10 @@ def finished(run: RunFactory, callbacks: dict[str, Callback], module: dict[str, 
 @pytest.fixture(scope="session")
 def paper(run: RunFactory, recipe: Recipe) -> Whole:
     """The paper's run."""
-    return finished(run, recipe(checkpoint=RunCheckpoint(every=2, keep=True)), {})
+    return finished(run, recipe(checkpoint=RunCheckpoint(every=4, keep=True)), {})
 
 
 @pytest.fixture(scope="session")
 def fast(run: RunFactory, recipe: Recipe) -> Whole:
     """The recipe's run."""
-    return finished(run, recipe(**recipe_options(), checkpoint=RunCheckpoint(every=2, keep=True)), RECIPE_MODULE)
+    return finished(run, recipe(**recipe_options(), checkpoint=RunCheckpoint(every=4, keep=True)), RECIPE_MODULE)

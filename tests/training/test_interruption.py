@@ -118,7 +118,7 @@ def whole(paper: Whole, fast: Whole) -> Callable[[str], Path]:
 
 def shortly_before(whole: Path, iteration: int) -> Path:
     """A checkpoint of the whole run, such that one more iteration at least is complete before this one."""
-    return whole / "checkpoints" / f"step-{(iteration - 2) // 10 * 10}.ckpt"
+    return whole / "checkpoints" / f"step-{(iteration - 2) // 4 * 4}.ckpt"
 
 
 def check(runner: Runner, whole: Path, kind: str, iteration: int) -> None:
