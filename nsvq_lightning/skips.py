@@ -47,7 +47,6 @@ SKIPS = {
         Skip("blocks", "4x4 blocks of pixels", "a splat cannot reach them"),
         Skip("saturated", "blocks of pixels", "all their pixels are opaque"),
         Skip("sh_bands", "SH bands in the renderer", "they are above the active degree"),
-        Skip("first_render", "a render that finds the visible splats", "the projection alone tells them"),
         # quantization
         Skip("visible_search", "the nearest code of a splat", "it is not visible in this step"),
         Skip("frozen_search", "the nearest code of a splat", "its codes are frozen"),

@@ -109,8 +109,9 @@ class _CudaLoss(torch.autograd.Function):
         from nsvq_lightning.quality.ssim_cuda import l1_dssim
 
         image, target = image.contiguous(), target.contiguous()
-        loss, ctx.derivatives = l1_dssim(image, target, dssim_weight, derived=ctx.needs_input_grad[0])
-        ctx.save_for_backward(image, target)
+        loss, derivatives = l1_dssim(image, target, dssim_weight, derived=ctx.needs_input_grad[0])
+        ctx.dssim_weight = dssim_weight
+        ctx.save_for_backward(image, target, derivatives)
         return loss
 
     @staticmethod
@@ -118,5 +119,5 @@ class _CudaLoss(torch.autograd.Function):
     def backward(ctx: Any, scale: Tensor) -> tuple[Tensor, None, None]:
         from nsvq_lightning.quality.ssim_cuda import l1_dssim_backward
 
-        image, target = ctx.saved_tensors
-        return l1_dssim_backward(image, target, ctx.derivatives, scale), None, None
+        image, target, derivatives = ctx.saved_tensors
+        return l1_dssim_backward(image, target, ctx.dssim_weight, derivatives, scale), None, None

@@ -13,10 +13,6 @@ from torchmetrics import Metric, MetricCollection
 from nsvq_lightning.quality.loss import apply_mask, mean_of_kept, ssim
 from nsvq_lightning.quality.ssim import check_pair
 
-ROUNDS = 5
-# Values beyond which a pixel is clipped, so that it says nothing about the map of colours.
-DARK, BRIGHT = 0.5 / 255, 1 - 0.5 / 255
-
 
 def color_corrected(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:
     """The image with the quadratic map of its colours that brings it nearest to the photo.
@@ -35,14 +31,15 @@ def color_corrected(image: Tensor, photo: Tensor, mask: Tensor | None = None) ->
     """
     colors, target = image.reshape(-1, 3).double(), photo.reshape(-1, 3).double()
     counting = torch.ones_like(colors[:, 0], dtype=torch.bool) if mask is None else mask.reshape(-1)
-    seen = counting[:, None] & (target >= DARK) & (target <= BRIGHT)
-    for _ in range(ROUNDS):
+    dark, bright = 0.5 / 255, 1 - 0.5 / 255  # beyond these, a pixel is clipped and says nothing about the map
+    seen = counting[:, None] & (target >= dark) & (target <= bright)
+    for _ in range(5):
         red, green, blue = colors.unbind(1)
         terms = torch.stack(
             [red * red, red * green, red * blue, green * green, green * blue, blue * blue, red, green, blue], 1
         )
         terms = torch.cat([terms, torch.ones_like(terms[:, :1])], 1)
-        unclipped = seen & (colors >= DARK) & (colors <= BRIGHT)
+        unclipped = seen & (colors >= dark) & (colors <= bright)
         corrected = []
         for channel in range(3):
             rows = unclipped[:, channel]

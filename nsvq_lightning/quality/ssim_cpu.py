@@ -18,6 +18,7 @@ from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat_checked, recycled
 from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
 
+# The taps of the window, from the middle outwards.
 G0, G1, G2, G3, G4, G5 = (F(tap) for tap in ssim_window()[SSIM_RADIUS:].tolist())
 C1, C2 = F(SSIM_C1), F(SSIM_C2)
 # Zeros beside every row, at least 3·radius floats, so that the horizontal blur needs no special case at the border.
@@ -26,7 +27,6 @@ RING = 2 * SSIM_RADIUS + 1
 IMAGES = 2
 MOMENTS = 4
 DERIVATIVES = 3
-LANE_NUMBERS = np.arange(16, dtype=np.float32)
 
 
 @inline
@@ -246,7 +246,7 @@ def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float) -> tuple[float,
     white = F(255 if target.dtype == torch.uint8 else 1)
     sweep_image(
         threads, *pixels, white, gradient.numpy().reshape(-1), height, length, pitch,
-        F((1 - dssim_weight) / count), F(dssim_weight / count), *rows.values(), LANE_NUMBERS, sums,
+        F((1 - dssim_weight) / count), F(dssim_weight / count), *rows.values(), np.arange(16, dtype=np.float32), sums,
     )  # fmt: skip
     similarity, difference = sums[0::2].sum() / count, sums[1::2].sum() / count
     work.give_back()

@@ -8,8 +8,6 @@ Every program writes its own sums and one program adds them up: no atomics, the 
 back from the device.
 """
 
-from typing import NamedTuple
-
 import torch
 import triton
 import triton.language as tl
@@ -31,18 +29,6 @@ ROWS = 4
 COLUMNS = 128
 # Number of programs whose sums are added up at a time.
 BLOCK = 1024
-
-
-class Derivatives(NamedTuple):
-    """What the backward pass needs besides the images.
-
-    Attributes:
-        planes: Derivatives of SSIM with respect to blurred p, p² and p·q, ``[3, H, W, 3]``.
-        dssim_weight: Share of 1 - SSIM in the loss.
-    """
-
-    planes: Tensor
-    dssim_weight: float
 
 
 @triton.jit
@@ -221,16 +207,16 @@ def _check_pictures(image: Tensor, target: Tensor) -> None:
     check_tensor("target", target, image.shape, image.device, kind)
 
 
-def l1_dssim(
-    image: Tensor, target: Tensor, dssim_weight: float, *, derived: bool = True
-) -> tuple[Tensor, Derivatives | None]:
-    """Loss, a float32 scalar on the device, of ``image``, which is clamped to [0, 1] first.
+def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float, *, derived: bool = True) -> tuple[Tensor, Tensor]:
+    """Loss of ``image``, which is clamped to [0, 1] first, a float32 scalar on the device; and derivatives of SSIM.
+
+    The derivatives, with respect to blurred p, p² and p·q, are ``[3, H, W, 3]``.
 
     Args:
         image: Contiguous float32 ``[H, W, 3]`` on a CUDA device, H and W at least 1.
         target: Contiguous ``[H, W, 3]`` there, float32 in [0, 1] or uint8.
         dssim_weight: Share of 1 - SSIM.
-        derived: Whether :func:`l1_dssim_backward` will follow.
+        derived: Whether :func:`l1_dssim_backward` will follow; without it there are no derivatives.
 
     Raises:
         ValueError: The pictures differ in shape or device or are not ``[H, W, 3]``, or one is not contiguous.
@@ -248,15 +234,16 @@ def l1_dssim(
         moments_kernel[grid](image, target, moments, sums, height, length, BYTES=target.dtype == torch.uint8, **tile)
         similarity_kernel[grid](moments, planes, sums, height, length, DERIVED=derived, **tile)
         loss_kernel[(1,)](sums, loss, programs, height * length, dssim_weight, BLOCK=BLOCK, **COMPILE)
-    return loss, Derivatives(planes, dssim_weight) if derived else None
+    return loss, planes
 
 
-def l1_dssim_backward(image: Tensor, target: Tensor, derivatives: Derivatives, scale: Tensor) -> Tensor:
+def l1_dssim_backward(image: Tensor, target: Tensor, dssim_weight: float, derivatives: Tensor, scale: Tensor) -> Tensor:
     """Gradient ``[H, W, 3]`` of ``scale`` times the loss with respect to ``image``.
 
     Args:
         image: As in :func:`l1_dssim`.
         target: As in :func:`l1_dssim`.
+        dssim_weight: As in :func:`l1_dssim`.
         derivatives: What :func:`l1_dssim` returned.
         scale: float32 scalar on the device.
 
@@ -265,17 +252,16 @@ def l1_dssim_backward(image: Tensor, target: Tensor, derivatives: Derivatives, s
         TypeError: A dtype is wrong.
     """
     _check_pictures(image, target)
-    check_tensor("derivatives", derivatives.planes, (DERIVATIVES, *image.shape), image.device)
+    check_tensor("derivatives", derivatives, (DERIVATIVES, *image.shape), image.device)
     check_tensor("scale", scale, (), image.device)
     height, width = image.shape[:2]
     length, grid, count = 3 * width, _grid(image), image.numel()
-    weight = derivatives.dssim_weight
     tile = {"ROWS": ROWS, "COLUMNS": COLUMNS, **COMPILE}
-    blurred, gradient = torch.empty_like(derivatives.planes), torch.empty_like(image)
+    blurred, gradient = torch.empty_like(derivatives), torch.empty_like(image)
     with torch.cuda.device_of(image):
-        spread_kernel[(*grid, DERIVATIVES)](derivatives.planes, blurred, height, length, **tile)
+        spread_kernel[(*grid, DERIVATIVES)](derivatives, blurred, height, length, **tile)
         gradient_kernel[grid](
-            image, target, blurred, scale, gradient, height, length, (1 - weight) / count, weight / count,
+            image, target, blurred, scale, gradient, height, length, (1 - dssim_weight) / count, dssim_weight / count,
             BYTES=target.dtype == torch.uint8, **tile,
         )  # fmt: skip
     return gradient

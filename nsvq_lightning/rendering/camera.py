@@ -1,7 +1,5 @@
 """A pinhole camera, and what several have in common: where up is, and the point that they look at."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -83,7 +81,7 @@ class Camera:
 
     def to(
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None, **kwargs: object
-    ) -> Camera:
+    ) -> "Camera":
         """The camera with both matrices on ``device`` and in ``dtype``; the same object if they already are."""
         K, viewmat = (matrix.to(device=device, dtype=dtype) for matrix in (self.K, self.viewmat))
         if K is self.K and viewmat is self.viewmat:
@@ -93,10 +91,6 @@ class Camera:
 
 # Weight of what decides where cameras that all look the same way leave a direction open.
 LITTLE = 1e-5
-# How often cameras are weighted again by how level they are.
-ROUNDS = 20
-# Sine of the roll below which a camera counts as level.
-LEVEL = 0.02
 
 
 def poses(cameras: Sequence[Camera]) -> tuple[NDArray[np.float64], Rotation]:
@@ -129,9 +123,9 @@ def up_of(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     if np.linalg.norm(upper) < 0.1:  # they are turned in all directions
         return np.asarray(-axes[0, :, 1])
     weights = np.ones(len(axes))
-    for _ in range(ROUNDS):
+    for _ in range(20):  # weighted again by how level they are
         level = (weights * right.T) @ right / weights.sum()
         up = np.linalg.solve(level + LITTLE * np.eye(3), upper)
         up /= np.linalg.norm(up)
-        weights = 1 / np.maximum(np.abs(right @ up), LEVEL)
+        weights = 1 / np.maximum(np.abs(right @ up), 0.02)  # sine of the roll below which a camera counts as level
     return up

@@ -14,13 +14,6 @@ from scipy.spatial.transform import RotationSpline
 
 from nsvq_lightning.rendering.camera import Camera, looked_at, poses, up_of
 
-# Points of a path at which its speed is measured, for each of its frames.
-FINE = 16
-# Arc that cameras must fill for an orbit to go all the way round.
-SURROUNDED = math.radians(270)
-# From a camera with y up that looks along -z to one with y down that looks along z.
-OPENGL = np.diag([1.0, -1.0, -1.0])
-
 
 def reframed(camera: Camera, width: int, height: int) -> Camera:
     """The camera with another picture size: all that it sees stays in view, centred."""
@@ -60,7 +53,7 @@ def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     at = np.concatenate([[0.0], np.cumsum(steps[kept[1:]])])
     place = CubicSpline(at, positions, bc_type="natural")
     turn = RotationSpline(at, rotations)
-    fine = np.linspace(0.0, at[-1], FINE * frames + 1)
+    fine = np.linspace(0.0, at[-1], 16 * frames + 1)  # where the speed is measured
     moved = np.linalg.norm(np.diff(place(fine), axis=0), axis=1) / unit
     turned = turn(fine)
     moved += (turned[:-1].inv() * turned[1:]).magnitude()
@@ -98,9 +91,8 @@ def orbit(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     height, radius = float(np.median(arms @ up)), float(np.median(np.hypot(arms @ across, arms @ ahead)))
     start, arc = _arc(np.arctan2(arms @ ahead, arms @ across))
     share = np.arange(frames) / frames
-    angles = (
-        start + 2 * math.pi * share if arc >= SURROUNDED else start + arc * (0.5 + 0.5 * np.sin(2 * math.pi * share))
-    )
+    swing = 0.5 + 0.5 * np.sin(2 * math.pi * share)
+    angles = start + (2 * math.pi * share if arc >= math.radians(270) else arc * swing)
     lens = tuple(np.median([camera.intrinsics for camera in cameras], axis=0))
     path = []
     for angle in angles:
@@ -155,7 +147,8 @@ def _entry_camera(entry: Mapping[str, Any], width: int, height: int) -> Camera:
     if not 0 < field < 180:
         raise ValueError(f"a field of view is {field} degrees")
     focal = 0.5 * height / math.tan(math.radians(field) / 2)
-    return _camera(_view(rotation @ OPENGL, pose[:3, 3]), (focal, focal, width / 2, height / 2), width, height)
+    rotation = rotation * [1, -1, -1]  # from y up, looking along -z, to y down, looking along z
+    return _camera(_view(rotation, pose[:3, 3]), (focal, focal, width / 2, height / 2), width, height)
 
 
 def _arc(angles: NDArray[np.float64]) -> tuple[float, float]:

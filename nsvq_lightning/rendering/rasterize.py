@@ -12,9 +12,6 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, check_shapes, sh_degree_of
 
-# Largest opacity of a splat that anti-aliasing has changed: the rasterizer caps it lower, and its logit is finite.
-OPAQUE = 1 - 2.0**-20
-
 
 class Render(NamedTuple):
     """What :func:`render` returns.
@@ -104,7 +101,7 @@ def _compensated(splats: SplatTensors, camera: Camera, module: Any) -> RawSplats
     with torch.no_grad():
         rows = module.visible(splats, camera)
     opacity = take_rows(splats.opacities, rows).sigmoid() * module.light_kept(splats, camera, rows)
-    opacity = opacity.clamp_max(OPAQUE)
+    opacity = opacity.clamp_max(1 - 2.0**-20)  # the rasterizer caps it lower, and its logit is finite
     seen = splats.opacities.index_copy(0, rows, opacity.log() - (-opacity).log1p())
     return RawSplats(splats.means, splats.quats, splats.scales, seen, splats.sh0, splats.shN)
 

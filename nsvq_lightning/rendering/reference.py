@@ -17,9 +17,6 @@ from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors
 
-# Side in pixels of the squares that are blended at a time.
-TILE = 32
-
 
 class Projection(NamedTuple):
     """Splats on the image plane.
@@ -163,12 +160,13 @@ def render(
     if pixel_map is None or observed is None:
         pixel_map, observed = centres.new_zeros(camera.height, camera.width), centres.new_zeros(n, 3)
     watched = observed[rows]
+    side = 32  # of the squares that are blended at a time, pixels
     strips = []
-    for top in range(0, camera.height, TILE):
-        bottom = min(top + TILE, camera.height)
+    for top in range(0, camera.height, side):
+        bottom = min(top + side, camera.height)
         tiles = []
-        for left in range(0, camera.width, TILE):
-            right = min(left + TILE, camera.width)
+        for left in range(0, camera.width, side):
+            right = min(left + side, camera.width)
             here = (low[:, 0] <= right) & (high[:, 0] >= left) & (low[:, 1] <= bottom) & (high[:, 1] >= top)
             near = order[here]
             ys, xs = torch.meshgrid(

@@ -11,9 +11,6 @@ C0 = 0.28209479177387814
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
-# Directions at which rotated functions are compared, evenly spread: four for each function of the largest band.
-_PROBES = 32
-_GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
@@ -62,9 +59,10 @@ def sh_rotation(rotation: Tensor, degree: int) -> Tensor:
         rotation: From old to new world axes ``[3, 3]``, float64 for an exact result.
         degree: Of the spherical harmonics, 0 to 3.
     """
-    steps = torch.arange(_PROBES, dtype=rotation.dtype, device=rotation.device)
-    height = (2 * steps + 1) / _PROBES - 1
-    across, turn = (1 - height * height).sqrt(), _GOLDEN_ANGLE * steps
+    probes = 32  # directions, evenly spread: four for each function of the largest band
+    steps = torch.arange(probes, dtype=rotation.dtype, device=rotation.device)
+    height = (2 * steps + 1) / probes - 1
+    across, turn = (1 - height * height).sqrt(), math.pi * (3 - math.sqrt(5)) * steps
     directions = torch.stack([across * turn.cos(), across * turn.sin(), height], 1)
     before, after = sh_basis(directions, degree), sh_basis(directions @ rotation.T, degree)
     bands = [slice(band * band, (band + 1) ** 2) for band in range(1, degree + 1)]

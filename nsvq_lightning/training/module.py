@@ -147,16 +147,9 @@ class SplatModule(ResumedModule):
         if self.phase < Phase.QUANTIZE or not self.codebooks:
             return raw
         if self.phase is Phase.QUANTIZE and self.training:
-            rows = self._visible_rows(raw, camera)
+            rows = visible(raw, camera, backend=self.backend)
             return noisy_rows(raw, rows, self.quantizers, lambda name: self._generator("noise", name))
         return decoded(raw, self.quantizers)
-
-    @torch.no_grad()
-    def _visible_rows(self, raw: RawSplats, camera: Camera) -> Tensor:
-        """Rows of the splats that can change the image, ascending."""
-        if is_on("first_render"):
-            return visible(raw, camera, backend=self.backend)
-        return self.render_splats(raw, camera).radii.nonzero()[:, 0]
 
     def _generator(self, *salts: str) -> torch.Generator:
         """Generator of one view of this step; quantizers draw a seed from it, so it lives on the CPU.

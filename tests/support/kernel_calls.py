@@ -196,7 +196,7 @@ NUMBA: dict[str, list[Case]] = {
     f"{_SSIM}_cpu.l1_dssim": [Case(_pictures), Case(lambda: _pictures(torch.uint8))],
     f"{_CPU}.rasterizer.render": [Case(_render, call=_render_and_back)],
     f"{_CPU}.rasterizer.visible": [Case(lambda: {"splats": _splats(), "camera": _camera()})],
-    f"{_CPU}.antialias.light_kept": [
+    f"{_CPU}.rasterizer.light_kept": [
         Case(
             lambda: {"splats": _splats(), "camera": _camera(), "rows": torch.arange(3, 60, 2)},
             rows=("splats", "rows"),
@@ -354,13 +354,7 @@ def _derivatives() -> Any:
 
 
 def _pictures_backward() -> dict[str, Any]:
-    pictures, derivatives = _pictures(), _derivatives()
-    return {
-        "image": pictures["image"],
-        "target": pictures["target"],
-        "derivatives": derivatives,
-        "scale": torch.ones(()),
-    }
+    return _pictures() | {"derivatives": _derivatives(), "scale": torch.ones(())}
 
 
 _CUDA = "nsvq_lightning.rendering.cuda"

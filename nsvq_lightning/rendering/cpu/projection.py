@@ -21,6 +21,8 @@ FINITE = F(constants.FINITE)
 HUGE_FOOTPRINT, LARGEST_FOOTPRINT = F(constants.HUGE_FOOTPRINT), F(constants.LARGEST_FOOTPRINT)
 HUGE_QUATERNION, SHRINK = F(constants.HUGE_QUATERNION), F(constants.SHRINK)
 LN2 = F(np.log(2.0))
+# Square of the smallest factor by which anti-aliasing dims.
+LEAST_LIGHT = F(constants.FAINTEST**2)
 
 
 @inline
@@ -255,3 +257,25 @@ def finish_records(threads, camera, means, colors, bands, runs, records, integer
     for thread in prange(threads):
         first, last = rec.vector_range(total, thread, threads)
         color_range(camera, means, colors, bands, ids, first, last, records, scratch[thread])
+
+
+@inline
+def light(u, v):
+    """The light that the blur leaves, squared; det Σ, the sum of the variances, what the blur adds to det Σ, u × v."""
+    n = rec.cross(u, v)
+    area, size = rec.dot3(n, n), rec.dot3(u, u) + rec.dot3(v, v)
+    added = BLUR * size + BLUR_SQUARED
+    squared = simd.select(size < HUGE_FOOTPRINT, area / (area + added), 1)
+    return simd.vmax(squared, LEAST_LIGHT), area, size, added, n
+
+
+@kernel
+def keep_light(threads, camera, means, quats, scales, ids, count, factors):
+    """Factors ``[count]`` of the splats ``ids``; both arrays have room for a last, incomplete vector."""
+    for thread in prange(threads):
+        first, last = rec.vector_range(count, thread, threads)
+        for start in range(first, last, 16):
+            _, _, _, t0, t1 = affine(camera, simd.gather_rows3(means, ids, start))
+            _, _, _, m = axes_of(simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start))
+            squared, _, _, _, _ = light(image_axes(t0, m), image_axes(t1, m))
+            simd.store(factors, start, simd.vsqrt(squared))

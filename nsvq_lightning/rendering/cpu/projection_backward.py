@@ -1,4 +1,4 @@
-"""The backward pass of the projection, 16 splats at a time: from the sums of a splat to gradients of its attributes."""
+"""The backward passes of the projection and of anti-aliasing, 16 splats at a time, to gradients of the attributes."""
 
 import numpy as np
 from numba import prange
@@ -6,9 +6,9 @@ from numba import prange
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, kernel
 from nsvq_lightning.compute.rows import clear
+from nsvq_lightning.rendering.cpu import projection
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import AHEAD, coefficients_of, color_backward, prefetch_sh
-from nsvq_lightning.rendering.cpu.projection import BLUR, affine, axes_of, image_axes
 
 # Converts moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)².
 COVARIANCE_SCALE = F(2 * np.log(2.0) ** 2)
@@ -79,19 +79,19 @@ def geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y):
 
     ``total`` are the 16 sums of a slot, ``g2x``, ``g2y`` the gradient of the projected centre.
     """
-    view, axes = affine(camera, mean), axes_of(quat, scale)
+    view, axes = projection.affine(camera, mean), projection.axes_of(quat, scale)
     _, _, _, t0, t1 = view
     _, _, _, m = axes
-    u, v = image_axes(t0, m), image_axes(t1, m)
+    u, v = projection.image_axes(t0, m), projection.image_axes(t1, m)
 
     # dL/dΣ = ½ Fᵀ S F with S = Σ h uuᵀ, so dL/dU = Fᵀ S (F U). The rows of F U are a·u + b·v and c·v; by Lagrange's
     # identity the first is a·(v × (u × v) + blur·u)/|v|², which stays accurate for needles.
     a, b, c = record[rec.A], record[rec.B], record[rec.C]
     k = F(2) * COVARIANCE_SCALE
     uu, uv, vv = k * total[rec.SUM_UU], k * total[rec.SUM_UV], k * total[rec.SUM_VV]
-    per_yy = 1 / (rec.dot3(v, v) + BLUR)
+    per_yy = 1 / (rec.dot3(v, v) + projection.BLUR)
     n = rec.cross(v, rec.scale3(per_yy, rec.cross(u, v)))
-    r, s = rec.scale3(a, rec.fma3(BLUR * per_yy, u, n)), rec.scale3(c, v)
+    r, s = rec.scale3(a, rec.fma3(projection.BLUR * per_yy, u, n)), rec.scale3(c, v)
     e, f = rec.fma3(uu, r, rec.scale3(uv, s)), rec.fma3(uv, r, rec.scale3(vv, s))
     gu, gv = rec.scale3(a, e), rec.fma3(b, e, rec.scale3(c, f))
     g_scale = simd.fma(r[0], e[0], s[0] * f[0]), simd.fma(r[1], e[1], s[1] * f[1]), simd.fma(r[2], e[2], s[2] * f[2])
@@ -155,3 +155,38 @@ def project_backward(
             logit = simd.gather_rows1(logits, ids, start)
             transparent = 1 / (1 + simd.exp2_clamped(logit * rec.LOG2_E))
             simd.scatter_rows1(g_logits, ids, start, total[rec.SUM_H] * transparent)
+
+
+@kernel
+def keep_light_backward(threads, camera, means, quats, scales, ids, count, gradient, g_means, g_quats, g_scales):
+    """Gradients of the rows ``ids`` of all means, quaternions and log-scales from that of their factors ``[count]``.
+
+    With A = det Σ, S the sum of the variances and D = A + b·S + b², the factor is ρ = √(A/D), and
+    dρ = ½·ρ·((b·S + b²)/(A·D)·dA − b/D·dS), where dA = 2·((v × n)·du + (n × u)·dv) with n = u × v.
+    """
+    for thread in prange(threads):
+        first, last = rec.vector_range(count, thread, threads)
+        for start in range(first, last, 16):
+            view = projection.affine(camera, simd.gather_rows3(means, ids, start))
+            axes = projection.axes_of(simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start))
+            _, _, _, t0, t1 = view
+            _, _, _, m = axes
+            u, v = projection.image_axes(t0, m), projection.image_axes(t1, m)
+            squared, area, size, added, n = projection.light(u, v)
+            # At the floor, and where the blur does not count, the factor is constant.
+            free = (size < projection.HUGE_FOOTPRINT) & (squared > projection.LEAST_LIGHT)
+            # A huge splat's v × n would overflow, and 0 · ∞ is not 0.
+            u = simd.select(free, u[0], 0), simd.select(free, u[1], 0), simd.select(free, u[2], 0)
+            v = simd.select(free, v[0], 0), simd.select(free, v[1], 0), simd.select(free, v[2], 0)
+            whole = area + added
+            g = simd.select(free, simd.load(gradient, start) * simd.vsqrt(squared) / whole, 0)
+            by_area = simd.select(free, g * added / area, 0)
+            by_size = g * projection.BLUR
+            vn, nu = rec.cross(v, n), rec.cross(n, u)
+            gu = by_area * vn[0] - by_size * u[0], by_area * vn[1] - by_size * u[1], by_area * vn[2] - by_size * u[2]
+            gv = by_area * nu[0] - by_size * v[0], by_area * nu[1] - by_size * v[1], by_area * nu[2] - by_size * v[2]
+            g_mean, g_quat = axes_backward(camera, view, axes, gu, gv, 0, 0, 0)
+            simd.scatter_rows3(g_means, ids, start, g_mean)
+            simd.scatter_rows4(g_quats, ids, start, g_quat)
+            g_scale = gu[0] * u[0] + gv[0] * v[0], gu[1] * u[1] + gv[1] * v[1], gu[2] * u[2] + gv[2] * v[2]
+            simd.scatter_rows3(g_scales, ids, start, g_scale)

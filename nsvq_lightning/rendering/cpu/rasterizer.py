@@ -8,50 +8,38 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.jit import thread_count
-from nsvq_lightning.compute.memory import Array, Workspace, flat, flat_checked, recycled
+from nsvq_lightning.compute.memory import Array, Workspace, flat, flat_checked, outside, recycled
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.cpu.antialias import light_kept as light_kept
-from nsvq_lightning.rendering.cpu.binning import DIGITS, count_tiles, fill_tiles, sort_by_depth
-from nsvq_lightning.rendering.cpu.blend import (
-    BACKWARD_SCRATCH,
-    BATCH,
-    FORWARD_SCRATCH,
-    blend,
-    blend_backward,
-    pixel_grid,
-    total_slots,
-)
-from nsvq_lightning.rendering.cpu.projection import find_visible, finish_records, project_splats
-from nsvq_lightning.rendering.cpu.projection_backward import project_backward
-from nsvq_lightning.rendering.cpu.records import GROUP_TILES, RECORD, group_grid, pack_camera
+from nsvq_lightning.rendering.cpu import binning, projection, projection_backward
+from nsvq_lightning.rendering.cpu import blend as blending
+from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import SplatTensors, sh_degree_of
 
 PROJECTION_SCRATCH = 2048 + 64
-MAX_ENTRIES = 2**31 - 1
 
 
-def _geometry(splats: SplatTensors) -> tuple[Array, ...]:
-    """Means, rotations, scales and opacities, flat."""
-    n = splats.means.shape[:1]
-    shapes = {"means": (*n, 3), "quats": (*n, 4), "scales": (*n, 3), "opacities": (*n,)}
-    return tuple(flat_checked(name, getattr(splats, name).contiguous(), shape) for name, shape in shapes.items())
+def _flat(attributes: tuple[Tensor, ...]) -> tuple[Array, ...]:
+    """Means, rotations, scales and, if it is there, opacities, flat."""
+    n = len(attributes[0])
+    named = zip(ATTRIBUTES, attributes, ((n, 3), (n, 4), (n, 3), (n,)), strict=False)
+    return tuple(flat_checked(name, tensor.contiguous(), shape) for name, tensor, shape in named)
 
 
 class _Frame:
     """One view of the splats on its way through the stages; holds its workspace for as long as it lives."""
 
     def __init__(self, splats: SplatTensors, camera: Camera) -> None:
-        self.camera = pack_camera(camera)
+        self.camera = rec.pack_camera(camera)
         self.size = width, height = camera.width, camera.height
-        self.group_columns, group_rows = group_grid(width, height)
-        self.tiles = self.group_columns * group_rows * GROUP_TILES
+        self.group_columns, group_rows = rec.group_grid(width, height)
+        self.tiles = self.group_columns * group_rows * rec.GROUP_TILES
         self.n = splats.means.shape[0]
-        self.geometry = _geometry(splats)
+        self.geometry = _flat((splats.means, splats.quats, splats.scales, splats.opacities))
         self.threads = thread_count()
         self.work = Workspace.borrow()
-        self.records = self.work.array("records", RECORD * self.n)
+        self.records = self.work.array("records", rec.RECORD * self.n)
         self.integers = self.records.view(np.int32)
         self.scratch = self.work.rows("projection", self.threads, PROJECTION_SCRATCH)
         self.count = self.slots = 0
@@ -68,7 +56,7 @@ class _Frame:
         """Write the records; list the visible splats by row (``ids``) and, as places in it, by depth (``order``)."""
         found = self.work.array("found", self.n, np.int32)
         counts, slots = (self.work.array(name, self.threads, np.int64) for name in ("counts", "slot_counts"))
-        project_splats(
+        projection.project_splats(
             self.threads, self.camera, *self.geometry, self.records, self.integers, found, counts, slots, self.scratch
         )
         self.count, self.slots = int(counts.sum()), int(slots.sum())
@@ -77,15 +65,15 @@ class _Frame:
         order = self.work.array("order", self.count, np.int32)
         self.boxes = self.work.array("boxes", self.count, np.int64)
         listed = self.ids, keys, order, self.boxes
-        finish_records(
+        projection.finish_records(
             self.threads, self.camera, self.geometry[0], colors, bands, (found, counts, slots), self.records,
             self.integers, listed, means2d, radii, self.scratch,
         )  # fmt: skip
         if self.count:
             other = self.work.array("order2", self.count, np.int32)
             keys2 = self.work.array("keys2", self.count + 1, np.int32)
-            histogram = self.work.rows("digits", self.threads, DIGITS, np.int64)
-            if sort_by_depth(self.threads, self.count, keys, order, keys2, other, histogram):
+            histogram = self.work.rows("digits", self.threads, binning.DIGITS, np.int64)
+            if binning.sort_by_depth(self.threads, self.count, keys, order, keys2, other, histogram):
                 order = other
         self.order = order
 
@@ -94,17 +82,17 @@ class _Frame:
         histogram = self.work.rows("tile_counts", self.threads, self.tiles, np.int64)
         self.offsets = self.work.array("offsets", self.tiles + 1, np.int64)
         listed = self.threads, self.count, self.order, self.boxes, self.group_columns, histogram
-        total = count_tiles(*listed, self.offsets)
-        if total > MAX_ENTRIES:
+        total = binning.count_tiles(*listed, self.offsets)
+        if total >= 2**31:
             raise RuntimeError(
                 f"{self.count} splats cover {total} tiles of the {self.size[0]}x{self.size[1]} image, more than can be "
                 "listed; the scales have probably diverged (lower their learning rate or prune large splats)"
             )
         self.entries = self.work.array("entries", total, np.int32)
-        fill_tiles(*listed, self.ids, self.entries)
+        binning.fill_tiles(*listed, self.ids, self.entries)
 
 
-_GRID = pixel_grid()
+_GRID = blending.pixel_grid()
 
 
 def _colors(n: int, sh0: Tensor, shN: Tensor) -> tuple[Array, Array]:
@@ -146,13 +134,13 @@ class _Project(torch.autograd.Function):
         frame: _Frame = ctx.frame
         if g_token is None:
             # Only the centres were differentiated, so no blend has written sums.
-            frame.sums = frame.work.array("sums", RECORD * frame.slots)
+            frame.sums = frame.work.array("sums", rec.RECORD * frame.slots)
             frame.sums.fill(0)
         g_means2d = torch.zeros(frame.n, 2) if g_means2d is None else g_means2d
         *_, sh0, shN = ctx.saved_tensors
         _check_kept(ctx.saved_tensors, ctx.shapes)
         gradients = [recycled(shape) for shape in ctx.shapes]
-        project_backward(
+        projection_backward.project_backward(
             frame.threads, frame.camera, frame.geometry, _colors(frame.n, sh0, shN)[1], ctx.bands, frame.ids,
             frame.count, frame.records, frame.integers, frame.sums, flat(g_means2d), tuple(map(flat, gradients)),
             frame.scratch,
@@ -177,13 +165,13 @@ class _Blend(torch.autograd.Function):
         image, transmittance, depth, alpha = (recycled((*shape, *last)) for last in ((3,), (), (), ()))
         frame.bin()
         work = frame.work
-        frame.touched = work.array("touched", frame.entries.size + BATCH, np.uint16)
+        frame.touched = work.array("touched", frame.entries.size + blending.BATCH, np.uint16)
         frame.ends = work.array("ends", frame.tiles, np.int64)
         behind = flat_checked("background", background.contiguous(), (3,))
-        blend(
+        blending.blend(
             frame.threads, frame.records, frame.entries, frame.offsets, frame.group_columns, frame.size, behind, _GRID,
             frame.touched, frame.ends, (flat(image), flat(transmittance), flat(depth)),
-            work.rows("blend", frame.threads, FORWARD_SCRATCH), (is_on("blocks"), is_on("saturated")),
+            work.rows("blend", frame.threads, blending.FORWARD_SCRATCH), (is_on("blocks"), is_on("saturated")),
             np.zeros(1, np.int64),
         )  # fmt: skip
         ctx.frame = frame
@@ -204,15 +192,15 @@ class _Blend(torch.autograd.Function):
         g_alpha = transmittance if g_alpha is None else g_alpha
         g_depth = depth if g_depth is None else g_depth
         work = frame.work
-        frame.sums = work.array("sums", RECORD * frame.slots)
+        frame.sums = work.array("sums", rec.RECORD * frame.slots)
         g_means2d, g_observed = torch.zeros(frame.n, 2), torch.zeros(frame.n if with_map else 0, 3)
-        blend_backward(
+        blending.blend_backward(
             frame.threads, frame.records, frame.integers, frame.entries, frame.offsets, frame.ends,
             frame.group_columns, frame.size, _GRID, frame.touched, (flat(image), flat(transmittance), flat(depth)),
             (flat(g_image), flat(g_alpha), flat(g_depth)), pixel_map, wanted, frame.sums, frame.slots,
-            work.rows("blend_backward", frame.threads, BACKWARD_SCRATCH), np.zeros(1, np.int64),
+            work.rows("blend_backward", frame.threads, blending.BACKWARD_SCRATCH), np.zeros(1, np.int64),
         )  # fmt: skip
-        total_slots(
+        blending.total_slots(
             frame.threads, frame.ids, frame.count, frame.slots, frame.records, frame.integers, frame.sums,
             flat(g_means2d), with_map, flat(g_observed),
         )  # fmt: skip
@@ -252,9 +240,53 @@ def visible(splats: SplatTensors, camera: Camera) -> Tensor:
         ValueError: The attributes do not fit together, or the image is too large.
         TypeError: An attribute is not float32.
     """
-    geometry = _geometry(splats)
+    geometry = _flat((splats.means, splats.quats, splats.scales, splats.opacities))
     threads = thread_count()
     found, runs = np.empty(splats.means.shape[0], np.int64), np.empty((threads, 2), np.int64)
     scratch = np.empty((threads, PROJECTION_SCRATCH), np.float32)
-    find_visible(threads, pack_camera(camera), *geometry, found, runs, scratch)
+    projection.find_visible(threads, rec.pack_camera(camera), *geometry, found, runs, scratch)
     return torch.from_numpy(np.concatenate([found[first:last] for first, last in runs]))
+
+
+class _LightKept(torch.autograd.Function):
+    """Means, rotations and scales to what anti-aliasing leaves of the light of some splats."""
+
+    @staticmethod
+    def forward(ctx: Any, camera: Array, ids: Array, count: int, *attributes: Tensor) -> Tensor:
+        factors = torch.empty(len(ids))
+        projection.keep_light(thread_count(), camera, *_flat(attributes), ids, count, flat(factors))
+        ctx.camera, ctx.ids, ctx.count = camera, ids, count
+        ctx.save_for_backward(*attributes)
+        return factors[:count]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        attributes = ctx.saved_tensors
+        gradients = [torch.zeros(tensor.shape) for tensor in attributes]
+        given = torch.zeros(len(ctx.ids))
+        given[: ctx.count], given[ctx.count :] = grad, grad[-1]
+        projection_backward.keep_light_backward(
+            thread_count(), ctx.camera, *_flat(attributes), ctx.ids, ctx.count, flat(given), *map(flat, gradients)
+        )
+        return None, None, None, *gradients
+
+
+def light_kept(splats: SplatTensors, camera: Camera, rows: Tensor) -> Tensor:
+    """Factors ``[V]`` of the splats ``rows [V]`` int64, differentiable in means, quaternions and log-scales.
+
+    Raises:
+        ValueError: The attributes do not fit together, or a row is outside them.
+        TypeError: An attribute is not float32.
+    """
+    count = len(rows)
+    if count == 0:
+        return splats.means.new_zeros(0)
+    numbers = rows.detach().numpy()
+    if int(numbers.min()) < 0 or int(numbers.max()) >= len(splats.means):
+        raise outside("rows", numbers, len(splats.means))
+    # A last, incomplete vector repeats the last splat; each of its lanes computes and writes the same.
+    ids = np.full(16 * ((count + 15) // 16), numbers[-1], np.int32)
+    ids[:count] = numbers
+    factors: Tensor = _LightKept.apply(rec.pack_camera(camera), ids, count, splats.means, splats.quats, splats.scales)
+    return factors

@@ -49,33 +49,28 @@ FACTOR_SCALE = F(math.sqrt(0.5 * math.log2(math.e)))
 ROTATION, TRANSLATION, POSITION, FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, WIDTH, HEIGHT = (
     0, 9, 12, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24,
 )  # fmt: skip
-CAMERA = 25
-
-
 # Largest image side in pixels: a record has 16 bits, one of them the sign, for a tile's column or row.
 MAX_SIDE = TILE * (2**15 - 1)
-
-
 # Cameras as kernels read them, and the version of the matrix that it was made from.
 _packed: WeakKeyDictionary[Camera, tuple[int, Array]] = WeakKeyDictionary()
 
 
 def pack_camera(camera: Camera) -> Array:
-    """A camera as kernels read it; packed once."""
+    """A camera as kernels read it; packed once.
+
+    Raises:
+        ValueError: The image is too large.
+    """
     version, packed = _packed.get(camera, (-1, np.empty(0)))
     if version != camera.viewmat._version:
-        packed = _packed_now(camera)
+        size = camera.width, camera.height
+        if max(size) > MAX_SIDE:
+            raise ValueError(
+                f"an image may have {MAX_SIDE} pixels along a side, got {size[0]}x{size[1]}; render it in parts"
+            )
+        packed = np.array([*camera.packed_view, *camera.intrinsics, *camera.slope_limits, *size], np.float32)
         _packed[camera] = camera.viewmat._version, packed
     return packed
-
-
-def _packed_now(camera: Camera) -> Array:
-    if max(camera.width, camera.height) > MAX_SIDE:
-        raise ValueError(
-            f"an image may have {MAX_SIDE} pixels along a side, got {camera.width}x{camera.height}; render it in parts"
-        )
-    packed = [*camera.packed_view, *camera.intrinsics, *camera.slope_limits, camera.width, camera.height]
-    return np.array(packed, np.float32).reshape(CAMERA)
 
 
 def group_grid(width: int, height: int) -> tuple[int, int]:

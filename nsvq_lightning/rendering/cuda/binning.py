@@ -14,11 +14,6 @@ from torch import Tensor
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 
-MAX_PAIRS = 2**31 - 1
-
-# Pairs per program.
-BLOCK = 512
-
 
 class Tiles(NamedTuple):
     """The lists of all tiles.
@@ -72,7 +67,7 @@ def list_tiles(boxes: Tensor, columns: int, rows: int) -> Tiles:
     """
     ends = (boxes[:, 2].long() * boxes[:, 3]).cumsum(0)
     total = int(ends[-1]) if len(boxes) else 0
-    if total > MAX_PAIRS:
+    if total >= 2**31:
         raise RuntimeError(
             f"{len(boxes)} splats cover {total} tiles of the {columns}x{rows} in the image, more than can be listed; "
             "the scales have probably diverged (lower their learning rate or prune large splats)"
@@ -94,8 +89,9 @@ def tiles_of(boxes: Tensor, ends: Tensor, total: int, columns: int, rows: int) -
     key = torch.int16 if tiles < 2**15 else torch.int32
     keys, owners = torch.empty(total, dtype=key, device=device), torch.empty(total, dtype=torch.int32, device=device)
     if total:
-        expand_kernel[(triton.cdiv(total, BLOCK),)](
-            boxes, ends, keys, owners, total, len(boxes), len(boxes).bit_length(), columns, BLOCK=BLOCK, **COMPILE
+        block = 512  # pairs per program
+        expand_kernel[(triton.cdiv(total, block),)](
+            boxes, ends, keys, owners, total, len(boxes), len(boxes).bit_length(), columns, BLOCK=block, **COMPILE
         )
     keys, slots = keys.sort(stable=True)
     offsets = torch.searchsorted(keys, torch.arange(tiles + 1, dtype=key, device=device), out_int32=True)

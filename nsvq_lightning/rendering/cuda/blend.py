@@ -16,62 +16,23 @@ from torch import Tensor
 
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
+from nsvq_lightning.rendering.cuda import records as rec
 from nsvq_lightning.rendering.cuda.binning import Tiles
 from nsvq_lightning.rendering.cuda.harmonics import load3
 from nsvq_lightning.rendering.cuda.projection import Lens
-from nsvq_lightning.rendering.cuda.records import (
-    ALPHA_MAX,
-    BLUE,
-    DEPTH,
-    FIELDS,
-    GREEN,
-    LN2,
-    LOG2_ALPHA_MIN,
-    LOG2_OPACITY,
-    OBSERVED_FIELDS,
-    OBSERVED_SLOT,
-    RECORD,
-    RED,
-    SUM_ABS_X,
-    SUM_ABS_Y,
-    SUM_BLUE,
-    SUM_DEPTH,
-    SUM_GREEN,
-    SUM_H,
-    SUM_MAP,
-    SUM_RED,
-    SUM_U,
-    SUM_UU,
-    SUM_UV,
-    SUM_V,
-    SUM_VV,
-    TILE,
-    TRANSMITTANCE_MIN,
-    A,
-    B,
-    C,
-    X,
-    Y,
-)
 
-# Splats between two checks of whether a tile is finished.
-BATCH = 32
-# Warps per tile: with one, every reduction stays inside the warp.
-WARPS = 1
 # Splats whose slots a program adds up: most have a few, and a program for each would have little to do.
 SPLATS = 16
 # Number of slots of one splat that are added up at a time.
 SLOTS = 8
-# Power of two that holds the fields of a slot.
-LANES = 16
 
 
 @triton.jit
 def tile_pixels(tile, columns, width, height):
     """Corner of a tile, its pixel centres, their indices in the image, and which of them lie inside the image."""
-    left, top = (tile % columns) * TILE, (tile // columns) * TILE
-    lane = tl.arange(0, TILE * TILE)
-    x, y = lane % TILE, lane // TILE
+    left, top = (tile % columns) * rec.TILE, (tile // columns) * rec.TILE
+    lane = tl.arange(0, rec.TILE * rec.TILE)
+    x, y = lane % rec.TILE, lane // rec.TILE
     inside = (left + x < width) & (top + y < height)
     return left, top, x + 0.5, y + 0.5, (top + y) * width + left + x, inside
 
@@ -80,10 +41,10 @@ def tile_pixels(tile, columns, width, height):
 def fetch(records, ranks, j, end):
     """The record at place ``j`` of the lists, before ``end``, and what α depends on: a, b, c, x, y, log2 opacity."""
     there = j < end
-    record = records + tl.load(ranks + j, mask=there, other=0).to(tl.int64) * RECORD
-    a, b, c = load3(record + A, there)
-    px, py = tl.load(record + X, mask=there, other=0.0), tl.load(record + Y, mask=there, other=0.0)
-    return record, a, b, c, px, py, tl.load(record + LOG2_OPACITY, mask=there, other=0.0)
+    record = records + tl.load(ranks + j, mask=there, other=0).to(tl.int64) * rec.RECORD
+    a, b, c = load3(record + rec.A, there)
+    px, py = tl.load(record + rec.X, mask=there, other=0.0), tl.load(record + rec.Y, mask=there, other=0.0)
+    return record, a, b, c, px, py, tl.load(record + rec.LOG2_OPACITY, mask=there, other=0.0)
 
 
 @triton.jit
@@ -95,7 +56,7 @@ def alpha_at(fetched, left, top, x, y):
     u = tl.fma(a, x, tl.fma(b, y, -tl.fma(a, px, b * py)))
     v = tl.fma(c, y, -(c * py))
     power = tl.fma(-u, u, tl.fma(-v, v, log2_opacity))
-    return tl.where(power >= LOG2_ALPHA_MIN, tl.exp2(power), 0.0), u, v
+    return tl.where(power >= rec.LOG2_ALPHA_MIN, tl.exp2(power), 0.0), u, v
 
 
 @triton.jit
@@ -106,9 +67,9 @@ def blend_step(fetched, left, top, x, y, t):
     pixel open, and the weight of the splat's colour.
     """
     raw, u, v = alpha_at(fetched, left, top, x, y)
-    alpha = tl.minimum(raw, ALPHA_MAX)
+    alpha = tl.minimum(raw, rec.ALPHA_MAX)
     after = tl.fma(-alpha, t, t)
-    is_open = after >= TRANSMITTANCE_MIN
+    is_open = after >= rec.TRANSMITTANCE_MIN
     return raw, u, v, alpha, after, is_open, tl.where(is_open, alpha * t, 0.0)
 
 
@@ -135,11 +96,11 @@ def blend_kernel(
             _, _, _, _, after, is_open, weight = blend_step(fetched, left, top, x, y, t)
             kept = tl.where(is_open, after, kept)
             t = after
-            red += weight * tl.load(record + RED)
-            green += weight * tl.load(record + GREEN)
-            blue += weight * tl.load(record + BLUE)
-            far += weight * tl.load(record + DEPTH)
-        i = tl.where(tl.max(t, 0) >= TRANSMITTANCE_MIN, looked, end)
+            red += weight * tl.load(record + rec.RED)
+            green += weight * tl.load(record + rec.GREEN)
+            blue += weight * tl.load(record + rec.BLUE)
+            far += weight * tl.load(record + rec.DEPTH)
+        i = tl.where(tl.max(t, 0) >= rec.TRANSMITTANCE_MIN, looked, end)
     tl.store(ends + tile, looked)
     tl.store(image + 3 * pixel, red + kept * tl.load(background), mask=inside)
     tl.store(image + 3 * pixel + 1, green + kept * tl.load(background + 1), mask=inside)
@@ -180,30 +141,34 @@ def blend_backward_kernel(
         record = fetched[0]
         raw, u, v, alpha, after, is_open, weight = blend_step(fetched, left, top, x, y, t)
         if tl.max(weight, 0) > 0:
-            d = g_red * tl.load(record + RED) + g_green * tl.load(record + GREEN) + g_blue * tl.load(record + BLUE)
+            d = (
+                g_red * tl.load(record + rec.RED)
+                + g_green * tl.load(record + rec.GREEN)
+                + g_blue * tl.load(record + rec.BLUE)
+            )
             if WITH_DEPTH:
-                d += g_far * tl.load(record + DEPTH)
+                d += g_far * tl.load(record + rec.DEPTH)
             # The cap of α has no gradient.
-            h = tl.where(is_open & (raw <= ALPHA_MAX), alpha / (1 - alpha) * (t * d - rest), 0.0)
+            h = tl.where(is_open & (raw <= rec.ALPHA_MAX), alpha / (1 - alpha) * (t * d - rest), 0.0)
             rest = tl.fma(-weight, d, rest)
             hu, hv = h * u, h * v
-            slot = sums + tl.load(slots + j).to(tl.int64) * (OBSERVED_SLOT if WITH_MAP else RECORD)
-            tl.store(slot + SUM_RED, tl.sum(weight * g_red, 0))
-            tl.store(slot + SUM_GREEN, tl.sum(weight * g_green, 0))
-            tl.store(slot + SUM_BLUE, tl.sum(weight * g_blue, 0))
-            tl.store(slot + SUM_H, tl.sum(h, 0))
-            tl.store(slot + SUM_U, tl.sum(hu, 0))
-            tl.store(slot + SUM_V, tl.sum(hv, 0))
-            tl.store(slot + SUM_UU, tl.sum(hu * u, 0))
-            tl.store(slot + SUM_UV, tl.sum(hu * v, 0))
-            tl.store(slot + SUM_VV, tl.sum(hv * v, 0))
+            slot = sums + tl.load(slots + j).to(tl.int64) * (rec.OBSERVED_SLOT if WITH_MAP else rec.RECORD)
+            tl.store(slot + rec.SUM_RED, tl.sum(weight * g_red, 0))
+            tl.store(slot + rec.SUM_GREEN, tl.sum(weight * g_green, 0))
+            tl.store(slot + rec.SUM_BLUE, tl.sum(weight * g_blue, 0))
+            tl.store(slot + rec.SUM_H, tl.sum(h, 0))
+            tl.store(slot + rec.SUM_U, tl.sum(hu, 0))
+            tl.store(slot + rec.SUM_V, tl.sum(hv, 0))
+            tl.store(slot + rec.SUM_UU, tl.sum(hu * u, 0))
+            tl.store(slot + rec.SUM_UV, tl.sum(hu * v, 0))
+            tl.store(slot + rec.SUM_VV, tl.sum(hv * v, 0))
             if WITH_DEPTH:
-                tl.store(slot + SUM_DEPTH, tl.sum(weight * g_far, 0))
+                tl.store(slot + rec.SUM_DEPTH, tl.sum(weight * g_far, 0))
             if WITH_MAP:
-                along_y = tl.fma(hu, tl.load(record + B), hv * tl.load(record + C))
-                tl.store(slot + SUM_ABS_X, tl.sum(tl.abs(hu), 0))
-                tl.store(slot + SUM_ABS_Y, tl.sum(tl.abs(along_y), 0))
-                tl.store(slot + SUM_MAP, tl.sum(weight * strength, 0))
+                along_y = tl.fma(hu, tl.load(record + rec.B), hv * tl.load(record + rec.C))
+                tl.store(slot + rec.SUM_ABS_X, tl.sum(tl.abs(hu), 0))
+                tl.store(slot + rec.SUM_ABS_Y, tl.sum(tl.abs(along_y), 0))
+                tl.store(slot + rec.SUM_MAP, tl.sum(weight * strength, 0))
         t = after
 
 
@@ -231,34 +196,34 @@ def total_kernel(
     acc = tl.zeros([SPLATS, SLOTS, LANES], tl.float32)
     for start in range(0, tl.max(end - begin, 0), SLOTS):
         slot = begin[:, None, None] + start + tl.arange(0, SLOTS)[None, :, None]
-        mask = (slot < end[:, None, None]) & (field < (OBSERVED_FIELDS if WITH_MAP else FIELDS))
-        place = slot.to(tl.int64) * (OBSERVED_SLOT if WITH_MAP else RECORD) + field
+        mask = (slot < end[:, None, None]) & (field < (rec.OBSERVED_FIELDS if WITH_MAP else rec.FIELDS))
+        place = slot.to(tl.int64) * (rec.OBSERVED_SLOT if WITH_MAP else rec.RECORD) + field
         acc += tl.load(sums + place, mask=mask, other=0.0)
     total = tl.sum(acc, 1)
     lane = tl.arange(0, LANES)[None, :]
-    tl.store(totals + rank[:, None] * RECORD + lane, total, mask=seen[:, None] & (lane < FIELDS))
-    u, v = field_of(total, SUM_U), field_of(total, SUM_V)
-    record = records + rank * RECORD
-    a, b = tl.load(record + A, mask=seen, other=0.0), tl.load(record + B, mask=seen, other=0.0)
-    c = tl.load(record + C, mask=seen, other=0.0)
+    tl.store(totals + rank[:, None] * rec.RECORD + lane, total, mask=seen[:, None] & (lane < rec.FIELDS))
+    u, v = field_of(total, rec.SUM_U), field_of(total, rec.SUM_V)
+    record = records + rank * rec.RECORD
+    a, b = tl.load(record + rec.A, mask=seen, other=0.0), tl.load(record + rec.B, mask=seen, other=0.0)
+    c = tl.load(record + rec.C, mask=seen, other=0.0)
     row = tl.load(ids + rank, mask=seen, other=0)
-    tl.store(g_means2d + 2 * row, a * u * (2 * LN2), mask=seen)
-    tl.store(g_means2d + 2 * row + 1, (b * u + c * v) * (2 * LN2), mask=seen)
+    tl.store(g_means2d + 2 * row, a * u * (2 * rec.LN2), mask=seen)
+    tl.store(g_means2d + 2 * row + 1, (b * u + c * v) * (2 * rec.LN2), mask=seen)
     if WITH_MAP:
-        tl.store(observed + 3 * row, tl.abs(a) * field_of(total, SUM_ABS_X) * (2 * LN2), mask=seen)
-        tl.store(observed + 3 * row + 1, field_of(total, SUM_ABS_Y) * (2 * LN2), mask=seen)
-        tl.store(observed + 3 * row + 2, field_of(total, SUM_MAP), mask=seen)
+        tl.store(observed + 3 * row, tl.abs(a) * field_of(total, rec.SUM_ABS_X) * (2 * rec.LN2), mask=seen)
+        tl.store(observed + 3 * row + 1, field_of(total, rec.SUM_ABS_Y) * (2 * rec.LN2), mask=seen)
+        tl.store(observed + 3 * row + 2, field_of(total, rec.SUM_MAP), mask=seen)
 
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:
     """Columns and rows of tiles that cover an image."""
-    return triton.cdiv(width, TILE.value), triton.cdiv(height, TILE.value)
+    return triton.cdiv(width, rec.TILE.value), triton.cdiv(height, rec.TILE.value)
 
 
 def _check_lists(records: Tensor, tiles: Tiles, count: int) -> None:
     """Check the records, and the lists of ``count`` tiles."""
     visible, pairs, device = len(records), len(tiles.ranks), records.device
-    check_tensor("records", records, (visible, RECORD.value), device)
+    check_tensor("records", records, (visible, rec.RECORD.value), device)
     lengths = {"offsets": count + 1, "order": count, "ranks": pairs, "slots": pairs, "ends": visible}
     for name, length in lengths.items():
         check_tensor(f"tiles.{name}", getattr(tiles, name), (length,), device, torch.int32)
@@ -283,9 +248,10 @@ def blend(lens: Lens, records: Tensor, tiles: Tiles, background: Tensor) -> tupl
     image = records.new_empty(lens.height, lens.width, 3)
     transmittance, depth = (records.new_empty(lens.height, lens.width) for _ in range(2))
     ends = torch.empty(columns * rows, dtype=torch.int32, device=records.device)
+    # With one warp a tile, every reduction stays inside it; after each batch, whether the tile is finished is checked.
     blend_kernel[(columns * rows,)](
         records, tiles.ranks, tiles.offsets, tiles.order, ends, background, image, transmittance, depth,
-        columns, lens.width, lens.height, BATCH=BATCH, num_warps=WARPS, **COMPILE,
+        columns, lens.width, lens.height, BATCH=32, num_warps=1, **COMPILE,
     )  # fmt: skip
     return image, transmittance, depth, ends
 
@@ -338,7 +304,7 @@ def blend_backward(
     totals, g_means2d = torch.zeros_like(records), records.new_zeros(n, 2)
     observed = records.new_zeros(n, 3) if with_map else None
     if len(ids):
-        sums = records.new_zeros(len(tiles.slots), (OBSERVED_SLOT if with_map else RECORD).value)
+        sums = records.new_zeros(len(tiles.slots), (rec.OBSERVED_SLOT if with_map else rec.RECORD).value)
         blend_backward_kernel[(columns * rows,)](
             records, tiles.ranks, tiles.slots, tiles.offsets, tiles.order, ends, image, transmittance, depth,
             torch.zeros_like(image) if g_image is None else g_image,
@@ -346,10 +312,10 @@ def blend_backward(
             *(depth if given is None else given for given in (g_alpha, g_depth, pixel_map)),
             sums, columns, lens.width, lens.height,
             WITH_ALPHA=g_alpha is not None, WITH_DEPTH=g_depth is not None, WITH_MAP=with_map,
-            num_warps=WARPS, **COMPILE,
+            num_warps=1, **COMPILE,
         )  # fmt: skip
         total_kernel[(triton.cdiv(len(ids), SPLATS),)](
             sums, tiles.ends, ids, records, totals, g_means2d, g_means2d if observed is None else observed, len(ids),
-            WITH_MAP=with_map, SPLATS=SPLATS, SLOTS=SLOTS, LANES=LANES, num_warps=2, **COMPILE,
+            WITH_MAP=with_map, SPLATS=SPLATS, SLOTS=SLOTS, LANES=16, num_warps=2, **COMPILE,
         )  # fmt: skip
     return totals, g_means2d, observed

@@ -3,8 +3,6 @@
 Equations: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting (Kerbl et al. 2023, sec. 4).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -15,44 +13,10 @@ from torch import Tensor
 
 from nsvq_lightning.compute.devices import COMPILE, to_device
 from nsvq_lightning.compute.memory import check_tensor
-from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.cuda import records as rec
 from nsvq_lightning.rendering.cuda.harmonics import color, color_backward, load3, store3
-from nsvq_lightning.rendering.cuda.records import (
-    BLUE,
-    COVARIANCE_SCALE,
-    DEPTH,
-    FACTOR_SCALE,
-    GREEN,
-    LN2,
-    LOG2_ALPHA_MIN,
-    LOG2_E,
-    LOG2_OPACITY,
-    RECORD,
-    RED,
-    SUM_DEPTH,
-    SUM_H,
-    SUM_RED,
-    SUM_UU,
-    TILE,
-    A,
-    B,
-    C,
-    X,
-    Y,
-)
-from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.attributes import ATTRIBUTES
-
-NEAR = tl.constexpr(constants.NEAR)
-BLUR = tl.constexpr(constants.BLUR)
-BLUR_SQUARED = tl.constexpr(constants.BLUR**2)
-FRUSTUM_MARGIN = tl.constexpr(constants.FRUSTUM_MARGIN)
-MIN_SQUARED_NORM = tl.constexpr(conventions.MIN_SQUARED_NORM)
-FINITE = tl.constexpr(constants.FINITE)
-HUGE_FOOTPRINT = tl.constexpr(constants.HUGE_FOOTPRINT)
-LARGEST_FOOTPRINT = tl.constexpr(constants.LARGEST_FOOTPRINT)
-HUGE_QUATERNION, SHRINK = tl.constexpr(constants.HUGE_QUATERNION), tl.constexpr(constants.SHRINK)
 
 # Splats per program.
 BLOCK = 128
@@ -89,11 +53,15 @@ def axes_of(quat, log_scales):
     """Unit quaternion and its inverse norm, axis lengths, and the rows of M = R·diag(lengths)."""
     w, x, y, z = quat
     largest = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
-    shrink = tl.where(largest > HUGE_QUATERNION, SHRINK, 1.0)
+    shrink = tl.where(largest > rec.HUGE_QUATERNION, rec.SHRINK, 1.0)
     w, x, y, z = w * shrink, x * shrink, y * shrink, z * shrink
-    inverse = 1 / tl.sqrt(tl.maximum(w * w + x * x + y * y + z * z, MIN_SQUARED_NORM))
+    inverse = 1 / tl.sqrt(tl.maximum(w * w + x * x + y * y + z * z, rec.MIN_SQUARED_NORM))
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
-    s0, s1, s2 = tl.exp2(log_scales[0] * LOG2_E), tl.exp2(log_scales[1] * LOG2_E), tl.exp2(log_scales[2] * LOG2_E)
+    s0, s1, s2 = (
+        tl.exp2(log_scales[0] * rec.LOG2_E),
+        tl.exp2(log_scales[1] * rec.LOG2_E),
+        tl.exp2(log_scales[2] * rec.LOG2_E),
+    )
     m0 = ((1 - 2 * (y * y + z * z)) * s0, 2 * (x * y - w * z) * s1, 2 * (x * z + w * y) * s2)
     m1 = (2 * (x * y + w * z) * s0, (1 - 2 * (x * x + z * z)) * s1, 2 * (y * z - w * x) * s2)
     m2 = (2 * (x * z - w * y) * s0, 2 * (y * z + w * x) * s1, (1 - 2 * (x * x + y * y)) * s2)
@@ -110,7 +78,7 @@ def view_point(view, mean):
 @triton.jit
 def limited_slope(tangent, focal, centre, size):
     """The slope at which the Jacobian is evaluated, limited to a margin around the image."""
-    margin = size * (0.5 * FRUSTUM_MARGIN)
+    margin = size * (0.5 * rec.FRUSTUM_MARGIN)
     return tl.minimum(tl.maximum(tangent, (-centre - margin) / focal), (size - centre + margin) / focal)
 
 
@@ -169,32 +137,35 @@ def project_kernel(
     xx, xy, yy = dot3(u, u), dot3(u, v), dot3(v, v)
     # |u|²|v|² - (u·v)² = |u × v|² (Lagrange): no cancellation for large splats.
     normal, size = cross(u, v), xx + yy
-    unit = tl.where(size > HUGE_FOOTPRINT, 1 / size, 1.0)
+    unit = tl.where(size > rec.HUGE_FOOTPRINT, 1 / size, 1.0)
     normal = (normal[0] * unit, normal[1] * unit, normal[2] * unit)
-    determinant = dot3(normal, normal) + (size * BLUR + BLUR_SQUARED) * unit * unit
-    xx, yy = xx + BLUR, yy + BLUR
+    determinant = dot3(normal, normal) + (size * rec.BLUR + rec.BLUR_SQUARED) * unit * unit
+    xx, yy = xx + rec.BLUR, yy + rec.BLUR
 
     px, py = fx * (x * inverse) + cx, fy * (y * inverse) + cy
-    log2_opacity = -tl.log2(1 + tl.exp2(-(logit * LOG2_E)))
+    log2_opacity = -tl.log2(1 + tl.exp2(-(logit * rec.LOG2_E)))
     # α reaches 1/255 where u² + v² ≤ log2(255 o): a box of half sizes √(2 ln(255 o)·Σ_ii).
-    reach = (log2_opacity - LOG2_ALPHA_MIN) * (2 * LN2)
+    reach = (log2_opacity - rec.LOG2_ALPHA_MIN) * (2 * rec.LN2)
     half_x, half_y = tl.sqrt(tl.maximum(reach, 0.0) * xx), tl.sqrt(tl.maximum(reach, 0.0) * yy)
     left, right = tl.maximum(tl.ceil(px - half_x - 0.5), 0.0), tl.floor(px + half_x - 0.5)
     top, bottom = tl.maximum(tl.ceil(py - half_y - 0.5), 0.0), tl.floor(py + half_y - 0.5)
     right, bottom = tl.minimum(right, width - 1.0), tl.minimum(bottom, height - 1.0)
-    seen = inside & (z > NEAR) & (reach > 0) & (left <= right) & (top <= bottom)
-    seen = seen & (size < LARGEST_FOOTPRINT) & (determinant < FINITE)
-    seen = seen & (tl.abs(px) < FINITE) & (tl.abs(py) < FINITE) & (logit >= -FINITE)
+    seen = inside & (z > rec.NEAR) & (reach > 0) & (left <= right) & (top <= bottom)
+    seen = seen & (size < rec.LARGEST_FOOTPRINT) & (determinant < rec.FINITE)
+    seen = seen & (tl.abs(px) < rec.FINITE) & (tl.abs(py) < rec.FINITE) & (logit >= -rec.FINITE)
     # A log-scale of -inf is a splat without extent; one of +inf or NaN is broken.
-    seen = seen & (scale[0] + scale[1] + scale[2] < FINITE)
+    seen = seen & (scale[0] + scale[1] + scale[2] < rec.FINITE)
 
     radius = tl.minimum(tl.ceil(tl.maximum(half_x, half_y)), 1e9)
     tl.store(radii + row, tl.where(seen, radius, 0.0).to(tl.int32), mask=inside)
     if DEGREE >= 0:
         tl.store(means2d + 2 * row, px, mask=seen)
         tl.store(means2d + 2 * row + 1, py, mask=seen)
-        x0, y0 = tl.where(seen, left, 0.0).to(tl.int32) // TILE, tl.where(seen, top, 0.0).to(tl.int32) // TILE
-        x1, y1 = tl.where(seen, right, 0.0).to(tl.int32) // TILE, tl.where(seen, bottom, 0.0).to(tl.int32) // TILE
+        x0, y0 = tl.where(seen, left, 0.0).to(tl.int32) // rec.TILE, tl.where(seen, top, 0.0).to(tl.int32) // rec.TILE
+        x1, y1 = (
+            tl.where(seen, right, 0.0).to(tl.int32) // rec.TILE,
+            tl.where(seen, bottom, 0.0).to(tl.int32) // rec.TILE,
+        )
         box = boxes + 4 * row
         tl.store(box, x0, mask=seen)
         tl.store(box + 1, y0, mask=seen)
@@ -202,18 +173,18 @@ def project_kernel(
         tl.store(box + 3, y1 - y0 + 1, mask=seen)
         dx, dy, dz, _ = unit_direction(view, mean)
         red, green, blue = color(sh0, shN, row, row * stride, dx, dy, dz, seen, DEGREE)
-        a = tl.sqrt(yy * unit / determinant * unit) * FACTOR_SCALE
-        record = records + row * RECORD
-        tl.store(record + X, px, mask=seen)
-        tl.store(record + Y, py, mask=seen)
-        tl.store(record + A, a, mask=seen)
-        tl.store(record + B, -(a * (xy / yy)), mask=seen)
-        tl.store(record + C, 1 / tl.sqrt(yy) * FACTOR_SCALE, mask=seen)
-        tl.store(record + LOG2_OPACITY, log2_opacity, mask=seen)
-        tl.store(record + RED, positive(red), mask=seen)
-        tl.store(record + GREEN, positive(green), mask=seen)
-        tl.store(record + BLUE, positive(blue), mask=seen)
-        tl.store(record + DEPTH, z, mask=seen)
+        a = tl.sqrt(yy * unit / determinant * unit) * rec.FACTOR_SCALE
+        record = records + row * rec.RECORD
+        tl.store(record + rec.X, px, mask=seen)
+        tl.store(record + rec.Y, py, mask=seen)
+        tl.store(record + rec.A, a, mask=seen)
+        tl.store(record + rec.B, -(a * (xy / yy)), mask=seen)
+        tl.store(record + rec.C, 1 / tl.sqrt(yy) * rec.FACTOR_SCALE, mask=seen)
+        tl.store(record + rec.LOG2_OPACITY, log2_opacity, mask=seen)
+        tl.store(record + rec.RED, positive(red), mask=seen)
+        tl.store(record + rec.GREEN, positive(green), mask=seen)
+        tl.store(record + rec.BLUE, positive(blue), mask=seen)
+        tl.store(record + rec.DEPTH, z, mask=seen)
 
 
 @triton.jit
@@ -265,14 +236,14 @@ def project_backward_kernel(
 
     # dL/dΣ = ½ Fᵀ S F with S = Σ h uuᵀ, so dL/dU = Fᵀ S (F U). The rows of F U are a·u + b·v and c·v; by Lagrange's
     # identity the first is a·(v × (u × v) + blur·u)/|v|², which stays accurate for needles.
-    total, record = totals + rank * RECORD, records + rank * RECORD
-    a, b, c = load3(record + A, seen)
-    uu, uv, vv = load3(total + SUM_UU, seen)
-    uu, uv, vv = uu * (2 * COVARIANCE_SCALE), uv * (2 * COVARIANCE_SCALE), vv * (2 * COVARIANCE_SCALE)
-    per_yy = 1 / (dot3(v, v) + BLUR)
+    total, record = totals + rank * rec.RECORD, records + rank * rec.RECORD
+    a, b, c = load3(record + rec.A, seen)
+    uu, uv, vv = load3(total + rec.SUM_UU, seen)
+    uu, uv, vv = uu * (2 * rec.COVARIANCE_SCALE), uv * (2 * rec.COVARIANCE_SCALE), vv * (2 * rec.COVARIANCE_SCALE)
+    per_yy = 1 / (dot3(v, v) + rec.BLUR)
     n = cross(u, v)
     n = cross(v, (n[0] * per_yy, n[1] * per_yy, n[2] * per_yy))
-    blur = per_yy * BLUR
+    blur = per_yy * rec.BLUR
     fu = (a * (blur * u[0] + n[0]), a * (blur * u[1] + n[1]), a * (blur * u[2] + n[2]))
     fv = (c * v[0], c * v[1], c * v[2])
     e = (uu * fu[0] + uv * fv[0], uu * fu[1] + uv * fv[1], uu * fu[2] + uv * fv[2])
@@ -316,10 +287,10 @@ def project_backward_kernel(
     vy = fy_z * g2y - free_y * fy_zz * j12
     vz = (1 + free_x) * fx_zz * slope_x * j02 + (1 + free_y) * fy_zz * slope_y * j12
     vz -= fx_zz * (x * g2x + j00) + fy_zz * (y * g2y + j11)
-    vz += tl.load(total + SUM_DEPTH, mask=seen, other=0.0)
+    vz += tl.load(total + rec.SUM_DEPTH, mask=seen, other=0.0)
 
     # A colour below 0 was clamped.
-    rgb, g_rgb = load3(record + RED, seen), load3(total + SUM_RED, seen)
+    rgb, g_rgb = load3(record + rec.RED, seen), load3(total + rec.SUM_RED, seen)
     red, green, blue = (
         tl.where(rgb[0] > 0, g_rgb[0], 0.0),
         tl.where(rgb[1] > 0, g_rgb[1], 0.0),
@@ -340,8 +311,8 @@ def project_backward_kernel(
         inside,
     )
     logit = tl.load(logits + row, mask=seen, other=0.0)
-    h = tl.load(total + SUM_H, mask=seen, other=0.0)
-    tl.store(g_logits + row, h / (1 + tl.exp2(logit * LOG2_E)), mask=inside)
+    h = tl.load(total + rec.SUM_H, mask=seen, other=0.0)
+    tl.store(g_logits + row, h / (1 + tl.exp2(logit * rec.LOG2_E)), mask=inside)
 
 
 class Lens(NamedTuple):
@@ -366,7 +337,7 @@ class Lens(NamedTuple):
     height: int
 
     @classmethod
-    def of(cls, camera: Camera, device: torch.device) -> Lens:
+    def of(cls, camera: Camera, device: torch.device) -> "Lens":
         """Pack a camera; for one that has been packed for the device before, nothing is copied."""
         version, lens = _lenses.get(camera, {}).get(device, (-1, None))
         if lens is None or version != camera.viewmat._version:
@@ -445,12 +416,12 @@ def project(lens: Lens, attributes: tuple[Tensor, ...], degree: int) -> Projecte
     """
     means = attributes[0]
     n = means.shape[0]
-    records = means.new_empty(n, RECORD.value)
+    records = means.new_empty(n, rec.RECORD.value)
     boxes = torch.empty(n, 4, dtype=torch.int32, device=means.device)
     means2d = means.new_zeros(n, 2)
     radii = _launch_projection(lens, attributes, degree, records, boxes, means2d)
     ids = radii.nonzero()[:, 0]
-    ids = ids[records[ids, DEPTH.value].sort(stable=True).indices]
+    ids = ids[records[ids, rec.DEPTH.value].sort(stable=True).indices]
     return Projected(means2d, radii, ids, records[ids], boxes[ids])
 
 
@@ -481,8 +452,8 @@ def project_backward(
     _check_attributes(lens, attributes)
     device = attributes[0].device
     check_tensor("ids", ids, (len(ids),), device, torch.int64)
-    check_tensor("records", records, (len(ids), RECORD.value), device)
-    check_tensor("totals", totals, (len(ids), RECORD.value), device)
+    check_tensor("records", records, (len(ids), rec.RECORD.value), device)
+    check_tensor("totals", totals, (len(ids), rec.RECORD.value), device)
     check_tensor("g_means2d", g_means2d, (len(attributes[0]), 2), device)
     gradients = [torch.empty_like(attribute) for attribute in attributes]
     means, quats, scales, logits, _, shN = attributes

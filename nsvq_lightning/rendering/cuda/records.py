@@ -16,6 +16,7 @@ import math
 import triton.language as tl
 
 from nsvq_lightning.rendering import constants
+from nsvq_lightning.splats import conventions
 
 # Stride between records, or slots, in floats: whole 16-byte words.
 RECORD = tl.constexpr(12)
@@ -47,3 +48,13 @@ TRANSMITTANCE_MIN = tl.constexpr(constants.TRANSMITTANCE_MIN)
 FACTOR_SCALE = tl.constexpr(math.sqrt(0.5 * math.log2(math.e)))
 # Converts moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)².
 COVARIANCE_SCALE = tl.constexpr(2 * math.log(2.0) ** 2)
+# The rest of what kernels take from the constants that all back-ends share.
+NEAR = tl.constexpr(constants.NEAR)
+BLUR = tl.constexpr(constants.BLUR)
+BLUR_SQUARED = tl.constexpr(constants.BLUR**2)
+FRUSTUM_MARGIN = tl.constexpr(constants.FRUSTUM_MARGIN)
+MIN_SQUARED_NORM = tl.constexpr(conventions.MIN_SQUARED_NORM)
+FINITE = tl.constexpr(constants.FINITE)
+HUGE_FOOTPRINT = tl.constexpr(constants.HUGE_FOOTPRINT)
+LARGEST_FOOTPRINT = tl.constexpr(constants.LARGEST_FOOTPRINT)
+HUGE_QUATERNION, SHRINK = tl.constexpr(constants.HUGE_QUATERNION), tl.constexpr(constants.SHRINK)
