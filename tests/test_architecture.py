@@ -26,7 +26,7 @@ FLOORS = (
     {"rendering", "quantize", "quality"},
     {"splats"},
     {"compute"},
-    {"protocols", "random", "skips", "top_level", "version"},
+    {"random", "skips", "top_level", "version"},
 )
 """Rooms from the top floor down; those of one floor do not know each other."""
 FRONT_DOOR = {NAME, f"{NAME}.__main__"}

@@ -5,8 +5,6 @@ from typing import Protocol, TypeGuard, cast
 import torch
 from torch import Tensor, nn
 
-from nsvq_lightning.protocols import missing_members
-
 
 class Quantizer(Protocol):
     """Vector quantizer of one attribute: maps rows ``[N, D]`` to codes ``[N]``, indices into a codebook ``[K, D]``.
@@ -55,47 +53,37 @@ class Quantizer(Protocol):
         """Fix the codes ``[N]``; from now on only the codebook is trained."""
 
 
-class Refittable(Quantizer, Protocol):
-    """Quantizer whose codebook gets no gradient in the quantize phase, but is refitted to the rows from time to time.
-
-    :class:`nsvq_lightning.callbacks.CodebookRefit` does so with every quantizer that offers it.
-    """
-
-    def refit(self, x: Tensor, steps: int) -> None:
-        """Fit the codebook to the rows ``x [N, D]`` by ``steps`` k-means steps from its current state; K stays."""
-
-
-class Holding(Quantizer, Protocol):
-    """Quantizer whose rows can be given other codes than the nearest ones while they are trained.
-
-    :class:`nsvq_lightning.callbacks.RateDistortion` uses it, and leaves other quantizers alone.
-    """
+class ExtendedQuantizer(Quantizer, Protocol):
+    """What a quantizer may offer, too; callbacks that use a member leave quantizers without it alone."""
 
     held: Tensor
     """Codes ``[N]`` int64 that rows have in training, or empty; they count only while the scene has N rows."""
 
     def hold(self, codes: Tensor) -> None:
-        """Set :attr:`held`."""
+        """Set :attr:`held`, as :class:`nsvq_lightning.callbacks.RateDistortion` does."""
 
+    def refit(self, x: Tensor, steps: int) -> None:
+        """Fit the codebook to the rows ``x [N, D]`` by ``steps`` k-means steps from its current state; K stays.
 
-class Limitable(Quantizer, Protocol):
-    """Quantizer whose next fit can be told to place fewer codes.
-
-    :class:`nsvq_lightning.callbacks.CodebookInit` uses it for scenes with few splats.
-    """
+        For a codebook that gets no gradient; :class:`nsvq_lightning.callbacks.CodebookRefit` does so now and then.
+        """
 
     def limit(self, codes: int) -> None:
-        """Have at most ``codes`` codes, at least 1, from the next fit on."""
+        """Have at most ``codes`` codes, at least 1, from the next fit on.
 
-
-class Mendable(Quantizer, Protocol):
-    """Quantizer that can repair codes that have become non-finite.
-
-    :class:`nsvq_lightning.callbacks.FiniteCodes` uses it; with other quantizers it ends the run.
-    """
+        :class:`nsvq_lightning.callbacks.CodebookInit` uses it for scenes with few splats.
+        """
 
     def mend(self, broken: Tensor, rows: Tensor, generator: torch.Generator) -> None:
-        """Make the codes ``broken [B]`` finite again, given that others are; the scene is ``rows [N, D]``."""
+        """Make the codes ``broken [B]`` finite again, given that others are; the scene is ``rows [N, D]``.
+
+        :class:`nsvq_lightning.callbacks.FiniteCodes` uses it; without it, the run ends.
+        """
+
+
+def offers(quantizer: object, *members: str) -> TypeGuard[ExtendedQuantizer]:
+    """Whether a quantizer has members of :class:`ExtendedQuantizer`, given by name."""
+    return all(hasattr(quantizer, member) for member in members)
 
 
 def as_quantizer(module: object) -> Quantizer:
@@ -104,7 +92,9 @@ def as_quantizer(module: object) -> Quantizer:
     Raises:
         TypeError: It lacks a member of :class:`Quantizer`; the message says which.
     """
-    lacks = missing_members(module, Quantizer)
+    # Not by isinstance: since Python 3.12 it misses parameters and buffers, which an nn.Module gives by `__getattr__`.
+    members = {name for name in (*Quantizer.__annotations__, *vars(Quantizer)) if not name.startswith("_")}
+    lacks = sorted(name for name in members if not hasattr(module, name))
     if lacks:
         raise TypeError(
             f"{type(module).__name__} is not a quantizer; it lacks: {', '.join(lacks)}; derive it from "
@@ -119,27 +109,7 @@ def as_quantizer(module: object) -> Quantizer:
     return quantizer
 
 
-def is_refittable(quantizer: object) -> TypeGuard[Refittable]:
-    """Whether a quantizer has all members of :class:`Refittable`."""
-    return not missing_members(quantizer, Refittable)
-
-
-def is_holding(quantizer: object) -> TypeGuard[Holding]:
-    """Whether a quantizer has all members of :class:`Holding`."""
-    return not missing_members(quantizer, Holding)
-
-
-def is_limitable(quantizer: object) -> TypeGuard[Limitable]:
-    """Whether a quantizer has all members of :class:`Limitable`."""
-    return not missing_members(quantizer, Limitable)
-
-
 def held_codes(quantizer: object, count: int) -> Tensor | None:
     """The codes ``[count]`` that rows hold in training; None if they hold none, or are of another number."""
     held: Tensor | None = getattr(quantizer, "held", None)
     return held if held is not None and held.shape[0] == count > 0 else None
-
-
-def is_mendable(quantizer: object) -> TypeGuard[Mendable]:
-    """Whether a quantizer has all members of :class:`Mendable`."""
-    return not missing_members(quantizer, Mendable)

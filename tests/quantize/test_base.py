@@ -1,38 +1,17 @@
-"""What an object lacks of a protocol, with members that only an nn.Module's ``__getattr__`` finds."""
+"""What a quantizer lacks and what it offers, with members that only an nn.Module's ``__getattr__`` finds."""
 
 from __future__ import annotations
 
 import ast
 from pathlib import Path
-from typing import Protocol
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 import nsvq_lightning
-from nsvq_lightning.protocols import missing_members
 from nsvq_lightning.quantize import NSVQ, DiVeQ, PostHoc, StraightThrough, TrainedStraightThrough
-from nsvq_lightning.quantize.base import Quantizer, as_quantizer, is_mendable, is_refittable
-
-
-class Shape(Protocol):
-    weight: Tensor
-    area: float
-
-    def scaled(self, factor: float) -> Shape: ...
-
-
-class Held(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.zeros(2))
-        self.register_buffer("area", torch.zeros(()))
-
-
-def test_parameters_and_buffers_count_as_members() -> None:
-    assert missing_members(Held(), Shape) == ["scaled"]
-    assert missing_members(object(), Shape) == ["area", "scaled", "weight"]
+from nsvq_lightning.quantize.base import Quantizer, as_quantizer, offers
 
 
 def test_what_a_quantizer_lacks_is_named() -> None:
@@ -56,9 +35,9 @@ def test_a_codebook_that_nothing_trains_is_refused() -> None:
 
 def test_what_quantizers_offer_beyond() -> None:
     for kind in (NSVQ, DiVeQ, StraightThrough, TrainedStraightThrough, PostHoc):
-        assert is_refittable(as_quantizer(kind(4, 3))) == (kind is StraightThrough)
-    assert is_mendable(NSVQ(4, 3))
-    assert not is_mendable(nn.Linear(2, 2))
+        assert offers(as_quantizer(kind(4, 3)), "refit") == (kind is StraightThrough)
+        assert offers(kind(4, 3), "held", "hold", "limit", "mend")
+    assert not offers(nn.Linear(2, 2), "mend")
 
 
 def sources() -> list[Path]:
