@@ -10,8 +10,8 @@ from typing import Any
 
 from lightning.pytorch import Trainer
 
-from nsvq_lightning.compute.compilation import compile_watcher
 from nsvq_lightning.compute.environment import usable_cores
+from nsvq_lightning.compute.jit import compile_watcher
 from nsvq_lightning.training import rehearsal
 from nsvq_lightning.training.module import SplatModule
 

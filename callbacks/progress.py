@@ -9,7 +9,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.callbacks.progress.tqdm_progress import Tqdm
 
-from nsvq_lightning.compute.compilation import compile_seconds, compile_watcher
+from nsvq_lightning.compute.jit import compile_seconds, compile_watcher
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.training.module import SplatModule
 

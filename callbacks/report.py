@@ -16,7 +16,7 @@ from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from torch import Tensor
 from torchmetrics import Metric
 
-from nsvq_lightning.compute.compilation import compile_seconds
+from nsvq_lightning.compute.jit import compile_seconds
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import save

@@ -1,9 +1,15 @@
-"""How kernels are compiled, cached and run in parallel."""
+"""How kernels are compiled, cached and run in parallel, and how long compiling has taken.
+
+A kernel is compiled at its first call on a machine and read from the disk cache from then on. Compiling is not
+training, so clocks leave it out, and it can look like a hang, so the progress display says what is going on.
+"""
 
 import contextlib
 import functools
+import logging
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numba
@@ -13,6 +19,10 @@ from numba.core import event
 
 from nsvq_lightning.compute.kernel_cache import KernelCache
 
+log = logging.getLogger(__name__)
+
+# Called when a compilation begins, with a line that says how many kernels there are and how many are ready.
+Watcher = Callable[[str], None]
 # Type of the numeric literals in kernels; Python floats would promote their operands to float64.
 F = np.float32
 
@@ -25,33 +35,68 @@ _OPTIONS: dict[str, Any] = {
     "no_cfunc_wrapper": True,
 }
 
-
 # Every kernel of the modules that are loaded.
 _kernels: list[Any] = []
 
 
-class _HelperLevel(event.Listener):
-    """Has LLVM optimise helpers at a low level.
+class _Compilations(event.Listener):
+    """Times Numba's compilations, tells watchers when they begin, and has LLVM optimise helpers at a low level.
 
-    It optimises them again, with the kernel they are inlined into, whose level decides about speed. Helpers are most of
-    what is compiled: at this level, and without a wrapper for Python, all takes half of the time.
+    LLVM optimises helpers again, with the kernel they are inlined into, whose level decides about speed. Helpers are
+    most of what is compiled: at this level, and without a wrapper for Python, all takes half of the time.
     """
 
-    LEVEL = 1
-
     def __init__(self) -> None:
-        self._before: list[int] = []
+        self.watchers: list[Watcher] = []
+        self.announced = False
+        self.seconds = self._since = 0.0
+        # LLVM's level before each compilation in progress, of a kernel and its helpers.
+        self._levels: list[int] = []
+
+    def so_far(self) -> float:
+        """Seconds, including the compilation in progress."""
+        return self.seconds + (time.perf_counter() - self._since if self._levels else 0.0)
 
     def on_start(self, compilation: Any) -> None:
-        self._before.append(numba.config.OPT)
+        if not self._levels:
+            self._since = time.perf_counter()
+            self._announce()
+        level = numba.config.OPT
+        self._levels.append(level)
         if compilation.data["dispatcher"].targetoptions.get("forceinline"):
-            numba.config.OPT = type(numba.config.OPT)(min(numba.config.OPT, self.LEVEL))
+            numba.config.OPT = type(level)(min(level, 1))
 
     def on_end(self, _: Any) -> None:
-        numba.config.OPT = self._before.pop()
+        numba.config.OPT = self._levels.pop()
+        if not self._levels:
+            self.seconds += time.perf_counter() - self._since
+
+    def _announce(self) -> None:
+        if not self.announced:
+            self.announced = True
+            log.info("compiling kernels as they are needed, once on this machine: half a minute to two in all")
+        ready, known = kernels_ready()
+        for watcher in self.watchers:
+            watcher(f"compiling kernels {ready + 1}/{known}, once on this machine")
 
 
-event.register("numba:compile", _HelperLevel())
+_compilations = _Compilations()
+event.register("numba:compile", _compilations)
+
+
+def compile_seconds() -> float:
+    """Seconds spent compiling CPU kernels in this process so far; cached kernels take none."""
+    return _compilations.so_far()
+
+
+@contextlib.contextmanager
+def compile_watcher(watcher: Watcher) -> Iterator[None]:
+    """Call ``watcher`` whenever a compilation begins within the block."""
+    _compilations.watchers.append(watcher)
+    try:
+        yield
+    finally:
+        _compilations.watchers.remove(watcher)
 
 
 class _Cache(KernelCache):

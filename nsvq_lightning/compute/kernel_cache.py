@@ -5,8 +5,6 @@ changes: too late, since a kernel contains the code of its helpers and constants
 still Numba's own, lie in a folder named after a digest of the sources of a kernel's module and of all that it imports.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import re
@@ -21,8 +19,6 @@ import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.misc.appdirs import AppDirs
 
-# An import that is not in a function: a module and names, or modules.
-IMPORT = re.compile(r"^(?:from +([\w.]+) +import +(\([^)]*\)|.*)|import +(.*))", re.MULTILINE)
 # So many folders are kept; those of a few checkouts, between which one may change.
 MAX_FOLDERS = 64
 
@@ -57,7 +53,9 @@ def source_digest(module: str) -> str:
 def _read(path: Path) -> tuple[bytes, list[Any]]:
     """The digest of a source, and its imports."""
     source = path.read_bytes()
-    return hashlib.sha256(source).digest(), IMPORT.findall(source.decode())
+    # Those that are not in a function: a module and names, or modules.
+    imports = re.findall(r"^(?:from +([\w.]+) +import +(\([^)]*\)|.*)|import +(.*))", source.decode(), re.MULTILINE)
+    return hashlib.sha256(source).digest(), imports
 
 
 def _file_of(name: str, module: str) -> Path | None:
@@ -99,7 +97,7 @@ class _Locator(_CacheLocator):
         self._folder = folder
 
     @classmethod
-    def from_function(cls, py_func: Any, py_file: str) -> _Locator | None:
+    def from_function(cls, py_func: Any, py_file: str) -> "_Locator | None":
         folder = kernel_folder()
         try:
             return None if folder is None else cls(folder / source_digest(py_func.__module__)[:16])

@@ -1,7 +1,5 @@
 """Tensors and arrays as kernels take them: a kernel checks no lengths, so whoever calls one checks here first."""
 
-from __future__ import annotations
-
 import math
 import sys
 import threading
@@ -69,7 +67,7 @@ def outside(name: str, numbers: Array, count: int) -> ValueError:
     return ValueError(f"{name} must be in [0, {count}), got {numbers.min()} to {numbers.max()}")
 
 
-_IDLE: list[Workspace] = []
+_IDLE: list["Workspace"] = []
 
 
 class Workspace:
@@ -83,7 +81,7 @@ class Workspace:
         self._arrays: dict[str, Array] = {}
 
     @staticmethod
-    def borrow() -> Workspace:
+    def borrow() -> "Workspace":
         """An idle workspace, or a new one."""
         try:
             return _IDLE.pop()

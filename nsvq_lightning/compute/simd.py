@@ -438,6 +438,15 @@ def transpose(context, builder, sig, values):
     return context.make_tuple(builder, sig.return_type, rows)
 
 
+def _row_address(
+    context: Any, builder: Any, sig: Any, array: Any, indices: Any, start: Any, lane: int, stride: Any
+) -> Any:
+    """Where the row of ``array`` begins whose number is ``indices[start + lane]``."""
+    index = builder.load(_address(context, builder, sig.args[1], indices, builder.add(start, _i64(lane))))
+    index = context.cast(builder, index, sig.args[1].dtype, types.int64)
+    return _address(context, builder, sig.args[0], array, builder.mul(index, stride))
+
+
 @_function(_SIXTEEN, 5)
 def gather_columns(context, builder, sig, values):
     """``gather_columns(array, indices, start, stride, column)``: 16 columns of 16 chosen rows.
@@ -447,10 +456,8 @@ def gather_columns(context, builder, sig, values):
     array, indices, start, stride, column = values
     rows = []
     for lane in range(WIDTH):
-        index = builder.load(_address(context, builder, sig.args[1], indices, builder.add(start, _i64(lane))))
-        index = context.cast(builder, index, sig.args[1].dtype, types.int64)
-        offset = builder.add(builder.mul(index, stride), column)
-        rows.append(_read(builder, _address(context, builder, sig.args[0], array, offset)))
+        address = _row_address(context, builder, sig, array, indices, start, lane, stride)
+        rows.append(_read(builder, builder.gep(address, [column])))
     return context.make_tuple(builder, sig.return_type, _transposed(builder, rows))
 
 
@@ -459,9 +466,7 @@ def _gatherer(columns: int) -> Any:
         array, indices, start = values
         vectors = [ir.Constant(_VF, ir.Undefined)] * columns
         for lane in range(WIDTH):
-            index = builder.load(_address(context, builder, sig.args[1], indices, builder.add(start, _i64(lane))))
-            index = context.cast(builder, index, sig.args[1].dtype, types.int64)
-            address = _address(context, builder, sig.args[0], array, builder.mul(index, _i64(columns)))
+            address = _row_address(context, builder, sig, array, indices, start, lane, _i64(columns))
             for column in range(columns):
                 element = builder.load(builder.gep(address, [_i64(column)]))
                 vectors[column] = builder.insert_element(vectors[column], element, _i32(lane))
@@ -479,9 +484,7 @@ def _scatterer(columns: int) -> Any:
         array, indices, start, rows = values
         vectors = [rows] if columns == 1 else cgutils.unpack_tuple(builder, rows, columns)
         for lane in range(WIDTH):
-            index = builder.load(_address(context, builder, sig.args[1], indices, builder.add(start, _i64(lane))))
-            index = context.cast(builder, index, sig.args[1].dtype, types.int64)
-            address = _address(context, builder, sig.args[0], array, builder.mul(index, _i64(columns)))
+            address = _row_address(context, builder, sig, array, indices, start, lane, _i64(columns))
             for column in range(columns):
                 element = builder.extract_element(vectors[column], _i32(lane))
                 builder.store(element, builder.gep(address, [_i64(column)]))
@@ -530,8 +533,12 @@ def _row_loader(columns: int) -> Any:
     return _function(types.UniTuple(Lanes, columns), 2)(emit)
 
 
-load_rows3 = _row_loader(3)
-load_rows4 = _row_loader(4)
+load_rows3, load_rows4 = _row_loader(3), _row_loader(4)
+
+
+def _line(context: Any, builder: Any, sig: Any, image: Any, offset: Any, stride: Any, row: int) -> Any:
+    """Where a row of a block of an image begins."""
+    return _address(context, builder, sig.args[0], image, builder.add(offset, builder.mul(_i64(row), stride)))
 
 
 @_function(types.UniTuple(Lanes, 3), 3)
@@ -543,7 +550,7 @@ def load_rgb_block(context, builder, sig, values):
     image, offset, stride = values
     rows = []
     for row in range(4):
-        address = _address(context, builder, sig.args[0], image, builder.add(offset, builder.mul(_i64(row), stride)))
+        address = _line(context, builder, sig, image, offset, stride, row)
         first = _read(builder, address, 8)
         last = _read(builder, builder.gep(address, [_i64(8)]), 4)
         last = _shuffle(builder, last, last, [0, 1, 2, 3, 0, 0, 0, 0])
@@ -566,7 +573,7 @@ def store_rgb_block(context, builder, sig, values):
     for row in range(4):
         order = [16 * channel + 4 * row + column for column in range(4) for channel in range(3)]
         pixels = _shuffle(builder, red_green, blue, order)
-        address = _address(context, builder, sig.args[0], image, builder.add(offset, builder.mul(_i64(row), stride)))
+        address = _line(context, builder, sig, image, offset, stride, row)
         _write(builder, address, _shuffle(builder, pixels, pixels, list(range(8))))
         _write(builder, builder.gep(address, [_i64(8)]), _shuffle(builder, pixels, pixels, list(range(8, 12))))
     return context.get_dummy_value()
@@ -576,14 +583,7 @@ def store_rgb_block(context, builder, sig, values):
 def load_block(context, builder, sig, values):
     """``load_block(image, offset, stride)``: a 4x4 block of a single-channel image as one vector."""
     image, offset, stride = values
-    rows = [
-        _read(
-            builder,
-            _address(context, builder, sig.args[0], image, builder.add(offset, builder.mul(_i64(row), stride))),
-            4,
-        )
-        for row in range(4)
-    ]
+    rows = [_read(builder, _line(context, builder, sig, image, offset, stride, row), 4) for row in range(4)]
     upper, lower = (_shuffle(builder, rows[k], rows[k + 1], list(range(8))) for k in (0, 2))
     return _shuffle(builder, upper, lower, list(range(WIDTH)))
 
@@ -593,6 +593,6 @@ def store_block(context, builder, sig, values):
     """``store_block(image, offset, stride, lanes)``: the inverse of :func:`load_block`."""
     image, offset, stride, lanes = values
     for row in range(4):
-        address = _address(context, builder, sig.args[0], image, builder.add(offset, builder.mul(_i64(row), stride)))
+        address = _line(context, builder, sig, image, offset, stride, row)
         _write(builder, address, _shuffle(builder, lanes, lanes, list(range(4 * row, 4 * row + 4))))
     return context.get_dummy_value()

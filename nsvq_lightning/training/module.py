@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from nsvq_lightning.compute.compilation import Stopwatch
+from nsvq_lightning.training.stopwatch import Stopwatch
 from nsvq_lightning.compute.devices import AsyncScalar, to_device
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.nsvq.precision import Storage

@@ -19,7 +19,7 @@ from lightning.pytorch.utilities.model_helpers import _restricted_classmethod
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from nsvq_lightning.compute.compilation import Stopwatch
+from nsvq_lightning.training.stopwatch import Stopwatch
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.splats.attributes import ATTRIBUTES

@@ -17,9 +17,10 @@ from numba import njit
 
 from nsvq_lightning.callbacks import progress
 from nsvq_lightning.callbacks.progress import SplatProgressBar
-from nsvq_lightning.compute import compilation
-from nsvq_lightning.compute.compilation import Stopwatch, compile_seconds, compile_watcher
+from nsvq_lightning.compute import jit
+from nsvq_lightning.compute.jit import compile_seconds, compile_watcher
 from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.stopwatch import Stopwatch
 
 
 def compiled() -> Callable[[float], float]:
@@ -52,8 +53,8 @@ def test_the_clock_counts_compilation_and_tells_those_who_watch() -> None:
 
 def test_training_time_leaves_compilation_out(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0, 0.0]
-    monkeypatch.setattr("nsvq_lightning.compute.compilation.time.perf_counter", lambda: now[0])
-    monkeypatch.setattr("nsvq_lightning.compute.compilation.compile_seconds", lambda: now[1])
+    monkeypatch.setattr("nsvq_lightning.training.stopwatch.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("nsvq_lightning.training.stopwatch.compile_seconds", lambda: now[1])
     watch = Stopwatch()
     watch.start()
     now[:] = [100.0, 93.0]
@@ -85,6 +86,6 @@ def test_what_is_no_terminal_gets_lines(monkeypatch: pytest.MonkeyPatch, tmp_pat
         bar = SplatProgressBar()
         bar.setup(Trainer(logger=False, max_steps=9), SplatModule(), "test")
         assert bar.is_disabled
-        monkeypatch.setitem(sys.modules, "ipykernel", compilation)
+        monkeypatch.setitem(sys.modules, "ipykernel", jit)
         bar.setup(Trainer(logger=False, max_steps=9), SplatModule(), "test")
         assert not bar.is_disabled
