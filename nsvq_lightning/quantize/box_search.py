@@ -11,18 +11,15 @@ second-nearest code was then. As long as the distance to its code and the distan
 moved add up to less, the code is still the nearest (:mod:`tracking`).
 """
 
-from __future__ import annotations
-
 from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
-from numpy.typing import NDArray
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import inline, kernel, thread_count
-from nsvq_lightning.compute.memory import aligned_empty, check_array, check_table, outside
+from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
+from nsvq_lightning.compute.memory import Array, aligned_empty, check_array, check_table, outside
 from nsvq_lightning.compute.rows import count_outside
 
 # Beyond this dimension, boxes prune too little, and the scores of :mod:`scores` are faster.
@@ -30,14 +27,9 @@ MAX_DIM = 8
 # Factor on the bounds, far above the relative rounding error of a float32 distance.
 ROUNDING = 1.0 + 1e-5
 
-_UNKNOWN = np.int32(-1)  # stands for the last code of a row that has not been searched
 _NO_CODE = np.int32(np.iinfo(np.int32).max)  # label of a lane without a code
-_LARGEST = np.finfo(np.float32).max
 _ROWS = 512  # queries per unit of parallel work; a pass over them hides the latency of one behind the others
 _TASKS = 2048  # capacity for visits to leaves, which are deferred and processed together
-
-Floats = NDArray[np.float32]
-Order = NDArray[np.int32]
 
 
 class Memory(NamedTuple):
@@ -50,19 +42,19 @@ class Memory(NamedTuple):
             float64, because movements add up over a whole run.
     """
 
-    last: NDArray[np.int32]
-    anchors: Floats
-    clearance: NDArray[np.float64]
+    last: Array
+    anchors: Array
+    clearance: Array
 
     @classmethod
-    def empty(cls, count: int, dim: int) -> Memory:
+    def empty(cls, count: int, dim: int) -> "Memory":
         """Memory of ``count`` rows that have not been searched."""
-        return cls(np.full(count, _UNKNOWN), np.zeros((count, dim), np.float32), np.full(count, -np.inf))
+        return cls(np.full(count, -1, np.int32), np.zeros((count, dim), np.float32), np.full(count, -np.inf))
 
 
 @inline
-def _widest_axis(points, order, start, stop):  # type: ignore[no-untyped-def]
-    axis, widest = 0, np.float32(-1.0)
+def _widest_axis(points, order, start, stop):
+    axis, widest = 0, F(-1)
     for j in range(points.shape[0]):
         low = high = points[j, order[start]]
         for i in range(start + 1, stop):
@@ -74,7 +66,7 @@ def _widest_axis(points, order, start, stop):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _split(values, order, start, stop, middle):  # type: ignore[no-untyped-def]
+def _split(values, order, start, stop, middle):
     """Quickselect: the ``middle - start`` smallest of ``order[start:stop]`` come first."""
     stop -= 1
     while start < stop:
@@ -97,7 +89,7 @@ def _split(values, order, start, stop, middle):  # type: ignore[no-untyped-def]
 
 
 @partial(kernel, parallel=False)
-def _sort_into_leaves(points, order):  # type: ignore[no-untyped-def]
+def _sort_into_leaves(points, order):
     """Split by medians at multiples of 256 codes (a node), then of 16 (a leaf)."""
     stack = np.empty((64, 2), np.int64)
     stack[0, 0], stack[0, 1] = 0, order.shape[0]
@@ -115,7 +107,7 @@ def _sort_into_leaves(points, order):  # type: ignore[no-untyped-def]
         depth += 2
 
 
-def sort_into_leaves(codebook: Floats) -> Order:
+def sort_into_leaves(codebook: Array) -> Array:
     """Codes ``[K]`` int32 in an order in which each 16, a leaf, are near each other, and each 256, a node.
 
     Raises:
@@ -128,7 +120,7 @@ def sort_into_leaves(codebook: Floats) -> Order:
     return order
 
 
-def _points(codebook: Floats) -> Floats:
+def _points(codebook: Array) -> Array:
     """Columns ``[D, K]`` of the codes; those with a NaN lie at infinity and are never chosen."""
     points = np.ascontiguousarray(codebook.T)
     points[np.isnan(points)] = np.inf
@@ -136,18 +128,18 @@ def _points(codebook: Floats) -> Floats:
 
 
 @kernel
-def _pack(points, order, codes, labels, leaves, nodes):  # type: ignore[no-untyped-def]
+def _pack(points, order, codes, labels, leaves, nodes):
     """Put codes and the corners of their boxes into the arrays of :func:`_boxes`."""
     dim, count = points.shape
     for node in prange(leaves.shape[0]):
         for j in range(dim):
-            node_low, node_high = np.float32(np.inf), np.float32(-np.inf)
+            node_low, node_high = F(np.inf), F(-np.inf)
             for child in range(16):
                 leaf = node * 16 + child
-                low, high = np.float32(np.inf), np.float32(-np.inf)
+                low, high = F(np.inf), F(-np.inf)
                 for lane in range(16):
                     place = leaf * 16 + lane
-                    value, label = np.float32(np.inf), _NO_CODE
+                    value, label = F(np.inf), _NO_CODE
                     if place < count:
                         label = order[place]
                         value = points[j, label]
@@ -161,7 +153,7 @@ def _pack(points, order, codes, labels, leaves, nodes):  # type: ignore[no-untyp
             nodes[node // 16, j, 1, node % 16] = node_high
 
 
-def _boxes(codebook: Floats, order: Order) -> tuple[Any, ...]:
+def _boxes(codebook: Array, order: Array) -> tuple[Any, ...]:
     """The codes in boxes, flat.
 
     Leaves ``[nodes · 16, D, 16]``, lanes without a code at infinity; the codes of their lanes ``[nodes · 16, 16]``;
@@ -176,36 +168,35 @@ def _boxes(codebook: Floats, order: Order) -> tuple[Any, ...]:
 
 
 @inline
-def _box_distances(dim, boxes, at, x, row):  # type: ignore[no-untyped-def]
+def _box_distances(dim, boxes, at, x, row):
     """Squared distances of a query to 16 boxes."""
-    zero = simd.broadcast(np.float32(0.0))
-    total = zero
+    total = simd.broadcast(0)
     for j in range(dim):
-        value = simd.broadcast(simd.get(x, row + j))
+        value = simd.get(x, row + j)
         below = simd.load(boxes, at + 32 * j) - value
         above = value - simd.load(boxes, at + 32 * j + 16)
-        gap = simd.vmax(simd.vmax(below, above), zero)
+        gap = simd.vmax(simd.vmax(below, above), 0)
         total = simd.fma(gap, gap, total)
     return total
 
 
 @inline
-def _code_distances(dim, codes, leaf, x, row):  # type: ignore[no-untyped-def]
+def _code_distances(dim, codes, leaf, x, row):
     """Squared distances of a query to the 16 codes of a leaf."""
-    total = simd.broadcast(np.float32(0.0))
+    total = simd.broadcast(0)
     for j in range(dim):
-        difference = simd.load(codes, (leaf * dim + j) * 16) - simd.broadcast(simd.get(x, row + j))
+        difference = simd.load(codes, (leaf * dim + j) * 16) - simd.get(x, row + j)
         total = simd.fma(difference, difference, total)
     return total
 
 
 @inline
-def _visit_leaf(dim, tree, leaf, x, i, limit, state):  # type: ignore[no-untyped-def]
+def _visit_leaf(dim, tree, leaf, x, i, limit, state):
     """Compare the codes of a leaf that are not farther than ``limit``; of equal distances the lower code wins."""
     codes, labels, _, _ = tree
     best, label, second, _, _, scratch, _ = state
     distances = _code_distances(dim, codes, leaf, x, i * dim)
-    bits = simd.mask_bits(distances <= simd.broadcast(limit))
+    bits = simd.mask_bits(distances <= limit)
     if bits != 0:
         simd.store(scratch, 0, distances)
         while bits != 0:
@@ -222,30 +213,30 @@ def _visit_leaf(dim, tree, leaf, x, i, limit, state):  # type: ignore[no-untyped
 
 
 @inline
-def place_of_least(least, block_of):  # type: ignore[no-untyped-def]
+def place_of_least(least, block_of):
     """Where the least of blocks of 16 numbers is, the first of equal ones; lanes hold their least and its block."""
-    smallest = simd.broadcast(simd.lane_min(least))
-    block = simd.lane_min(simd.select(least <= smallest, block_of, simd.broadcast(np.float32(np.inf))))
-    lane = simd.mask_bits((least <= smallest) & (block_of <= simd.broadcast(block)))
+    smallest = simd.lane_min(least)
+    block = simd.lane_min(simd.select(least <= smallest, block_of, np.inf))
+    lane = simd.mask_bits((least <= smallest) & (block_of <= block))
     return np.int64(block) * 16 + simd.lowest_bit(lane)
 
 
 @inline
-def _nearest_node(dim, nodes, x, row):  # type: ignore[no-untyped-def]
+def _nearest_node(dim, nodes, x, row):
     """Node whose box is nearest (0 for a query with a NaN)."""
-    nearest, group_of = simd.broadcast(np.float32(np.inf)), simd.broadcast(np.float32(0.0))
+    nearest, group_of = simd.broadcast(np.inf), simd.broadcast(0)
     for group in range(nodes.size // (32 * dim)):
         distances = _box_distances(dim, nodes, group * 32 * dim, x, row)
-        group_of = simd.select(distances < nearest, simd.broadcast(np.float32(group)), group_of)
+        group_of = simd.select(distances < nearest, group, group_of)
         nearest = simd.vmin(distances, nearest)
     return place_of_least(nearest, group_of)
 
 
 @inline
-def _prove(dim, codebook, x, row, code, memory, travelled):  # type: ignore[no-untyped-def]
+def _prove(dim, codebook, x, row, code, memory, travelled):
     """Whether a bound proves that a row has kept its last code."""
     _, anchors, clearance = memory
-    moved = distance = np.float32(0.0)
+    moved = distance = F(0.0)
     for j in range(dim):
         value = simd.get(x, row * dim + j)
         from_anchor, from_code = value - simd.get(anchors, row * dim + j), value - simd.get(codebook, code * dim + j)
@@ -256,32 +247,31 @@ def _prove(dim, codebook, x, row, code, memory, travelled):  # type: ignore[no-u
 
 
 @inline
-def _guess(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
+def _guess(dim, tree, x, count, state):
     """For each query, find the best code of one near leaf: three passes without unpredictable branches."""
     codes, _, leaves, nodes = tree
     best, label, second, guess, _, _, bounded = state
-    infinity = np.float32(np.inf)
     for i in range(count):
         simd.put(guess, i, _nearest_node(dim, nodes, x, i * dim))
     for i in range(count):
         node = simd.get(guess, i)
         distances = _box_distances(dim, leaves, node * 32 * dim, x, i * dim)
-        lane = simd.lowest_bit(simd.mask_bits(distances <= simd.broadcast(simd.lane_min(distances))))
+        lane = simd.lowest_bit(simd.mask_bits(distances <= simd.lane_min(distances)))
         simd.put(guess, i, node * 16 + lane)
     for i in range(count):
         leaf = simd.get(guess, i)
         distances = _code_distances(dim, codes, leaf, x, i * dim)
         limit = simd.lane_min(distances)
         if bounded:
-            limit = simd.lane_min(simd.select(distances > simd.broadcast(limit), distances, simd.broadcast(infinity)))
-        simd.put(best, i, infinity)
+            limit = simd.lane_min(simd.select(distances > limit, distances, np.inf))
+        simd.put(best, i, np.inf)
         simd.put(label, i, _NO_CODE)
-        simd.put(second, i, infinity)
+        simd.put(second, i, np.inf)
         _visit_leaf(dim, tree, leaf, x, i, limit, state)
 
 
 @inline
-def _visit_leaves(dim, tree, x, state, pending):  # type: ignore[no-untyped-def]
+def _visit_leaves(dim, tree, x, state, pending):
     """Visit the pending (query, leaf) pairs."""
     best, _, second, _, tasks, _, bounded = state
     for t in range(pending):
@@ -290,13 +280,13 @@ def _visit_leaves(dim, tree, x, state, pending):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _visit_near(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
+def _visit_near(dim, tree, x, count, state):
     """Visit every other leaf that is not farther than the best code so far, or the second-best if that is needed."""
     _, _, leaves, nodes = tree
     best, _, second, guess, tasks, _, bounded = state
     pending = 0
     for i in range(count):
-        row, limit = i * dim, simd.broadcast(simd.get(second, i) if bounded else simd.get(best, i))
+        row, limit = i * dim, simd.get(second, i) if bounded else simd.get(best, i)
         for group in range(nodes.size // (32 * dim)):
             near_nodes = simd.mask_bits(_box_distances(dim, nodes, group * 32 * dim, x, row) <= limit)
             while near_nodes != 0:
@@ -318,8 +308,9 @@ def _visit_near(dim, tree, x, count, state):  # type: ignore[no-untyped-def]
 @cache
 def _search_kernel(dim: int) -> Any:
     """The search for one dimension, a compile-time constant, so that short loops over it are unrolled."""
+    largest = np.finfo(np.float32).max
 
-    def search(x, rows, codebook, codes, labels, leaves, nodes, memory, travelled, result):  # type: ignore[no-untyped-def]
+    def search(x, rows, codebook, codes, labels, leaves, nodes, memory, travelled, result):
         last_codes, anchors, clearance = memory
         total, bounded, missing = result.shape[0], last_codes.shape[0] > 0, 0
         for block in prange((total + _ROWS - 1) // _ROWS):
@@ -333,7 +324,7 @@ def _search_kernel(dim: int) -> Any:
             missing += found_outside
             for i in range(first, stop if found_outside == 0 else first):
                 row = simd.get(rows, i)
-                last = np.int64(simd.get(last_codes, row)) if bounded else np.int64(_UNKNOWN)
+                last = np.int64(simd.get(last_codes, row)) if bounded else np.int64(-1)
                 simd.put(result, i, last)
                 simd.put(places, count, i)
                 known = last >= 0 and last < codebook.shape[0] // dim
@@ -349,7 +340,7 @@ def _search_kernel(dim: int) -> Any:
                 simd.put(result, simd.get(places, i), np.int64(nearest))
                 if bounded:
                     # Keep where the row was searched; there may still be codes beyond the largest float32 number.
-                    row, away = simd.get(rows, simd.get(places, i)), min(simd.get(second, i), _LARGEST)
+                    row, away = simd.get(rows, simd.get(places, i)), min(simd.get(second, i), largest)
                     simd.put(last_codes, row, nearest)
                     for j in range(dim):
                         simd.put(anchors, row * dim + j, simd.get(queries, i * dim + j))
@@ -360,13 +351,13 @@ def _search_kernel(dim: int) -> Any:
 
 
 def box_search(
-    x: Floats,
-    codebook: Floats,
-    order: Order | None = None,
-    rows: NDArray[np.int64] | None = None,
+    x: Array,
+    codebook: Array,
+    order: Array | None = None,
+    rows: Array | None = None,
     memory: Memory | None = None,
     travelled: float = 0.0,
-) -> NDArray[np.int64]:
+) -> Array:
     """Nearest codes ``[V]`` of contiguous queries; one with a NaN gets code 0.
 
     Args:

@@ -19,7 +19,7 @@ from nsvq_lightning.quantize.nearest import nearest
 
 
 @kernel
-def _sum_rows(values, codes, sums, parts):  # type: ignore[no-untyped-def]
+def _sum_rows(values, codes, sums, parts):
     """Each part owns a range of codes and scans all rows, so the order of the threads cannot change a sum."""
     for part in prange(parts):
         first, last = part * sums.shape[0] // parts, (part + 1) * sums.shape[0] // parts
@@ -187,7 +187,7 @@ def distinct_rows(x: Tensor) -> Tensor:
 
 
 @kernel
-def _hash_rows(bits, hashes):  # type: ignore[no-untyped-def]
+def _hash_rows(bits, hashes):
     """One 64-bit hash per row of integers ``[N, D]``, by multiplication and xor-shift."""
     for i in prange(bits.shape[0]):
         value = np.uint64(0x9E3779B97F4A7C15)

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 from numba import prange
-from numpy.typing import NDArray
 from torch import Tensor
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import kernel, thread_count
+from nsvq_lightning.compute.memory import Array
 from nsvq_lightning.quantize.box_search import MAX_DIM, box_search, place_of_least
 from nsvq_lightning.quantize.scores import score_search
 
@@ -150,7 +150,7 @@ def cheapest_reference(x: Tensor, codebook: Tensor, rates: Tensor, prices: Tenso
     return torch.cat([least(part) for part in costs])
 
 
-def _blocks(codebook: NDArray[np.float32], rates: NDArray[np.float32]) -> NDArray[np.float32]:
+def _blocks(codebook: Array, rates: Array) -> Array:
     """Blocks of 16 codes, ``[⌈K/16⌉, D + 1, 16]`` flat: their values, infinite in lanes without a code, and rates."""
     count, dim = codebook.shape
     padded = np.zeros((-(-count // 16) * 16, dim + 1), np.float32)
@@ -163,21 +163,21 @@ def _blocks(codebook: NDArray[np.float32], rates: NDArray[np.float32]) -> NDArra
 def _search_kernel(dim: int) -> Any:
     """The search for one dimension, a compile-time constant."""
 
-    def search(x, prices, table, result):  # type: ignore[no-untyped-def]
+    def search(x, prices, table, result):
         blocks = table.shape[0] // (16 * (dim + 1))
         for i in prange(result.shape[0]):
-            price = simd.broadcast(simd.get(prices, i))
-            best, block_of = simd.broadcast(np.float32(np.inf)), simd.broadcast(np.float32(0.0))
+            price = simd.get(prices, i)
+            best, block_of = simd.broadcast(np.inf), simd.broadcast(0)
             for block in range(blocks):
                 at = block * 16 * (dim + 1)
-                total = simd.broadcast(np.float32(0.0))
+                total = simd.broadcast(0)
                 for j in range(dim):
-                    difference = simd.load(table, at + 16 * j) - simd.broadcast(simd.get(x, i * dim + j))
+                    difference = simd.load(table, at + 16 * j) - simd.get(x, i * dim + j)
                     total = simd.fma(difference, difference, total)
                 total = simd.fma(price, simd.load(table, at + 16 * dim), total)
                 cheaper = total < best
                 best = simd.select(cheaper, total, best)
-                block_of = simd.select(cheaper, simd.broadcast(np.float32(block)), block_of)
+                block_of = simd.select(cheaper, block, block_of)
             simd.put(result, i, place_of_least(best, block_of))
 
     return kernel(search)

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 from numba import prange
-from numpy.typing import NDArray
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import inline, kernel, thread_count
-from nsvq_lightning.compute.memory import FLOAT32, aligned_empty, check_array, check_table
+from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
+from nsvq_lightning.compute.memory import FLOAT32, Array, aligned_empty, check_array, check_table
 
 # Codes in the list of a row.
 LIST = 8
@@ -28,11 +27,9 @@ _GROUP = 6  # rows scored together
 _TILE = 8 * _GROUP  # rows that pass over a chunk of codes while it stays in the L1 cache
 _CHUNK = 4  # blocks of 32 codes in a chunk
 
-Floats = NDArray[np.float32]
-
 
 @kernel
-def _lay_out(codebook, centre, blocks, halves):  # type: ignore[no-untyped-def]
+def _lay_out(codebook, centre, blocks, halves):
     """Write blocks of centred codes and half their squared norms; a non-finite code becomes 0 with an infinite norm."""
     count, dim = codebook.shape
     for block in prange(blocks.shape[0]):
@@ -52,7 +49,7 @@ def _lay_out(codebook, centre, blocks, halves):  # type: ignore[no-untyped-def]
                 blocks[block, j, lane] = 0
 
 
-def _centred(codebook: Floats) -> tuple[Floats, Floats, Floats, np.float32]:
+def _centred(codebook: Array) -> tuple[Array, Array, Array, np.float32]:
     """Mean of the finite codes ``[D]``, and what is centred on it.
 
     The codes in blocks of 32, ``[⌈K/32⌉, D, 32]`` flat; half their squared norms ``[⌈K/32⌉ · 32]``, infinite where
@@ -64,26 +61,26 @@ def _centred(codebook: Floats) -> tuple[Floats, Floats, Floats, np.float32]:
     blocks, halves = aligned_empty((-(-count // 32), dim, 32)), np.empty(-(-count // 32) * 32, np.float32)
     _lay_out(codebook, centre, blocks, halves)
     longest = float(halves[np.isfinite(halves)].max(initial=0.0))
-    return centre, blocks.ravel(), halves, np.float32(np.sqrt(2.0 * longest))
+    return centre, blocks.ravel(), halves, F(np.sqrt(2.0 * longest))
 
 
 @inline
-def true_distance(dim, x, row, codebook, code):  # type: ignore[no-untyped-def]
+def true_distance(dim, x, row, codebook, code):
     """Squared distance as a sum of squared differences in one fixed order; it decides between codes that tie."""
-    total = simd.broadcast(np.float32(0.0))
+    total = simd.broadcast(0)
     for j in range(dim):
-        difference = simd.broadcast(simd.get(codebook, code * dim + j) - simd.get(x, row * dim + j))
+        difference = simd.get(codebook, code * dim + j) - simd.get(x, row * dim + j)
         total = simd.fma(difference, difference, total)
     return simd.lane_min(total)
 
 
 @inline
-def squares(dim, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
+def squares(dim, a, at_a, b, at_b, keep):
     """Squared differences of two rows, to be summed. ``keep`` masks the overlap of the last two vectors."""
-    total = simd.broadcast(np.float32(0.0))
+    total = simd.broadcast(0)
     if dim < 16:
         for j in range(dim):
-            difference = simd.broadcast(simd.get(a, at_a + j) - simd.get(b, at_b + j)) * simd.load(keep, 0)
+            difference = (simd.get(a, at_a + j) - simd.get(b, at_b + j)) * simd.load(keep, 0)
             total = simd.fma(difference, difference, total)
         return total
     for j in range(0, dim // 16 * 16, 16):
@@ -96,7 +93,7 @@ def squares(dim, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _insert(scores, codes, at, kept, score, code):  # type: ignore[no-untyped-def]
+def _insert(scores, codes, at, kept, score, code):
     """Insert a score into the sorted scores of a row; the last one drops out."""
     place = at + kept - 1
     while place > at and simd.get(scores, place - 1) > score:
@@ -108,28 +105,24 @@ def _insert(scores, codes, at, kept, score, code):  # type: ignore[no-untyped-de
 
 
 @inline
-def _keep(scores, codes, limits, slack, kept, first, block, found):  # type: ignore[no-untyped-def]
+def _keep(scores, codes, limits, slack, kept, first, block, found):
     """Of the scores ``found`` of a block, insert those below the limits of 6 rows."""
     for i in range(_GROUP):
-        limit = simd.broadcast(simd.get(limits, first + i))
-        below = simd.mask_bits(simd.load(found, 32 * i) < limit) | (
-            simd.mask_bits(simd.load(found, 32 * i + 16) < limit) << 16
-        )
+        limit = simd.get(limits, first + i)
+        low, high = simd.load(found, 32 * i), simd.load(found, 32 * i + 16)
+        below = simd.mask_bits(low < limit) | (simd.mask_bits(high < limit) << 16)
         while below != 0:
             lane = simd.lowest_bit(below)
             below &= below - 1
             score, at = simd.get(found, 32 * i + lane), (first + i) * _BEST
             if score < simd.get(limits, first + i):
                 _insert(scores, codes, at, kept, score, np.int32(block * 32 + lane))
-                simd.put(
-                    limits,
-                    first + i,
-                    min(simd.get(scores, at + kept - 1), simd.get(scores, at) + simd.get(slack, first + i)),
-                )
+                last, reach = simd.get(scores, at + kept - 1), simd.get(scores, at) + simd.get(slack, first + i)
+                simd.put(limits, first + i, min(last, reach))
 
 
 @inline
-def _score_block(dim, blocks, halves, block, rows, first, kept, state):  # type: ignore[no-untyped-def]
+def _score_block(dim, blocks, halves, block, rows, first, kept, state):
     """Scores of 6 rows against 32 codes: 12 sums that hide each other's latency."""
     scores, codes, limits, slack, found = state
     a0 = a1 = a2 = a3 = a4 = a5 = simd.load(halves, block * 32)
@@ -137,50 +130,41 @@ def _score_block(dim, blocks, halves, block, rows, first, kept, state):  # type:
     at, row = block * dim * 32, first * dim
     for j in range(dim):
         low, high = simd.load(blocks, at + 32 * j), simd.load(blocks, at + 32 * j + 16)
-        value = simd.broadcast(simd.get(rows, row + j))
+        value = simd.get(rows, row + j)
         a0, b0 = simd.fnma(value, low, a0), simd.fnma(value, high, b0)
-        value = simd.broadcast(simd.get(rows, row + dim + j))
+        value = simd.get(rows, row + dim + j)
         a1, b1 = simd.fnma(value, low, a1), simd.fnma(value, high, b1)
-        value = simd.broadcast(simd.get(rows, row + 2 * dim + j))
+        value = simd.get(rows, row + 2 * dim + j)
         a2, b2 = simd.fnma(value, low, a2), simd.fnma(value, high, b2)
-        value = simd.broadcast(simd.get(rows, row + 3 * dim + j))
+        value = simd.get(rows, row + 3 * dim + j)
         a3, b3 = simd.fnma(value, low, a3), simd.fnma(value, high, b3)
-        value = simd.broadcast(simd.get(rows, row + 4 * dim + j))
+        value = simd.get(rows, row + 4 * dim + j)
         a4, b4 = simd.fnma(value, low, a4), simd.fnma(value, high, b4)
-        value = simd.broadcast(simd.get(rows, row + 5 * dim + j))
+        value = simd.get(rows, row + 5 * dim + j)
         a5, b5 = simd.fnma(value, low, a5), simd.fnma(value, high, b5)
     below = (
-        (simd.vmin(a0, b0) < simd.broadcast(simd.get(limits, first)))
-        | (simd.vmin(a1, b1) < simd.broadcast(simd.get(limits, first + 1)))
-        | (simd.vmin(a2, b2) < simd.broadcast(simd.get(limits, first + 2)))
-        | (simd.vmin(a3, b3) < simd.broadcast(simd.get(limits, first + 3)))
-        | (simd.vmin(a4, b4) < simd.broadcast(simd.get(limits, first + 4)))
-        | (simd.vmin(a5, b5) < simd.broadcast(simd.get(limits, first + 5)))
+        (simd.vmin(a0, b0) < simd.get(limits, first))
+        | (simd.vmin(a1, b1) < simd.get(limits, first + 1))
+        | (simd.vmin(a2, b2) < simd.get(limits, first + 2))
+        | (simd.vmin(a3, b3) < simd.get(limits, first + 3))
+        | (simd.vmin(a4, b4) < simd.get(limits, first + 4))
+        | (simd.vmin(a5, b5) < simd.get(limits, first + 5))
     )
     if simd.mask_bits(below) != 0:
-        simd.store(found, 0, a0)
-        simd.store(found, 16, b0)
-        simd.store(found, 32, a1)
-        simd.store(found, 48, b1)
-        simd.store(found, 64, a2)
-        simd.store(found, 80, b2)
-        simd.store(found, 96, a3)
-        simd.store(found, 112, b3)
-        simd.store(found, 128, a4)
-        simd.store(found, 144, b4)
-        simd.store(found, 160, a5)
-        simd.store(found, 176, b5)
+        sums = a0, b0, a1, b1, a2, b2, a3, b3, a4, b4, a5, b5
+        for k in range(12):
+            simd.store(found, 16 * k, sums[k])
         _keep(scores, codes, limits, slack, kept, first, block, found)
 
 
 @inline
-def _score_tile(dim, blocks, halves, rows, count, kept, state):  # type: ignore[no-untyped-def]
+def _score_tile(dim, blocks, halves, rows, count, kept, state):
     scores, codes, limits, _, _ = state
     for i in range(count * _BEST):
-        simd.put(scores, i, np.float32(np.inf))
+        simd.put(scores, i, F(np.inf))
         simd.put(codes, i, np.int32(0))
     for i in range(count):
-        simd.put(limits, i, np.float32(np.inf))
+        simd.put(limits, i, F(np.inf))
     total = halves.shape[0] // 32
     for chunk in range(0, total, _CHUNK):
         for first in range(0, count, _GROUP):
@@ -189,12 +173,12 @@ def _score_tile(dim, blocks, halves, rows, count, kept, state):  # type: ignore[
 
 
 @inline
-def _settle(dim, x, row, codebook, scores, codes, at, kept, limit):  # type: ignore[no-untyped-def]
+def _settle(dim, x, row, codebook, scores, codes, at, kept, limit):
     """Nearest code by true distance among those with a score up to ``limit``."""
     code = np.int64(simd.get(codes, at))
     if simd.get(scores, at + 1) > limit:
         return code
-    distance = np.float32(np.inf)
+    distance = F(np.inf)
     for place in range(at, at + kept):
         if simd.get(scores, place) <= limit:
             candidate = np.int64(simd.get(codes, place))
@@ -205,8 +189,8 @@ def _settle(dim, x, row, codebook, scores, codes, at, kept, limit):  # type: ign
 
 
 @inline
-def _compare_all(dim, x, row, codebook):  # type: ignore[no-untyped-def]
-    code, distance = 0, np.float32(np.inf)
+def _compare_all(dim, x, row, codebook):
+    code, distance = 0, F(np.inf)
     for candidate in range(codebook.shape[0] // dim):
         candidate_distance = true_distance(dim, x, row, codebook, candidate)
         if candidate_distance < distance:
@@ -218,11 +202,11 @@ def _compare_all(dim, x, row, codebook):  # type: ignore[no-untyped-def]
 def _search_kernel(dim: int) -> Any:
     """The search for one dimension, a compile-time constant."""
 
-    def search(x, codebook, centre, blocks, halves, longest, result, lists, distances):  # type: ignore[no-untyped-def]
+    def search(x, codebook, centre, blocks, halves, longest, result, lists, distances):
         count = result.shape[0]
         with_lists = lists.shape[0] > 0
         kept = _BEST if with_lists else _FEW
-        rounding = np.float32(2.0 * (dim + 8) * 2.0**-24)
+        rounding = F(2.0 * (dim + 8) * 2.0**-24)
         for tile in prange((count + _TILE - 1) // _TILE):
             rows, squared = np.empty(_TILE * dim, np.float32), np.zeros(_TILE, np.float32)
             scores, codes = np.empty(_TILE * _BEST, np.float32), np.empty(_TILE * _BEST, np.int32)
@@ -236,7 +220,7 @@ def _search_kernel(dim: int) -> Any:
                     squared[i] += value * value
                 reach = np.sqrt(squared[i]) + longest
                 # Without a list, only codes that may be nearest after rounding are kept.
-                slack[i] = np.float32(np.inf) if with_lists else np.float32(2.0) * rounding * reach * reach
+                slack[i] = F(np.inf) if with_lists else F(2.0) * rounding * reach * reach
             _score_tile(dim, blocks, halves, rows, (valid + _GROUP - 1) // _GROUP * _GROUP, kept, state)
             for i in range(valid):
                 at, row = i * _BEST, start + i
@@ -249,20 +233,18 @@ def _search_kernel(dim: int) -> Any:
                     result[row] = _compare_all(dim, x, row, codebook)
                 if with_lists:
                     for k in range(LIST):
-                        lists[row * LIST + k] = codes[at + k] if scores[at + k] < np.float32(np.inf) else codes[at]
-                    distances[row] = np.sqrt(max(np.float32(0.0), squared[i] + np.float32(2.0) * (others - margin)))
+                        lists[row * LIST + k] = codes[at + k] if scores[at + k] < F(np.inf) else codes[at]
+                    distances[row] = np.sqrt(max(F(0.0), squared[i] + F(2.0) * (others - margin)))
                     second = scores[at + 1]
-                    clearance = np.float32(0.0)
+                    clearance = F(0.0)
                     if second > limit:
-                        clearance = np.sqrt(max(np.float32(0.0), squared[i] + np.float32(2.0) * (second - margin)))
+                        clearance = np.sqrt(max(F(0.0), squared[i] + F(2.0) * (second - margin)))
                     distances[count + row] = clearance
 
     return kernel(search)
 
 
-def score_search(
-    x: Floats, codebook: Floats, with_lists: bool = False
-) -> tuple[NDArray[np.int64], NDArray[np.int32], Floats]:
+def score_search(x: Array, codebook: Array, with_lists: bool = False) -> tuple[Array, Array, Array]:
     """Nearest codes of contiguous rows ``x [N, D]``; a row with a NaN gets code 0.
 
     Args:

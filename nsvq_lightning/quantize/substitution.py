@@ -21,7 +21,7 @@ from numba import prange
 from torch import Tensor
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import inline, kernel, thread_count
+from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
 from nsvq_lightning.compute.memory import INT64, Array, flat_checked, outside, recycled
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside
 from nsvq_lightning.quantize.scores import squares
@@ -33,14 +33,13 @@ SIN = (-12.471244, 41.342884, -76.614471, 81.599945, -41.341591, 6.283185)
 
 _GOLDEN, _FIRST, _SECOND = (np.uint64(value) for value in MULTIPLIERS)
 _S27, _S30, _S31, _S40, _LOW24 = np.uint64(27), np.uint64(30), np.uint64(31), np.uint64(40), np.uint64(0xFFFFFF)
-_COS, _SIN = (tuple(np.float32(value) for value in each) for each in (COS, SIN))
-_UNIT, _TINY = np.float32(2.0**-24), np.finfo(np.float32).tiny
-_MINUS_TWO_LN2 = np.float32(-2 * np.log(2))
+_COS, _SIN = (tuple(F(value) for value in each) for each in (COS, SIN))
+_UNIT, _TINY, _MINUS_TWO_LN2 = F(2.0**-24), np.finfo(np.float32).tiny, F(-2 * np.log(2))
 _ROWS = 256  # rows per unit of parallel work; the noise of a row depends only on its position
 
 
 @inline
-def _uniforms(seed, pair, radius, angle):  # type: ignore[no-untyped-def]
+def _uniforms(seed, pair, radius, angle):
     """Sixteen pairs starting at ``pair``: radius in (0, 1], angle in [-1/2, 1/2) turns, 24 random bits each."""
     key = np.uint64(seed)
     second_key = (key ^ (key >> _S31)) * _SECOND
@@ -49,33 +48,33 @@ def _uniforms(seed, pair, radius, angle):  # type: ignore[no-untyped-def]
         bits = (bits ^ (bits >> _S30)) * _FIRST
         bits = (bits ^ (bits >> _S27) ^ second_key) * _SECOND
         bits = bits ^ (bits >> _S31)
-        radius[lane] = np.float32(np.int32(bits >> _S40) + np.int32(1)) * _UNIT
-        angle[lane] = np.float32(np.int32(bits & _LOW24)) * _UNIT - np.float32(0.5)
+        radius[lane] = F(np.int32(bits >> _S40) + np.int32(1)) * _UNIT
+        angle[lane] = F(np.int32(bits & _LOW24)) * _UNIT - F(0.5)
 
 
 @inline
-def _polynomial(c, t):  # type: ignore[no-untyped-def]
-    value = simd.fma(simd.broadcast(c[0]), t, simd.broadcast(c[1]))
-    value = simd.fma(simd.fma(value, t, simd.broadcast(c[2])), t, simd.broadcast(c[3]))
-    return simd.fma(simd.fma(value, t, simd.broadcast(c[4])), t, simd.broadcast(c[5]))
+def _polynomial(c, t):
+    value = simd.fma(c[0], t, c[1])
+    value = simd.fma(simd.fma(value, t, c[2]), t, c[3])
+    return simd.fma(simd.fma(value, t, c[4]), t, c[5])
 
 
 @inline
-def fill_normal(seed, first, count, out, radius, angle):  # type: ignore[no-untyped-def]
+def fill_normal(seed, first, count, out, radius, angle):
     """Write vectors ``first`` to ``first + count`` (both even) of a seed to ``out [count · 16]``.
 
     ``radius`` and ``angle`` are scratch, ``[16]`` each.
     """
     for pair in range(count // 2):
         _uniforms(seed, (first // 2 + pair) * 16, radius, angle)
-        length = simd.vsqrt(simd.log2(simd.load(radius, 0)) * simd.broadcast(_MINUS_TWO_LN2))
+        length = simd.vsqrt(simd.log2(simd.load(radius, 0)) * _MINUS_TWO_LN2)
         turn = simd.load(angle, 0)
         simd.store(out, pair * 32, length * _polynomial(_COS, turn * turn))
         simd.store(out, pair * 32 + 16, length * (turn * _polynomial(_SIN, turn * turn)))
 
 
 @inline
-def _copy_in(dim, source, rows, first, count, group):  # type: ignore[no-untyped-def]
+def _copy_in(dim, source, rows, first, count, group):
     """Copy chosen rows into vectors, one row per lane."""
     for lane in range(count):
         start = simd.get(rows, first + lane) * dim
@@ -84,24 +83,22 @@ def _copy_in(dim, source, rows, first, count, group):  # type: ignore[no-untyped
 
 
 @inline
-def _outside(dim, x, rows, codebook, codes, begin, stop):  # type: ignore[no-untyped-def]
+def _outside(dim, x, rows, codebook, codes, begin, stop):
     """How many rows and codes are out of range, with the row before the first, which says where clearing begins."""
     found = count_outside(rows, begin - 1, stop, x.shape[0] // dim)
     return found + count_outside(codes, begin, stop, codebook.shape[0] // dim)
 
 
 @inline
-def _inverses(squared):  # type: ignore[no-untyped-def]
+def _inverses(squared):
     """1/s, and 0 where s is 0 (or its inverse too large): a zero vector has no direction."""
-    return simd.select(
-        squared > simd.broadcast(_TINY), simd.broadcast(np.float32(1.0)) / squared, simd.broadcast(np.float32(0.0))
-    )
+    return simd.select(squared > _TINY, 1 / squared, 0)
 
 
 @inline
-def _dot_difference(dim, g, at_g, a, at_a, b, at_b, keep):  # type: ignore[no-untyped-def]
+def _dot_difference(dim, g, at_g, a, at_a, b, at_b, keep):
     """Dot product of a long row with a difference. ``keep`` masks the overlap of the last two vectors."""
-    total = simd.broadcast(np.float32(0.0))
+    total = simd.broadcast(0)
     for j in range(0, dim // 16 * 16, 16):
         total = simd.fma(simd.load(g, at_g + j), simd.load(a, at_a + j) - simd.load(b, at_b + j), total)
     if dim % 16:
@@ -111,12 +108,12 @@ def _dot_difference(dim, g, at_g, a, at_a, b, at_b, keep):  # type: ignore[no-un
 
 
 @inline
-def _inverse(squared):  # type: ignore[no-untyped-def]
-    return np.float32(1.0) / squared if squared > _TINY else np.float32(0.0)
+def _inverse(squared):
+    return F(1.0) / squared if squared > _TINY else F(0.0)
 
 
 def _short_forward(dim: int) -> Any:
-    def forward(seed, aim, spread, x, rows, codebook, codes, out):  # type: ignore[no-untyped-def]
+    def forward(seed, aim, spread, x, rows, codebook, codes, out):
         count, missing = codes.shape[0], 0
         for block in prange((count + _ROWS - 1) // _ROWS):
             begin, stop = block * _ROWS, min(count, (block + 1) * _ROWS)
@@ -130,12 +127,10 @@ def _short_forward(dim: int) -> Any:
                 _copy_in(dim, x, rows, first, valid, values)
                 _copy_in(dim, codebook, codes, first, valid, chosen)
                 at = (first - begin) * dim
-                error, squared = simd.broadcast(np.float32(0.0)), simd.broadcast(np.float32(0.0))
+                error, squared = simd.broadcast(0), simd.broadcast(0)
                 for j in range(dim):
                     residual = simd.load(chosen, 16 * j) - simd.load(values, 16 * j)
-                    direction = simd.fma(
-                        simd.broadcast(aim), residual, simd.broadcast(spread) * simd.load(noise, at + 16 * j)
-                    )
+                    direction = simd.fma(aim, residual, spread * simd.load(noise, at + 16 * j))
                     simd.store(noise, at + 16 * j, direction)
                     error, squared = simd.fma(residual, residual, error), simd.fma(direction, direction, squared)
                 length = simd.vsqrt(error * _inverses(squared))
@@ -154,7 +149,7 @@ def _short_forward(dim: int) -> Any:
 def _long_forward(dim: int) -> Any:
     vectors = -(-dim // 16)
 
-    def forward(seed, aim, spread, x, rows, codebook, codes, out):  # type: ignore[no-untyped-def]
+    def forward(seed, aim, spread, x, rows, codebook, codes, out):
         count, missing = codes.shape[0], 0
         for block in prange((count + _ROWS - 1) // _ROWS):
             begin, stop = block * _ROWS, min(count, (block + 1) * _ROWS)
@@ -168,18 +163,16 @@ def _long_forward(dim: int) -> Any:
                 if start == 0:
                     fill_normal(seed, i * vectors, 2 * vectors, noise, radius, angle)
                 at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
-                error, squared = simd.broadcast(np.float32(0.0)), simd.broadcast(np.float32(0.0))
+                error, squared = simd.broadcast(0), simd.broadcast(0)
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
                     residual = simd.load(codebook, code + place) - simd.load(x, at + place)
-                    way = simd.fma(
-                        simd.broadcast(aim), residual, simd.broadcast(spread) * simd.load(noise, start + place)
-                    )
+                    way = simd.fma(aim, residual, spread * simd.load(noise, start + place))
                     simd.store(direction, place, way)
                     if j == vectors - 1:
                         residual, way = residual * simd.load(keep, 0), way * simd.load(keep, 0)
                     error, squared = simd.fma(residual, residual, error), simd.fma(way, way, squared)
-                length = simd.broadcast(np.sqrt(simd.lane_sum(error) * _inverse(simd.lane_sum(squared))))
+                length = np.sqrt(simd.lane_sum(error) * _inverse(simd.lane_sum(squared)))
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
                     simd.store(
@@ -191,7 +184,7 @@ def _long_forward(dim: int) -> Any:
 
 
 def _short_backward(dim: int) -> Any:
-    def backward(grad, x, rows, codebook, codes, out, grad_x, sums):  # type: ignore[no-untyped-def]
+    def backward(grad, x, rows, codebook, codes, out, grad_x, sums):
         count, parts, missing = codes.shape[0], sums.shape[0], 0
         for part in prange(parts):
             values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
@@ -209,7 +202,7 @@ def _short_backward(dim: int) -> Any:
                     for j in range(dim):
                         simd.put(moved, j * 16 + lane, simd.get(out, (first + lane) * dim + j))
                         simd.put(slope, j * 16 + lane, simd.get(grad, (first + lane) * dim + j))
-                dots, squared = simd.broadcast(np.float32(0.0)), simd.broadcast(np.float32(0.0))
+                dots, squared = simd.broadcast(0), simd.broadcast(0)
                 for j in range(dim):
                     value = simd.load(values, 16 * j)
                     dots = simd.fma(simd.load(slope, 16 * j), simd.load(moved, 16 * j) - value, dots)
@@ -237,7 +230,7 @@ def _short_backward(dim: int) -> Any:
 def _long_backward(dim: int) -> Any:
     vectors = -(-dim // 16)
 
-    def backward(grad, x, rows, codebook, codes, out, grad_x, sums):  # type: ignore[no-untyped-def]
+    def backward(grad, x, rows, codebook, codes, out, grad_x, sums):
         count, parts, missing = codes.shape[0], sums.shape[0], 0
         for part in prange(parts):
             keep = np.ones(16, np.float32)
@@ -256,7 +249,7 @@ def _long_backward(dim: int) -> Any:
                 last = simd.load(total, code + dim - 16)
                 for j in range(vectors):
                     place = min(16 * j, dim - 16)
-                    radial = simd.broadcast(scale) * (simd.load(x, at + place) - simd.load(codebook, code + place))
+                    radial = scale * (simd.load(x, at + place) - simd.load(codebook, code + place))
                     simd.store(grad_x, at + place, simd.load(grad, i * dim + place) + radial)
                     before = last if j == vectors - 1 else simd.load(total, code + place)
                     simd.store(total, code + place, before - radial)
@@ -294,7 +287,7 @@ def substitute(
     inputs = _checked(x, rows, codebook, codes)
     out = recycled((len(rows), x.shape[1]))
     thread_count()
-    if _kernels(x.shape[1])[0](seed, np.float32(aim), np.float32(spread), *inputs, out.numpy().reshape(-1)):
+    if _kernels(x.shape[1])[0](seed, F(aim), F(spread), *inputs, out.numpy().reshape(-1)):
         raise _missing(x, rows, codebook, codes)
     return out
 

@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 from numba import prange
-from numpy.typing import NDArray
 from torch import Tensor
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.compute.jit import inline, kernel, thread_count
-from nsvq_lightning.compute.memory import INT64, check_array
+from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
+from nsvq_lightning.compute.memory import INT64, Array, check_array
 from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, Memory, box_search, sort_into_leaves
 from nsvq_lightning.quantize.nearest import check_rows, nearest
 from nsvq_lightning.quantize.scores import LIST, score_search, squares, true_distance
@@ -32,17 +31,14 @@ _BOX_STEPS = 32  # searches after which the codes are sorted into boxes anew; th
 # snapshot: the more snapshots, the more a random walk counts as if it were a straight line.
 _SNAPSHOT_STEPS = 16
 
-Floats = NDArray[np.float32]
-Integers = NDArray[np.int64]
-
 
 @inline
-def _member(dim, x, at, codebook, lists, place, keep):  # type: ignore[no-untyped-def]
+def _member(dim, x, at, codebook, lists, place, keep):
     return squares(dim, x, at, codebook, np.int64(simd.get(lists, place)) * dim, keep)
 
 
 @inline
-def _list_squared(dim, x, at, codebook, lists, start, keep):  # type: ignore[no-untyped-def]
+def _list_squared(dim, x, at, codebook, lists, start, keep):
     """Squared distances to the codes of a list, one per lane; the other lanes hold 0."""
     return simd.lane_sums(
         (
@@ -59,12 +55,12 @@ def _list_squared(dim, x, at, codebook, lists, start, keep):  # type: ignore[no-
 
 
 @inline
-def _settle(dim, x, row, codebook, lists, start, near):  # type: ignore[no-untyped-def]
+def _settle(dim, x, row, codebook, lists, start, near):
     """Nearest code by true distance among the members of a list whose bits are set."""
     code = np.int64(simd.get(lists, start + simd.lowest_bit(near)))
     if near & (near - 1) == 0:
         return code
-    distance = np.float32(np.inf)
+    distance = F(np.inf)
     while near != 0:
         candidate = np.int64(simd.get(lists, start + simd.lowest_bit(near)))
         near &= near - 1
@@ -78,7 +74,7 @@ def _settle(dim, x, row, codebook, lists, start, near):  # type: ignore[no-untyp
 def _check_kernel(dim: int) -> Any:
     """The check for one dimension, a compile-time constant."""
 
-    def check(x, rows, codebook, memory, keep, travelled, drift, result):  # type: ignore[no-untyped-def]
+    def check(x, rows, codebook, memory, keep, travelled, drift, result):
         last, lists, anchors, clearance, limits = memory
         way = travelled + drift
         for block in prange((rows.shape[0] + _BLOCK - 1) // _BLOCK):
@@ -99,12 +95,12 @@ def _check_kernel(dim: int) -> Any:
                 best = simd.lane_min(squared)
                 distance = np.sqrt(best)
                 if np.float64(distance) * ROUNDING + moved < simd.get(limits, row) - way:
-                    near = simd.mask_bits(squared <= simd.broadcast(best * np.float32(ROUNDING)))
+                    near = simd.mask_bits(squared <= best * F(ROUNDING))
                     code = _settle(dim, x, row, codebook, lists, start, near)
                     simd.put(result, i, code)
                     simd.put(last, row, np.int32(code))
                     simd.store(scratch, 0, squared)
-                    simd.put(scratch, simd.lowest_bit(near), np.float32(np.inf))
+                    simd.put(scratch, simd.lowest_bit(near), F(np.inf))
                     second = np.float64(np.sqrt(simd.lane_min(simd.load(scratch, 0))))
                     if near & (near - 1) == 0 and second - distance > moved:
                         # The gap to the second code now exceeds how far the row has moved, so a new anchor pays.
@@ -131,7 +127,7 @@ class NearestTracker:
         """Forget all searches; worth calling when codes have jumped."""
         self._on_device: Any = None
         self._steps = 0
-        self._order: NDArray[np.int32] | None = None
+        self._order: Array | None = None
         self._snapshot = np.zeros((0, 0), np.float32)
         self._travelled = 0.0
         self._memory = Memory.empty(0, 0)
@@ -176,7 +172,7 @@ class NearestTracker:
         search = self._search_boxes if codebook.shape[1] <= MAX_DIM else self._search_lists
         return torch.from_numpy(search(x.numpy(), codebook.numpy(), numbers))
 
-    def _make_room(self, count: int, codebook: Floats) -> None:
+    def _make_room(self, count: int, codebook: Array) -> None:
         """Have a memory of at least ``count`` rows, an empty one if the codebook has another shape than the last."""
         dim = codebook.shape[1]
         if self._snapshot.shape != codebook.shape:
@@ -190,13 +186,13 @@ class NearestTracker:
                 self._lists = np.append(self._lists, np.zeros((new, LIST), np.int32), 0)
                 self._limits = np.append(self._limits, np.full(new, -np.inf))
 
-    def _search_boxes(self, x: Floats, codebook: Floats, rows: Integers) -> Integers:
+    def _search_boxes(self, x: Array, codebook: Array, rows: Array) -> Array:
         if self._steps % _BOX_STEPS == 0 or self._order is None:
             self._order = sort_into_leaves(codebook)
         self._drift(codebook, 1)
         return box_search(x, codebook, self._order, rows, self._memory, self._travelled)
 
-    def _search_lists(self, x: Floats, codebook: Floats, rows: Integers) -> Integers:
+    def _search_lists(self, x: Array, codebook: Array, rows: Array) -> Array:
         drift = self._drift(codebook, _SNAPSHOT_STEPS)
         result = np.empty(len(rows), np.int64)
         last, anchors, clearance = self._memory
@@ -218,14 +214,14 @@ class NearestTracker:
             self._limits[where], clearance[where] = distances / ROUNDING - drift + self._travelled
         return result
 
-    def _drift(self, codebook: Floats, every: int) -> float:
+    def _drift(self, codebook: Array, every: int) -> float:
         """Farthest that any code has moved since the snapshot; a new one is taken after ``every`` searches."""
         moved = codebook - self._snapshot
         drift = float(np.sqrt(np.einsum("ij,ij->i", moved, moved).max())) * ROUNDING
         self._steps += 1
         return self._take_snapshot(codebook, drift) if self._steps % every == 0 else drift
 
-    def _take_snapshot(self, codebook: Floats, drift: float) -> float:
+    def _take_snapshot(self, codebook: Array, drift: float) -> float:
         """Take a snapshot of codes that have moved by ``drift`` since the last; returns the new drift, 0."""
         self._travelled += drift
         self._snapshot = codebook.copy()
