@@ -24,9 +24,6 @@ from nsvq_lightning.compute.memory import Array
 from nsvq_lightning.quantize.box_search import MAX_DIM, box_search, place_of_least
 from nsvq_lightning.quantize.scores import score_search
 
-# Distances that the plain version holds at once: what fits the caches of a CPU, or enough to keep a GPU busy.
-_CPU_CHUNK, _DEVICE_CHUNK = 1 << 22, 1 << 26
-
 
 def check_rows(x: Tensor, codebook: Tensor) -> None:
     """Refuse rows and codes that do not fit together.
@@ -63,7 +60,8 @@ def nearest_reference(x: Tensor, codebook: Tensor) -> Tensor:
 
 def distance_parts(x: Tensor, codebook: Tensor) -> Iterator[tuple[slice, Tensor]]:
     """Rows of ``x [N, D]``, part by part, and their exact distances ``[rows, K]`` to the codes ``[K, D]``, detached."""
-    rows = max(1, (_CPU_CHUNK if x.device.type == "cpu" else _DEVICE_CHUNK) // codebook.shape[0])
+    # As many distances at once as fit the caches of a CPU, or are enough to keep a GPU busy.
+    rows = max(1, (1 << 22 if x.device.type == "cpu" else 1 << 26) // codebook.shape[0])
     for start in range(0, max(1, x.shape[0]), rows):
         part = slice(start, start + rows)
         with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
@@ -104,12 +102,10 @@ def nearest(x: Tensor, codebook: Tensor) -> Tensor:
     return nearest_reference(x, codebook)
 
 
-_UNSEEN = 0.3  # uses that a code counts beyond those it has: one that is not used costs bits, too, but finitely many
-
-
 def code_rates(codes: Tensor, count: int) -> Tensor:
     """Bits ``[count]`` float32 that each code takes, −log2 of how often it is among ``codes [N]`` int64."""
-    uses = torch.bincount(codes, minlength=count).double() + _UNSEEN
+    # A code that is not used costs bits, too, but finitely many.
+    uses = torch.bincount(codes, minlength=count).double() + 0.3
     return (uses.sum().log2() - uses.log2()).float()
 
 

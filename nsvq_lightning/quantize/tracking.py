@@ -26,10 +26,6 @@ from nsvq_lightning.quantize.nearest import check_rows, nearest
 from nsvq_lightning.quantize.scores import LIST, score_search, squares, true_distance
 
 _BLOCK = 256  # rows per unit of parallel work
-_BOX_STEPS = 32  # searches after which the codes are sorted into boxes anew; those in an old order are larger
-# Searches between two snapshots of the codebook. How far a code has moved is the sum of its distances from snapshot to
-# snapshot: the more snapshots, the more a random walk counts as if it were a straight line.
-_SNAPSHOT_STEPS = 16
 
 
 @inline
@@ -187,13 +183,15 @@ class NearestTracker:
                 self._limits = np.append(self._limits, np.full(new, -np.inf))
 
     def _search_boxes(self, x: Array, codebook: Array, rows: Array) -> Array:
-        if self._steps % _BOX_STEPS == 0 or self._order is None:
+        if self._steps % 32 == 0 or self._order is None:  # boxes in an old order are larger
             self._order = sort_into_leaves(codebook)
         self._drift(codebook, 1)
         return box_search(x, codebook, self._order, rows, self._memory, self._travelled)
 
     def _search_lists(self, x: Array, codebook: Array, rows: Array) -> Array:
-        drift = self._drift(codebook, _SNAPSHOT_STEPS)
+        # How far a code has moved is the sum of its distances from snapshot to snapshot: the more snapshots, the more a
+        # random walk counts as if it were a straight line.
+        drift = self._drift(codebook, 16)
         result = np.empty(len(rows), np.int64)
         last, anchors, clearance = self._memory
         memory = last, self._lists.ravel(), anchors.ravel(), clearance, self._limits

@@ -1,7 +1,5 @@
 """Copies that nobody waits for; what a GPU does is played by a stand-in."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

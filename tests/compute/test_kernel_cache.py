@@ -1,7 +1,5 @@
 """Which changes compile a stored kernel again, and where kernels are kept."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Memory that is used again, and never while somebody still looks at it."""
 
-from __future__ import annotations
-
 import sys
 import threading
 

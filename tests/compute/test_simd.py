@@ -1,7 +1,5 @@
 """The vector type, lane by lane, against NumPy."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

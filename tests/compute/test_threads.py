@@ -1,7 +1,5 @@
 """The number of threads that the user has set holds for all kernels, from the first one on."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """The photometric loss against scikit-image and against plain torch in float64."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """PSNR by hand, distributed state against one process."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

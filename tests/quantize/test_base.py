@@ -1,7 +1,5 @@
 """What a quantizer lacks and what it offers, with members that only an nn.Module's ``__getattr__`` finds."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A codebook that is fitted, counted, repaired, frozen and stored; which codes are replaced and by what."""
 
-from __future__ import annotations
-
 import logging
 from itertools import chain
 

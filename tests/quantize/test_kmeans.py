@@ -1,7 +1,5 @@
 """k-means, and D² sampling: frequencies, differences, and what it does for a start."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

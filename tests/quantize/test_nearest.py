@@ -1,7 +1,5 @@
 """Exact nearest codes, and cheapest ones: against the definition in float64, at the limits."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Noise substitution, as NSVQ and DiVeQ use it: values, gradients in closed form, and the noise itself."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

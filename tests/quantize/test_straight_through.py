@@ -1,7 +1,5 @@
 """Straight-through quantizers, k-means after training, and the quantizer of another library."""
 
-from __future__ import annotations
-
 import sys
 from typing import Any, TypeVar
 

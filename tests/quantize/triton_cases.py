@@ -3,8 +3,6 @@
 See ``tests/rendering/triton_cases.py`` on how this is run.
 """
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Iterator
 

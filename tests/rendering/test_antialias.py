@@ -1,7 +1,5 @@
 """Anti-aliasing: the same in all back-ends, with exact gradients, and alike at other resolutions."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

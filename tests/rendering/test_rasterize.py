@@ -1,7 +1,5 @@
 """The CPU back-end against the float64 oracle, and the oracle against finite differences."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Pieces of the oracle that others use, against independent programs."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation

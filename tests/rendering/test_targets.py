@@ -1,7 +1,5 @@
 """The machine code of the CPU kernels for processors that are not here; see cross_compile.py."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The CUDA back-end: its cases in a process of their own, and whether its kernels compile for a GPU."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

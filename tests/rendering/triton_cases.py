@@ -5,8 +5,6 @@ interprets. Alone: ``TRITON_INTERPRET=1 pytest tests/rendering/triton_cases.py``
 milliseconds for a splat in a tile, so scenes are tiny.
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from itertools import pairwise

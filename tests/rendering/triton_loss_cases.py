@@ -3,8 +3,6 @@
 See ``triton_cases.py`` on how this is run.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,10 +1,8 @@
 """Error substitution on a GPU: gather, residual, noise and result of a row in one pass, gradients in another.
 
 Sums of rows by code have one fixed order: rows are sorted by code, and some programs add up one code's.
-
-As on the CPU, the backward pass takes the direction from the result, not from a second draw: with x̃ - x = ‖r‖ d̂ the
-radial term (g·d̂) r/‖r‖ is (g·(x̃ - x)) r/‖r‖². The noise of a row is that of the CPU kernel:
-the integers are the same, and the arithmetic after them is the same sequence of roundings, polynomials included.
+The noise of a row is that of the CPU kernel in :mod:`nsvq_lightning.quantize.substitution`: the integers are equal, and
+the arithmetic after them is the same sequence of roundings, polynomials included.
 """
 
 import math
@@ -28,9 +26,7 @@ SPLIT = tl.constexpr(0x3F3504F3)  # bits of 1/√2: a mantissa lies in [1/√2, 
 TWO_LOG2_E = tl.constexpr(2 / math.log(2))
 L0, L1, L2, L3, L4 = (tl.constexpr(1 / odd) for odd in (11, 9, 7, 5, 3))
 TINY = tl.constexpr(torch.finfo(torch.float32).tiny)
-BLOCK = 1024  # elements per program of a substitution
 ROWS = 16  # rows of a code that are added up side by side
-WIDTH = 64  # largest number of columns per program of a sum
 PARTS = 8  # most programs that share the rows of one code, so that one of very many is no long tail; a power of two
 PART = 256  # fewest rows of a part, but for the last one
 
@@ -141,7 +137,7 @@ def radial_kernel(
 
 def _tile(dim: int) -> dict[str, int]:
     width = triton.next_power_of_2(dim)
-    return {"DIM": dim, "WIDTH": width, "ROWS": max(1, BLOCK // width)}
+    return {"DIM": dim, "WIDTH": width, "ROWS": max(1, 1024 // width)}  # 1024 elements per program
 
 
 def _check(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor) -> None:
@@ -289,7 +285,7 @@ def sum_rows(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype) 
     check_tensor("codes", codes, (len(values),), values.device, torch.int64)
     order, offsets = _remembered(codes, num_codes)
     dim = values.shape[1]
-    width = min(WIDTH, triton.next_power_of_2(dim))
+    width = min(64, triton.next_power_of_2(dim))
     columns = triton.cdiv(dim, width)
     partial = torch.empty(num_codes * PARTS, dim, dtype=dtype, device=values.device)
     sums = torch.empty(num_codes, dim, dtype=dtype, device=values.device)
