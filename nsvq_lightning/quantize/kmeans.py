@@ -75,7 +75,7 @@ def lookup(codebook: Tensor, codes: Tensor, x: Tensor | None = None, rows: Tenso
 
     With ``x [N, D]`` the gradient is also that of its rows ``rows [V]``, or of all of them: it passes straight through.
     """
-    result: Tensor = _Lookup.apply(codebook, codes, x, rows)  # type: ignore[no-untyped-call]
+    result: Tensor = _Lookup.apply(codebook, codes, x, rows)
     return result
 
 

@@ -73,11 +73,6 @@ def test_bits_do_not_depend_on_the_number_of_threads() -> None:
     assert torch.equal(results[0][1], results[1][1])
 
 
-def test_equal_images_have_no_loss() -> None:
-    image, _ = pair(20, 20)
-    assert float(photometric_loss(image, image)) == pytest.approx(0, abs=1e-6)
-
-
 def test_a_loss_that_is_no_number_stays_none() -> None:
     image, target = pair(20, 20)
     image[3, 4, 1] = torch.nan
