@@ -8,7 +8,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from nsvq_lightning.training.stopwatch import Stopwatch
 from nsvq_lightning.compute.devices import AsyncScalar, to_device
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.nsvq.precision import Storage
@@ -24,6 +23,7 @@ from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training import optim, scene_access
 from nsvq_lightning.training.resume import ResumedModule
 from nsvq_lightning.training.schedule import Phase, Schedule
+from nsvq_lightning.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 

@@ -19,7 +19,6 @@ from lightning.pytorch.utilities.model_helpers import _restricted_classmethod
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from nsvq_lightning.training.stopwatch import Stopwatch
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.splats.attributes import ATTRIBUTES
@@ -27,6 +26,7 @@ from nsvq_lightning.splats.splats import sh_degree_of
 from nsvq_lightning.training.scene_access import scene_of
 from nsvq_lightning.training.scene_module import SceneModule
 from nsvq_lightning.training.schedule import Phase, Schedule
+from nsvq_lightning.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
