@@ -21,12 +21,11 @@ def unframe(data):
     assert len(data) >= 32
     assert hashlib.blake2b(data[24:], digest_size=16).digest() == data[8:24]
     version, length = struct.unpack_from("<II", data, 24)
-    assert version in (1, 2)
+    assert version == 2
     assert 32 + length <= len(data)
     header = json.loads(data[32 : 32 + length].decode("utf-8"), parse_constant=refuse)
     streams, at = {}, 32 + length
-    for row in header["streams"]:
-        name, size = (row["name"], row["length"]) if isinstance(row, dict) else row[:2]
+    for name, size, _ in header["streams"]:
         streams[name] = data[at : at + size]
         at += size
     assert at == len(data)
@@ -36,17 +35,13 @@ def unframe(data):
 
 def attribute_table(header):
     keys = ("name", "dim", "storage", "codes", "step")
-    rows = header["attributes"]
-    rows = [row if isinstance(row, dict) else dict(zip(keys, row, strict=True)) for row in rows]
-    return {row["name"]: {**row, "step": float(row.get("step", 0.0))} for row in rows}
+    return {row[0]: dict(zip(keys, row, strict=True)) for row in header["attributes"]}
 
 
 DIMS = {"means": 3, "opacities": 1, "quats": 4, "scales": 3, "sh0": 3}
-LATER = ["quats", "sh0", "shN"]
 ORDERS = {
-    "raw": ["means", "opacities", "quats", "scales", "sh0", "shN"],
-    "cells": ["opacities", "scales", "means", *LATER],
-    "grid": ["scales", "means", "opacities", *LATER],
+    "paper": ["means", "opacities", "quats", "scales", "sh0", "shN"],
+    "compact": ["opacities", "scales", "means", "quats", "sh0", "shN"],
 }
 FEW_SPLATS, FEW_ROWS = 2**18, 2**16
 
@@ -72,23 +67,22 @@ def check(header, streams):
     assert type(metrics) is dict
     assert all(value is None or number(value) for value in metrics.values())
     table, compact = attribute_table(header), level == "compact"
-    assert [*table] == ORDERS[table["means"]["storage"]]
+    assert [*table] == ORDERS[level]
     assert len(table) == len(header["attributes"])
-    assert compact == (table["means"]["storage"] != "raw")
     for name, entry in table.items():
         dim, storage, codes, step = (entry[key] for key in ("dim", "storage", "codes", "step"))
         assert natural(dim)
         assert dim == DIMS.get(name, 3 * ((degree + 1) ** 2 - 1))
-        own = {"means": ("cells", "grid"), "opacities": ("levels",)}.get(name, ("steps",)) if compact else ("raw",)
-        assert storage in own or (storage == "codes" and name not in ("means", "opacities") and dim > 0)
+        own = {"means": "cells", "opacities": "levels"}.get(name, "steps") if compact else "raw"
+        assert storage == own or (storage == "codes" and name not in ("means", "opacities") and dim > 0)
         most = {"codes": 2**32, "levels": 2**20}.get(storage, 0)
         assert natural(codes)
         assert min(most, 1) <= codes <= most
+        assert number(step)
         assert 0 <= step < math.inf
         assert (step > 0) == (compact and storage != "levels")
     expected = expected_streams(table.values(), count, compact)
     for row, (name, encoding, length) in zip(header["streams"], expected, strict=True):
-        row = [row["name"], row["length"], row["encoding"]] if isinstance(row, dict) else row
         assert row == [name, row[1], encoding]
         assert natural(row[1])
         assert length in (row[1], None)
@@ -272,13 +266,12 @@ def near_rows(points, count):
 LN2 = float.fromhex("0x1.62e42fefa39efp-1")
 
 
-def depths_of(scales, scale_step, doublings, levels=None, level_count=0):
-    """scales: int64 [N, 3]; levels: int64 [N], None with storage "grid"."""
+def depths_of(scales, scale_step, doublings, levels, level_count):
+    """scales: int64 [N, 3]; levels: int64 [N]."""
     factor = (scale_step / 3.0) / LN2
     x = scales.sum(axis=1).astype(np.float64) * factor + doublings
-    if levels is not None:
-        mantissas, exponents = np.frexp((np.arange(level_count) + 0.5) / level_count)
-        x = x - 0.5 * ((2.0 * mantissas - 2.0) + exponents)[levels]
+    mantissas, exponents = np.frexp((np.arange(level_count) + 0.5) / level_count)
+    x = x - 0.5 * ((2.0 * mantissas - 2.0) + exponents)[levels]
     return [21 - math.floor(min(max(value, 0.0), 21.0)) for value in x.tolist()]
 
 
@@ -322,7 +315,6 @@ def values_of(integers, step):
 
 def decode_compact(header, streams):
     table, count = attribute_table(header), header["splats"]
-    cells = table["means"]["storage"] == "cells"
     leaves, integers, rows = {}, {}, {}
 
     def decode(name, neighbours):
@@ -335,22 +327,21 @@ def decode_compact(header, streams):
             codebook = decode_integers(streams[f"{name}.codebook"], entry["codes"], entry["dim"])
             integers[name] = codebook[leaves[name]]
 
-    first = ("opacities", "scales") if cells else ("scales",)
-    for name in first:
+    for name in ("opacities", "scales"):
         decode(name, rows_before(count))
     *base, doublings = struct.unpack("<qqqd", streams["means.grid"])
     assert math.isfinite(doublings)
     far = float_rows(streams["means.far"], 3)
-    levels = (leaves["opacities"], table["opacities"]["codes"]) if cells else ()
-    depths = depths_of(integers["scales"], table["scales"]["step"], doublings, *levels)[: count - len(far)]
+    levels, level_count = leaves["opacities"], table["opacities"]["codes"]
+    depths = depths_of(integers["scales"], table["scales"]["step"], doublings, levels, level_count)
+    depths = depths[: count - len(far)]
     keys = decode_keys(streams["means"], depths)
     means, points = decode_positions(keys, depths, base, table["means"]["step"])
     rows["means"] = np.concatenate([means, far])
     near = near_rows(points, count)
-    for name in table:
-        if name != "means" and name not in first:
-            decode(name, near)
-    rows["opacities"] = opacity_table(table["opacities"]["codes"])[leaves["opacities"]]
+    for name in ("quats", "sh0", "shN"):
+        decode(name, near)
+    rows["opacities"] = opacity_table(level_count)[levels]
     for name, values in integers.items():
         rows[name] = values_of(values, table[name]["step"])
     return rows

@@ -22,58 +22,38 @@ stream                      content
 ``quats`` ``sh0`` ``shN``   codes as paths, or integers; neighbours: two near splats among the 16 before
 ``<attribute>.codebook``    integers, before the stream of its codes
 ==========================  ================================================================================
-
-In files of version 1, whose positions have the storage ``grid`` instead of ``cells``, the width of a cell follows the
-size alone, and the opacities come after the positions, with near splats as neighbours.
 """
 
 import math
 import struct
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from nsvq_lightning.io import errors, morton
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FEW_ROWS, FormatError, check_room
-from nsvq_lightning.io.morton import AXIS_BITS, Grid, morton_keys, nearest_before, unmorton
-from nsvq_lightning.io.nsvq import entropy
+from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.nsvq import entropy, rounding
 from nsvq_lightning.io.nsvq.codebook_order import leaf_paths
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
 from nsvq_lightning.io.nsvq.precision import MOST_OPACITY_LEVELS, Precision
-from nsvq_lightning.io.nsvq.rounding import Stored, doublings_of, logits_of_levels, position_grid, rounded
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims
 
+# Attributes by when their streams come; the cells of the positions, which are between, follow from the early ones.
+_EARLY, _LATE = ("opacities", "scales"), tuple(name for name in QUANTIZABLE if name != "scales")
+# Endings of the names and encodings of the streams that an attribute has, by its storage.
+_STREAMS = {
+    "levels": {"": "paths"},
+    "steps": {"": "integers"},
+    "codes": {".codebook": "integers", "": "paths"},
+    "cells": {".grid": "grid", "": "keys", ".far": "float32"},
+}
 _GRID = struct.Struct("<qqqd")
-
-_POSITIONS = ("means.grid", "means", "means.far")
-_STREAMS = {"grid": _POSITIONS, "cells": _POSITIONS, "codes": ("{}.codebook", "{}"), "steps": ("{}",)}
-_ENCODINGS = {"means.grid": "grid", "means": "keys", "means.far": "float32"}
-# Attributes whose streams come before those of the positions, by the storage of these.
-_BEFORE_POSITIONS = {"cells": ("opacities", "scales"), "grid": ("scales",)}
-# The other attributes, by the time they take: the longest task should not begin last.
-_LARGEST_FIRST = sorted((name for name in QUANTIZABLE if name != "scales"), key=lambda name: -attribute_dims(3)[name])
 # Three float32.
 _FAR_BYTES = 12
-
-
-class _Places(NamedTuple):
-    """Where the splats are, but for the far ones, in the order of the file.
-
-    Attributes:
-        grid: The grid of the positions.
-        doublings: Of its step, for an opaque splat of size 1.
-        keys: Morton keys, ascending.
-        depths: Bits per axis of each.
-    """
-
-    grid: Grid
-    doublings: float
-    keys: NDArray[np.uint64]
-    depths: NDArray[np.int64]
 
 
 def encode_compact(scene: CompressedScene, precision: Precision | None = None) -> tuple[Header, dict[str, bytes]]:
@@ -87,29 +67,28 @@ def encode_compact(scene: CompressedScene, precision: Precision | None = None) -
         ValueError: A value is too large for its step.
     """
     precision = precision or Precision()
-    early = _BEFORE_POSITIONS["cells"]
     with _workers() as pool:
-        # Positions follow two attributes. They give the order of the splats, in which all others are written.
-        rounding = {name: pool.submit(rounded, scene, name, precision) for name in (*early, _LARGEST_FIRST[0])}
-        placing = pool.submit(_places, scene.means, {name: rounding[name].result() for name in early}, precision)
-        rounding |= {name: pool.submit(rounded, scene, name, precision) for name in _LARGEST_FIRST[1:]}
-        places, order = placing.result()
-        before, near = _before(len(order)), pool.submit(_neighbours, places, len(order))
-        tasks = {"means": pool.submit(entropy.encode_keys, places.keys, 3 * places.depths)}
-        for name in (*early, *_LARGEST_FIRST):
-            neighbours = before if name in early else near.result()
-            attribute = rounding[name].result()
-            tasks[name] = pool.submit(_encode_values, attribute, order, neighbours)
-            if attribute.codebook is not None:
-                tasks[f"{name}.codebook"] = pool.submit(entropy.encode_integers, attribute.codebook)
-    streams = {name: task.result() for name, task in tasks.items()}
-    streams["means.grid"] = _GRID.pack(*places.grid.base, places.doublings)
-    streams["means.far"] = scene.means[order[len(places.keys) :]].astype("<f4", copy=False).tobytes()
-    entries = {name: task.result().entry for name, task in rounding.items()}
-    entries["means"] = AttributeEntry("means", 3, "cells", step=places.grid.step)
-    attributes = tuple(entries[name] for name in _order("cells"))
-    entry_of = tuple(StreamEntry(name, len(streams[name]), kind) for name, kind in _stream_names(attributes))
-    return Header.of(scene, "compact", attributes, entry_of), streams
+        tasks = {name: pool.submit(rounding.rounded, scene, name, precision) for name in (*_EARLY, *_largest_first())}
+        early = {name: tasks[name].result() for name in _EARLY}
+        grid, doublings, depths = rounding.position_grid(scene.means, early, precision)
+        cells, inside = grid.cells(scene.means)
+        keys = morton.morton_keys(cells, depths)
+        # The order of the file: along the Morton curve, the far splats at the end.
+        near, far = np.flatnonzero(inside), np.flatnonzero(~inside)
+        near = near[np.argsort(keys[near], kind="stable")]
+        keys, depths, order = keys[near], depths[near], np.concatenate([near, far])
+        writing = [pool.submit(_encoded, early[name], order, _before(len(order))) for name in _EARLY]
+        positions = pool.submit(entropy.encode_keys, keys, 3 * depths)
+        neighbours = _neighbours(keys, depths, len(order))
+        writing += [pool.submit(_encoded, tasks[name].result(), order, neighbours) for name in _largest_first()]
+        streams = {name: data for task in writing for name, data in task.result().items()}
+    streams["means"], streams["means.grid"] = positions.result(), _GRID.pack(*grid.base, doublings)
+    streams["means.far"] = scene.means[far].astype("<f4", copy=False).tobytes()
+    entries = {name: task.result().entry for name, task in tasks.items()}
+    entries["means"] = AttributeEntry("means", 3, "cells", step=grid.step)
+    attributes = tuple(entries[name] for name in (*_EARLY, "means", *_LATE))
+    table = tuple(StreamEntry(name, len(streams[name]), encoding) for name, encoding in _stream_names(attributes))
+    return Header.of(scene, "compact", attributes, table), streams
 
 
 def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene:
@@ -118,32 +97,37 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
     Raises:
         FormatError: The tables do not belong to this level, or a stream does not hold what they say.
     """
-    entries = _checked_tables(header)
-    early = _BEFORE_POSITIONS[entries["means"].storage]
-    late = [name for name in (*_LARGEST_FIRST, "opacities") if name not in early]
+    _check_tables(header)
+    entries = {entry.name: entry for entry in header.attributes}
+    *base, doublings = _GRID.unpack(streams["means.grid"])
+    if not math.isfinite(doublings):
+        raise FormatError(f"damaged: the cells of the positions have {doublings} doublings, not a finite number")
+    grid = morton.Grid(entries["means"].step, (base[0], base[1], base[2]))
+    far = np.frombuffer(streams["means.far"], "<f4").astype(np.float32).reshape(-1, 3)
     with _workers() as pool:
-        before = _before(header.splats)
-        values = {name: pool.submit(_decode_values, entries[name], streams, before) for name in early}
-        codebooks = {name: pool.submit(_decode_codebook, entries[name], streams) for name in (*early, *late)}
-        stored = {name: Stored(entries[name], values[name].result(), codebooks[name].result()) for name in early}
-        places = _decode_places(entries["means"].step, stored, streams)
-        near = _neighbours(places, header.splats)
-        values |= {name: pool.submit(_decode_values, entries[name], streams, near) for name in late}
-        means = pool.submit(_decode_means, places, streams["means.far"])
-        stored |= {name: Stored(entries[name], values[name].result(), codebooks[name].result()) for name in late}
+        early = [pool.submit(_decoded, entries[name], streams, _before(header.splats)) for name in _EARLY]
+        stored = {task.result().entry.name: task.result() for task in early}
+        depths = grid.depths(rounding.doublings_of(stored, doublings))[: header.splats - len(far)]
+        keys = entropy.decode_keys(streams["means"], 3 * depths)
+        neighbours = _neighbours(keys, depths, header.splats)
+        late = {name: pool.submit(_decoded, entries[name], streams, neighbours) for name in _largest_first()}
+        means = np.concatenate([grid.centers(morton.unmorton(keys), depths), far])
+        stored |= {name: late[name].result() for name in _LATE}
     levels = stored.pop("opacities")
-    coded = {name: attribute for name, attribute in stored.items() if attribute.codebook is not None}
+    coded = {name: stored[name] for name in QUANTIZABLE if stored[name].codebook is not None}
     return CompressedScene(
-        means=means.result(),
-        opacities=logits_of_levels(levels.entry.codes)[levels.values],
-        codes={name: coded[name].values for name in QUANTIZABLE if name in coded},
-        codebooks={name: coded[name].floats() for name in QUANTIZABLE if name in coded},
+        means=means,
+        opacities=rounding.logits_of_levels(levels.entry.codes)[levels.values],
+        codes={name: attribute.values for name, attribute in coded.items()},
+        codebooks={name: attribute.floats() for name, attribute in coded.items()},
         raw={name: stored[name].floats() for name in QUANTIZABLE if name not in coded},
         **header.of_scene,
     )
 
 
-# Streams
+def _largest_first() -> list[str]:
+    """The late attributes by the time they take: the longest task should not begin last."""
+    return sorted(_LATE, key=attribute_dims(3).__getitem__, reverse=True)
 
 
 def _workers() -> ThreadPoolExecutor:
@@ -154,122 +138,77 @@ def _workers() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=torch.get_num_threads())
 
 
-def _places(
-    means: NDArray[np.float32], stored: Mapping[str, Stored], precision: Precision
-) -> tuple[_Places, NDArray[np.int64]]:
-    """Where splats are, and the order ``[N]`` of the file: along the Morton curve, the far ones at the end."""
-    grid, doublings, depths = position_grid(means, stored, precision)
-    cells, inside = grid.cells(means)
-    keys = morton_keys(cells, depths)
-    near = np.flatnonzero(inside)
-    near = near[np.argsort(keys[near], kind="stable")]
-    return _Places(grid, doublings, keys[near], depths[near]), np.concatenate([near, np.flatnonzero(~inside)])
-
-
 def _before(count: int) -> NDArray[np.int32]:
     """The two rows ``[N, 2]`` before each row, -1 where there is none."""
     rows = np.arange(count, dtype=np.int32)[:, None] - np.array([1, 2], np.int32)
     return np.maximum(rows, np.int32(-1))
 
 
-def _neighbours(places: _Places, count: int) -> NDArray[np.int32]:
+def _neighbours(keys: NDArray[np.uint64], depths: NDArray[np.int64], count: int) -> NDArray[np.int32]:
     """Two near rows ``[N, 2]`` before each row; for the far splats, which come last, the two rows before."""
-    half = (np.int64(1) << (AXIS_BITS - places.depths)) >> 1
+    half = (np.int64(1) << (morton.AXIS_BITS - depths)) >> 1
     neighbours = _before(count)
-    neighbours[: len(places.keys)] = nearest_before(unmorton(places.keys) + half[:, None])
+    neighbours[: len(keys)] = morton.nearest_before(morton.unmorton(keys) + half[:, None])
     return neighbours
 
 
-def _encode_values(attribute: Stored, order: NDArray[np.int64], neighbours: NDArray[np.int32]) -> bytes:
-    entry, values = attribute.entry, attribute.values[order]
+def _encoded(attribute: rounding.Stored, order: NDArray[np.int64], neighbours: NDArray[np.int32]) -> dict[str, bytes]:
+    """The streams of an attribute, but not of the positions, for splats in an order."""
+    entry, values, codebook = attribute.entry, attribute.values[order], attribute.codebook
     if entry.storage == "steps":
-        return entropy.encode_integers(values)
-    return entropy.encode_paths(leaf_paths(entry.codes)[values], entry.bits, neighbours)
+        return {entry.name: entropy.encode_integers(values)}
+    paths = {entry.name: entropy.encode_paths(leaf_paths(entry.codes)[values], entry.bits, neighbours)}
+    return paths if codebook is None else paths | {f"{entry.name}.codebook": entropy.encode_integers(codebook)}
 
 
-def _decode_values(
+def _decoded(
     entry: AttributeEntry, streams: Mapping[str, memoryview], neighbours: NDArray[np.int32]
-) -> NDArray[np.int64]:
+) -> rounding.Stored:
+    """Invert :func:`_encoded`."""
     if entry.storage == "steps":
-        return entropy.decode_integers(streams[entry.name], len(neighbours), entry.dim)
+        return rounding.Stored(entry, entropy.decode_integers(streams[entry.name], len(neighbours), entry.dim))
     leaf_of = np.full(1 << entry.bits, -1)
     leaf_of[leaf_paths(entry.codes)] = np.arange(entry.codes)
     values = leaf_of[entropy.decode_paths(streams[entry.name], entry.bits, neighbours)]
     if (values < 0).any():
         raise FormatError(f"damaged: a code of {entry.name} is not one of {entry.codes}")
-    return values
-
-
-def _decode_codebook(entry: AttributeEntry, streams: Mapping[str, memoryview]) -> NDArray[np.int64] | None:
-    if entry.storage != "codes":
-        return None
-    return entropy.decode_integers(streams[f"{entry.name}.codebook"], entry.codes, entry.dim)
-
-
-def _decode_places(step: float, stored: Mapping[str, Stored], streams: Mapping[str, memoryview]) -> _Places:
-    *base, doublings = _GRID.unpack(streams["means.grid"])
-    if not math.isfinite(doublings):
-        raise FormatError(f"damaged: the cells of the positions have {doublings} doublings, not a finite number")
-    grid, far = Grid(step, (base[0], base[1], base[2])), len(streams["means.far"]) // _FAR_BYTES
-    depths = grid.depths(doublings_of(stored, doublings))
-    depths = depths[: len(depths) - far]
-    return _Places(grid, doublings, entropy.decode_keys(streams["means"], 3 * depths), depths)
-
-
-def _decode_means(places: _Places, far: memoryview) -> NDArray[np.float32]:
-    near = places.grid.centers(unmorton(places.keys), places.depths)
-    return np.concatenate([near, np.frombuffer(far, "<f4").astype(np.float32).reshape(-1, 3)])
-
-
-def _order(storage: str) -> tuple[str, ...]:
-    """Attributes in the order of their streams, by the storage of the positions."""
-    first = _BEFORE_POSITIONS[storage]
-    return (*first, "means", *(name for name in ("opacities", *QUANTIZABLE) if name not in first))
+    if entry.storage == "levels":
+        return rounding.Stored(entry, values)
+    codebook = entropy.decode_integers(streams[f"{entry.name}.codebook"], entry.codes, entry.dim)
+    return rounding.Stored(entry, values, codebook)
 
 
 def _stream_names(attributes: tuple[AttributeEntry, ...]) -> list[tuple[str, str]]:
     """Name and encoding of the streams that the attributes have."""
-    names = []
-    for entry in attributes:
-        for pattern in _STREAMS.get(entry.storage, ("{}",)):
-            name = pattern.format(entry.name)
-            integers = name.endswith(".codebook") or entry.storage == "steps"
-            names.append((name, _ENCODINGS.get(name, "integers" if integers else "paths")))
-    return names
+    return [(entry.name + end, kind) for entry in attributes for end, kind in _STREAMS[entry.storage].items()]
 
 
-def _checked_tables(header: Header) -> dict[str, AttributeEntry]:
+def _check_tables(header: Header) -> None:
     """Compare with the tables this release would write, before anything is allocated from their sizes."""
     dims = attribute_dims(header.sh_degree)
-    orders = [[(name, dims[name]) for name in _order(storage)] for storage in _BEFORE_POSITIONS]
-    entries = {entry.name: entry for entry in header.attributes}
-    if [(entry.name, entry.dim) for entry in header.attributes] not in orders:
+    expected = [(name, dims[name]) for name in (*_EARLY, "means", *_LATE)]
+    if [(entry.name, entry.dim) for entry in header.attributes] != expected:
         raise FormatError(f"damaged: the attribute table must list {', '.join(dims)}, got {header.attributes}")
-    lengths = {stream.name: stream.length for stream in header.streams}
     for entry in header.attributes:
         if not _possible(entry):
             raise FormatError(f"damaged: impossible attribute {entry}")
     if [(stream.name, stream.encoding) for stream in header.streams] != _stream_names(header.attributes):
         raise FormatError("damaged: the stream table does not fit the attribute table")
-    if (
-        lengths["means.grid"] != _GRID.size
-        or lengths["means.far"] % _FAR_BYTES
-        or lengths["means.far"] // _FAR_BYTES > header.splats
-    ):
+    lengths = {stream.name: stream.length for stream in header.streams}
+    far, rest = divmod(lengths["means.far"], _FAR_BYTES)
+    if lengths["means.grid"] != _GRID.size or rest or far > header.splats:
         raise FormatError("damaged: the streams of the positions do not have their sizes")
-    check_room("splats", header.splats, sum(lengths.values()))
+    errors.check_room("splats", header.splats, sum(lengths.values()))
     for entry in header.attributes:
         if entry.storage == "codes":
             name = f"{entry.name}.codebook"
-            check_room(f"rows of {name}", entry.codes, lengths[name], FEW_ROWS, each=1)
-    return entries
+            errors.check_room(f"rows of {name}", entry.codes, lengths[name], errors.FEW_ROWS, each=1)
 
 
 def _possible(entry: AttributeEntry) -> bool:
-    if entry.name == "means":
-        return entry.storage in _BEFORE_POSITIONS and entry.codes == 0 and entry.step > 0
-    if entry.storage == "steps":
-        return entry.name in QUANTIZABLE and entry.codes == 0 and entry.step > 0
+    if entry.name == "means" or entry.storage == "steps":
+        allowed = entry.storage == "cells" if entry.name == "means" else entry.name in QUANTIZABLE
+        return allowed and entry.codes == 0 and entry.step > 0
     if not 1 <= entry.codes <= 1 << 32:
         return False
     if entry.name == "opacities":

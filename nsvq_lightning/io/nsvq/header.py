@@ -33,8 +33,6 @@ from nsvq_lightning.io.errors import FormatError, naming_file
 
 MAGIC = b"\x89NSVQ\r\n\x1a"
 VERSION = 2
-# Versions that are read; the header of version 1 spells out the columns of its tables in every row.
-READABLE = (1, 2)
 
 _PREFIX = struct.Struct("<8s16sII")
 _DIGEST_END = 24
@@ -48,7 +46,7 @@ class AttributeEntry(NamedTuple):
         name: Attribute, for example ``quats``.
         dim: Values per splat, D.
         storage: ``raw`` (float32, one row per splat), ``codes`` (rows of a codebook), ``steps`` (integers, one row per
-            splat), ``levels`` (equal steps of [0, 1]), or ``cells`` (of a grid; ``grid`` in version 1).
+            splat), ``levels`` (equal steps of [0, 1]), or ``cells`` (of a grid).
         codes: Rows of the codebook K, or number of levels; 0 where there are none.
         step: Step of which the integers of this attribute, or of its codebook, are multiples; 0 for float32.
     """
@@ -183,8 +181,8 @@ def _no_number(name: str) -> None:
 
 
 def _entry(table: object, key: str, kind: type[_T]) -> _T:
-    """An entry of a type; numbers must be finite and not negative, and a step may be missing, as in version 1."""
-    value: Any = table.get(key, 0.0 if kind is float else None) if isinstance(table, dict) else None
+    """An entry of a type; numbers must be finite and not negative."""
+    value: Any = table.get(key) if isinstance(table, dict) else None
     number = kind in (int, float)
     fits = isinstance(value, int | float if kind is float else kind) and not isinstance(value, bool)
     if not fits or (number and not 0 <= value <= sys.float_info.max):
@@ -194,11 +192,10 @@ def _entry(table: object, key: str, kind: type[_T]) -> _T:
 
 
 def _row(kind: type[_T], row: object) -> _T:
-    """A row of a table; version 1 of the format wrote dictionaries, which hold more than what is used."""
     columns = get_type_hints(kind)
-    if isinstance(row, list) and len(row) != len(columns):
+    if not isinstance(row, list) or len(row) != len(columns):
         raise FormatError(f"damaged: a row of the header's tables does not hold {', '.join(columns)}")
-    named = dict(zip(columns, row, strict=True)) if isinstance(row, list) else row
+    named = dict(zip(columns, row, strict=True))
     return kind(**{name: _entry(named, name, column) for name, column in columns.items()})
 
 
@@ -250,11 +247,8 @@ def unframe(data: bytes) -> tuple[Header, dict[str, memoryview]]:
     _, digest, version, json_bytes = _PREFIX.unpack_from(data)
     if blake2b(memoryview(data)[_DIGEST_END:], digest_size=len(digest)).digest() != digest:
         raise FormatError("truncated or altered: the checksum does not fit the content")
-    if version not in READABLE:
-        raise FormatError(
-            f"version {version} of the format; this release reads {' and '.join(map(str, READABLE))}",
-            "update nsvq-lightning",
-        )
+    if version != VERSION:
+        raise FormatError(f"version {version} of the format; this release reads {VERSION}", "update nsvq-lightning")
     payload = memoryview(data)[_PREFIX.size + json_bytes :]
     if _PREFIX.size + json_bytes > len(data):
         raise FormatError(f"damaged: a header of {json_bytes} bytes in a file of {len(data)}")

@@ -153,14 +153,12 @@ def doublings_of(stored: Mapping[str, Stored], for_size_one: float) -> NDArray[n
     Only sums, products and quotients are used, whose rounding is the same everywhere: key depths depend on it.
 
     Args:
-        stored: The log-scales, and the opacities where they count.
+        stored: The log-scales and the opacities.
         for_size_one: The result for an opaque splat of size 1.
     """
-    scales, factor = stored["scales"], stored["scales"].entry.step / 3 / math.log(2.0)
+    scales, levels = stored["scales"], stored["opacities"]
+    factor = scales.entry.step / 3 / math.log(2.0)
     doublings: NDArray[np.float64] = scales.row_sums().astype(np.float64) * factor + for_size_one
-    if "opacities" not in stored:
-        return doublings
-    levels = stored["opacities"]
     # The logarithm, linear between powers of two.
     mantissas, exponents = np.frexp((np.arange(levels.entry.codes) + 0.5) / levels.entry.codes)
     logarithms = 2 * mantissas - 2 + exponents

@@ -14,8 +14,7 @@
   const DIMS = { means: 3, opacities: 1, quats: 4, scales: 3, sh0: 3 };
   const ORDERS = {
     paper: ["means", "opacities", "quats", "scales", "sh0", "shN"],
-    cells: ["opacities", "scales", "means", "quats", "sh0", "shN"],
-    grid: ["scales", "means", "opacities", "quats", "sh0", "shN"],
+    compact: ["opacities", "scales", "means", "quats", "sh0", "shN"],
   };
 
   function refuse(what) {
@@ -101,7 +100,7 @@
     if (checksum(data.subarray(24)).some((byte, i) => data[8 + i] !== byte)) refuse("its checksum does not fit its content");
     const view = new DataView(data.buffer, data.byteOffset, data.length);
     const version = view.getUint32(24, true), length = view.getUint32(28, true);
-    if (version !== 1 && version !== 2) throw new Error(`.nsvq version ${version} is newer than this reader, which knows 1 and 2`);
+    if (version !== 2) throw new Error(`.nsvq version ${version} is not 2, the one that this reader knows`);
     if (PREFIX + length > data.length) refuse("its header is longer than the file");
     let header;
     try {
@@ -122,9 +121,8 @@
   function rowsOf(table, keys) {
     if (!Array.isArray(table)) refuse("its header lacks a table");
     return table.map(row => {
-      const named = Array.isArray(row) ? Object.fromEntries(keys.map((key, i) => [key, row[i]])) : { ...row };
-      if (Array.isArray(row) && row.length !== keys.length) refuse("a row of its tables has the wrong length");
-      return named;
+      if (!Array.isArray(row) || row.length !== keys.length) refuse("a row of its tables has the wrong length");
+      return Object.fromEntries(keys.map((key, i) => [key, row[i]]));
     });
   }
 
@@ -137,23 +135,22 @@
     if (!isTable(header.config) || !isTable(header.metrics)) refuse("its header lacks the settings or the metrics");
     if (!Object.values(header.metrics).every(value => value === null || typeof value === "number")) refuse("its metrics are not numbers");
     const attributes = rowsOf(header.attributes, ["name", "dim", "storage", "codes", "step"]);
-    const kind = level === "paper" ? level : (attributes.find(row => row.name === "means") || {}).storage;
     const table = {}, expected = [];
-    if (!ORDERS[kind] || !same(attributes.map(row => row.name), ORDERS[kind])) refuse("its attributes are not those of its level");
+    if (!same(attributes.map(row => row.name), ORDERS[level])) refuse("its attributes are not those of its level");
     for (const entry of attributes) {
-      const { name, dim, storage, codes } = entry, step = entry.step === undefined ? 0 : entry.step;
+      const { name, dim, storage, codes, step } = entry;
       const wanted = name === "shN" ? 3 * ((degree + 1) ** 2 - 1) : DIMS[name];
       const codable = !(name in { means: 0, opacities: 0 }) && dim > 0;
       if (dim !== wanted || !natural(codes) || !Number.isFinite(step) || step < 0) refuse(`its entry of ${name} is not possible`);
       const stored = level === "paper" ? storage === "raw" || (storage === "codes" && codable)
-        : name === "means" ? storage === kind
+        : name === "means" ? storage === "cells"
         : name === "opacities" ? storage === "levels"
         : storage === "steps" || (storage === "codes" && codable);
       const coded = storage === "codes" || storage === "levels";
       const most = storage === "levels" ? 2 ** 20 : TWO32;
       if (!stored || (coded ? codes < 1 || codes > most : codes !== 0)) refuse(`its entry of ${name} is not possible`);
       if ((level === "compact" && storage !== "levels") !== step > 0) refuse(`its step of ${name} is not possible`);
-      table[name] = { name, dim, storage, codes, step };
+      table[name] = entry;
       if (level === "compact" && name === "means") expected.push("means.grid:grid", "means:keys", "means.far:float32");
       else if (level === "compact" && storage === "codes") expected.push(`${name}.codebook:integers`, `${name}:paths`);
       else if (level === "compact") expected.push(`${name}:${storage === "levels" ? "paths" : "integers"}`);
@@ -175,7 +172,7 @@
     for (const { name, codes } of coded)
       if (level === "compact" && codes > Math.max(FEW_ROWS, streams[`${name}.codebook`].length)) refuse(`its codebook of ${name} is too large`);
     if (level === "compact" && splats > Math.max(FEW_SPLATS, body.length / 2)) refuse("it has too many splats for its length");
-    return { level, kind, splats, degree, origin, table, streams };
+    return { level, splats, degree, origin, table, streams };
   }
 
   // The range decoder
@@ -418,8 +415,7 @@
       logs[level] = 2 * mantissa - 2 + exponent;
     }
     for (let row = 0; row < count; row++) {
-      let x = scaleSum(row) * factor + doublings;
-      if (levels) x -= 0.5 * logs[levels[row]];
+      const x = scaleSum(row) * factor + doublings - 0.5 * logs[levels[row]];
       depths[row] = 21 - Math.min(Math.max(Math.floor(x), 0), 21);
     }
     return depths;
@@ -437,7 +433,7 @@
     return values;
   }
 
-  function decodeCompact({ kind, splats, table, streams }) {
+  function decodeCompact({ splats, table, streams }) {
     const values = {}, leaves = {}, integers = {};
     if (streams["means.grid"].length !== 32) refuse("its grid is not 32 bytes");
     if (streams["means.far"].length % 12 || streams["means.far"].length > 12 * splats) refuse("its far positions have the wrong length");
@@ -456,8 +452,8 @@
       if (storage !== "levels") values[name] = storage === "codes" ? taken(found, dim, leaves[name]) : found;
     }
 
-    const first = kind === "cells" ? ["opacities", "scales"] : ["scales"], before = rowsBefore(splats);
-    for (const name of first) decode(name, before);
+    const before = rowsBefore(splats);
+    for (const name of ["opacities", "scales"]) decode(name, before);
     const grid = new DataView(streams["means.grid"].slice().buffer), doublings = grid.getFloat64(24, true);
     const base = [0, 8, 16].map(at => Number(grid.getBigInt64(at, true))), far = floats(streams["means.far"]);
     if (!Number.isFinite(doublings)) refuse("its grid is not finite");
@@ -466,12 +462,12 @@
       const at = 3 * (scaleCodes ? scaleCodes[row] : row);
       return three[at] + three[at + 1] + three[at + 2];
     };
-    const levels = kind === "cells" ? leaves.opacities : null, count = table.opacities.codes;
-    const depths = depthsOf(inside, scaleSum, table.scales.step, doublings, levels, levels ? count : 0);
+    const count = table.opacities.codes;
+    const depths = depthsOf(inside, scaleSum, table.scales.step, doublings, leaves.opacities, count);
     values.means = new Float32Array(3 * splats);
     values.means.set(far, 3 * inside);
     const near = nearRows(decodeKeys(streams.means, depths, base, table.means.step, values.means), splats);
-    for (const name of ORDERS[kind]) if (name !== "means" && !first.includes(name)) decode(name, near);
+    for (const name of ["quats", "sh0", "shN"]) decode(name, near);
     const logits = Float32Array.from({ length: count }, (_, level) => {
       const share = (level + 0.5) / count;
       return Math.log(share) - Math.log1p(-share);

@@ -11,11 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from compressed_scenes import arrays_of
 
 from nsvq_lightning import io
 from nsvq_lightning.io import CompressedScene, FormatError, read_header, read_nsvq
-from nsvq_lightning.io.nsvq.file import LEVELS
 from nsvq_lightning.io.nsvq.header import VERSION
 
 write_nsvq = partial(io.write_nsvq, level="paper")
@@ -201,7 +199,7 @@ def test_a_newer_version_says_so(tmp_path: Path) -> None:
     write_nsvq(path, scene(4, {}))
     body = struct.pack("<I", VERSION + 1) + path.read_bytes()[28:]
     path.write_bytes(path.read_bytes()[:8] + hashlib.blake2b(body, digest_size=16).digest() + body)
-    with pytest.raises(FormatError, match="version 3 of the format; this release reads 1 and 2; update"):
+    with pytest.raises(FormatError, match="version 3 of the format; this release reads 2; update"):
         read_nsvq(path)
 
 
@@ -245,15 +243,3 @@ def test_settings_must_be_json_and_metrics_may_be_infinite(tmp_path: Path) -> No
     assert read_nsvq(path).metrics == {"psnr": None, "ssim": 1.0}
     with pytest.raises(ValueError, match="unknown compression level 'tiny'; there are compact, paper"):
         write_nsvq(path, scene(2, {}), level="tiny")
-
-
-@pytest.mark.parametrize("level", LEVELS)
-def test_files_of_version_1_still_open(level: str) -> None:
-    """Oracle: what the release that wrote them read from them."""
-    folder = Path(__file__).parent / "version_1"
-    read = read_nsvq(folder / f"{level}.nsvq")
-    assert (read.config, read.metrics, read.origin) == ({"seed": 1}, {"psnr": 30.0}, (1.0, 2.0, 3.0))
-    arrays = arrays_of(read)
-    with np.load(folder / f"{level}.npz") as expected:
-        for name, values in expected.items():
-            np.testing.assert_array_equal(getattr(arrays, name), values, err_msg=name)
