@@ -60,7 +60,7 @@ class CanonicalCovariance(SplatCallback):
         if not quantized or first is None or iteration != first - 1:
             return
         optimizer, splats = trainer.optimizers[0], module.splats
-        new = canonical(splats.scales.detach(), splats.quats.detach(), "full")
+        new = canonical(splats.scales.detach(), splats.quats.detach())
         edit.change_coordinates(splats, optimizer, "scales", new.scales, new.scale_maps)
         edit.change_coordinates(splats, optimizer, "quats", new.quats, new.quat_maps)
         log.info("iteration %d: canonical covariances", iteration)

@@ -40,21 +40,6 @@ def contributions(
     return total
 
 
-def least_contributing(contribution: Tensor, share: float) -> Tensor:
-    """Mask ``[N]`` of the least contributing splats: as many as together have at most ``share`` of the sum.
-
-    Args:
-        contribution: Contribution ``[N]``, not negative.
-        share: Share of the sum, in [0, 1); splats that contribute nothing are always in the mask.
-    """
-    ascending, order = contribution.sort(stable=True)
-    # One after the other, on the CPU: a GPU may add in any order, and replicas would then drop different splats.
-    sums = ascending.cpu().double().cumsum(0)
-    mask = torch.empty_like(order, dtype=torch.bool)
-    mask[order] = (sums <= share * sums[-1:]).to(mask.device)
-    return mask
-
-
 def most_contributing(contribution: Tensor, count: int) -> Tensor:
     """Mask ``[N]`` of the ``count`` splats that contribute most; ties go to the first.
 

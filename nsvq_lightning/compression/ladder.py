@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nsvq_lightning.compression.covariance_error import form_errors
 from nsvq_lightning.compression.importance import contributions, row_weights, scale_floor
 from nsvq_lightning.compression.stored import to_compressed
 from nsvq_lightning.compression.viewpoints import decibels, picture_error, pictures
@@ -144,8 +143,8 @@ class Candidate:
 class Compressor:
     """Compresses one scene at any rung, each at most once.
 
-    Before k-means, scales too small to be visible are raised, and scales and rotations take the canonical form that
-    suits the scene; k-means weights rotations and colours by how much each splat contributes to the pictures. After
+    Before k-means, scales too small to be visible are raised, and scales and rotations take their canonical form;
+    k-means weights rotations and colours by how much each splat contributes to the pictures. After
     it, the scene is tuned until its pictures resemble those of the original.
 
     Args:
@@ -236,16 +235,12 @@ class Compressor:
         return tuned(scene, splats, self._views, self._tuning, self._seed) if quantizers else scene
 
     def _canonical(self, codebooks: Mapping[str, int]) -> RawSplats:
-        codes = {name: codebooks[name] for name in ("scales", "quats") if name in codebooks}
-        if not codes:
+        if not {"scales", "quats"} & codebooks.keys():
             return self._splats
-        scales, quats = self._splats.scales, self._splats.quats
-        if "scales" in codes and self._log_floor is not None:
+        scales = self._splats.scales
+        if "scales" in codebooks and self._log_floor is not None:
             scales = scales.clamp(min=self._log_floor)
-        errors = form_errors(scales, quats, codes, self._seed)
-        form = min(errors, key=errors.__getitem__)
-        if form != "none":
-            scales, quats, *_ = canonical(scales, quats, form)
+        scales, quats, *_ = canonical(scales, self._splats.quats)
         return self._splats._replace(scales=scales, quats=quats)
 
 

@@ -6,16 +6,12 @@ codebook; a canonical representative brings them together.
 """
 
 import math
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM
-
-Form = Literal["none", "sign", "full"]
-# How much of the redundancy is removed, in ascending order.
-FORMS: tuple[Form, ...] = ("none", "sign", "full")
 
 
 def _right_products(quats: Tensor) -> Tensor:
@@ -60,34 +56,23 @@ class Canonical(NamedTuple):
     quat_maps: Tensor
 
 
-def canonical(scales: Tensor, quats: Tensor, form: Form) -> Canonical:
+def canonical(scales: Tensor, quats: Tensor) -> Canonical:
     """Scales and rotations of the same covariances in a canonical form.
 
-    ``sign`` gives every quaternion length 1 and w ≥ 0. ``full`` also sorts the axes, longest first, and takes the
-    smallest of the remaining rotations, the one with the largest w. A quaternion too short to have a direction is the
-    identity, as for the renderer; NaN and infinity are kept.
+    The axes are sorted, longest first; of the remaining rotations it is the smallest one, with the largest w; and the
+    quaternion has length 1. One too short to have a direction is the identity, as for the renderer; NaN and infinity
+    are kept.
 
     Args:
         scales: Log-scales ``[N, 3]``.
         quats: Quaternions ``[N, 4]``, wxyz, any length.
-        form: ``sign`` or ``full``.
-
-    Raises:
-        ValueError: Another form.
     """
-    if form not in ("sign", "full"):
-        raise ValueError(f"a canonical form is 'sign' or 'full', got {form!r}")
     squared = quats.square().sum(1, keepdim=True)
-    identity = torch.eye(4, dtype=quats.dtype, device=quats.device)
     directed = ~(squared < MIN_SQUARED_NORM)
-    quats = torch.where(directed, quats, identity[0])
+    quats = torch.where(directed, quats, torch.eye(4, dtype=quats.dtype, device=quats.device)[0])
     lengths = torch.where(directed, squared, 1.0).sqrt()
-    if form == "full":
-        order = scales.argsort(dim=1, descending=True, stable=True)
-        turns = _turns_to(order, quats)
-    else:
-        order = torch.arange(3, device=scales.device).expand_as(scales)
-        turns = identity.expand(len(quats), 4, 4)
+    order = scales.argsort(dim=1, descending=True, stable=True)
+    turns = _turns_to(order, quats)
     turned = _apply(turns, quats)
     signs = torch.where(turned[:, :1] < 0, -1.0, 1.0).to(quats)
     axes = torch.eye(3, dtype=scales.dtype, device=scales.device)

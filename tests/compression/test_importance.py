@@ -12,7 +12,6 @@ from torch import Tensor
 
 from nsvq_lightning.compression.importance import (
     contributions,
-    least_contributing,
     most_contributing,
     pixel_sizes,
     row_weights,
@@ -55,14 +54,6 @@ def test_all_contributions_make_the_alpha_of_the_picture() -> None:
     splats, camera = random_splats(2000), front_camera()
     found = contributions(splats, [camera], rendered)
     torch.testing.assert_close(found.sum(), render(splats, camera).alpha.sum(), rtol=1e-4, atol=0)
-
-
-def test_the_least_contributing_go() -> None:
-    contribution = torch.tensor([5.0, 0.0, 1.0, 90.0, 0.0, 4.0])
-    assert least_contributing(contribution, 0.0).nonzero()[:, 0].tolist() == [1, 4]
-    assert least_contributing(contribution, 0.049).nonzero()[:, 0].tolist() == [1, 2, 4]
-    assert least_contributing(contribution, 0.05).nonzero()[:, 0].tolist() == [1, 2, 4, 5]
-    assert least_contributing(contribution, 0.999).nonzero()[:, 0].tolist() == [0, 1, 2, 4, 5]
 
 
 def test_weights_are_never_zero() -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from splat_scenes import front_camera, random_splats
 from torch import Tensor
 
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.canonical_covariance import Form, canonical
+from nsvq_lightning.splats.canonical_covariance import canonical
 
 
 def rows(count: int = 500, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
@@ -26,10 +25,9 @@ def scipy_covariances(scales: Tensor, quats: Tensor) -> np.ndarray:
     return np.einsum("nij,nj,nkj->nik", rotations, np.exp(2 * scales.numpy()), rotations)
 
 
-@pytest.mark.parametrize("form", ["sign", "full"])
-def test_covariances_stay(form: Form) -> None:
+def test_covariances_stay() -> None:
     scales, quats = rows()
-    new = canonical(scales, quats, form)
+    new = canonical(scales, quats)
     before, after = scipy_covariances(scales, quats), scipy_covariances(new.scales, new.quats)
     size = np.abs(before).max(axis=(1, 2), keepdims=True)
     assert np.abs((after - before) / size).max() < 1e-12
@@ -40,23 +38,22 @@ def test_covariances_stay(form: Form) -> None:
 def test_all_48_representatives_become_one() -> None:
     scales, quats = rows(20)
     rotations = Rotation.from_quat(quats.numpy()[:, [1, 2, 3, 0]])
-    expected = canonical(scales, quats, "full")
+    expected = canonical(scales, quats)
     for turn in Rotation.create_group("O"):
         # The columns of R·G are those of R in another order and direction; the scales go with them.
         other = torch.from_numpy((rotations * turn).as_quat()[:, [3, 0, 1, 2]])
         axes = scales @ torch.from_numpy(np.abs(turn.as_matrix()).round())
         for sign in (1.0, -3.0):
-            found = canonical(axes, sign * other, "full")
+            found = canonical(axes, sign * other)
             torch.testing.assert_close(found.scales, expected.scales)
             torch.testing.assert_close(found.quats, expected.quats)
     assert (expected.scales.diff(dim=1) <= 0).all()
     assert (expected.quats[:, 0] >= 0.5).all()  # the largest w of four half turns
 
 
-@pytest.mark.parametrize("form", ["sign", "full"])
-def test_maps_take_gradients_along(form: Form) -> None:
+def test_maps_take_gradients_along() -> None:
     scales, quats = rows(50)
-    new = canonical(scales, quats, form)
+    new = canonical(scales, quats)
     weights = torch.randn(50, 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
     def gradients(scales: Tensor, quats: Tensor) -> tuple[Tensor, ...]:
@@ -73,10 +70,9 @@ def test_maps_take_gradients_along(form: Form) -> None:
         torch.testing.assert_close(torch.einsum("nij,nj->ni", maps, old), fresh)
 
 
-@pytest.mark.parametrize("form", ["sign", "full"])
-def test_pictures_stay(form: Form) -> None:
+def test_pictures_stay() -> None:
     splats = random_splats(300)
-    new = canonical(splats.scales, splats.quats, form)
+    new = canonical(splats.scales, splats.quats)
     before, after = (
         render(s, front_camera()).image for s in (splats, splats._replace(scales=new.scales, quats=new.quats))
     )
@@ -88,23 +84,20 @@ def test_pictures_stay(form: Form) -> None:
 
 def test_canonical_rows_stay_and_a_zero_quaternion_is_the_identity() -> None:
     scales, quats = rows(dtype=torch.float32)
-    once = canonical(scales, quats, "full")
-    twice = canonical(once.scales, once.quats, "full")
+    once = canonical(scales, quats)
+    twice = canonical(once.scales, once.quats)
     assert torch.equal(twice.scales, once.scales)
     torch.testing.assert_close(twice.quats, once.quats, rtol=0, atol=1e-6)
-    zero = canonical(torch.zeros(1, 3), torch.zeros(1, 4), "sign")
+    zero = canonical(torch.zeros(1, 3), torch.zeros(1, 4))
     assert zero.quats.tolist() == [[1.0, 0.0, 0.0, 0.0]]
     assert zero.quat_maps.isfinite().all()
-    with pytest.raises(ValueError, match="'sign' or 'full'"):
-        canonical(scales, quats, "none")
 
 
-@pytest.mark.parametrize("form", ["sign", "full"])
-def test_what_is_not_finite_stays_so_and_changes_no_other(form: Form) -> None:
+def test_what_is_not_finite_stays_so_and_changes_no_other() -> None:
     scales, quats = rows(5)
-    expected = canonical(scales, quats, form)
+    expected = canonical(scales, quats)
     scales[1, 2], quats[3, 0] = torch.nan, torch.nan
-    found = canonical(scales, quats, form)
+    found = canonical(scales, quats)
     assert found.scales.isfinite().all(1).tolist() == [True, False, True, True, True]
     assert found.quats.isfinite().all(1).tolist()[3] is False
     for row in (0, 2, 4):

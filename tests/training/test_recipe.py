@@ -26,10 +26,10 @@ from nsvq_lightning.callbacks import (
     SplatBudget,
 )
 from nsvq_lightning.commands.main import main
-from nsvq_lightning.compression.covariance_error import covariances
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.quantize.nearest import code_rates
+from nsvq_lightning.rendering.reference import rotation_matrices
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import run_folder
 from nsvq_lightning.training.schedule import Phase
@@ -166,7 +166,8 @@ def test_rows_are_canonical_when_codebooks_are_placed(run: RunFactory, recipe: R
     _, module = run([look, *recipe(canonical=CanonicalCovariance()).values()], max_steps=20)
     assert module.schedule.first_of(Phase.QUANTIZE) == 10
     before, after = look.seen
-    first, second = (covariances(*pair).double() for pair in look.seen)
+    axes = [rotation_matrices(quats.double()) * scales.double().exp()[:, None] for scales, quats in look.seen]
+    first, second = (a @ a.mT for a in axes)
     assert ((second - first).norm(dim=(1, 2)) / first.norm(dim=(1, 2))).max() < 1e-5
     assert (before[0].diff(dim=1) > 0).any()
     assert (after[0].diff(dim=1) <= 0).all()
