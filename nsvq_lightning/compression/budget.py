@@ -6,20 +6,8 @@ from collections.abc import Mapping, Sequence
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.splats.attributes import ATTRIBUTES, QUANTIZABLE, attribute_dims
 
-# Splats for each detailed pixel of a photo, times the cube root of the number of photos.
-SPLATS_PER_PIXEL = 0.165
-
 # A scene of fewer splats is no scene.
 LEAST = 1000
-
-# Bits of a splat's position and opacity at the precision of level ``compact``, 22 to 25 on the measured scenes.
-GEOMETRY_BITS = 23.5
-# Codes and codebooks take 1 / (1 + this · strength) of their bits where codes are chosen by rate and distortion.
-RATE_DISTORTION = 0.28
-# Bytes of the header.
-HEADER = 2048
-# Bits of each number of an attribute without a codebook.
-FULL_BITS = 32
 
 
 def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:
@@ -32,7 +20,7 @@ def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:
         detail: Detailed pixels of a photo (:func:`nsvq_lightning.data.scene.detailed_pixels`).
         quality: Factor.
     """
-    return max(LEAST, round(quality * SPLATS_PER_PIXEL * math.cbrt(photos) * detail))
+    return max(LEAST, round(quality * 0.165 * math.cbrt(photos) * detail))
 
 
 def splats_for_bytes(
@@ -56,15 +44,18 @@ def splats_for_bytes(
     """
     usual, precision = Precision(), precision or Precision()
     position, opacity = precision.position / usual.position, precision.opacity / usual.opacity
-    fixed, bits = 8.0 * HEADER, GEOMETRY_BITS - 3 * math.log2(position) - math.log2(opacity)
-    coded = 1 / (1 + RATE_DISTORTION * strength)
+    fixed = 8 * 2048.0  # the header
+    # Position and opacity of a splat take 22 to 25 bits on the measured scenes.
+    bits = 23.5 - 3 * math.log2(position) - math.log2(opacity)
+    # What remains of codes and codebooks where codes are chosen by rate and distortion, as measured.
+    coded = 1 / (1 + 0.28 * strength)
     for name in QUANTIZABLE:
         if name in codebooks:
             codes, dim = codebooks[name]
             fixed += coded * codes * dim * ATTRIBUTES[name].code_bits
             bits += coded * (math.log2(codes) + ATTRIBUTES[name].row_bits)
         else:
-            bits += FULL_BITS * attribute_dims(sh_degree)[name]
+            bits += 32 * attribute_dims(sh_degree)[name]
     splats = int((8 * size - fixed) / bits)
     if splats < LEAST:
         raise ValueError(

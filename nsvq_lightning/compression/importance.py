@@ -93,12 +93,6 @@ def sensitivity(
 
 # Size in pixels below which the scale of a splat is not visible; the rasterizer blurs every splat by 0.55 pixels.
 INVISIBLE = 0.25
-# Share of the splats that may be seen from closer than the floor assumes.
-CLOSE = 0.05
-# Largest number of splats in the sample.
-SAMPLE = 1 << 16
-# Pairs of a splat and a view that are looked at together; they fit into a processor's cache.
-BATCH = 1 << 17
 
 
 @torch.no_grad()
@@ -120,7 +114,7 @@ def pixel_sizes(means: Tensor, cameras: Iterable[Camera]) -> Tensor:
     # Rows ``[views, 4]`` that give, of a position, its column · depth, row · depth and depth.
     lines = [line.to(means).unsqueeze(-1).unbind(1) for line in (fx * x + cx * z, fy * y + cy * z, z)]
     width, height, focal = torch.cat([extents, intrinsics[:, :2].amax(1, keepdim=True)], 1).to(means).T[:, :, None]
-    step = max(1, BATCH // len(views))
+    step = max(1, (1 << 17) // len(views))  # pairs of a splat and a view that fit into a processor's cache
     for rows in (slice(start, start + step) for start in range(0, len(means), step)):
         batch = means[rows].unbind(1)
         u, v, depth = (_affine(line, batch) for line in lines)
@@ -150,6 +144,6 @@ def scale_floor(means: Tensor, cameras: Iterable[Camera], pixels: float = INVISI
     Returns:
         The floor, or None where no view sees a splat.
     """
-    sizes = pixel_sizes(means[:: 1 + len(means) // SAMPLE], cameras)
+    sizes = pixel_sizes(means[:: 1 + len(means) // (1 << 16)], cameras)  # of a sample
     sizes = sizes[sizes.isfinite()]
-    return math.log(pixels * float(sizes.quantile(CLOSE))) if len(sizes) else None
+    return math.log(pixels * float(sizes.quantile(0.05))) if len(sizes) else None

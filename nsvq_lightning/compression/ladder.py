@@ -27,9 +27,6 @@ from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.canonical_covariance import canonical
 from nsvq_lightning.splats.splats import RawSplats, detached
 
-# Learning rates at the end, as a share of those at the start.
-FINAL = 0.05
-
 
 def tuned(
     scene: CompressedScene, original: RawSplats, cameras: Sequence[Camera], steps: int, seed: int
@@ -57,7 +54,7 @@ def tuned(
     rates["means"] = 3e-5 * float(original.means.std(0).norm())  # nothing is far from its place
     groups = [{"params": [tensor], "lr": rates[name]} for name, tensor in free.items()]
     adam = torch.optim.Adam(groups, eps=1e-15)
-    decay = torch.optim.lr_scheduler.ExponentialLR(adam, FINAL ** (1 / steps))
+    decay = torch.optim.lr_scheduler.ExponentialLR(adam, 0.05 ** (1 / steps))  # to a twentieth at the end
     fixed = detached(scene.decode())
     draws, order = generator(seed, 0, "views"), list[int]()
     for _ in range(steps):
@@ -212,7 +209,7 @@ class Compressor:
         least, most = OPACITY_ERRORS
         errors["opacity"] = min(max(errors["opacity"], least), most)
         storage = replace(self._storage, precision=Precision(**errors))
-        data = b"".join(frame(*encode(scene, storage.level, storage.precision)))
+        data = b"".join(frame(*encode(scene, storage)))
         return Candidate(rung, scene, storage, data, self.error(data))
 
     def _quantized(self, codebooks: Mapping[str, int]) -> CompressedScene:

@@ -64,18 +64,6 @@ def decibels(error: float) -> float:
     return math.inf if error == 0 else -20 * math.log10(error)
 
 
-# Views that are looked at for each that is taken.
-CANDIDATES = 5
-# How far from the middle of the detail a candidate stands, in root mean square distances of the detail.
-DISTANCE = 1.5, 3.0
-# How far from that middle it looks, standard deviation in the same unit.
-STRAY = 0.6
-# Horizontal field of view.
-ANGLE = math.radians(70)
-# Pixels of a candidate's picture.
-PREVIEW = 96, 67
-
-
 def views_of(splats: SplatTensors, root: Path | None, most: int) -> list[Camera]:
     """At most ``most`` views in which the pictures of a scene count.
 
@@ -111,10 +99,11 @@ def likely_cameras(
         height: Pixels.
         seed: Seed of the candidates.
     """
-    eyes, targets = _candidates(splats, CANDIDATES * count, np.random.default_rng(seed))
-    scores = [_detail(splats, look_at(target, eye, *PREVIEW, ANGLE)) for eye, target in zip(eyes, targets, strict=True)]
+    angle = math.radians(70)
+    eyes, targets = _candidates(splats, 5 * count, np.random.default_rng(seed))
+    scores = [_detail(splats, look_at(target, eye, 96, 67, angle)) for eye, target in zip(eyes, targets, strict=True)]
     best = np.argsort(-np.array(scores), kind="stable")[:count]
-    return [look_at(targets[k], eyes[k], width, height, ANGLE) for k in best]
+    return [look_at(targets[k], eyes[k], width, height, angle) for k in best]
 
 
 def _candidates(
@@ -129,8 +118,8 @@ def _candidates(
     reach = max(math.sqrt(weights @ ((means - middle) ** 2).sum(1)), 2 * NEAR)
     directions = draws.standard_normal((count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    eyes = middle + reach * draws.uniform(*DISTANCE, (count, 1)) * directions
-    targets = middle + reach * STRAY * draws.standard_normal((count, 3))
+    eyes = middle + reach * draws.uniform(1.5, 3.0, (count, 1)) * directions
+    targets = middle + reach * 0.6 * draws.standard_normal((count, 3))
     across, up, _ = np.abs(eyes - targets).T
     eyes[:, 0] += np.where(across < 0.05 * up, 0.2 * up, 0.0)  # straight up or down, a camera has no upright
     return eyes, targets

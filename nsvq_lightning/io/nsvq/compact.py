@@ -56,7 +56,7 @@ _GRID = struct.Struct("<qqqd")
 _FAR_BYTES = 12
 
 
-def encode_compact(scene: CompressedScene, precision: Precision | None = None) -> tuple[Header, dict[str, bytes]]:
+def encode_compact(scene: CompressedScene, precision: Precision) -> tuple[Header, dict[str, bytes]]:
     """Header and streams of a scene.
 
     Args:
@@ -66,7 +66,6 @@ def encode_compact(scene: CompressedScene, precision: Precision | None = None) -
     Raises:
         ValueError: A value is too large for its step.
     """
-    precision = precision or Precision()
     with _workers() as pool:
         tasks = {name: pool.submit(rounding.rounded, scene, name, precision) for name in (*_EARLY, *_largest_first())}
         early = {name: tasks[name].result() for name in _EARLY}

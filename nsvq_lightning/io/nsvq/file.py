@@ -8,29 +8,25 @@ from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.nsvq.header import Header, frame, read_frame
-from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Precision, Storage, check_level
+from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Precision, Storage
 from nsvq_lightning.splats.attributes import listed
 
 
-def encode(
-    scene: CompressedScene, level: str = DEFAULT_LEVEL, precision: Precision | None = None
-) -> tuple[Header, dict[str, bytes]]:
+def encode(scene: CompressedScene, storage: Storage) -> tuple[Header, dict[str, bytes]]:
     """Header and streams of a scene; the same arguments give the same bytes.
 
     Args:
         scene: The scene.
-        level: One of :data:`LEVELS`.
-        precision: Largest errors of level ``compact``; level ``paper`` has none.
+        storage: Level and precision.
 
     Raises:
-        ValueError: Unknown level, or ``config`` is not made of JSON values.
+        ValueError: ``config`` is not made of JSON values, or a value is too large for its step.
     """
-    check_level(level)
     # Import only the level's module: entropy coding needs Numba, which level ``paper`` does without.
-    if level == "compact":
+    if storage.level == "compact":
         from nsvq_lightning.io.nsvq.compact import encode_compact
 
-        return encode_compact(scene, precision)
+        return encode_compact(scene, storage.precision)
     from nsvq_lightning.io.nsvq.paper import encode_paper
 
     return encode_paper(scene)
@@ -42,22 +38,32 @@ def write_nsvq(
     level: str = DEFAULT_LEVEL,
     precision: Precision | None = None,
 ) -> int:
-    """Write a scene to a file, replaced atomically; arguments and errors are those of :func:`encode`.
+    """Write a scene to a file, replaced atomically; the same arguments give the same bytes.
+
+    Args:
+        path: File to write.
+        scene: The scene.
+        level: ``compact`` or ``paper``.
+        precision: Largest errors of level ``compact``; level ``paper`` has none.
 
     Returns:
         Bytes of the file.
+
+    Raises:
+        ValueError: Unknown level, ``config`` is not made of JSON values, or level ``compact`` cannot store a value.
     """
+    storage = Storage(level, precision or Precision())
     if level == "compact" and (culprits := scene.finite_rows()[1]):
         raise ValueError(
             f"numbers that are not finite ({listed(culprits)}): drop those splats, or use level 'paper', which stores "
             "float32 as it is"
         )
-    return write_finite(path, scene, Storage(level, precision or Precision()))
+    return write_finite(path, scene, storage)
 
 
 def write_finite(path: str | os.PathLike[str], scene: CompressedScene, storage: Storage) -> int:
     """:func:`write_nsvq` for a scene whose values are known to be finite."""
-    parts = frame(*encode(scene, storage.level, storage.precision))
+    parts = frame(*encode(scene, storage))
     with atomic_write(path) as file:
         file.writelines(parts)
     return sum(map(len, parts))
@@ -70,7 +76,7 @@ def as_stored(scene: CompressedScene, storage: Storage) -> CompressedScene:
     """
     if not scene.codes:
         return scene
-    header, streams = encode(scene, storage.level, storage.precision)
+    header, streams = encode(scene, storage)
     return decode(header, {name: memoryview(data) for name, data in streams.items()})
 
 

@@ -84,19 +84,10 @@ class Storage:
     precision: Precision = field(default_factory=Precision)
 
     def __post_init__(self) -> None:
-        check_level(self.level)
+        if self.level not in LEVELS:
+            raise ValueError(f"unknown compression level {self.level!r}; there are {', '.join(LEVELS)}")
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Storage:
         """The settings from plain data, as stored in a checkpoint."""
         return cls(values["level"], Precision(**values["precision"]))
-
-
-def check_level(level: str) -> None:
-    """Refuse an unknown level.
-
-    Raises:
-        ValueError: Unknown level.
-    """
-    if level not in LEVELS:
-        raise ValueError(f"unknown compression level {level!r}; there are {', '.join(LEVELS)}")
