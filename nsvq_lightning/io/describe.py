@@ -6,15 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from nsvq_lightning.io import ply, sog, splat, spz
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.formats import FORMATS
 from nsvq_lightning.io.nsvq.header import MAGIC, read_header
 from nsvq_lightning.io.numbers import opacity_of
-from nsvq_lightning.io.ply import PLY_MAGIC, attribute_bytes, plain_ply_bytes, read_ply_header, splat_degree
-from nsvq_lightning.io.sog import META, ZIP_MAGIC, read_sog_header
-from nsvq_lightning.io.splat import SPLAT_LAYOUT, count_splats
-from nsvq_lightning.io.spz import DEFAULT_AXES, SPZ_MAGICS, read_spz_header
 from nsvq_lightning.splats.conventions import unit
 
 
@@ -57,7 +54,7 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
         start = file.read(len(MAGIC))
     total = path.stat().st_size
     facts = _describe_nsvq(path, total) if start.startswith(MAGIC) else _describe_others(path, start, total)
-    plain_bytes = plain_ply_bytes(facts["splats"], facts["sh_degree"])
+    plain_bytes = ply.plain_ply_bytes(facts["splats"], facts["sh_degree"])
     # An empty .splat has no bytes.
     return {
         "file": str(path),
@@ -85,26 +82,26 @@ def _describe_nsvq(path: Path, total: int) -> dict[str, Any]:
 
 
 def _describe_others(path: Path, start: bytes, total: int) -> dict[str, Any]:
-    if start.startswith(PLY_MAGIC):
-        ply = read_ply_header(path)
+    if start.startswith(ply.PLY_MAGIC):
+        header = ply.read_ply_header(path)
         with naming_file(path):
-            count, sh_degree = ply.count, splat_degree(ply)
-        kind, encoding = f"ply, {'compressed' if ply.packed else ply.encoding}", "ply"
+            count, sh_degree = header.count, ply.splat_degree(header)
+        kind, encoding = f"ply, {'compressed' if header.packed else header.encoding}", "ply"
         # The lengths of ascii numbers vary, so only the total is known.
-        sizes = attribute_bytes(ply) if ply.encoding != "ascii" else {}
+        sizes = ply.attribute_bytes(header) if header.encoding != "ascii" else {}
         sizes = {"header": total - sum(sizes.values()), **sizes} if sizes else {"text": total}
-    elif start.startswith(ZIP_MAGIC):
-        count, sh_degree, sizes = read_sog_header(path)
+    elif start.startswith(sog.ZIP_MAGIC):
+        count, sh_degree, sizes = sog.read_sog_header(path)
         kind, encoding, sizes = "sog, version 2", "webp", {**sizes, "zip": total - sum(sizes.values())}
-    elif start.startswith(SPZ_MAGICS):
-        spz, sizes = read_spz_header(path)
-        count, sh_degree, encoding = spz.count, spz.sh_degree, "zstd" if spz.version == 4 else "gzip"
-        kind = f"spz, version {spz.version}, axes {spz.axes or f'not stated, taken as {DEFAULT_AXES.upper()}'}"
+    elif start.startswith(spz.SPZ_MAGICS):
+        found, sizes = spz.read_spz_header(path)
+        count, sh_degree, encoding = found.count, found.sh_degree, "zstd" if found.version == 4 else "gzip"
+        kind = f"spz, version {found.version}, axes {found.axes or f'not stated, taken as {spz.DEFAULT_AXES.upper()}'}"
     elif path.suffix.lower() == ".splat":
-        count, sh_degree, kind, encoding = count_splats(path), 0, "splat", "splat"
-        sizes = {name: count * size for name, size in SPLAT_LAYOUT.items()}
+        count, sh_degree, kind, encoding = splat.count_splats(path), 0, "splat", "splat"
+        sizes = {name: count * size for name, size in splat.SPLAT_LAYOUT.items()}
     else:
         raise FormatError(f"{path}: not a {', '.join(FORMATS)} file", "give the file of a scene")
-    around = {"header": "plain", META: "json", "zip": "zip"}
+    around = {"header": "plain", sog.META: "json", "zip": "zip"}
     streams = [{"name": s, "encoding": around.get(s, encoding), "bytes": size} for s, size in sizes.items()]
     return {"format": kind, "splats": count, "sh_degree": sh_degree, "streams": streams}

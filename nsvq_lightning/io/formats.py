@@ -9,13 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nsvq_lightning.io import ply, sog, splat, spz
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_finite
 from nsvq_lightning.io.nsvq.precision import Storage
-from nsvq_lightning.io.ply import read_ply, write_ply
-from nsvq_lightning.io.sog import in_sog_order, read_sog, write_sog
-from nsvq_lightning.io.splat import read_splat, write_splat
-from nsvq_lightning.io.spz import in_spz_order, read_spz, write_spz
 
 if TYPE_CHECKING:
     from nsvq_lightning.splats.splats import Splats, SplatTensors
@@ -31,8 +28,8 @@ class Format:
         description: A few words for error messages and help.
         read: Scene from a file; codebooks are kept where the format has them.
         write: ``write(path, scene, **options) -> bytes written``.
-        keeps_origin: Whether the file holds the origin that positions are relative to.
-        takes_storage: Whether ``write`` has an option ``storage``, the level and precision.
+        native: Whether it is our own: it holds the origin that positions are relative to, and ``write`` has an option
+            ``storage``, the level and precision.
         in_order: Gives the splats of a scene that a file holds, in file order, for comparison with what is read back;
             None if the format loses nothing, or states its errors itself.
     """
@@ -40,8 +37,7 @@ class Format:
     description: str
     read: Callable[[Path], CompressedScene]
     write: Callable[..., int]
-    keeps_origin: bool = False
-    takes_storage: bool = False
+    native: bool = False
     in_order: Callable[[CompressedScene], CompressedScene] | None = None
 
 
@@ -102,9 +98,9 @@ def save(
     if not isinstance(scene, CompressedScene):
         scene = CompressedScene.from_splats(scene)
     scene = scene.finite()
-    if any(scene.origin) and not entry.keeps_origin:
+    if any(scene.origin) and not entry.native:
         logger.warning("%s: the origin %s of the positions is not stored; add it in the viewer", path, scene.origin)
-    if entry.takes_storage:
+    if entry.native:
         options["storage"] = storage or Storage()
     elif storage is not None:
         scene = as_stored(scene, storage)
@@ -121,14 +117,14 @@ def _format_of(path: Path, action: str) -> Format:
 
 # Formats by suffix; a new format is one more entry.
 FORMATS: dict[str, Format] = {
-    ".ply": Format("3D Gaussian Splatting", read_ply, write_ply),
-    ".nsvq": Format("compressed scene of this package", read_nsvq, write_finite, keeps_origin=True, takes_storage=True),
-    ".sog": Format("PlayCanvas, SuperSplat", read_sog, write_sog, in_order=in_sog_order),
-    ".spz": Format("Niantic", read_spz, write_spz, in_order=in_spz_order),
+    ".ply": Format("3D Gaussian Splatting", ply.read_ply, ply.write_ply),
+    ".nsvq": Format("compressed scene of this package", read_nsvq, write_finite, native=True),
+    ".sog": Format("PlayCanvas, SuperSplat", sog.read_sog, sog.write_sog, in_order=sog.in_sog_order),
+    ".spz": Format("Niantic", spz.read_spz, spz.write_spz, in_order=spz.in_spz_order),
     ".splat": Format(
         "first viewers on the web, without spherical harmonics",
-        read_splat,
-        write_splat,
+        splat.read_splat,
+        splat.write_splat,
         in_order=lambda scene: scene,
     ),
 }

@@ -1,9 +1,8 @@
 """Positions as integers on a grid, in Morton order, each only as fine as necessary."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
+from typing import Self
 
 import numpy as np
 from numba import uint64
@@ -22,13 +21,6 @@ _WINDOW = 16
 # Rows that are searched side by side.
 _BLOCK = 256
 
-# No step is finer than the extent times ½ to this power: the scene takes up to half of each side of the grid.
-_EXTENT_BITS = AXIS_BITS - 1
-
-# The first cell of a grid is a multiple of 2 to this power, so cells up to that wide lie on multiples of their own
-# width, whichever scene the grid was made for.
-_BASE_BITS = AXIS_BITS - 2
-
 
 @dataclass(frozen=True)
 class Grid:
@@ -45,7 +37,7 @@ class Grid:
     base: tuple[int, int, int]
 
     @classmethod
-    def around(cls, means: NDArray[np.float32], widest: NDArray[np.float64]) -> Grid:
+    def around(cls, means: NDArray[np.float32], widest: NDArray[np.float64]) -> Self:
         """The grid for positions ``[N, 3]`` whose cells may be at most ``widest [N]`` wide.
 
         Its cells are small enough for all but the smallest thousandth of splats, yet not below 2⁻²⁰ of the extent of
@@ -55,10 +47,12 @@ class Grid:
             return cls(1.0, (0, 0, 0))
         low, high = np.quantile(means.astype(np.float64), (0.001, 0.999), axis=0)
         extent = max(float((high - low).max()), float(np.abs(means).max()) * 2.0**-40, 1e-30)
-        finest = power_above(extent * 2.0**-_EXTENT_BITS)
+        finest = power_above(extent * 2.0 ** (1 - AXIS_BITS))  # the scene takes up to half of each side of the grid
         step = power_below(max(float(np.quantile(widest, 0.001)), finest))
-        first = np.rint(((low + high) / 2 / step - (1 << AXIS_BITS - 1)) / (1 << _BASE_BITS))
-        return cls(step, tuple(int(cell) << _BASE_BITS for cell in first))  # type: ignore[arg-type]
+        # Cells up to a quarter of the grid lie on multiples of their own width, whichever scene it was made for.
+        quarter = 1 << AXIS_BITS - 2
+        first = np.rint(((low + high) / 2 / step - 2 * quarter) / quarter)
+        return cls(step, tuple(int(cell) * quarter for cell in first))  # type: ignore[arg-type]
 
     def cells(self, means: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Cell of each position ``[N, 3]``, 0 for those outside; and which ``[N]`` are inside."""

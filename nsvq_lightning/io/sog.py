@@ -18,8 +18,6 @@ The palette corresponds to an SH codebook, so a scene with one needs no clusteri
 depends only on the decoded splats: a scene gives the same file with its codebooks and without them.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math
@@ -29,7 +27,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,9 +41,6 @@ from nsvq_lightning.splats.conventions import from_smallest_three, sh_coefficien
 
 META = "meta.json"
 ZIP_MAGIC = b"PK\x03\x04"
-_META_LIMIT = 1 << 20
-# Most bytes of a picture for each texel that the file may hold; uncompressed, a texel has four.
-_TEXEL_BYTES = 8
 
 
 def picture_shape(count: int) -> tuple[int, int]:
@@ -101,7 +96,7 @@ class SogArchive:
         except (zipfile.BadZipFile, ValueError, NotImplementedError, EOFError) as error:
             raise FormatError(f"truncated, or not a .sog file: no valid zip archive ({error})") from None
 
-    def __enter__(self) -> SogArchive:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -118,7 +113,7 @@ class SogArchive:
         Raises:
             FormatError: It is missing, damaged, or not a JSON object.
         """
-        text = self._bytes(META, _META_LIMIT)
+        text = self._bytes(META, 1 << 20)
         try:
             meta = json.loads(text)
         except (ValueError, RecursionError) as error:
@@ -143,7 +138,8 @@ class SogArchive:
         """
         from PIL import Image
 
-        data = self._bytes(name, _TEXEL_BYTES * max(FEW_SPLATS, self._size // 2))
+        # Twice the bytes that uncompressed texels have.
+        data = self._bytes(name, 8 * max(FEW_SPLATS, self._size // 2))
         try:
             with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
                 if image.width * image.height < count:

@@ -21,24 +21,10 @@ Axes: the text of the format says right, up, back (RUB), but viewers and convert
 ours: right, down, front (RDF). So these are the default, also of a file that does not say. Where others have the
 opposite direction, coordinates change sign, and with them the coefficients of odd functions.
 
-The container is one gzip stream up to version 3, one Zstandard stream per array in version 4. Up to version 3 the gzip
-stream holds the first 16 bytes below, the arrays, and perhaps extensions, of which only that of the axes is read and
-written. Version 4:
-
-============  ==================  ==================================================================================
-offset        bytes               content
-============  ==================  ==================================================================================
-0             16                  header: ``NGSP``, version (4), N (4), SH degree, fractional bits, flags, and S:
-                                  number of streams (0 up to version 3)
-16            4                   offset T of the table
-20            12                  0
-32            T - 32              extensions, each type (4), length (4), content
-T             16 S                table: compressed and uncompressed bytes of each stream, 8 bytes each
-T + 16 S      rest                streams: the arrays that are not empty
-============  ==================  ==================================================================================
+The container is one gzip stream up to version 3: a header of 16 bytes, the arrays, and perhaps extensions, of which
+only that of the axes is read and written. In version 4, the header is followed by the offset of a table, 12 zero bytes,
+extensions, the table, and one Zstandard stream for each array that is not empty.
 """
-
-from __future__ import annotations
 
 import gzip
 import logging
@@ -51,7 +37,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +46,7 @@ from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, rotated
 from nsvq_lightning.io.errors import FormatError, check_room, naming_file
 from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, opacity_of
-from nsvq_lightning.splats.conventions import from_smallest_three, sh_coefficients, smallest_three, unit
+from nsvq_lightning.splats import conventions as conventions
 
 _MAGIC = b"NGSP"
 # First bytes: those of gzip up to version 3, those of the plain header from version 4 on.
@@ -70,13 +56,12 @@ SPZ_VERSIONS = (3, 4)
 # Largest number of fractional bits of a position.
 MOST_FRACTION = 30
 
+# Magic, version, N, SH degree, fractional bits, flags, and number of streams (0 up to version 3).
 _HEADER = struct.Struct("<4sIIBBBB")
 _TABLE_OFFSET = struct.Struct("<I12x")
 _HEAD = _HEADER.size + _TABLE_OFFSET.size
+# Compressed and uncompressed bytes of a stream.
 _ENTRY = struct.Struct("<QQ")
-# Most bytes that one byte of Zstandard can expand to: a block of 128 KiB of equal bytes takes four.
-_MOST_A_BYTE = 1 << 15
-_LEVEL = 19
 # Bytes of extensions that are read; those in use have less than a hundred.
 _MOST_EXTENDED = 1 << 20
 # The flag of a scene that was trained with anti-aliasing.
@@ -119,7 +104,7 @@ class SpzHeader:
     def sizes(self) -> dict[str, int]:
         """Bytes per splat of each array, in file order."""
         means, quats = (6 if self.version == 1 else 9), (4 if self.version >= 3 else 3)
-        sh = 3 * sh_coefficients(self.sh_degree)
+        sh = 3 * conventions.sh_coefficients(self.sh_degree)
         return {"means": means, "opacities": 1, "sh0": 3, "scales": 3, "quats": quats, "shN": sh}
 
     @property
@@ -229,7 +214,8 @@ def _lengths(header: SpzHeader, table: bytes, rest: int) -> dict[str, int]:
     """Compressed bytes of each stream; table and streams must fill the ``rest`` of the file."""
     entries = dict(zip(header.streams, _ENTRY.iter_unpack(table), strict=True))
     for name, (length, size) in entries.items():
-        if size != header.streams[name] or size > length * _MOST_A_BYTE:
+        # One byte of Zstandard expands to 32 KiB at most: a block of 128 KiB of equal bytes takes four.
+        if size != header.streams[name] or size > length << 15:
             raise FormatError(f"damaged: {name} of {header.count} splats cannot be {size} bytes in {length}")
     lengths = {name: length for name, (length, _) in entries.items()}
     if len(table) + sum(lengths.values()) != rest:
@@ -240,7 +226,7 @@ def _lengths(header: SpzHeader, table: bytes, rest: int) -> dict[str, int]:
 def zstd_compress(data: memoryview) -> bytes:
     """A Zstandard frame with its length and a checksum; the same data give the same bytes with the same release."""
     zstd = _zstd()
-    options = {zstd.CompressionParameter.compression_level: _LEVEL, zstd.CompressionParameter.checksum_flag: 1}
+    options = {zstd.CompressionParameter.compression_level: 19, zstd.CompressionParameter.checksum_flag: 1}
     frame: bytes = zstd.compress(data, options=options)
     return frame
 
@@ -299,7 +285,7 @@ def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
     return _with_axes(header, extensions), contents
 
 
-def _parse_stream(gunzip: zlib._Decompress, data: bytes, file_bytes: int) -> SpzHeader:
+def _parse_stream(gunzip: "zlib._Decompress", data: bytes, file_bytes: int) -> SpzHeader:
     """Header of versions 1 to 3; refuses more splats than the file can hold."""
     header = _parse(_inflate(gunzip, data, _HEADER.size))
     if header.version > 3:
@@ -308,7 +294,7 @@ def _parse_stream(gunzip: zlib._Decompress, data: bytes, file_bytes: int) -> Spz
     return header
 
 
-def _inflate(gunzip: zlib._Decompress, data: bytes, most: int) -> bytes:
+def _inflate(gunzip: "zlib._Decompress", data: bytes, most: int) -> bytes:
     """At most ``most`` bytes of the stream; ``most`` must be above 0, which zlib takes as no limit."""
     try:
         return gunzip.decompress(data, most)
@@ -341,13 +327,7 @@ SPZ_AXES = ("rdf", "rub")
 DEFAULT_AXES = "rdf"
 _POSITION = 24
 _USUAL_FRACTION = 12
-# Largest error of a coordinate as a share of the splat's size, for all but the smallest thousandth of the splats.
-_POSITION_ERROR = 0.05
 _COLOR = 0.15
-# Rows of spherical harmonics rounded at a time.
-_BLOCK = 1 << 16
-# Attributes by whose codes the splats are sorted, the most important last.
-_ORDER = ("quats", "scales", "sh0", "shN")
 # Coordinates that the real spherical harmonics of degree 1 to 3 are odd functions of.
 _ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 
@@ -359,7 +339,7 @@ class _Signs:
     axes: NDArray[np.float32]
 
     @classmethod
-    def of(cls, axes: str) -> _Signs:
+    def of(cls, axes: str) -> Self:
         return cls(np.array([1 if a == b else -1 for a, b in zip(axes, "RDF", strict=True)], np.float32))
 
     @property
@@ -369,7 +349,10 @@ class _Signs:
 
     def harmonics(self, sh_degree: int) -> NDArray[np.float32]:
         """Of the spherical harmonics ``[coefficients, 1]``."""
-        signs = [math.prod(self.axes["xyz".index(axis)] for axis in odd) for odd in _ODD[: sh_coefficients(sh_degree)]]
+        signs = [
+            math.prod(self.axes["xyz".index(axis)] for axis in odd)
+            for odd in _ODD[: conventions.sh_coefficients(sh_degree)]
+        ]
         return np.array(signs, np.float32)[:, None]
 
 
@@ -381,7 +364,7 @@ def in_spz_order(scene: CompressedScene) -> CompressedScene:
     from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
 
     scene = scene.take(spatial_order(scene.means))
-    codes = [scene.codes[name] for name in _ORDER if name in scene.codes]
+    codes = [scene.codes[name] for name in ("quats", "scales", "sh0", "shN") if name in scene.codes]  # shN sorts first
     return scene.take(np.lexsort([np.arange(len(scene)), *codes]))
 
 
@@ -438,7 +421,8 @@ def _fraction_bits(scene: CompressedScene) -> int:
     if len(scene) == 0:
         return _USUAL_FRACTION
     sizes = scene.spread("scales", lambda rows, _: rows.mean(1))
-    needed = math.ceil(-(math.log2(2 * _POSITION_ERROR) + float(np.quantile(sizes, 0.001)) / math.log(2)))
+    # No coordinate is off by more than a twentieth of the splat's size, but for the smallest thousandth of the splats.
+    needed = math.ceil(-(math.log2(2 * 0.05) + float(np.quantile(sizes, 0.001)) / math.log(2)))
     farthest, far = np.abs(scene.means).max(), np.quantile(np.abs(scene.means).max(1), 0.999)
     fits, mostly_fits = (_POSITION - 1 - math.frexp(float(reach))[1] for reach in (farthest, far))
     return min(max(min(needed, fits), min(_USUAL_FRACTION, mostly_fits), 0), MOST_FRACTION)
@@ -457,7 +441,7 @@ def _packed(scene: CompressedScene, name: str, factor: float, zero: float, clamp
 
 
 def _packed_quats(rows: NDArray[np.float32]) -> NDArray[np.uint32]:
-    largest, others = smallest_three(unit(rows)[:, [1, 2, 3, 0]])
+    largest, others = conventions.smallest_three(conventions.unit(rows)[:, [1, 2, 3, 0]])
     packed = largest.astype(np.uint32)
     for part in others.T:
         magnitude = np.minimum(np.rint(511 * math.sqrt(2) * np.abs(part)), 511).astype(np.uint32)
@@ -470,8 +454,8 @@ def _packed_sh(
 ) -> NDArray[np.uint8]:
     values = rows.reshape(len(rows), len(signs), 3)
     packed = np.empty(values.shape, np.uint8)
-    for start in range(0, len(rows), _BLOCK):
-        block = slice(start, start + _BLOCK)
+    for start in range(0, len(rows), 1 << 16):
+        block = slice(start, start + (1 << 16))
         packed[block] = clamped.nearest(
             "shN", 128 * signs * values[block] + 128, (0, 255), None if uses is None else uses[block]
         )
@@ -525,10 +509,10 @@ def _unpacked_means(header: SpzHeader, data: NDArray[np.uint8]) -> NDArray[np.fl
 def _unpacked_quats(header: SpzHeader, data: NDArray[np.uint8]) -> NDArray[np.float32]:
     if header.version < 3:
         xyz = data.astype(np.float64) / 127.5 - 1
-        xyzw = from_smallest_three(np.full(header.count, 3), xyz)
+        xyzw = conventions.from_smallest_three(np.full(header.count, 3), xyz)
     else:
         packed = np.ascontiguousarray(data).view("<u4")[:, 0]
         parts = np.stack([packed >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)], axis=1)
         others = (parts & 511) / (511 * math.sqrt(2)) * np.where(parts & 512, -1, 1)
-        xyzw = from_smallest_three((packed >> np.uint32(30)).astype(np.intp), others)
+        xyzw = conventions.from_smallest_three((packed >> np.uint32(30)).astype(np.intp), others)
     return xyzw[:, [3, 0, 1, 2]]
