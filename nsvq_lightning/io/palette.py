@@ -1,6 +1,5 @@
 """A palette for many rows: cells of similar rows, found by always splitting the cell where that gains most."""
 
-import heapq
 from functools import partial
 from typing import Any
 
@@ -9,9 +8,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import kernel
 from nsvq_lightning.compute.memory import check_array, check_table
-
-# Power-iteration steps for the direction of a cut, which need not be exact.
-_ITERATIONS = 4
+from nsvq_lightning.io.scalar_kmeans import split
 
 
 def find_palette(
@@ -39,7 +36,9 @@ def find_palette(
     check_table("rows", rows)
     wide = weight.astype(np.float64)
     check_array("weight", wide, rows.shape[:1], wide.dtype)
-    labels = _labels(rows, wide, count)
+    cells, labels = _Cells(rows, wide), np.empty(len(rows), np.int64)
+    for number, (start, end) in enumerate(split(cells.best_cut, len(rows), count)):
+        labels[cells.order[start:end]] = number
     mass = np.bincount(labels, wide)
     sums = (np.bincount(labels, wide * column) for column in rows.T)
     return np.stack([total / mass for total in sums], axis=1).astype(np.float32), labels
@@ -64,21 +63,6 @@ def in_order_of_use(
     return distinct[order], order.argsort()[labels]
 
 
-def _labels(rows: NDArray[np.float32], weight: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    cells = _Cells(rows, weight)
-    gain, cut = cells.best_cut(0, len(rows))
-    heap = [(-gain, 0, cut, len(rows))]
-    while len(heap) < count and heap[0][0] < 0:
-        _, start, cut, end = heapq.heappop(heap)
-        for first, last in ((start, cut), (cut, end)):
-            gain, inner = cells.best_cut(first, last)
-            heapq.heappush(heap, (-gain, first, inner, last))
-    labels = np.empty(len(rows), np.int64)
-    for number, (_, start, _, end) in enumerate(heap):
-        labels[cells.order[start:end]] = number
-    return labels
-
-
 class _Cells:
     """Runs of ``order [N]``, the indices of the rows; each run is a cell."""
 
@@ -89,7 +73,7 @@ class _Cells:
     def best_cut(self, start: int, end: int) -> tuple[float, int]:
         """Sort a cell along its direction; returns how much the sum of squares falls if it is cut in two, and where."""
         if end - start < 2:
-            return 0.0, start
+            return -1.0, start
         numbers = self.order[start:end]
         along = np.empty(end - start)
         _place_along(self._rows, self._weight, numbers, along)
@@ -100,7 +84,7 @@ class _Cells:
         left, right = mass[:-1], mass[-1] - mass[:-1]
         gains = np.square(total[:-1] / left - (total[-1] - total[:-1]) / right) * (left * right / mass[-1])
         best = int(gains.argmax())
-        return float(gains[best]), start + 1 + best
+        return float(gains[best]) or -1.0, start + 1 + best  # equal rows gain nothing
 
 
 @partial(kernel, parallel=False)
@@ -126,7 +110,7 @@ def _place_along(rows, weight, numbers, along):  # type: ignore[no-untyped-def]
         if product[j] > product[widest]:
             widest = j
     direction[widest] = 1
-    for _ in range(_ITERATIONS):
+    for _ in range(4):  # steps of power iteration: the direction of a cut need not be exact
         length = 0.0
         product[:] = 0
         for n, i in enumerate(numbers):

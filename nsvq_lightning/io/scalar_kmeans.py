@@ -1,12 +1,28 @@
 """The few levels that represent many values with the least squared error (Max 1960, Lloyd 1982)."""
 
 import heapq
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-# Largest number of Lloyd steps; each costs one search of 256 borders, whatever the number of values.
-_STEPS = 500
+
+def split(best_cut: Callable[[int, int], tuple[float, int]], size: int, count: int) -> list[tuple[int, int]]:
+    """Start and end of cells of ``size`` numbers: of one cell of all, always the one that gains most is cut in two.
+
+    Args:
+        best_cut: From start and end of a cell, how much a cut gains and where it is; below 0 if there is none.
+        size: How many numbers there are.
+        count: Largest number of cells.
+    """
+    gain, cut = best_cut(0, size)
+    heap = [(-gain, 0, cut, size)]
+    while len(heap) < count and heap[0][0] <= 0:
+        _, start, cut, end = heapq.heappop(heap)
+        for first, last in ((start, cut), (cut, end)):
+            gain, inner = best_cut(first, last)
+            heapq.heappush(heap, (-gain, first, inner, last))
+    return [(start, end) for _, start, _, end in heap]
 
 
 def scalar_kmeans(
@@ -31,8 +47,9 @@ def scalar_kmeans(
         padded = np.concatenate([numbers, np.full(count - len(numbers), numbers[-1] if len(numbers) else 0.0)])
         return padded.astype(np.float32)
     cells = _Cells(numbers, mass)
-    levels = cells.means(_split(cells, len(numbers), count), np.zeros(count))
-    for _ in range(_STEPS):
+    starts = sorted(start for start, _ in split(cells.best_split, len(numbers), count))
+    levels = cells.means(np.array([*starts, len(numbers)]), np.zeros(count))
+    for _ in range(500):  # each costs one search of 256 borders, whatever the number of values
         ends = np.concatenate([[0], np.searchsorted(numbers, _borders(levels)), [len(numbers)]])
         moved = cells.means(ends, levels)
         if np.array_equal(moved, levels):
@@ -73,15 +90,3 @@ class _Cells:
         gains = np.square(left_sum / left - right_sum / right) * (left * right / (left + right))
         best = int(gains.argmax())
         return float(gains[best]), first + 1 + best
-
-
-def _split(cells: _Cells, numbers: int, count: int) -> NDArray[np.intp]:
-    """Ends ``[count + 1]`` of cells: starting from one cell of all values, always split the one that gains most."""
-    gain, cut = cells.best_split(0, numbers)
-    heap = [(-gain, 0, cut, numbers)]
-    while len(heap) < count:
-        _, first, cut, end = heapq.heappop(heap)
-        for start, stop in ((first, cut), (cut, end)):
-            gain, inner = cells.best_split(start, stop)
-            heapq.heappush(heap, (-gain, start, inner, stop))
-    return np.array([*sorted(cell[1] for cell in heap), numbers])

@@ -28,8 +28,6 @@ logger = logging.getLogger(__name__)
 _RECORD = np.dtype([("means", "<f4", 3), ("lengths", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
 # Bytes of each part of a splat.
 SPLAT_LAYOUT = {name: _RECORD[name].itemsize for name in _RECORD.names or ()}
-# Logarithms of the smallest and largest length that float32 holds with full precision.
-_SMALLEST, _LARGEST = -87.0, 88.0
 
 
 def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:
@@ -51,8 +49,9 @@ def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:
     clamped = Clamped()
     records = np.empty(len(scene), _RECORD)
     records["means"] = scene.means
+    # Between the smallest and the largest length that float32 holds with full precision.
     records["lengths"] = scene.spread(
-        "scales", lambda rows, uses: np.exp(clamped.within("scales", rows, _SMALLEST, _LARGEST, uses))
+        "scales", lambda rows, uses: np.exp(clamped.within("scales", rows, -87.0, 88.0, uses))
     )
     records["colors"][:, :3] = scene.spread(
         "sh0", lambda rows, uses: clamped.nearest("sh0", 255 * (0.5 + SH_C0 * rows), (0, 255), uses=uses)

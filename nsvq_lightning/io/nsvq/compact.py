@@ -11,17 +11,7 @@
 
 Decoding never depends on floating-point arithmetic that two machines might round differently.
 
-==========================  ================================================================================
-stream                      content
-==========================  ================================================================================
-``opacities``               levels as paths; neighbours: the two splats before
-``scales``                  codes as paths, or integers; the same neighbours
-``means.grid``              base of the grid (3 int64), doublings of its step for a splat of size 1 (float64)
-``means``                   Morton keys of all splats but the far ones
-``means.far``               float32 positions of the far splats
-``quats`` ``sh0`` ``shN``   codes as paths, or integers; neighbours: two near splats among the 16 before
-``<attribute>.codebook``    integers, before the stream of its codes
-==========================  ================================================================================
+The streams, one by one: docs/nsvq_format.md.
 """
 
 import math

@@ -21,13 +21,10 @@ KEY_BITS = 63
 # Decisions of a path that have contexts; those further down are written without a model.
 _MODELLED_BITS = 16
 
-_LONGEST_PATH = 32
-
 # What two neighbours say about a decision: each one has left the path before, takes 0 here, or takes 1 here.
 _RELATIONS = 9
 
 _START = uint64(0xFFFFFFFFFFFFFFFF)
-_WORD_BITS = 32
 # Integers are below it in size: they and their sums are exact in float64.
 _TOO_LARGE = 1 << 52
 _KEY_MASK = uint64((1 << KEY_BITS) - 1)
@@ -57,8 +54,8 @@ def encode_paths(paths: NDArray[np.int64], bits: int, neighbours: NDArray[np.int
 
 
 def _check_paths(bits: int, neighbours: NDArray[np.int32]) -> None:
-    if not 0 <= bits <= _LONGEST_PATH:
-        raise ValueError(f"a path must have 0 to {_LONGEST_PATH} bits, got {bits}")
+    if not 0 <= bits <= 32:
+        raise ValueError(f"a path must have 0 to 32 bits, got {bits}")
     check_array("neighbours", neighbours, (len(neighbours), 2), INT32)
     if neighbours.size and (neighbours.min() < -1 or neighbours.max() >= len(neighbours)):
         raise ValueError(f"neighbours must be in [-1, {len(neighbours)}), got {neighbours.min()} to {neighbours.max()}")
@@ -136,7 +133,7 @@ def encode_integers(values: NDArray[np.int64]) -> bytes:
     if values.ndim != 2 or (values.size and max(-int(values.min()), int(values.max())) >= _TOO_LARGE):
         raise ValueError(f"values must have shape [N, D] and be below 2^52 in size, got {list(values.shape)}")
     steps = np.diff(values, axis=0, prepend=0)
-    by_steps = _size(steps) < _size(values)
+    by_steps: NDArray[np.bool_] = _bit_lengths(steps).sum(0) < _bit_lengths(values).sum(0)  # approximately their bits
     chosen = np.where(by_steps, steps, values)
     words = _room(int(_bit_lengths(chosen).sum()) + 8 * chosen.size)
     used = _write_integers(chosen, words, rc.new_contexts(_INTEGER_CONTEXTS * values.shape[1]))
@@ -165,7 +162,7 @@ def decode_integers(data: bytes | memoryview, rows: int, columns: int) -> NDArra
 
 def _room(bits: int) -> NDArray[np.uint32]:
     """Enough words for this many modelled bits: an unlikely bit costs up to 11 bits."""
-    return np.zeros(11 * bits // _WORD_BITS + 4, np.uint32)
+    return np.zeros(11 * bits // 32 + 4, np.uint32)
 
 
 def _bytes(words: NDArray[np.uint32], used: int) -> bytes:
@@ -352,12 +349,6 @@ def _bit_lengths(values: NDArray[np.int64]) -> NDArray[np.int64]:
     """Bit length of each absolute value; 0 for 0."""
     exponents: NDArray[np.int64] = np.frexp(np.abs(values).astype(np.float64))[1].astype(np.int64)
     return exponents
-
-
-def _size(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Approximate number of bits of each column."""
-    total: NDArray[np.int64] = _bit_lengths(values).sum(0)
-    return total
 
 
 @partial(kernel, parallel=False, allocates=False)

@@ -18,13 +18,6 @@ from nsvq_lightning.io.nsvq.header import AttributeEntry
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.io.numbers import coarsest_power, nearest_power, opacity_of
 
-# Largest base-2 logarithm of a width in scene units whose multiples float64 still holds.
-_MOST_DOUBLINGS = 500.0
-# A codebook on a lattice this much finer than necessary is stored on it, without an error.
-_FINER = 4
-# Step of a codebook whose rows do not differ.
-_SMALLEST_STEP = 2.0**-16
-
 
 class Stored(NamedTuple):
     """One attribute as integers.
@@ -81,7 +74,7 @@ def _coded(name: str, codes: NDArray[np.integer], codebook: NDArray[np.float32],
 def _codebook_step(name: str, rows: NDArray[np.float32], error: float) -> float:
     """Step of the codebook of an attribute, a power of two.
 
-    It is that lattice which all values lie on already, unless it is much finer than ``error`` asks for.
+    It is that lattice which all values lie on already, unless it is over four times finer than ``error`` asks for.
 
     Args:
         name: The attribute.
@@ -90,8 +83,8 @@ def _codebook_step(name: str, rows: NDArray[np.float32], error: float) -> float:
     """
     lattice = coarsest_power(rows)
     distinct = np.unique(_unit(rows) if name == "quats" else rows, axis=0)
-    wanted = nearest_power(2 * error * sibling_distance(distinct[tree_order(distinct)]) or _SMALLEST_STEP)
-    return lattice if lattice * _FINER >= wanted else wanted
+    wanted = nearest_power(2 * error * sibling_distance(distinct[tree_order(distinct)]) or 2.0**-16)
+    return lattice if 4 * lattice >= wanted else wanted
 
 
 def _unit(quats: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -140,7 +133,7 @@ def position_grid(
         stored: The log-scales and the opacities of their splats.
         precision: The largest errors.
     """
-    widest = np.minimum(doublings_of(stored, math.log2(2 * precision.position)), _MOST_DOUBLINGS)
+    widest = np.minimum(doublings_of(stored, math.log2(2 * precision.position)), 500.0)  # float64 holds the multiples
     grid = Grid.around(means, np.exp2(widest))
     for_size_one = math.log2(2 * precision.position / grid.step)
     return grid, for_size_one, grid.depths(doublings_of(stored, for_size_one))
