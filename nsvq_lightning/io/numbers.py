@@ -81,16 +81,10 @@ class Clamped:
         """Warn how many of ``count`` splats were clamped to the format's range."""
         changed = ", ".join(f"{name} {splats}" for name, splats in self._counts.items() if splats)
         if changed:
+            suffix = os.path.splitext(path)[1].lower()
             logger.warning(
-                "%s: out of the range of %s files and clamped to it: %s (of %d splats)",
-                os.fspath(path),
-                os.path.splitext(path)[1].lower(),
-                changed,
-                count,
+                f"{path}: out of the range of {suffix} files and clamped to it: {changed} (of {count} splats)"
             )
-
-
-_MANTISSA_BITS = 24
 
 
 def power_below(value: float) -> float:
@@ -115,6 +109,6 @@ def coarsest_power(values: NDArray[np.float32]) -> float:
     mantissas, exponents = np.frexp(values[values != 0])
     if not mantissas.size:
         return 0.0
-    wholes = np.ldexp(mantissas, _MANTISSA_BITS).astype(np.int64)
+    wholes = np.ldexp(mantissas, 24).astype(np.int64)  # float32 has so many bits
     lowest = (wholes & -wholes).astype(np.float64)  # the lowest bit that is set
-    return math.ldexp(1.0, int((np.frexp(lowest)[1] - 1 + exponents).min()) - _MANTISSA_BITS)
+    return math.ldexp(1.0, int((np.frexp(lowest)[1] - 1 + exponents).min()) - 24)

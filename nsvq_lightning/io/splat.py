@@ -42,10 +42,8 @@ def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:
     if scene.sh_degree:
         logger.warning("%s: .splat files hold no spherical harmonics; colours no longer change with the view", path)
     if scene.antialiased:
-        logger.warning(
-            "%s: the file cannot say that the scene was trained with anti-aliasing: switch it on in the viewer, or "
-            "small splats look too thick", path,
-        )  # fmt: skip
+        advice = "switch it on in the viewer, or small splats look too thick"
+        logger.warning("%s: the file cannot say that the scene was trained with anti-aliasing: %s", path, advice)
     clamped = Clamped()
     records = np.empty(len(scene), _RECORD)
     records["means"] = scene.means

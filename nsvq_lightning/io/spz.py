@@ -471,10 +471,10 @@ def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
     """
     header, arrays = read_frame(path)
     if not header.axes:
-        logger.info(
-            "%s: the file does not say where its axes point; taken as right, down, front, as in .ply. If it is upside "
-            "down: nsvq convert --up minus-y --up-from 0 1 0", path,
-        )  # fmt: skip
+        taken = (
+            "taken as right, down, front, as in .ply. If it is upside down: nsvq convert --up minus-y --up-from 0 1 0"
+        )
+        logger.info("%s: the file does not say where its axes point; %s", path, taken)
     axes = header.axes or DEFAULT_AXES.upper()
     turn = axes[1] in "FB"
     if turn:  # z is up or down: signs first, then a quarter turn, as Niantic's library does it, which writes such files

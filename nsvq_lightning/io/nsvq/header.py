@@ -1,15 +1,6 @@
-r"""The frame of a ``.nsvq`` file, readable without knowing the compression level: prefix, JSON header, streams.
+"""The frame of a ``.nsvq`` file, readable without knowing the compression level: prefix, JSON header, streams.
 
-============  =====  ==========================================================================================
-offset        bytes  content
-============  =====  ==========================================================================================
-0             8      magic ``\x89NSVQ\r\n\x1a``; its line ends and high bit expose transfers that treat it as text
-8             16     BLAKE2b digest (16 bytes) of everything after it
-24            4      format version, uint32 little-endian
-28            4      length J of the JSON header, uint32 little-endian
-32            J      header: UTF-8 JSON, keys sorted, no spaces; it says what the streams hold
-32 + J        rest   streams, back to back in the order of the stream table
-============  =====  ==========================================================================================
+docs/nsvq_format.md lists every byte.
 
 Nothing in the file is executable, and every length is checked against the available bytes before it is used. New levels
 add storage kinds of attributes, stream names and stream encodings; the frame stays the same.
@@ -31,9 +22,11 @@ from typing import Any, NamedTuple, TypeVar, get_type_hints
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 
+# Its line ends and high bit expose transfers that treat it as text.
 MAGIC = b"\x89NSVQ\r\n\x1a"
 VERSION = 2
 
+# Magic, BLAKE2b digest of everything after it, version, and bytes of the JSON, whose keys are sorted, without spaces.
 _PREFIX = struct.Struct("<8s16sII")
 _DIGEST_END = 24
 _T = TypeVar("_T")
