@@ -1,4 +1,4 @@
-"""A sweep over a tiny scene: shared trunks, the same bits as alone, failures, interruptions, the rerun."""
+"""A sweep over a tiny scene: the same bits as alone, failures, interruptions, the rerun."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import csv
 import json
 import os
 import shlex
-import shutil
 import signal
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -29,13 +28,10 @@ Calls = list[Sequence[str]]
 Swept = tuple[Path, Calls, list[Row]]
 """Folder, what was run, and the rows."""
 
-SMALL = """
---data.factor=2 --trainer.accelerator=cpu --model.sh_degree=1 --callbacks.phases.min_density_interval=4
---callbacks.phases.min_reset_interval=11 --callbacks.phases.min_replacement_interval=5
---callbacks.density.grad_threshold=5e-6 --callbacks.density.max_splats=1500 --callbacks.report.every=20
---callbacks.report.lpips=false
-"""
-OPTIONS = SMALL.split()
+OPTIONS = (
+    "--data.factor=4 --trainer.accelerator=cpu --trainer.max_steps=16 --model.sh_degree=0 --splats=400 "
+    "--callbacks.report.pictures=false --callbacks.report.every=0 --callbacks.report.lpips=false"
+).split()
 
 
 @contextmanager
@@ -55,19 +51,17 @@ def in_process() -> Iterator[Calls]:
 
 @pytest.fixture(scope="module")
 def configs(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
-    """Two sizes (the larger with options that only matter once quantized), none, and a quantizer that cannot work."""
+    """A size, no codebooks, and a quantizer that cannot work."""
     folder = tmp_path_factory.mktemp("configs")
-    late = "callbacks: {canonical: {mode: full}, phases: {quantize_end: 40000}}"
-    large = "{scales: 32, quats: 24, sh0: 16, shN: 16}"
-    codebooks = {"small": "{scales: 8, sh0: 8}", "large": large, "none": "null", "wrong": "{sh1: 8}"}
+    codebooks = {"small": "{scales: 8, sh0: 8}", "none": "null", "wrong": "{sh1: 8}"}
     for name, sizes in codebooks.items():
-        (folder / f"{name}.yaml").write_text(f"model: {{codebooks: {sizes}}}\n{late * (name == 'large')}\n")
+        (folder / f"{name}.yaml").write_text(f"model: {{codebooks: {sizes}}}\n")
     return tuple(str(folder / f"{name}.yaml") for name in codebooks)
 
 
 @pytest.fixture(scope="module")
 def runs(demo_scene: Path, configs: tuple[str, ...]) -> list[Run]:
-    return plan([demo_scene], configs, options=("--trainer.max_steps=60", *OPTIONS))
+    return plan([demo_scene], configs, options=OPTIONS)
 
 
 @pytest.fixture(scope="module")
@@ -104,9 +98,9 @@ def held(folder: Path) -> Iterator[None]:
 def test_a_run_of_a_sweep_is_the_run_alone(
     swept: Swept, demo_scene: Path, configs: tuple[str, ...], tmp_path: Path
 ) -> None:
-    alone = ["fit", f"--config={configs[1]}", f"--data.root={demo_scene}", "--trainer.max_steps=60", *OPTIONS]
+    alone = ["fit", f"--config={configs[0]}", f"--data.root={demo_scene}", *OPTIONS]
     assert main([*alone, f"--trainer.run_folder={tmp_path / 'alone'}", "--trainer.logger=false"]) == 0
-    assert same(swept[2][1]["folder"], tmp_path / "alone")
+    assert same(swept[2][0]["folder"], tmp_path / "alone")
 
 
 def test_what_its_command_has_trained_is_collected(
@@ -122,57 +116,32 @@ def test_what_its_command_has_trained_is_collected(
         (row,) = sweep(output, runs[:1])
     assert calls == []
     assert same(row["folder"], swept[2][0]["folder"])
-    assert row["trunk_seconds"] == 0.0
     assert not (row["folder"] / "checkpoints").exists()
 
 
-def test_what_the_runs_share_is_trained_once_and_a_failure_stops_no_other(swept: Swept) -> None:
+def test_a_failure_stops_no_other_and_a_rerun_tries_it_again_under_any_name(swept: Swept, runs: list[Run]) -> None:
     output, calls, rows = swept
-    (trunk,) = (output / "trunks").iterdir()
-    checkpoint = f"--ckpt_path={trunk / 'checkpoints' / 'last.ckpt'}"
-    assert [checkpoint in call for call in calls] == [False, True, True, True, True]
-    seconds = json.loads((trunk / "metrics.json").read_text())["train_seconds"]
-    for row in rows[:3]:
-        assert row["trunk_seconds"] == pytest.approx(seconds, abs=0.02)
-        assert row["seconds"] > seconds
-    assert [bool(row["error"]) for row in rows] == [False, False, False, True]
+    assert len(calls) == 3
+    assert [bool(row["error"]) for row in rows] == [False, False, True]
     with open(output / "results.csv", newline="") as file:
         table = list(csv.DictReader(file))
-    assert [line["config"] for line in table] == ["small", "large", "none", "wrong"]
-    for line, row in zip(table[:3], rows, strict=False):
+    assert [line["config"] for line in table] == ["small", "none", "wrong"]
+    for line, row in zip(table[:2], rows, strict=False):
         size = (row["folder"] / "scene.nsvq").stat().st_size
         assert int(line["bytes"]) == size < int(line["bytes_paper"])
         assert float(line["psnr"]) == metrics_of(row["folder"])["psnr"]
         before = metrics_of(row["folder"])["before_quantization"]
         assert line["psnr_before"] == ("" if line["codebooks"] == "" else str(before["psnr"]))
-    assert table[3]["psnr"] == ""
-    assert table[3]["error"]
+    assert table[2]["psnr"] == ""
+    assert table[2]["error"]
     assert (output / "results.png").is_file()
     assert "Failed:" in (output / "results.md").read_text()
-
-
-def test_a_rerun_skips_what_is_finished_even_under_another_name(swept: Swept, runs: list[Run]) -> None:
-    output, _, rows = swept
     renamed = replace(runs[0], names=runs[0].names | {"config": "renamed"})
     with in_process() as calls:
         again = sweep(output, [renamed, *runs[1:]])
-    assert again[:3] == [rows[0] | {"config": "renamed"}, *rows[1:3]]
-    assert len(calls) == 1  # what failed is tried again, from the trunk
+    assert again[:2] == [rows[0] | {"config": "renamed"}, rows[1]]
+    assert len(calls) == 1
     assert not list(output.glob("runs/*none*/checkpoints"))
-
-
-def test_a_run_stopped_after_its_last_step_is_only_measured(swept: Swept, runs: list[Run], tmp_path: Path) -> None:
-    output = tmp_path / "copy"
-    shutil.copytree(swept[0], output)
-    folder = folder_of(output, runs[0])
-    shutil.rmtree(folder)
-    with in_process():
-        (first,) = sweep(output, runs[:1], keep_checkpoints=True)
-        for name in ("finished.json", "metrics.json", "scene.nsvq"):
-            (folder / name).unlink()
-        (second,) = sweep(output, runs[:1])
-    assert second["seconds"] == pytest.approx(first["seconds"], abs=0.05)
-    assert second | {"seconds": first["seconds"]} == first
 
 
 def test_an_interrupted_run_goes_on_from_its_checkpoint(
@@ -184,40 +153,28 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint(
         """No error that the command turns into a line."""
 
     def save(self: RunCheckpoint, trainer: Any, module: Any) -> None:
-        """Stop at the first checkpoint after the trunk, as a killed process would."""
         original(self, trainer, module)
-        if trainer.ckpt_path is not None:
-            raise Killed
+        raise Killed
 
     original = RunCheckpoint._save
     with in_process(), monkeypatch.context() as patch:
         patch.setattr(RunCheckpoint, "_save", save)
         with pytest.raises(Killed):
-            sweep(tmp_path, runs[1:2])
+            sweep(tmp_path, runs[:1])
     assert not (tmp_path / "results.csv").exists()
-    own = f"--ckpt_path={folder_of(tmp_path, runs[1]) / 'checkpoints' / 'last.ckpt'}"
-    (line,) = commands(tmp_path, runs[1:2])
+    own = f"--ckpt_path={folder_of(tmp_path, runs[0]) / 'checkpoints' / 'last.ckpt'}"
+    (line,) = commands(tmp_path, runs[:1])
     assert shlex.split(line)[-1] == own
     with in_process() as calls:
-        (row,) = sweep(tmp_path, runs[1:2])
-    ((*_, checkpoint),) = calls  # neither the trunk nor the part that was done
-    assert checkpoint == own
-    assert same(row["folder"], swept[2][1]["folder"])
-    assert row["trunk_seconds"] > 0
-
-
-def test_a_trunk_that_fails_is_tried_once(runs: list[Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-
-    def fails(arguments: Sequence[str], log: Path) -> int:
-        calls.append(arguments)
-        log.write_text("begun\nerror: no photos here\n(NSVQ_TRACEBACK=1 shows where)\n")
-        return 1
-
-    monkeypatch.setattr(module, "run_subprocess", fails)
-    rows = sweep(tmp_path, runs)
-    assert len(calls) == 1
-    assert all(row["error"].startswith("trunk: no photos here (see ") for row in rows)
+        (row,) = sweep(tmp_path, runs[:1], keep_checkpoints=True)
+    assert [call[-1] for call in calls] == [own]
+    assert same(row["folder"], swept[2][0]["folder"])
+    for name in ("metrics.json", "scene.nsvq"):  # as if stopped after its last step: it is only measured
+        (row["folder"] / name).unlink()
+    with in_process():
+        (second,) = sweep(tmp_path, runs[:1])
+    assert second["seconds"] == pytest.approx(row["seconds"], abs=0.05)
+    assert second | {"seconds": row["seconds"]} == row
 
 
 def test_a_process_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -261,11 +218,10 @@ def test_the_command_says_what_it_would_do(
     demo_scene: Path, configs: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = [f"--scenes={demo_scene}", f"--configs={configs[0]},plain", "--seeds=0,1", "--max-steps=60"]
-    assert main(["sweep", "--dry-run", f"--output={tmp_path}", *given, *OPTIONS[:3]]) == 0
+    assert main(["sweep", "--dry-run", f"--output={tmp_path}", *given, *OPTIONS[:2]]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 4
-    assert "60 iterations from trunks/scene-seed0-" in lines[0]
-    assert lines[1].endswith("60 iterations from the start, new")
+    assert all(line.endswith(": 60 iterations, new") for line in lines)
     assert main(["sweep", f"--output={tmp_path}", "--scenes=missing"]) == 1
     problem = "missing is no folder; --scenes takes COLMAP folders with commas between them"
     assert capsys.readouterr().err == f"nsvq sweep: {problem}\n"

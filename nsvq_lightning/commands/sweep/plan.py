@@ -1,6 +1,4 @@
-"""Which runs a sweep is made of (scenes × seeds × configurations × quantizers × sizes), and what two of them share."""
-
-from __future__ import annotations
+"""Which runs a sweep is made of: scenes × seeds × configurations × quantizers × sizes."""
 
 import hashlib
 import json
@@ -12,19 +10,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.commands.arguments import expand, resolve_configs
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.quantize.attributes import codebook_sizes
-from nsvq_lightning.training.resume import QUANTIZE_RULES
-from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.version import __version__
 
 # All settings of a ``nsvq fit``: what ``--print_config`` shows, as JSON values.
 Settings = dict[str, Any]
-
-# Callbacks that do nothing before the iterations of the prune phase are done.
-BRANCH_CALLBACKS = ("canonical", "codebook_init", "codebook_refit", "codebook_replacement", "codebook_finite", "freeze")
 
 
 @dataclass(frozen=True)
@@ -52,46 +44,6 @@ class Run:
         text = json.dumps({"version": __version__, "settings": self.settings}, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
-    @property
-    def trunk(self) -> Run | None:
-        """The run up to the end of the prune phase, where quantizer and codebooks do not matter yet.
-
-        Runs with the same trunk are the same, bit for bit, until the quantize phase starts. Left out of the trunk are
-        the quantizer, the codebooks, the callbacks that drive them, and where the quantize phase ends; everything else
-        counts.
-
-        Returns:
-            None where that is not certain, or there is nothing to share: no phase before or after that point, callbacks
-            that are not this package's, or a trainer that may stop elsewhere.
-        """
-        trainer, callbacks = self.settings["trainer"], self.settings["callbacks"]
-        drivers = [callbacks[name] for name in ("phases", *BRANCH_CALLBACKS) if callbacks[name] is not None]
-        known = all(driver["class_path"].startswith("nsvq_lightning.") for driver in drivers)
-        # With these, unless null or 0, it may end elsewhere when it is cut in two.
-        stops = ("callbacks", "fast_dev_run", "max_time", "min_epochs", "min_steps", "overfit_batches")
-        endless = trainer["max_epochs"] in (None, -1) and trainer["limit_train_batches"] in (None, 1.0)
-        if any(trainer[name] for name in stops) or not endless or not known or callbacks["phases"] is None:
-            return None
-        phases = PhaseSchedule(**callbacks["phases"]["init_args"])
-        total = phases.total or trainer["max_steps"]
-        if total < 1 or (phases.total is None and phases.iterations_per_photo is not None):
-            return None  # it has no end, or one that follows from the photos
-        schedule = phases.schedule(total)
-        end = schedule.ends[Phase.PRUNE]
-        if not 0 < end < trainer["max_steps"]:
-            return None
-        trunk = deepcopy(self.settings)
-        trunk["trainer"]["max_steps"] = end
-        trunk_phases = trunk["callbacks"]["phases"]["init_args"]
-        for name in QUANTIZE_RULES:
-            trunk_phases.pop(name, None)
-        trunk_phases |= {"total": total, "quantize_end": schedule.reference_total}
-        trunk["callbacks"] |= dict.fromkeys((*BRANCH_CALLBACKS, "export"))
-        # What all branches start from, whatever they keep of themselves.
-        del trunk["callbacks"]["checkpoint"], trunk["model"]["quantizer"]
-        trunk["model"]["codebooks"] = None
-        return Run(self.names | dict.fromkeys(("config", "quantizer", "codebooks"), ""), trunk)
-
 
 def plan(
     scenes: Sequence[str | Path] = (),
@@ -101,7 +53,7 @@ def plan(
     seeds: Sequence[int] = (),
     options: Sequence[str] = (),
 ) -> list[Run]:
-    """All runs, those that share most next to each other; of two with the same settings the first.
+    """All runs, scene by scene; of two with the same settings the first.
 
     An empty list leaves the choice to the configurations.
 

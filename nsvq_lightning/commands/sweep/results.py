@@ -9,17 +9,12 @@ import numpy as np
 
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.report import figures
-from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.version import __version__
 
 Row = dict[str, Any]
 
 # Columns that say which runs a line of the table is about: they differ in the seed alone.
 NAMES = ("scene", "config", "quantizer", "codebooks")
-
-
-def read(path: Path) -> Any:
-    """A JSON file; None if it is not there."""
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
 
 
 def row_of(names: Row, folder: Path, error: str = "") -> Row:
@@ -28,14 +23,11 @@ def row_of(names: Row, folder: Path, error: str = "") -> Row:
     Returns:
         Scene, config, quantizer, codebooks, seed, steps; PSNR (dB; None where infinite) and SSIM of the decoded file on
         the test views, its bytes and splats; its bytes at level ``paper``, and the PSNR of the scene before it was
-        stored, which is that of level ``paper``; the seconds of training as if nothing had been shared, and the part of
-        them that was trained once for all runs with this trunk; the PSNR of the plain splats at the end of the prune
-        phase, None without codebooks; the version of the package that trained it; folder; error. What is not known, as
-        in a failed run, is None.
+        stored, which is that of level ``paper``; the seconds of training; the PSNR of the plain splats at the end of
+        the prune phase, None without codebooks; the version of the package that trained it; folder; error. What is not
+        known, as in a failed run, is None.
     """
-    metrics, record = ({}, {}) if error else (read(folder / "metrics.json"), read(folder / "finished.json"))
-    ends = metrics.get("phases", [{}])
-    shared = [end["seconds"] for end in ends if record.get("trunk") and Phase[end["phase"].upper()] <= Phase.PRUNE]
+    metrics = {} if error else json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
     return {
         **names,
         "psnr": metrics.get("psnr"),
@@ -43,11 +35,10 @@ def row_of(names: Row, folder: Path, error: str = "") -> Row:
         "bytes": metrics.get("file_bytes"),
         "splats": metrics.get("num_splats"),
         "bytes_paper": metrics.get("paper_level", {}).get("file_bytes"),
-        "psnr_paper": ends[-1].get("psnr"),
+        "psnr_paper": metrics.get("phases", [{}])[-1].get("psnr"),
         "seconds": metrics.get("train_seconds"),
-        "trunk_seconds": None if error else max(shared, default=0.0),
         "psnr_before": (metrics.get("before_quantization") or {}).get("psnr"),
-        "version": record.get("version"),
+        "version": None if error else __version__,
         "folder": folder,
         "error": error,
     }
@@ -109,7 +100,7 @@ def as_markdown(rows: Sequence[Row]) -> str:
         parts.append(figures.markdown_table([*NAMES, "runs", *table], lines, words=NAMES))
         parts.append(
             "Mean ± standard deviation over the seeds. PSNR and SSIM are those of the decoded file on the test views; "
-            "before: of the plain splats. Seconds include those that runs have shared (`trunk_seconds` in the CSV)."
+            "before: of the plain splats."
         )
     failed = ["* {scene}, {config}, {codebooks}, seed {seed}: {error}".format(**row) for row in rows if row["error"]]
     if failed:

@@ -1,7 +1,7 @@
 """Train every combination of the lists; write a table and a picture of PSNR over file size.
 
-What several runs share is trained once. The same command goes on where it was, and trains only what is new. Options
-of 'nsvq fit' may follow; they hold for every run: --data.factor=2 --callbacks.density.max_splats=80000
+The same command goes on where it was, and trains only what is new. Options of 'nsvq fit' may follow; they hold for
+every run: --data.factor=2 --splats=80000
 
 Examples:
   nsvq sweep --scenes fox --codebooks 0.5k,1k,2k,4k,8k,16k --seeds 0,1,2 --max-steps 4500 --output sweeps/fox
@@ -26,7 +26,6 @@ from typing import TYPE_CHECKING
 from nsvq_lightning.commands.arguments import integers, names
 from nsvq_lightning.commands.sweep import results
 from nsvq_lightning.io.atomic import write_text
-from nsvq_lightning.version import __version__
 
 if TYPE_CHECKING:
     from nsvq_lightning.commands.sweep.plan import Run, Settings
@@ -120,16 +119,15 @@ def run_subprocess(arguments: Sequence[str], log: Path) -> int:
         process.wait()
 
 
-def prepare(folder: Path, settings: Settings, start: Path | None = None) -> list[str]:
+def prepare(folder: Path, settings: Settings) -> list[str]:
     """Make the folder of a training ready and write its settings there.
 
     Args:
         folder: Where; what a training that failed before its first checkpoint has left there is removed.
         settings: All settings of ``nsvq fit``.
-        start: Checkpoint to branch from if there is none in the folder to continue from.
 
     Returns:
-        Arguments of ``nsvq`` that train.
+        Arguments of ``nsvq`` that train, from the checkpoint in the folder if there is one.
 
     Raises:
         FileExistsError: Another process writes to the folder.
@@ -139,9 +137,8 @@ def prepare(folder: Path, settings: Settings, start: Path | None = None) -> list
     folder.mkdir(parents=True, exist_ok=True)
     hold(folder)
     try:
-        if (folder / CHECKPOINT).is_file():
-            start = folder / CHECKPOINT
-        else:
+        begun = (folder / CHECKPOINT).is_file()
+        if not begun:
             for path in map(folder.joinpath, RUN_FILES):
                 shutil.rmtree(path, ignore_errors=True)
                 path.unlink(missing_ok=True)
@@ -149,11 +146,11 @@ def prepare(folder: Path, settings: Settings, start: Path | None = None) -> list
     finally:
         let_go(folder)
     arguments = ["fit", "--config", str(folder / "config.yaml"), f"--trainer.run_folder={folder}"]
-    return arguments if start is None else [*arguments, f"--ckpt_path={start}"]
+    return [*arguments, f"--ckpt_path={folder / CHECKPOINT}"] if begun else arguments
 
 
-def train(folder: Path, settings: Settings, start: Path | None = None) -> str:
-    """Train, from the checkpoint in the folder if there is one, else from ``start``, else from the beginning.
+def train(folder: Path, settings: Settings) -> str:
+    """Train, from the checkpoint in the folder if there is one.
 
     Returns:
         Why the training has failed, in one line; nothing if it is done.
@@ -161,7 +158,7 @@ def train(folder: Path, settings: Settings, start: Path | None = None) -> str:
     said = folder / "log.txt"
     log.info("%s: see %s", folder.name, said)
     try:
-        status = run_subprocess(prepare(folder, settings, start), said)
+        status = run_subprocess(prepare(folder, settings), said)
     except OSError as error:  # of the disk, or another process trains there
         return str(error)
     if status == 0:
@@ -174,19 +171,18 @@ def train(folder: Path, settings: Settings, start: Path | None = None) -> str:
     return f"{(errors or lines or [f'exit status {status}'])[-1]} (see {said})"
 
 
-def folder_of(output: Path, run: Run, kind: str = "runs") -> Path:
+def folder_of(output: Path, run: Run) -> Path:
     """Folder of a run, named after its digest: no other run writes there. The title is that of the first."""
-    return next((output / kind).glob(f"*-{run.digest}"), output / kind / f"{run.title}-{run.digest}")
+    return next((output / "runs").glob(f"*-{run.digest}"), output / "runs" / f"{run.title}-{run.digest}")
 
 
 def preview(output: Path, runs: Sequence[Run]) -> Iterator[str]:
     """A line for each run."""
     for run in runs:
-        folder, trunk = folder_of(output, run), run.trunk
+        folder = folder_of(output, run)
         begun = "begun" if (folder / CHECKPOINT).is_file() else "new"
         state = "finished" if (folder / "metrics.json").is_file() else begun
-        origin = f"trunks/{folder_of(output, trunk, 'trunks').name}" if trunk is not None else "the start"
-        yield f"{folder.name}: {run.names['steps']} iterations from {origin}, {state}\n"
+        yield f"{folder.name}: {run.names['steps']} iterations, {state}\n"
 
 
 def commands(output: Path, runs: Sequence[Run]) -> Iterator[str]:
@@ -203,12 +199,10 @@ def commands(output: Path, runs: Sequence[Run]) -> Iterator[str]:
 def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> list[results.Row]:
     """Train what is not finished yet; a run that fails does not keep the others from theirs.
 
-    The tables are written anew after each run, so they are complete whenever this is interrupted. A trunk is what
-    several runs share: the training up to the end of the prune phase. It is trained once, and its checkpoint stays, so
-    that more sizes or quantizers can branch from it later.
+    The tables are written anew after each run, so they are complete whenever this is interrupted.
 
     Args:
-        output: Where: ``results.csv``, ``results.md``, ``results.png``, and a folder for each run and trunk.
+        output: Where: ``results.csv``, ``results.md``, ``results.png``, and a folder for each run.
         runs: The runs.
         keep_checkpoints: Keep those of finished runs, too.
 
@@ -216,51 +210,18 @@ def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> 
         A row for each run, in their order.
     """
     folders = {folder_of(output, run): run for run in runs}
-    rows: dict[Path, results.Row] = {}
-    for folder, run in folders.items():
-        if (folder / "finished.json").is_file():
-            rows[folder] = results.row_of(run.names, folder)
-    failed: dict[Path, str] = {}
+    finished = [folder for folder in folders if (folder / "metrics.json").is_file()]
+    rows = {folder: results.row_of(folders[folder].names, folder) for folder in finished}
     results.write_results(output, list(rows.values()))
     for number, (folder, run) in enumerate(folders.items(), start=1):
-        counted = f"[{number}/{len(runs)}] {run.title}"
-        if folder in rows:
-            log.info("%s: finished before", counted)
-            continue
-        error = _finish(output, run, folder, failed)
+        error, said = "", "finished before"
+        if folder not in finished:
+            error = train(folder, run.settings)
+            row = rows[folder] = results.row_of(run.names, folder, error)
+            said = "PSNR {:.2f} dB, {bytes} bytes, {seconds:.0f} s of training"
+            said = f"failed: {error}" if error else said.format(row["psnr"] or float("inf"), **row)
+            results.write_results(output, [rows[folder] for folder in folders if folder in rows])
         if not (error or keep_checkpoints):  # they are larger than everything else
             shutil.rmtree(folder / CHECKPOINT.parent, ignore_errors=True)
-        row = rows[folder] = results.row_of(run.names, folder, error)
-        result = "PSNR {:.2f} dB, {bytes} bytes, {seconds:.0f} s of training, {trunk_seconds:.0f} s of it shared"
-        log.info("%s: %s", counted, f"failed: {error}" if error else result.format(row["psnr"] or float("inf"), **row))
-        results.write_results(output, [rows[folder] for folder in folders if folder in rows])
+        log.info("[%d/%d] %s: %s", number, len(runs), run.title, said)
     return [rows[folder] for folder in folders]
-
-
-def _finish(output: Path, run: Run, folder: Path, failed: dict[Path, str]) -> str:
-    """Train a run and its trunk, or collect what its command has left; returns why it has failed.
-
-    Args:
-        output: Folder of the sweep.
-        run: The run.
-        folder: Its folder.
-        failed: Why trunks have failed, by their folders; they are not tried again.
-    """
-    trunk, start, shared = run.trunk, None, None
-    if trunk is not None:
-        base = folder_of(output, trunk, "trunks")
-        start, shared = base / CHECKPOINT, results.read(base / "metrics.json")
-        # A run that was interrupted after its trunk goes on from its own checkpoint.
-        needed = not any((folder / name).is_file() for name in ("metrics.json", CHECKPOINT))
-        if needed and (shared is None or not start.is_file()):
-            failed[base] = failed.get(base) or train(base, trunk.settings)
-            if failed[base]:
-                return f"trunk: {failed[base]}"
-            shared = results.read(base / "metrics.json")
-    if not (folder / "metrics.json").is_file() and (error := train(folder, run.settings, start)):
-        return error
-    # A run that its command has started has not branched, and has measured other times.
-    branched = shared is not None and shared["phases"][-1] in results.read(folder / "metrics.json")["phases"]
-    record = {"version": __version__, "trunk": base.name if branched else None}
-    write_text(folder / "finished.json", json.dumps(record, indent=2) + "\n")
-    return ""
