@@ -25,7 +25,7 @@ from functools import partial
 from importlib.metadata import packages_distributions, version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
@@ -91,27 +91,25 @@ class Finding(NamedTuple):
         verdict: ``good``; ``note`` for what costs quality or time; ``problem`` for what keeps a run from working.
         subject: What was checked, one or two words.
         text: What was found and, unless it is good, what would help.
-        values: The figures behind it, as JSON values.
     """
 
     verdict: Literal["good", "note", "problem"]
     subject: str
     text: str
-    values: Mapping[str, Any]
 
     def __str__(self) -> str:
         return f"{self.verdict:<8} {self.subject:<12} {self.text}"
 
 
-def judged(subject: str, text: str, *advice: str | Literal[False], **values: Any) -> Finding:
+def judged(subject: str, text: str, *advice: str | Literal[False]) -> Finding:
     """A note with the first advice that is given, ``condition and "advice"``; good if there is none."""
     said = next(filter(None, advice), None)
-    return Finding("note" if said else "good", subject, f"{text}: {said}" if said else text, values)
+    return Finding("note" if said else "good", subject, f"{text}: {said}" if said else text)
 
 
-def problem(subject: str, text: str, **values: Any) -> Finding:
+def problem(subject: str, text: str) -> Finding:
     """A run would fail or be worthless."""
-    return Finding("problem", subject, text, values)
+    return Finding("problem", subject, text)
 
 
 def attempt(subject: str, check: Iterator[Finding]) -> Iterator[Finding]:
@@ -131,38 +129,34 @@ def check_machine() -> Iterator[Finding]:
     from nsvq_lightning.compute.simd import WIDTH
 
     machine = describe_machine()
-    yield judged("machine", f"{machine['system']}, {machine['cpu']}", **machine)
+    yield judged("machine", f"{machine['system']}, {machine['cpu']}")
     bits, simd = machine["simd_bits"], machine["simd"]
     text = f"{WIDTH} floats at a time in {bits}-bit registers ({', '.join(simd) or 'no vector extension'})"
     # ARM64 has no wider ones.
     narrow = bits < 256 and "neon" not in simd and "a processor with AVX2 or AVX-512 is about twice as fast"
     fused = not {"fma", "neon"}.isdisjoint(simd)
     split = not fused and "somewhat slower without fused multiply-add, last digits may differ"
-    yield judged("cpu", text, narrow, split, simd_bits=bits, simd=simd, fma=fused)
+    yield judged("cpu", text, narrow, split)
     more = ("lightning", "torchmetrics", "jsonargparse", "scipy", "pycolmap")
     versions = machine["versions"] | {name: version(name) for name in more}
-    yield judged("versions", ", ".join(f"{name} {number}" for name, number in versions.items()), **versions)
+    yield judged("versions", ", ".join(f"{name} {number}" for name, number in versions.items()))
 
 
 def check_packages() -> Iterator[Finding]:
     """OpenCV, once: several packages overwrite each other's files; and what a run uses if it is installed."""
-    import torch
-
     packages = sorted(set(packages_distributions().get("cv2", ())))
     try:
         import cv2
     except ImportError as error:
-        yield problem("opencv", f"cannot be loaded ({error}): pip install {OPENCV}", packages=packages)
+        yield problem("opencv", f"cannot be loaded ({error}): pip install {OPENCV}")
     else:
         text = f"{cv2.__version__} ({' and '.join(packages) or 'not from pip'})"
         advice = f"they overwrite each other's files; uninstall all of them, then pip install {OPENCV}"
-        yield judged("opencv", text, len(packages) > 1 and advice, packages=packages)
+        yield judged("opencv", text, len(packages) > 1 and advice)
     for extra, package in (("lpips", "torchvision"), ("tensorboard", "tensorboard")):
         missing = find_spec(package) is None
         advice = f"optional, pip install 'nsvq-lightning[{extra}]'"
         yield judged(extra, f"{package} is {'not ' * missing}installed", missing and advice)
-    if find_spec("torchvision") and not any(Path(torch.hub.get_dir(), "checkpoints").glob("vgg16-*.pth")):
-        yield judged("lpips", "no weights of VGG-16", "the first test downloads them (528 MB)")
 
 
 def check_threads() -> Iterator[Finding]:
@@ -181,12 +175,10 @@ def check_threads() -> Iterator[Finding]:
     text = f"{used} used of {cores} cores (torch {torchs}, numba {numbas})"
     advice = f"as many as cores are fastest; unset OMP_NUM_THREADS and NUMBA_NUM_THREADS, or set them to {cores}"
     bad = used != cores and not spared
-    yield judged("threads", text, bad and advice, cores=cores, torch=torchs, numba=numbas, used=used)
+    yield judged("threads", text, bad and advice)
     policy = os.environ.get("OMP_WAIT_POLICY", "not set")
     advice = "on a shared machine threads that wait by spinning slow a step down several times; set it to passive"
-    yield judged("waiting", f"OMP_WAIT_POLICY is {policy}", policy.lower() != "passive" and advice, policy=policy)
-    if hasattr(os, "getloadavg") and (load := os.getloadavg()[0]) > cores / 2:
-        yield judged("load", f"{load:.1f} processes ran in the last minute", "times will be longer", load=load)
+    yield judged("waiting", f"OMP_WAIT_POLICY is {policy}", policy.lower() != "passive" and advice)
 
 
 def check_room(folder: Path) -> Iterator[Finding]:
@@ -196,11 +188,11 @@ def check_room(folder: Path) -> Iterator[Finding]:
     free, disk = available_memory(), shutil.disk_usage(folder).free
     text = "not told by this system" if free is None else f"{readable_bytes(free)} available"
     advice = "a usual run takes 2 to 4 GB; end programs, or try --data.max_width 800 --data.cache_bytes 500000000"
-    yield judged("memory", text, free is not None and free < 4 << 30 and advice, available=free)
+    yield judged("memory", text, free is not None and free < 4 << 30 and advice)
     writable = os.access(folder, os.W_OK)
     text = f"{readable_bytes(disk)} free in {folder.resolve()}{'' if writable else ', which is read-only'}"
     advice = "checkpoints of a run take about 1 GB; see --trainer.default_root_dir"
-    yield judged("disk", text, (disk < SMALL_DISK or not writable) and advice, free=disk)
+    yield judged("disk", text, (disk < SMALL_DISK or not writable) and advice)
 
 
 def check_gpu() -> Iterator[Finding]:
@@ -212,7 +204,7 @@ def check_gpu() -> Iterator[Finding]:
     if torch.cuda.is_available():
         name, fast = torch.cuda.get_device_name(), fast_backends(torch.zeros(1, device="cuda"))
         advice = "this version renders on it in plain torch, slower than on the CPU; use the CPU"
-        yield judged("gpu", f"{name}, back-ends {', '.join(fast)}", not fast and advice, name=name, backends=fast)
+        yield judged("gpu", f"{name}, back-ends {', '.join(fast)}", not fast and advice)
     else:
         built = torch.version.cuda or torch.version.hip
         advice = "check nvidia-smi and CUDA_VISIBLE_DEVICES" if built else "for an NVIDIA GPU install a CUDA build"
@@ -241,18 +233,17 @@ def check_backends() -> Iterator[Finding]:
             run = partial(results, here, backend, torch.float32)
             times = [timing.milliseconds(run, device) for _ in range(REPEATS)]
             errors = {name: workloads.relative_l2(value.cpu(), truth[name]) for name, value in run().items()}
-            values = {"backend": backend, "errors": errors, "ms": min(times), "first_seconds": times[0] / 1000}
             # Rounding stays below 1e-4, but a splat that crosses α = 1/255 costs more. "not <", so that NaN fails.
             wrong = [f"{name} {error:.1e}" for name, error in errors.items() if not error < 1e-3]
             if wrong:
                 text = f"{backend}: relative error against the float64 oracle: {', '.join(wrong)}; do not trust a run; "
                 text += f"remove {kernel_folder()}, and if that does not help report it with nsvq doctor --json"
-                yield problem("self-test", text, **values)
+                yield problem("self-test", text)
             else:
                 image, *gradients = errors.values()
                 text = f"{backend}: image to {image:.1e}, gradients to {max(gradients):.1e} of the float64 oracle; "
                 text += f"{min(times):.1f} ms for 4,000 splats at {here.size}"
-                yield judged("self-test", text, **values)
+                yield judged("self-test", text)
 
 
 def check_folder(root: Path) -> Iterator[Finding]:
@@ -280,10 +271,9 @@ def check_cameras(model: ColmapModel) -> Iterator[Finding]:
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     names = sorted({camera.model_name for camera in cameras})
     text = f"{len(cameras)} of {'/'.join(names)}, {_range(sizes)}, for {len(model.images)} registered photos"
-    values = {"cameras": len(cameras), "models": names, "sizes": sizes, "photos": len(model.images)}
     many = model.source == "COLMAP" and len(cameras) > max(1, len(model.images) // 2) and len(sizes) <= 2
     advice = "more exact if one lens took them and COLMAP knows it (--ImageReader.single_camera 1)"
-    yield judged("cameras", text, many and advice, **values)
+    yield judged("cameras", text, many and advice)
 
 
 def _range(sizes: Sequence[tuple[int, int]]) -> str:
@@ -296,7 +286,7 @@ def check_points(model: ColmapModel) -> Iterator[Finding]:
     if not count:
         text = f"none in {model.source}: random ones take their place, and training has more to do"
         advice = "name a point cloud (ply_file_path in the file), or run COLMAP"
-        yield judged("points", text, not model.synthetic and advice, points=0)
+        yield judged("points", text, not model.synthetic and advice)
     elif not len(finite):
         yield problem("points", f"none is finite: run {'COLMAP' if model.source == 'COLMAP' else 'the export'} again")
     else:
@@ -307,7 +297,7 @@ def check_points(model: ColmapModel) -> Iterator[Finding]:
         text = f"{count:,}, {100 * far:.2g} % far outliers{f', {lost} not finite (left out)' if lost else ''}"
         few = count < 1000 and "few to start from; take more photos with more overlap, or match more features"
         spread = far > 0.02 and "they become floaters; filter them with `colmap point_filtering`"
-        yield judged("points", text, few, spread, points=count, not_finite=lost, outliers=far)
+        yield judged("points", text, few, spread)
 
 
 def check_overlap(model: ColmapModel) -> Iterator[Finding]:
@@ -324,7 +314,7 @@ def check_overlap(model: ColmapModel) -> Iterator[Finding]:
     share, mean = float(np.mean(lengths >= 3)), float(lengths.mean())
     text = f"{100 * share:.0f} % of the points were seen by 3 views or more, {mean:.1f} on average"
     advice = "many points are uncertain; take photos closer to each other"
-    yield judged("tracks", text, share < 0.5 and advice, seen_by_three=share, mean=mean)
+    yield judged("tracks", text, share < 0.5 and advice)
     seen = csr_array((np.ones(len(pairs), np.int64), pairs.T), shape=(len(lengths), len(names)))
     common = (seen.T @ seen).toarray()  # points that two views both saw [V, V]; on the diagonal, those of one view
     own = np.maximum(common.diagonal(), 1)
@@ -337,7 +327,7 @@ def check_overlap(model: ColmapModel) -> Iterator[Finding]:
     text = f"a photo shares {100 * usual:.0f} % of its points with its best partner, at least {100 * least:.0f} %"
     apart = groups > 1 and f"under 15 with the rest for {named}; take photos between them, or leave them out"
     little = len(weak) > 0 and f"little for {named}; take photos in between"
-    yield judged("overlap", text, apart, little, median=usual, least=least, groups=int(groups))
+    yield judged("overlap", text, apart, little)
 
 
 def check_scene(root: Path, model: ColmapModel) -> Iterator[Finding]:
@@ -348,9 +338,9 @@ def check_scene(root: Path, model: ColmapModel) -> Iterator[Finding]:
     train, test = len(scene.train), len(scene.test)
     text = f"{train} train and {test} test photos ({scene.split})"
     advice = "few; what lies between them is guessed, and the test score says little; take more photos"
-    yield judged("split", text, train < 20 and advice, train=train, test=test)
+    yield judged("split", text, train < 20 and advice)
     if not scene.extent > 0:
-        yield problem("extent", f"all train photos {ONE_PLACE}", extent=scene.extent)
+        yield problem("extent", f"all train photos {ONE_PLACE}")
     yield from attempt("sizes", check_sizes(scene, model))
     yield from attempt("photos", check_photos(scene, model))
     yield from attempt("run time", check_budget(scene))
@@ -358,7 +348,6 @@ def check_scene(root: Path, model: ColmapModel) -> Iterator[Finding]:
 
 def check_sizes(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
     """Whether files are of the size that the model says, and what becomes of those that lie on their side."""
-    from nsvq_lightning.data.images import image_head
     from nsvq_lightning.data.scene import OTHER_SHAPE, same_shape
 
     sources, scaled, others = scene.images.sources, 0, 0
@@ -369,17 +358,11 @@ def check_sizes(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
     used = _range([(source.pinhole.width, source.pinhole.height) for source in sources])
     text = f"trained at {used}; {others or scaled} of {len(sources)} files "
     if others:
-        yield problem("sizes", f"{text}{OTHER_SHAPE}", scaled=scaled, other_shape=others)
+        yield problem("sizes", f"{text}{OTHER_SHAPE}")
     else:
-        yield judged("sizes", f"{text}are scaled from what {model.source} says, their cameras with them", scaled=scaled)
+        yield judged("sizes", f"{text}are scaled from what {model.source} says, their cameras with them")
     undistorted = sum(source.undistortion is not None for source in sources)
     yield judged("distortion", f"{undistorted} of {len(sources)} photos are undistorted when they are decoded")
-    turned = sum(source.orientation != 1 for source in sources)
-    stored = sum(image_head(source.path).lies_on_its_side for source in sources) - turned
-    if turned or stored:
-        text = f"{turned} photos are turned by their EXIF orientation, as cameras are; {stored} are used as stored, "
-        text += "like COLMAP did: they lie on their side in the report, the scene does not"
-        yield judged("orientation", text, turned=turned, stored=stored)
 
 
 def check_photos(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
@@ -400,7 +383,7 @@ def check_photos(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
         photos = dict(zip(scene.names, pool.map(read, range(len(scene))), strict=True))
     broken = [photo for photo in photos.values() if isinstance(photo, str)]
     if broken:
-        yield problem("photos", f"{len(broken)} of {len(photos)} cannot be used; first: {broken[0]}", errors=broken)
+        yield problem("photos", f"{len(broken)} of {len(photos)} cannot be used; first: {broken[0]}")
     else:
         yield judged("photos", f"all {len(photos)} registered photos can be read")
     folder = scene.root / (model.images_folder or "images")
@@ -411,7 +394,7 @@ def check_photos(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
     extra = sorted(str(path) for path in files if path.with_suffix("") not in known)
     if extra:
         text = f"{len(extra)} of {len(files)} files in {folder} are not in the model"
-        yield judged("registered", text, "they are not used; if many, photos lack overlap or sharpness", files=extra)
+        yield judged("registered", text, "they are not used; if many, photos lack overlap or sharpness")
     if len(broken) < len(photos):
         usable = {name: photo for name, photo in photos.items() if not isinstance(photo, str)}
         yield from attempt("exposure", check_exposure(usable))
@@ -457,7 +440,7 @@ def check_exposure(photos: Mapping[str, tuple[float, float, float]]) -> Iterator
         share = 1 - float(counts[counts < 1].mean())
         text = f"{masked} of {len(names)} photos have pixels that do not count, {100 * share:.0f} % of them"
         advice = f"most in {names[counts.argmin()]}; masks are white where the photo counts; if not, invert them"
-        yield judged("masks", text, share > 0.7 and advice, masked=masked, excluded=share)
+        yield judged("masks", text, share > 0.7 and advice)
     text = "mean grey level {:.0f} to {:.0f}".format(*np.quantile(grey, (0.1, 0.9)))
     if np.isnan(stops).mean() > 0.5:
         yield judged("exposure", f"{text}; without observations, exposure and content of a photo cannot be separated")
@@ -466,7 +449,7 @@ def check_exposure(photos: Mapping[str, tuple[float, float, float]]) -> Iterator
     text += f"; the same points are {low:+.2f} to {high:+.2f} stops from their usual brightness"
     brightest = names[np.nanargmax(stops)]
     advice = f"colours disagree, {brightest} is brightest; lock exposure and white balance, or equalize the photos"
-    yield judged("exposure", text, high - low > 0.5 and advice, stops=[low, high], grey=grey.tolist())
+    yield judged("exposure", text, high - low > 0.5 and advice)
 
 
 def check_budget(scene: Scene) -> Iterator[Finding]:
@@ -484,14 +467,14 @@ def check_budget(scene: Scene) -> Iterator[Finding]:
     if photos > CACHE_BYTES:
         text += f" (all would take {readable_bytes(photos)}; the others are decoded each time)"
     advice = f"{readable_bytes(free or 0)} are available; lower --data.max_width or --data.cache_bytes"
-    yield judged("run memory", text, free is not None and needed > free and advice, bytes=needed)
+    yield judged("run memory", text, free is not None and needed > free and advice)
     # A step is a render forward and backward, and as long again for loss, optimizer and codebooks.
     step, paper_step = (2.0 * render_seconds(scene, count) for count in (fast, paper))
     text = f"about {4000 * step / 60:.0f} min for fast.yaml (4,000 steps, {fast:,} splats on average), "
     text += (
         f"{45_000 * paper_step / 3600:.1f} h for the paper's run (45,000, {paper:,}), with the machine as busy as now"
     )
-    yield judged("run time", text, step_seconds=step, paper_step_seconds=paper_step)
+    yield judged("run time", text)
 
 
 def render_seconds(scene: Scene, count: int) -> float:
