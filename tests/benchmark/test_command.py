@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from nsvq_lightning.commands.benchmark import SUITES, render, timing, train
+from nsvq_lightning.commands.benchmark import SUITES, render, timing
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.skips import SKIPS
 
@@ -79,6 +79,3 @@ def test_quick_run_of_everything(tmp_path: Path) -> None:
         [sys.executable, "-m", "nsvq_lightning", "benchmark", "all", "--quick", "--output", str(tmp_path)], check=True
     )
     assert {path.stem for path in tmp_path.glob("*.png")} == set(SUITES)
-    rows = json.loads((tmp_path / "benchmark.json").read_text())["rows"]
-    (peak,) = (row["values"]["peak MB"] for row in rows if row["operation"] == train.ALONE)
-    assert 100 < peak < 3000 or sys.platform != "linux"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-# Modules of this package; each has a function ``run(scope)``, which returns measurements, and ``PANELS``.
+# Modules of this package; each has a function ``run(scope)``, which returns measurements.
 SUITES = ("render", "quantize", "codec", "train")
 
 

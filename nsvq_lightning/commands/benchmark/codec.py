@@ -30,7 +30,6 @@ from nsvq_lightning.splats.splats import SplatTensors
 log = logging.getLogger(__name__)
 
 SMALL = "made small"
-PANELS = (("write", "bytes a splat", "ms"), ("read", "image error", "ms"), (SMALL, "PSNR dB", "bytes"))
 
 
 def run(scope: Scope) -> Iterator[timing.Measurement]:

@@ -4,7 +4,7 @@ Suites:
   render     back-ends of the rasterizer and of the loss, forward and backward, against float64
   quantize   a step of NSVQ, the search for the nearest code, and k-means
   codec      writing and reading scene files; a trained scene made small, beside other formats
-  train      whole runs, with switches on and off; the parts of a step; how it grows with splats and pixels
+  train      whole runs, with switches on and off; the parts of a step
 
 Examples:
   nsvq benchmark all --quick
@@ -111,7 +111,7 @@ def run(options: argparse.Namespace) -> int:
         options.output.mkdir(parents=True, exist_ok=True)
         write_text(options.output / "benchmark.json", text)
         write_text(options.output / "benchmark.md", tables)
-        for name, suite in suites.items():
-            report.draw_suite(options.output / f"{name}.png", found[name], suite.PANELS)
+        for name in suites:
+            report.draw_suite(options.output / f"{name}.png", found[name])
     sys.stdout.write(text if options.json else tables)
     return 0

@@ -18,7 +18,6 @@ from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.optim import LearningRates
 
 STEP, SEARCH, KMEANS = "step, forward + backward", "search", "k-means"
-PANELS = ((STEP, "gradient error", "ms"), (SEARCH, "wrong codes", "ms"), (KMEANS, "distortion", "ms"))
 # Rows an attribute whose codes are checked: the float64 oracle is slow.
 CHECKED_ROWS = 4_000
 

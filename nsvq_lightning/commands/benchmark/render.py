@@ -24,7 +24,6 @@ from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats
 
 FORWARD, BOTH, LOSS = "forward", "forward + backward", "L1 + D-SSIM, forward + backward"
-PANELS = ((FORWARD, "max error", "ms"), (BOTH, "gradient error", "ms"), (LOSS, "gradient error", "ms"))
 # Splats times pixels that the oracle is given, quick and full: half a minute on one core at most.
 ORACLE_WORK = {True: 1e8, False: 6e9}
 PHOTO = (533, 800, 3)

@@ -20,9 +20,6 @@ from nsvq_lightning.version import __version__
 
 # Measurements by the name of their suite.
 Suites = Mapping[str, Sequence[Measurement]]
-# What a panel of the picture shows: rows of an operation, a value of theirs or ``ms``, and what that stands over:
-# ``ms``, a value, or ``seconds`` for the course of a run.
-Panel = tuple[str, str, str]
 
 
 def describe_machine() -> dict[str, Any]:
@@ -134,46 +131,35 @@ def number(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
-def points(row: Measurement, panel: Panel) -> Sequence[tuple[float, float]]:
-    """Where a row is in a panel, ``(x, y)``; nowhere if it is of another operation or lacks a value."""
-    operation, value, against = panel
-    if row.operation != operation:
-        return ()
-    if against == "seconds":
-        return row.course
-    known = {"ms": row.timing.median, **row.values}
-    return [(known[against], known[value])] if {against, value} <= known.keys() else ()
+def draw_suite(path: Path, rows: Sequence[Measurement]) -> None:
+    """Draw the rows of one suite, error over time: a panel for each operation, with the first value of its rows.
 
-
-def draw_suite(path: Path, rows: Sequence[Measurement], wanted: Sequence[Panel]) -> None:
-    """Draw the rows of one suite: a colour for each method, a marker for each workload, hollow where threads are fewer.
-
-    Axes are logarithmic; where a value is 0 its axis has a linear strip at the bottom, and dB are linear. Rows whose
-    methods have the same name up to a colon are joined by a line.
+    A colour for each method, a marker for each workload, hollow where threads are fewer. Axes are logarithmic; where a
+    value is 0 its axis has a linear strip at the bottom, and dB are linear. Rows whose methods have the same name up to
+    a colon are joined by a line.
 
     Args:
-        path: PNG file, replaced atomically; none is written if no row is in a panel.
-        rows: Those of one suite.
-        wanted: The panels, those without rows are left out.
+        path: PNG file, replaced atomically.
+        rows: Those of one suite; those that say what share of a step they are have no error.
     """
-    drawn = [panel for panel in wanted if any(points(row, panel) for row in rows)]
-    if not drawn:
-        return
-    rows = [row for row in rows if any(points(row, panel) for panel in drawn)]
+    rows = [row for row in rows if "share %" not in row.values]
     colours = figures.colours_of(list(dict.fromkeys(row.method.partition(":")[0] for row in rows)))
     markers = figures.markers_of(list(dict.fromkeys(row.workload for row in rows)))
     most = max(row.threads for row in rows)
-    figure, axes = figures.panels(len(drawn), 4.2, max(len(colours), len(markers)))
-    for axis, panel in zip(axes, drawn, strict=True):
+    operations = dict.fromkeys(row.operation for row in rows)
+    figure, axes = figures.panels(len(operations), 4.2, max(len(colours), len(markers)))
+    for axis, operation in zip(axes, operations, strict=True):
+        shown = [row for row in rows if row.operation == operation]
+        value = next(iter(shown[0].values))
         lines: dict[tuple[str, str, int], list[tuple[float, float]]] = {}
-        for row in rows:
-            lines.setdefault((row.method.partition(":")[0], row.workload, row.threads), []).extend(points(row, panel))
+        for row in shown:
+            line = lines.setdefault((row.method.partition(":")[0], row.workload, row.threads), [])
+            line.append((row.timing.median, row.values[value]))
         for (method, workload, threads), line in lines.items():
             face = colours[method] if threads == most else "none"
             style = {"marker": markers[workload], "color": colours[method], "markerfacecolor": face}
             axis.plot([x for x, _ in line], [y for _, y in line], linewidth=1, **style)
-        operation, value, against = panel
-        axis.set(xscale="log", xlabel=against, ylabel=value, title=operation)
+        axis.set(xscale="log", xlabel="ms", ylabel=value, title=operation)
         axis.xaxis.set_major_formatter("{x:g}")
         axis.grid(alpha=0.3)
         heights = [y for line in lines.values() for _, y in line]

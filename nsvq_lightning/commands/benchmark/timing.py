@@ -61,7 +61,6 @@ class Measurement:
         timing: How long it took.
         values: Errors and sizes by name, the unit in the name where there is one.
         note: How the errors were measured, where that is not on the workload itself.
-        course: Seconds and the first value during a run, ``(s, value)``. Empty for single calls.
     """
 
     operation: str
@@ -71,7 +70,6 @@ class Measurement:
     timing: Timing
     values: Mapping[str, float] = field(default_factory=dict)
     note: str = ""
-    course: tuple[tuple[float, float], ...] = ()
 
 
 def compare(

@@ -1,4 +1,4 @@
-"""Suite ``train``: whole runs of a config, PSNR against seconds; the parts of their steps; steps by themselves.
+"""Suite ``train``: whole runs of a config, PSNR against seconds; the parts of their steps.
 
 Runs are those of ``nsvq fit``: its module, data, callbacks, loggers and trainer. What only watches a run (reports,
 checkpoints, the progress bar) is left out, and test views are compared while the clock is stopped. Every run has the
@@ -8,7 +8,6 @@ same number of steps. Variants differ from the first one in one thing. Where one
 
 import cProfile
 import logging
-import multiprocessing
 import sys
 import tempfile
 import time
@@ -25,8 +24,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from nsvq_lightning.commands.arguments import find_config
-from nsvq_lightning.commands.benchmark import SIZES, Scope, timing
-from nsvq_lightning.commands.benchmark.workloads import synthetic_workload
+from nsvq_lightning.commands.benchmark import Scope, timing
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
@@ -40,8 +38,6 @@ from nsvq_lightning.training.schedule import Phase
 
 log = logging.getLogger(__name__)
 
-RUN, ALONE = "run", "step by itself"
-PANELS = ((RUN, "PSNR dB", "seconds"), (ALONE, "ms", "splats"), (ALONE, "peak MB", "splats"))
 # Callbacks of ``nsvq fit`` that write files or lines but train nothing; the benchmark measures by itself.
 WATCHING = ("report", "export", "predictions", "checkpoint", "kernels", "progress")
 QUICK_DEMO = ("--data.factor=4",)
@@ -49,13 +45,12 @@ SHIPPED, WHOLE, OUTSIDE = "as shipped", "whole step", "between the functions"
 
 
 def run(scope: Scope) -> Iterator[timing.Measurement]:
-    """Train with every variant, then profile the steps of a run, then time steps of growing size."""
+    """Train with every variant, then profile the steps of a run."""
     yield from run_rows(scope)
     if sys.version_info < (3, 12) or numba.config.ENABLE_SYS_MONITORING:
         yield from part_rows(scope)
     else:
         log.warning("train: no profile: it shows kernels only if NUMBA_ENABLE_SYS_MONITORING=1 when Numba is loaded")
-    yield from size_rows(scope)
 
 
 class Step(NamedTuple):
@@ -167,31 +162,25 @@ def _run_name(scope: Scope) -> str:
 class Watched:
     """What is seen of the runs of one variant; its ``between`` is called between their steps.
 
-    Args:
-        steps: Length of a run.
-
     Attributes:
         steps: All steps.
-        course: Seconds and test PSNR in dB, during the first run and at its end.
+        psnr: Of the test views, in dB, at the end of the last run.
         products: Matrix products in between, ms.
         numbers: Everything that the first run has trained, by name.
     """
 
-    def __init__(self, steps: int) -> None:
+    def __init__(self) -> None:
         self.steps: list[Step] = []
-        self.course: list[tuple[float, float]] = []
+        self.psnr = 0.0
         self.products: list[float] = []
         self.numbers: Mapping[str, Tensor] = {}
-        self._product, self._every = timing.sgemm(), max(1, steps // 16)
+        self._product = timing.sgemm()
 
     def between(self, module: SplatModule, step: Step) -> None:
-        """Keep a step, and compare the test views now and then."""
+        """Keep a step, and compare the test views after the last."""
         self.steps.append(step)
-        # Between the round numbers: opacities are reset at those, and just then a picture says nothing.
-        if not self.numbers and (
-            step.iteration in module.schedule.ends or step.iteration % self._every == self._every // 2
-        ):
-            self.course.append((sum(step.milliseconds for step in self.steps) / 1000, _test_psnr(module)))
+        if step.iteration == module.trainer.max_steps:
+            self.psnr = _test_psnr(module)
         if step.iteration % 8 == 0 or not self.products:
             self.products.append(timing.milliseconds(self._product))
 
@@ -216,7 +205,7 @@ def run_rows(scope: Scope) -> Iterator[timing.Measurement]:
         variants["without codebooks"] = most, ("--model.codebooks=null",)
     # Not counted, through all phases: kernels are loaded, and compiled where they never were.
     _train(replace(scope, steps=8), most, lambda module, step: None)
-    found = {name: Watched(scope.steps) for name in variants}
+    found = {name: Watched() for name in variants}
     for turn in range(rounds):
         order = list(variants)
         for name in order[turn:] + order[:turn]:
@@ -228,7 +217,7 @@ def run_rows(scope: Scope) -> Iterator[timing.Measurement]:
         for step in watched.steps:
             by_phase.setdefault(step.phase, []).append(step.milliseconds)
         values = {
-            "PSNR dB": watched.course[-1][1],
+            "PSNR dB": watched.psnr,
             "seconds": sum(watched.timing.samples) / 1000 / rounds,
             "times as shipped": watched.relative / shipped.relative,
             **{f"{phase.name.lower()} ms": median(times) for phase, times in by_phase.items()},
@@ -237,9 +226,9 @@ def run_rows(scope: Scope) -> Iterator[timing.Measurement]:
         }
         if name.startswith("no skip"):
             values["saves %"] = 100 * (1 - shipped.relative / watched.relative)
-        threads, course = variants[name][0], tuple(watched.course)
+        threads = variants[name][0]
         note = "times are of whole steps, those that start a phase included; PSNR is that of the test views"
-        yield timing.Measurement(RUN, _run_name(scope), name, threads, watched.timing, values, note, course)
+        yield timing.Measurement("run", _run_name(scope), name, threads, watched.timing, values, note)
 
 
 @torch.no_grad()
@@ -334,37 +323,3 @@ def part_rows(scope: Scope) -> Iterator[timing.Measurement]:
             values = {"share %": 100 * fmean(samples) / fmean(found[WHOLE])}
             took, operation = timing.Timing(tuple(samples), tuple(sampler.products)), f"{phase.name.lower()} step"
             yield timing.Measurement(f"parts of a {operation}", _run_name(scope), name, threads, took, values, note)
-
-
-# Growth
-
-
-def size_rows(scope: Scope) -> Iterator[timing.Measurement]:
-    """Render, loss, backward pass and Adam on every workload, each in a process whose peak of memory is its own."""
-    threads = max(scope.threads)
-    for name in scope.workloads:
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
-            took, peak = pool.apply(_step_alone, (name, scope, threads))
-        size = SIZES[name]
-        values = {"splats": float(size.splats), "megapixels": size.width * size.height / 1e6, "peak MB": peak / 1e6}
-        yield timing.Measurement(ALONE, "synthetic scenes", f"step: {name}", threads, took, values)
-
-
-def _step_alone(name: str, scope: Scope, threads: int) -> tuple[timing.Timing, int]:
-    """Times of a step, and the largest resident memory of this process so far, bytes; 0 where no one says."""
-    workload = synthetic_workload(name)
-    splats = Splats.from_tensors(*workload.splats)
-    optimizer = optim.build_adam(optim.param_groups(splats, {}, optim.LearningRates(), extent=1.0))
-    photo = torch.full(workload.image_gradient.shape, 128, dtype=torch.uint8)
-
-    def step() -> None:
-        optimizer.zero_grad()
-        loss = photometric_loss(render(splats.raw(), workload.camera).image, photo)
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-
-    took = timing.measure({"step": step}, scope, threads)["step"]
-    # Not resource.getrusage, whose maximum a new process takes over from the one that starts it.
-    status = Path("/proc/self/status")
-    lines = status.read_text(encoding="utf-8").splitlines() if status.exists() else []
-    return took, next((1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM:")), 0)
