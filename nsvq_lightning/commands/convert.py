@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
-from nsvq_lightning.commands.progress import progress
 from nsvq_lightning.io import formats, spz
 from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, cropped, rotated, turn_up
 from nsvq_lightning.io.describe import attribute_errors
@@ -154,7 +154,7 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     look = partial(render, antialiased=scene.antialiased)
 
     def views() -> Iterator[View]:
-        return (photos.view(index) for index in progress(photos.train, "photos"))
+        return (photos.view(index) for index in tqdm(photos.train, unit=" photos", mininterval=1))
 
     def psnr(keep: torch.Tensor) -> float:
         kept = type(splats)(*(tensor[keep] for tensor in splats))

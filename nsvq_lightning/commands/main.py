@@ -84,6 +84,36 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
 
 
+def lightning(argv: Sequence[str] | None = None) -> int:
+    """Run ``lightning ARGUMENTS``: our commands, and what other distributions do under the same name.
+
+    Lightning itself has shipped no ``lightning`` script since 2.5.1, but lightning-sdk and litserve do, and pip lets
+    the distribution installed last own the name.
+
+    Args:
+        argv: Arguments; those of the process if None. No arguments, or an option first, is ours too.
+
+    Returns:
+        Exit status of our command; 2 if no distribution knows it. The script of another one ends the process.
+    """
+    from importlib.metadata import entry_points
+
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0].startswith("-") or arguments[0] in COMMANDS:
+        return main(arguments)
+    points = entry_points(group="console_scripts", name="lightning")
+    scripts = {re.sub(r"[-_.]+", "-", point.dist.name).lower(): point for point in points if point.dist is not None}
+    scripts.pop("nsvq-lightning", None)
+    if not scripts:
+        sys.stderr.write(
+            f"lightning: unknown command {arguments[0]!r}; nsvq-lightning has {', '.join(COMMANDS)}, "
+            "and no other installed package has a lightning command\n"
+        )
+        return 2
+    sys.argv = ["lightning", *arguments]
+    sys.exit(scripts[min(scripts)].load()())
+
+
 def run_command(name: str, arguments: Sequence[str]) -> int:
     """Run a command that is not Lightning's.
 

@@ -16,11 +16,13 @@ import json
 import shutil
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tqdm import tqdm
+
 from nsvq_lightning.commands.arguments import positive
-from nsvq_lightning.commands.progress import Progress
 from nsvq_lightning.io.atomic import write_text
 
 if TYPE_CHECKING:
@@ -72,25 +74,31 @@ def run(options: argparse.Namespace) -> int:
     images = scene / "images"
     in_place = source.resolve() == images.resolve()
     _claim(options, is_video, in_place)
+    bars: dict[str, tqdm] = {}
+
+    def report(step: str, done: int, total: int) -> None:
+        if step not in bars:
+            bars[step] = tqdm(total=total, desc=step, mininterval=1)
+        bars[step].update(done - bars[step].n)
+        if done >= total:
+            bars[step].close()
+
     # The frames were complete before features were looked for.
     if is_video and not (any(images.iterdir()) and (scene / "database.db").exists()):
         for old in images.iterdir():
             old.unlink()
         total = frames.frame_count(source)
-        chosen = frames.write_frames(source, images, options.frames, Progress(total, "choosing frames").show)
+        show = partial(report, "choosing frames", total=total)
+        chosen = frames.write_frames(source, images, options.frames, show)
         sys.stdout.write(f"{len(chosen)} sharp frames of {total:,}\n")
     elif not (is_video or in_place):
         photos = frames.photos_in(source)
-        for path, reason in frames.copy_photos(photos, images, Progress(len(photos), "copying photos").show):
+        show = partial(report, "copying photos", total=len(photos))
+        for path, reason in frames.copy_photos(photos, images, show):
             sys.stdout.write(f"left out: {path.name} cannot be read ({reason})\n")
     names = [path.name for path in frames.photos_in(images)]
     if len(names) < 2:
         raise ValueError(f"{source}: {len(names)} pictures are too few; a scene takes 50 to 300")
-    shown: dict[str, Progress] = {}
-
-    def report(step: str, done: int, total: int) -> None:
-        shown.setdefault(step, Progress(total, step)).show(done)
-
     verdict = reconstruct(scene, names, report, is_video, options.max_size, options.threads)
     sys.stdout.writelines(f"{line}\n" for line in _told(verdict, images))
     print(flush=True)

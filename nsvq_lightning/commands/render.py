@@ -23,9 +23,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from nsvq_lightning.commands.arguments import cameras_of, names, photos_of, positive, scene_file
-from nsvq_lightning.commands.progress import progress
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
@@ -123,7 +123,7 @@ def run(options: argparse.Namespace) -> int:
     size = cameras[0].width, cameras[0].height
     with ExitStack() as stack:
         writers = {kind: stack.enter_context(_writer(path, kind, size, fps)) for kind, path in outputs.items()}
-        for index, camera in enumerate(progress(cameras, "frames")):
+        for index, camera in enumerate(tqdm(cameras, unit=" frames", mininterval=1)):
             view = look(camera)
             for kind, write in writers.items():
                 write(index, *_picture(view, kind, *depths))

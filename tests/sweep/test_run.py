@@ -28,10 +28,10 @@ Calls = list[Sequence[str]]
 Swept = tuple[Path, Calls, list[Row]]
 """Folder, what was run, and the rows."""
 
-OPTIONS = (
-    "--data.factor=4 --trainer.accelerator=cpu --trainer.max_steps=16 --model.sh_degree=0 --splats=400 "
-    "--callbacks.report.pictures=false --callbacks.report.every=0 --callbacks.report.lpips=false"
-).split()
+OPTIONS = [
+    *("--data.factor=4", "--trainer.accelerator=cpu", "--trainer.max_steps=16", "--model.sh_degree=0", "--splats=400"),
+    *("--callbacks.report.pictures=false", "--callbacks.report.every=0", "--callbacks.report.lpips=false"),
+]
 
 
 @contextmanager
