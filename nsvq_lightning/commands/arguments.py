@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
 from functools import cache
 from itertools import chain
@@ -64,28 +64,38 @@ SHORTHANDS: dict[str, str] = {
 }
 
 
+def joined(arguments: Sequence[str]) -> list[str]:
+    """The arguments, each option together with its value (``--a=1`` for ``--a 1``), ``-c`` as ``--config``."""
+    found: list[str] = []
+    for argument in arguments:
+        option = re.sub(r"^-c(?==|$)", "--config", argument)
+        waits = found and found[-1].startswith("--") and "=" not in found[-1] and found[-1] != "--help"
+        if waits and not option.startswith("--"):
+            found[-1] += f"={option}"
+        else:
+            found.append(option)
+    return found
+
+
 def expand(arguments: Sequence[str]) -> list[str]:
-    """The arguments with every shorthand replaced by the options it stands for: its own number, and none of the others.
+    """The joined arguments with every shorthand replaced by what it stands for: its own number, and none of the others.
 
     Raises:
         ValueError: Two shorthands are given, of which only one can hold, or one without its number.
     """
     expanded: list[str] = []
     given: str | None = None
-    rest = list(arguments)
-    while rest:
-        argument = rest.pop(0)
-        option, equals, value = argument.partition("=")
+    for argument in arguments:
+        option, _, value = argument.partition("=")
         name = option.removeprefix("--")
         if not option.startswith("--") or name not in SHORTHANDS:
             expanded.append(argument)
             continue
         if given not in (None, name):
             raise ValueError(f"--{given} and --{name} both say how large the scene is to be: give one of them")
-        given = name
-        if not (equals or rest):
+        if not value:
             raise ValueError(f"{option} needs a number")
-        value = value if equals else rest.pop(0)
+        given = name
         others = [other for other in ("splats", "bytes") if other != name]
         expanded += [f"{BUDGET}.{name}={value}", *(f"{BUDGET}.{other}=null" for other in others)]
     return expanded
@@ -142,34 +152,22 @@ class Parser(argparse.ArgumentParser):
         super().error(message + unknown_option(message, self._option_string_actions))
 
 
-CONFIG_OPTIONS = ("--config", "-c")
+CONFIG = "--config="
 # Of a config, and of its values with every alias written out; that of a run has 6 kB and 500 values.
 _MOST_BYTES, _MOST_VALUES = 1 << 17, 100_000
 
 
 def resolve_configs(arguments: Sequence[str]) -> list[str]:
-    """The arguments, with every ``--config NAME`` that is not a file replaced by the shipped config of that name."""
-    resolved = list(arguments)
-    for place, name in _configs(arguments):
-        resolved[place] = resolved[place].removesuffix(name) + find_config(name)
-    return resolved
+    """The joined arguments, with every ``--config=NAME`` that is not a file replaced by the shipped config."""
+    return [
+        CONFIG + find_config(argument.removeprefix(CONFIG)) if argument.startswith(CONFIG) else argument
+        for argument in joined(arguments)
+    ]
 
 
 def configs_among(arguments: Sequence[str]) -> list[str]:
-    """The values of ``--config`` among the arguments."""
-    return [name for _, name in _configs(arguments)]
-
-
-def _configs(arguments: Sequence[str]) -> Iterator[tuple[int, str]]:
-    """Position of each argument that ends with the name of a config, and that name."""
-    expects_config = False
-    for place, argument in enumerate(arguments):
-        option, equals, value = argument.partition("=")
-        if expects_config:
-            yield place, argument
-        elif option in CONFIG_OPTIONS and equals:
-            yield place, value
-        expects_config = not expects_config and argument in CONFIG_OPTIONS
+    """The values of ``--config`` among joined arguments."""
+    return [argument.removeprefix(CONFIG) for argument in arguments if argument.startswith(CONFIG)]
 
 
 def check_config(path: str) -> dict[str, Any]:

@@ -8,7 +8,6 @@ import shlex
 import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
-from itertools import pairwise
 from pathlib import Path
 from pkgutil import resolve_name
 from types import NoneType
@@ -23,14 +22,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 import nsvq_lightning.callbacks as callbacks
 import nsvq_lightning.quantize as quantize
 from nsvq_lightning.callbacks.standard import OPTIONAL, STANDARD
-from nsvq_lightning.commands.arguments import (
-    SHORTHANDS,
-    find_config,
-    in_plain_words,
-    nearest,
-    shipped_configs,
-    unknown_option,
-)
+from nsvq_lightning.commands import arguments as given
 from nsvq_lightning.commands.option_help import class_help, command_help, first_sentence
 from nsvq_lightning.commands.registry import COMMANDS
 from nsvq_lightning.data.colmap import check_name
@@ -52,20 +44,14 @@ TRAINER_DEFAULTS: dict[str, Any] = {
     "default_root_dir": "runs",
 }
 
-# Options of the trainer that the help explains.
-TRAINER_OPTIONS = ("run_folder", "allow_other_scene", "max_steps", "accelerator", "devices", "logger", "callbacks")
-
 # Names that options take as they are: short class names resolve to what is imported.
 CLASSES = (*callbacks.__all__, *quantize.__all__, "ColmapDataModule", "DemoDataModule")
-
-# Words that Lightning accepts instead of a checkpoint's path; ``last`` and ``best`` refer to its own callback.
-NAMED_CHECKPOINTS = frozenset({"hpc", "registry"})
 
 PARSER_SETTINGS: dict[str, Any] = {
     "prog": "nsvq",
     **{name: {"description": command.summary} for name, command in COMMANDS.items() if command.module is None},
 }
-PARSER_SETTINGS["fit"]["default_config_files"] = [find_config("fast")]
+PARSER_SETTINGS["fit"]["default_config_files"] = [given.find_config("fast")]
 
 
 class QuietParser(LightningArgumentParser):
@@ -79,7 +65,9 @@ class QuietParser(LightningArgumentParser):
         subcommand = self.prog.rpartition(" ")[2]
         if subcommand not in COMMANDS:
             return super().format_help(*args)
-        return command_help(self, subcommand, None if subcommand == "export" else ColmapDataModule, TRAINER_OPTIONS)
+        data = None if subcommand == "export" else ColmapDataModule
+        explained = "run_folder", "allow_other_scene", "max_steps", "accelerator", "devices", "logger", "callbacks"
+        return command_help(self, subcommand, data, explained)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Write the message to stderr and exit with status 2."""
@@ -90,28 +78,27 @@ class QuietParser(LightningArgumentParser):
         elif message.startswith('Parser key "data":') and Path(message.rpartition("Given value: ")[2]).is_dir():
             message = "--data takes the name of a data module; the folder of a scene is --data.root=path/to/scene"
         elif missing := re.match(r"Parser key \"config\": File does not exist: '(.*)'", message):
-            names = shipped_configs()
+            names = given.shipped_configs()
             path = Path(missing[1])
-            message = f"there is no config {path}{nearest(path.stem, names)}\nShipped ones: {', '.join(names)}"
+            message = f"there is no config {path}{given.nearest(path.stem, names)}\nShipped ones: {', '.join(names)}"
         else:
-            message = in_plain_words(self._with_whole_option(message), CLASSES)
+            message = given.in_plain_words(self._with_whole_option(message), CLASSES)
             parsers = getattr(self._subcommands_action, "_name_parser_map", {"": self}).values()
             options = [option for parser in parsers for option in parser._option_string_actions]
             if program == "nsvq fit":
-                options += [f"--{name}" for name in SHORTHANDS]
-            message += unknown_option(message, options)
+                options += [f"--{name}" for name in given.SHORTHANDS]
+            message += given.unknown_option(message, options)
         sys.stderr.write(f"error: {message}\nAll options: {program} --help\n")
         self.exit(2)
 
     def _with_whole_option(self, message: str) -> str:
         """The message with the option as it was given: the parser of a nested class knows only its last part."""
         key = re.match(r'Parser key "(\w+)":', message)
-        if key is None or key[1] in SHORTHANDS:
+        if key is None or key[1] in given.SHORTHANDS:
             return message
-        for argument, following in pairwise([*self.arguments, ""]):
-            option, equals, value = argument.partition("=")
-            given = value if equals else following
-            if option.endswith(f".{key[1]}") and message.endswith(f"value: {given}"):
+        for argument in self.arguments:
+            option, _, value = argument.partition("=")
+            if option.endswith(f".{key[1]}") and message.endswith(f"value: {value}"):
                 return message.replace(key[1], option.removeprefix("--"), 1)
         return message
 
@@ -237,15 +224,16 @@ class SplatCLI(LightningCLI):
             FileNotFoundError: There is no such checkpoint.
         """
         path = self.config[self.config.subcommand].get("ckpt_path")
-        remote = path is not None and (path.partition(":")[0] in NAMED_CHECKPOINTS or "://" in path)
+        # Words that Lightning accepts instead of a path; ``last`` and ``best`` refer to its own callback.
+        remote = path is not None and (path.partition(":")[0] in ("hpc", "registry") or "://" in path)
         if path is not None and (not remote or Path(path).is_file()):
             settings = read_checkpoint(path).get("hyper_parameters", {})
             if self.config.subcommand != "fit":
                 check_settings(path, settings, [argument.partition("=")[2] or argument for argument in self._arguments])
         if self.config.subcommand != "fit":
             super()._parse_ckpt_path()
-            own = [self.config.subcommand, *_options_of("model", self._arguments)]
-            self.config = self.parser.parse_args(own, namespace=self.config, defaults=False)
+            own = [argument for argument in self._arguments if argument.startswith(("--model.", "--model="))]
+            self.config = self.parser.parse_args([self.config.subcommand, *own], namespace=self.config, defaults=False)
 
     def _prepare_subcommand_kwargs(self, subcommand: str) -> dict[str, Any]:
         kwargs = super()._prepare_subcommand_kwargs(subcommand)
@@ -325,26 +313,11 @@ class SplatCLI(LightningCLI):
             sys.stdout.write(summary(path.parent, json.loads(path.read_text(encoding="utf-8"))))
 
 
-def _options_of(group: str, arguments: Sequence[str]) -> list[str]:
-    """The options of a group among the arguments, each with its value."""
-    found, takes_value = [], False
-    for argument in arguments:
-        starts = argument.startswith((f"--{group}.", f"--{group}="))
-        if starts or (takes_value and not argument.startswith("--")):
-            found.append(argument)
-        takes_value = starts and "=" not in argument
-    return found
-
-
 def continuation(arguments: Sequence[str], checkpoint: Path) -> str:
     """The shell command that continues from a checkpoint with the arguments of the run that wrote it."""
     as_module = Path(sys.argv[0]).parts[-2:] == ("nsvq_lightning", "__main__.py")
     program = ["python", "-m", "nsvq_lightning"] if as_module else ["nsvq"]
-    kept, skip = [], False
-    for argument in arguments:
-        if not (skip or argument.startswith("--ckpt_path=") or argument == "--ckpt_path"):
-            kept.append(argument)
-        skip = argument == "--ckpt_path"
+    kept = [argument for argument in given.joined(arguments) if not argument.startswith("--ckpt_path=")]
     return shlex.join([*program, *kept, f"--ckpt_path={checkpoint}"])
 
 

@@ -22,20 +22,6 @@ TRACEBACK = "NSVQ_TRACEBACK"
 
 INTERRUPTED = 128 + signal.SIGINT
 
-# Fragments of Lightning's and torch's warnings that a user of this command can do nothing about.
-NOT_ACTIONABLE = (
-    "does not have many workers",  # views come from a cache in memory; each worker would hold a copy
-    "args parameter is intended",  # we pass the arguments after looking up configs
-    "dataloader.*no length",
-    "LeafSpec",
-    "(Checkpoint|Experiment logs) directory .* exists and is not empty",  # the marker of who writes there
-    "`tensorboardX` has been removed",
-    "Couldn't infer the batch indices",  # RenderWriter names pictures after their photos
-)
-
-# Fragments of Lightning's messages that advertise, or repeat the progress bar in the middle of its line.
-NOT_OURS = ("Tip:", "TPU available", "HPU available", "litlogger", "litmodels", "`Trainer.fit` stopped")
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``nsvq ARGUMENTS``.
@@ -153,7 +139,17 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
 
 
 def _run_lightning(arguments: list[str]) -> int:
-    for message in NOT_ACTIONABLE:
+    # Fragments of Lightning's and torch's warnings that a user of this command can do nothing about.
+    not_actionable = (
+        "does not have many workers",  # views come from a cache in memory; each worker would hold a copy
+        "args parameter is intended",  # we pass the arguments after looking up configs
+        "dataloader.*no length",
+        "LeafSpec",
+        "(Checkpoint|Experiment logs) directory .* exists and is not empty",  # the marker of who writes there
+        "`tensorboardX` has been removed",
+        "Couldn't infer the batch indices",  # RenderWriter names pictures after their photos
+    )
+    for message in not_actionable:
         warnings.filterwarnings("ignore", f".*{message}.*")
     from lightning.fabric.utilities.exceptions import MisconfigurationException
     from lightning.pytorch.utilities.exceptions import SIGTERMException
@@ -228,5 +224,7 @@ def _quiet_lightning() -> None:
         # With several processes, only the first logs below warnings; each logs its own warnings and errors.
         handler.addFilter(lambda record: record.levelno >= logging.WARNING or getattr(rank_zero_only, "rank", 0) == 0)
 
+    # Fragments of Lightning's messages that advertise, or repeat the progress bar in the middle of its line.
+    not_ours = ("Tip:", "TPU available", "HPU available", "litlogger", "litmodels", "`Trainer.fit` stopped")
     for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
-        logging.getLogger(name).addFilter(lambda record: not any(part in record.getMessage() for part in NOT_OURS))
+        logging.getLogger(name).addFilter(lambda record: not any(part in record.getMessage() for part in not_ours))

@@ -10,7 +10,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.commands.arguments import expand, resolve_configs
+from nsvq_lightning.commands import arguments as given
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.quantize.attributes import codebook_sizes
 from nsvq_lightning.version import __version__
@@ -139,7 +139,7 @@ def resolve(arguments: Sequence[str]) -> Settings:
     with warnings.catch_warnings():
         # Lightning warns of arguments that are not the process's, jsonargparse of the name `skip_none`.
         warnings.simplefilter("ignore")
-        reader = _Reader(["fit", *expand(resolve_configs(arguments))])
+        reader = _Reader(["fit", *given.expand(given.resolve_configs(arguments))])
         text = reader._parser("fit").dump(reader.config["fit"], skip_none=False, format="json")
     settings: Settings = json.loads(text)
     if settings["ckpt_path"] is not None:
