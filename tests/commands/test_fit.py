@@ -372,7 +372,7 @@ def test_configs_are_found_as_files_first_then_by_name(tmp_path: Path) -> None:
     assert find_config("no_such_config") == "no_such_config"
     arguments = ["fit", "--config", "paper", "--config=paper", "-c", str(mine), "--data.root", "paper"]
     assert resolve_configs(arguments) == [
-        *("fit", "--config", shipped, f"--config={shipped}", "-c", str(mine), "--data.root", "paper")
+        *("fit", f"--config={shipped}", f"--config={shipped}", f"--config={mine}", "--data.root=paper")
     ]
 
 

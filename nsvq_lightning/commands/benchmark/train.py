@@ -28,11 +28,7 @@ from nsvq_lightning.commands.benchmark import Scope, timing
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.quality.loss import photometric_loss
-from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.report.files import evaluate
-from nsvq_lightning.splats.splats import Splats
-from nsvq_lightning.training import optim
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
