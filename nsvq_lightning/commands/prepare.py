@@ -30,13 +30,8 @@ if TYPE_CHECKING:
 
 # File that shows that a folder was made by this command, and from what.
 RECORD = "prepare.json"
-# What this command makes in a scene.
-MADE = ("images", "sparse", "mapping", "database.db", "database.db-shm", "database.db-wal", RECORD)
-FRAMES, MAX_SIZE = 150, 1600
 # Photos below which a scene is likely to look good only from where they were taken.
 FEW = 20
-# Photos that are named at most.
-LISTED = 8
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,9 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("source", type=Path, metavar="SOURCE", help="folder of photos, or a video")
     add("scene", type=Path, metavar="SCENE", help="folder to make")
-    add("--frames", type=positive(int), default=FRAMES, metavar="N", help=f"frames of a video; {FRAMES} by default")
-    help_ = f"longer side of the photos in which features are looked for; {MAX_SIZE} by default, fewer are faster"
-    add("--max-size", type=positive(int), default=MAX_SIZE, metavar="PIXELS", help=help_)
+    add("--frames", type=positive(int), default=150, metavar="N", help="frames of a video; %(default)s by default")
+    help_ = "longer side of the photos in which features are looked for; %(default)s by default, fewer are faster"
+    add("--max-size", type=positive(int), default=1600, metavar="PIXELS", help=help_)
     add("--threads", type=int, default=-1, metavar="N", help="threads; one a core by default")
     add("--again", action="store_true", help="begin anew instead of continuing")
 
@@ -126,7 +121,8 @@ def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
     elif scene.is_dir() and not path.is_file() and {each.name for each in scene.iterdir()} - own:
         raise ValueError(f"{scene} is not empty and was not made by this command: name a new folder")
     if options.again and path.is_file():
-        for target in (scene / name for name in MADE if name not in own):
+        made = {"images", "sparse", "mapping", "database.db", "database.db-shm", "database.db-wal", RECORD}
+        for target in (scene / name for name in made - own):
             shutil.rmtree(target) if target.is_dir() else target.unlink(missing_ok=True)
     (scene / "images").mkdir(parents=True, exist_ok=True)
     write_text(path, json.dumps(record, indent=2) + "\n")
@@ -154,11 +150,12 @@ def _told(verdict: Verdict, images: Path) -> Iterator[str]:
     some = verdict.registered[:: max(1, count // FEW)]
     usual = sorted(sharpness(read_image(images / name)) for name in some)[len(some) // 2]
     yield "  without a place, better taken again:"
-    for name, partners in list(verdict.missing.items())[:LISTED]:
+    listed = 8
+    for name, partners in list(verdict.missing.items())[:listed]:
         if sharpness(read_image(images / name)) < 0.3 * usual:
             reason = "blurred"
         else:
             reason = f"shares enough with {partners} other photos" if partners else "overlaps no other"
         yield f"    {name}: {reason}"
-    if len(verdict.missing) > LISTED:
-        yield f"    and {len(verdict.missing) - LISTED} more"
+    if len(verdict.missing) > listed:
+        yield f"    and {len(verdict.missing) - listed} more"

@@ -27,7 +27,6 @@ from nsvq_lightning.commands.arguments import cameras_of, photos_of, scene_file
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
 
-PORT = 7007
 # Connections at a time; more are closed at once.
 MOST = 64
 
@@ -40,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     help_ = "folder of the photos, whose cameras are offered; that of the run by default"
     add("--data.root", dest="root", type=Path, metavar="FOLDER", help=help_)
     add("-o", "--output", type=Path, metavar="OUT.html", help="write one page with the scene instead")
-    add("--port", type=_port, default=PORT, help=f"{PORT} by default; 0 for any that is free")
+    add("--port", type=_port, default=7007, help="%(default)s by default; 0 for any that is free")
     help_ = "127.0.0.1, this machine only, by default; 0.0.0.0 for all of the network"
     add("--host", default="127.0.0.1", help=help_)
     add("--no-open", dest="open", action="store_false", help="do not open the browser")
