@@ -36,7 +36,7 @@ def test_every_readable_format_becomes_every_writable_one(tmp_path: Path, capsys
             output = tmp_path / "new" / f"b{target}"
             assert main([str(tmp_path / f"a{source}"), str(output)]) == 0
             assert f"30 splats in {output.stat().st_size:,} bytes" in capsys.readouterr().out
-            nearest_in(read_scene(output), scene)
+            nearest_in(arrays_of(read_scene(output)), arrays_of(scene))
 
 
 def test_codebooks_survive_where_the_format_has_them(tmp_path: Path) -> None:
