@@ -30,11 +30,19 @@ def entry_points() -> dict[str, str]:
     """Compiler, ``numba`` or ``triton``, by full name of each entry point."""
     found = {}
     for module in _modules():
-        kernels = {name: kind for name, value in vars(module).items() if (kind := _compiler(value)) is not None}
+        kernels = _kernels(module)
+        for alias, value in vars(module).items():
+            if inspect.ismodule(value) and value.__name__.startswith("nsvq_lightning."):
+                kernels |= {f"{alias}.{name}": kind for name, kind in _kernels(value).items()}
         if kernels or MAKER in vars(module):
             compiler = next(iter(kernels.values()), "numba")
             found |= {f"{module.__name__}.{name}": compiler for name in _reaching(module, set(kernels))}
     return found
+
+
+def _kernels(module: ModuleType) -> dict[str, str]:
+    """Compiler of each kernel among the names of a module."""
+    return {name: kind for name, value in vars(module).items() if (kind := _compiler(value)) is not None}
 
 
 def _modules() -> Iterator[ModuleType]:
@@ -90,3 +98,5 @@ def _names(node: ast.AST) -> Iterator[str]:
             yield part.id
         elif isinstance(part, ast.Attribute):
             yield part.attr
+            if isinstance(part.value, ast.Name):
+                yield f"{part.value.id}.{part.attr}"
