@@ -28,7 +28,7 @@ CASES = {
     "colmap-txt": 50,
     "photo": 100,
     "config": 10,
-    "checkpoint": 20,
+    "checkpoint": 60,
 }
 """Cases in a quick test; in a slow one three times as many."""
 
