@@ -1,6 +1,7 @@
 """The callbacks of ``nsvq fit``, one of each, in order."""
 
 from importlib import import_module
+from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint, ProgressBar, RichProgressBar, TQDMProgressBar
@@ -114,7 +115,7 @@ def standard(config: str | None = None, /, **replaced: Callback | None) -> list[
 
 
 def _callbacks_of(config: str) -> dict[str, Callback | None]:
-    """What a config says of callbacks: null, the name of a class, or settings of the standard one."""
+    """What a config says of callbacks: null, a class by name or with its settings, or settings of the standard one."""
     import yaml
 
     text = (folder_of("configs") / f"{config}.yaml").read_text(encoding="utf-8")
@@ -122,8 +123,11 @@ def _callbacks_of(config: str) -> dict[str, Callback | None]:
     for name, value in yaml.safe_load(text).get("callbacks", {}).items():
         if value is None:
             made[name] = None
-        elif isinstance(value, str):
-            made[name] = getattr(import_module(__package__), value)()
+            continue
+        named: dict[str, Any] = {"class_path": value} if isinstance(value, str) else value
+        if "class_path" in named:
+            kind = getattr(import_module(__package__), named["class_path"])
+            made[name] = kind(**named.get("init_args", {}))
         else:
-            made[name] = STANDARD[name](**value)
+            made[name] = STANDARD[name](**named)
     return made

@@ -9,7 +9,15 @@ import pytest
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 
-from nsvq_lightning.callbacks import MetricReport, RunCheckpoint, SplatProgressBar, standard
+from nsvq_lightning.callbacks import (
+    DensityControl,
+    MetricReport,
+    PhaseSchedule,
+    RateDistortion,
+    RunCheckpoint,
+    SplatProgressBar,
+    standard,
+)
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.training.module import SplatModule
 
@@ -61,3 +69,12 @@ def test_a_checkpoint_callback_of_the_users_is_the_trainers(demo_scene: Path, tm
     assert Path(best.best_model_path).is_file()
     assert isinstance(trainer.checkpoint_callbacks[-1], RunCheckpoint)
     assert trainer.checkpoint_callbacks[-1].last_path is not None
+
+
+def test_a_shipped_config_gives_its_callbacks() -> None:
+    (density,) = (each for each in standard("plain") if isinstance(each, DensityControl))
+    assert (density.prune_every, density.every) == (0, 100)
+    (phases,) = (each for each in standard("paper") if isinstance(each, PhaseSchedule))
+    assert phases.schedule(45_000).ends == (15_000, 20_000, 43_000, 45_000)
+    assert any(isinstance(each, RateDistortion) for each in standard("small"))
+    assert {type(each) for each in standard("fast")} == {type(each) for each in standard()}
