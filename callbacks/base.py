@@ -30,7 +30,7 @@ class SplatCallback(Callback):
     A callback decides by the module's ``schedule`` and the trainer's step alone, so that each works without the others.
     What is to happen once per iteration goes into :meth:`before_step` and :meth:`after_step`; with gradient
     accumulation Lightning calls the hooks that they come from for every view of the iteration. A subclass that
-    overrides a hook of this class calls it here first.
+    overrides ``setup``, or one of these hooks beside its method, calls it here first.
 
     A callback is a dataclass whose fields are its settings; those that :attr:`state` names are what it has reached, and
     have ``init=False``.

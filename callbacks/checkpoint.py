@@ -272,7 +272,6 @@ class RunCheckpoint(WritingCallback, Checkpoint):
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Start to hold back signals."""
-        super().on_train_start(trainer, module)
         if trainer.ckpt_path is not None:
             self.best_model_path, self._saved = str(trainer.ckpt_path), trainer.global_step
         self._training = True

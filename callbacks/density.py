@@ -95,7 +95,6 @@ class Densification(SplatCallback, ABC):
             ValueError: There are more than :meth:`limit`, and the trainer has no data module whose views show which
                 ones matter.
         """
-        super().on_train_start(trainer, module)
         limit, count = self.limit(module), len(module.splats)
         if limit is None:
             return

@@ -67,7 +67,6 @@ class SplatBudget(SplatCallback):
             ValueError: The budget in bytes has no room for codebooks; or it is to come from photos, and the trainer has
                 no data module with a scene.
         """
-        super().on_train_start(trainer, module)
         module.splat_budget, reason = self.splats, "as asked"
         if self.bytes is not None:
             codebooks = {name: tuple(quantizer.codebook.shape) for name, quantizer in module.quantizers.items()}

@@ -65,7 +65,6 @@ class ExposureCompensation(SplatCallback):
         Raises:
             ValueError: The trainer has no data module with a scene, or the checkpoint is of another number of photos.
         """
-        super().on_train_start(trainer, module)
         scene = scene_access.needed_scene(
             trainer, "exposures are those of the train photos", "leave out ExposureCompensation"
         )
@@ -173,7 +172,6 @@ class FrequencyLimit(SplatCallback):
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Look at the splats anew; what is known of them is in a side table."""
-        super().on_train_start(trainer, module)
         self._floor = None
 
     def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:

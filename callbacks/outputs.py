@@ -157,7 +157,6 @@ class LiveScene(WritingCallback):
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Forget who asked an earlier part of the run."""
-        super().on_train_start(trainer, module)
         self._running = not is_trial(trainer)
         self._answered, self._next = viewer.live_asked(run_folder(trainer)), 0.0
 

@@ -97,7 +97,8 @@ class SplatProgressBar(TQDMProgressBar):
             left = seconds * (total - done) / max(1.0, done - self.train_progress_bar.initial)
             elapsed, remaining = Tqdm.format_interval(seconds), Tqdm.format_interval(left)
             progress = f"iteration {done} of {total} ({100 * done // total} %), {elapsed} elapsed, {remaining} left"
-            print(f"{progress}: {text}", flush=True)
+            sys.stdout.write(f"{progress}: {text}\n")
+            sys.stdout.flush()
             return
         bar = self.train_progress_bar
         bar.start_t = self._start_without_compilation()

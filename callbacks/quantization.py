@@ -49,7 +49,6 @@ class CanonicalCovariance(SplatCallback):
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Act before the first iteration of a run that starts in the quantize phase."""
-        super().on_train_start(trainer, module)
         if self._first_time("after", trainer.global_step):
             self.after_step(trainer, module, trainer.global_step)
 
@@ -212,7 +211,6 @@ class CodebookReplacement(SplatCallback):
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Keep a checkpoint's counts on the first process only: they are the sum of all."""
-        super().on_train_start(trainer, module)
         if not trainer.is_global_zero:
             _forget_usage(module)
 

@@ -110,7 +110,6 @@ class PhaseSchedule(SplatCallback):
         Raises:
             ValueError: In this schedule, the last trained iteration is in another phase.
         """
-        super().on_train_start(trainer, module)
         step = trainer.global_step
         expected = module.schedule.phase_at(step) if step else Phase.WARMUP
         # A checkpoint may have been written just after the next iteration began.

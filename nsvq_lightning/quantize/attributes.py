@@ -1,6 +1,6 @@
 """Which attributes are quantized, with which codebooks, and a scene whose rows are replaced by their codes."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,16 +50,6 @@ QUANTIZED = {
     name: QuantizedAttribute(name, ATTRIBUTES[name].code_share)
     for name in sorted(QUANTIZABLE, key=lambda name: (-ATTRIBUTES[name].code_share, _DIMS[name]))
 }
-
-
-def check_attributes(name: str, attributes: Iterable[str]) -> None:
-    """Refuse the argument ``name`` if one of its attributes is not vector quantized.
-
-    Raises:
-        ValueError: One is not.
-    """
-    if not set(attributes) <= set(QUANTIZED):
-        raise ValueError(f"{name} must be among {', '.join(QUANTIZED)}, got {', '.join(attributes)}")
 
 
 def codebook_sizes(name: str) -> dict[str, int]:

@@ -52,8 +52,8 @@ def train_cameras(trainer: Trainer, *, share: bool = False) -> Iterator[Camera]:
     """
     scene = needed_scene(
         trainer,
-        "contributions of splats and the floor of scales need the train views",
-        "leave contribution pruning, weights by contribution and the floor off",
+        "contributions of splats and the smallest scales need the train views",
+        "leave weights by contribution and FrequencyLimit off",
     )
     indices = scene.train[trainer.global_rank :: trainer.world_size] if share else scene.train
     return (scene.cameras[index] for index in indices)
