@@ -21,7 +21,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from runs import RECIPE_MODULE, Recipe, RunFactory, Whole, paper_phases, recipe_options
 
-from nsvq_lightning.callbacks import MetricReport, OpacitySelection, RunCheckpoint
+from nsvq_lightning.callbacks import MetricReport, OpacitySelection, PhaseSchedule, RunCheckpoint
 from nsvq_lightning.commands.fit import continuation
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.training.module import SplatModule
@@ -373,7 +373,7 @@ def test_a_killed_process_leaves_its_periodic_checkpoint(
     assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
     path = tmp_path / demo_scene.name / "version_0" / "checkpoints" / "last.ckpt"
     assert os.listdir(path.parent) == ["last.ckpt"]
-    ends = Schedule(total=12).ends
+    ends = PhaseSchedule().schedule(12).ends
     assert iteration_of(path) == max(i for i in range(1, iteration) if i % 2 == 0 or i in ends)
     assert main([*arguments, f"--ckpt_path={path}"]) == 0
     assert (tmp_path / demo_scene.name / "version_1" / "scene.nsvq").read_bytes() == command_scene
