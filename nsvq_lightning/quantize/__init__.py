@@ -7,12 +7,7 @@ from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest, nearest_reference
 from nsvq_lightning.quantize.nsvq import NSVQ, DiVeQ
-from nsvq_lightning.quantize.straight_through import (
-    PostHoc,
-    StraightThrough,
-    TrainedStraightThrough,
-    VectorQuantizeAdapter,
-)
+from nsvq_lightning.quantize.straight_through import PostHoc, StraightThrough, TrainedStraightThrough
 
 __all__ = [
     "NSVQ",
@@ -25,7 +20,6 @@ __all__ = [
     "Quantizer",
     "StraightThrough",
     "TrainedStraightThrough",
-    "VectorQuantizeAdapter",
     "codebook_sizes",
     "kmeans",
     "nearest",

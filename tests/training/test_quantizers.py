@@ -20,7 +20,6 @@ from nsvq_lightning.quantize import (
     PostHoc,
     StraightThrough,
     TrainedStraightThrough,
-    VectorQuantizeAdapter,
     kmeans,
 )
 from nsvq_lightning.random import generator
@@ -30,7 +29,7 @@ from nsvq_lightning.training.schedule import Phase, Schedule
 
 Quantizers = type[CodebookQuantizer]
 
-KINDS = [StraightThrough, TrainedStraightThrough, DiVeQ, PostHoc, VectorQuantizeAdapter]
+KINDS = [StraightThrough, TrainedStraightThrough, DiVeQ, PostHoc]
 PAPER = Storage("paper")  # stores codes and codebooks as they are
 STEPS, PRUNE_END, MIDDLE, QUANTIZE_END = 60, 27, 46, 57
 
@@ -79,9 +78,7 @@ Finished = tuple[Quantizers, Trainer, SplatModule, Books]
 
 @pytest.fixture(scope="module", params=KINDS, ids=lambda kind: kind.__name__)
 def finished(request: pytest.FixtureRequest, run: RunFactory, quantized_recipe: Recipe) -> Finished:
-    """A run through all phases with each quantizer, a foreign one among them; the callbacks are the same."""
-    if request.param is VectorQuantizeAdapter:
-        pytest.importorskip("vector_quantize_pytorch")
+    """A run through all phases with each quantizer; the callbacks are the same."""
     books = Books()
     callbacks = [*quantized_recipe(checkpoint=MiddleCheckpoint()).values(), books]
     trainer, module = run(callbacks, module={"quantizer": request.param, "storage": PAPER})
