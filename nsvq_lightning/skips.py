@@ -48,14 +48,9 @@ SKIPS = {
         Skip("saturated", "blocks of pixels", "all their pixels are opaque"),
         Skip("sh_bands", "SH bands in the renderer", "they are above the active degree"),
         # quantization
-        Skip("visible_search", "the nearest code of a splat", "it is not visible in this step"),
-        Skip("frozen_search", "the nearest code of a splat", "its codes are frozen"),
         Skip("distance_bounds", "the nearest code of a splat", "bounds prove that it is the last one"),
         # training step
         Skip("metrics", "the PSNR of a training view", "it is not logged in this step"),
-        # photos
-        Skip("undistortion", "resampling a photo", "its camera is a pinhole"),
-        Skip("resizing", "resampling a photo", "it has its size already"),
     )
 }
 

@@ -20,7 +20,6 @@ from torch import Tensor
 
 from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.undistort import Pinhole, Undistortion
-from nsvq_lightning.skips import is_on
 
 # Relative difference of aspect ratios that rounding explains.
 ROUNDED = 0.01
@@ -282,7 +281,7 @@ class ImageSource:
         if self.undistortion is not None:
             image, kept = self.undistortion(image), self.undistortion.kept(kept)
         size = self.pinhole.width, self.pinhole.height
-        if image.shape[1::-1] != size or not is_on("resizing"):
+        if image.shape[1::-1] != size:
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
             if kept is not None:
                 kept = cv2.resize(kept.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap
-from nsvq_lightning.skips import is_on
 
 log = logging.getLogger(__name__)
 
@@ -161,8 +160,7 @@ def rectify(camera: Any, width: int, height: int, keep_maps: bool = True) -> tup
     # An all-zero polynomial is a pinhole too, but COLMAP's undistorter would crop its picture by a pixel.
     # Fisheye models without distortion are none.
     polynomial = camera.model_name in ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-    is_pinhole = camera.model_name in ("SIMPLE_PINHOLE", "PINHOLE")
-    if (polynomial and camera.is_undistorted()) or (is_pinhole and is_on("undistortion")):
+    if (polynomial and camera.is_undistorted()) or camera.model_name in ("SIMPLE_PINHOLE", "PINHOLE"):
         pinhole = Pinhole(camera.calibration_matrix(), camera.width, camera.height)
         return pinhole.resized(width, height), None
     undistortion = Undistortion(camera, width, height, keep_maps)

@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.quantize.base import Quantizer, as_quantizer, held_codes
-from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.attributes import ATTRIBUTES, QUANTIZABLE, attribute_dims
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
@@ -112,11 +111,9 @@ def codes_of(splats: RawSplats, attribute: str, quantizer: Quantizer) -> Tensor:
     held = held_codes(quantizer, splats.means.shape[0])
     if held is not None:
         return held
-    frozen = quantizer.codes.shape[0] == splats.means.shape[0]
-    if frozen and is_on("frozen_search"):
+    if quantizer.codes.shape[0] == splats.means.shape[0]:
         return quantizer.codes
-    nearest = quantizer.encode(attribute_rows(splats, attribute))
-    return quantizer.codes if frozen else nearest
+    return quantizer.encode(attribute_rows(splats, attribute))
 
 
 def decoded(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> RawSplats:

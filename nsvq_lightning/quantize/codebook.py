@@ -183,8 +183,6 @@ class CodebookQuantizer(nn.Module, ABC):
         """
         if self.frozen:
             codes = self._frozen_codes(x.shape[0], rows)
-            if not is_on("frozen_search"):
-                self._search(x, rows)
             return self.decode(codes), codes
         held = held_codes(self, len(x))
         if held is not None and rows is not None:
@@ -312,8 +310,6 @@ class CodebookQuantizer(nn.Module, ABC):
 
     def _search(self, x: Tensor, rows: Tensor | None) -> Tensor:
         """Nearest codes ``[V]`` of the rows ``rows [V]`` of ``x [N, D]``."""
-        if rows is not None and not is_on("visible_search"):
-            return self._search(x, None)[rows]
         if is_on("distance_bounds"):
             return self._tracker.search(x, self.codebook, rows)
         return self.encode(x if rows is None else x.detach().index_select(0, rows))

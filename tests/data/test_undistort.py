@@ -11,7 +11,6 @@ import pytest
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap, read_model
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.data.undistort import rectify
-from nsvq_lightning.skips import switched
 
 SceneFactory = Callable[..., Path]
 
@@ -78,19 +77,6 @@ def test_cameras_without_distortion_pass_straight_through(model: str, params: tu
     assert undistortion is None
     assert pinhole.K.tolist() == [[300, 0, 205], [0, 300, 148], [0, 0, 1]]
     assert (pinhole.width, pinhole.height) == (400, 300)
-
-
-@pytest.mark.parametrize(
-    ("model", "params"), [("PINHOLE", (300.0, 310.0, 205.3, 148.7)), ("SIMPLE_PINHOLE", (300.0, 205.0, 148.0))]
-)
-def test_undistorting_a_pinhole_picture_would_change_no_bit(model: str, params: tuple[float, ...]) -> None:
-    camera, image = _camera(model, params), _picture(400, 300)
-    skipped, _ = rectify(camera, 400, 300)
-    with switched(undistortion=False):
-        pinhole, undistortion = rectify(camera, 400, 300)
-    assert undistortion is not None
-    assert np.array_equal(pinhole.K, skipped.K)
-    assert np.array_equal(undistortion(image), image)
 
 
 def test_files_of_half_the_models_size() -> None:
