@@ -7,11 +7,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 import PIL.ImageOps
 from cv2.typing import MatLike
 
 from nsvq_lightning.data.colmap import SceneError
-from nsvq_lightning.data.images import ORIENTATION, opened
+from nsvq_lightning.data.images import DAMAGED, ORIENTATION
 from nsvq_lightning.io.atomic import atomic_path, atomic_write
 
 # Suffixes of photos that both COLMAP and this package read.
@@ -56,7 +57,7 @@ def copy_photos(photos: Sequence[Path], folder: Path, done: Callable[[int], None
     for count, path in enumerate(photos, 1):
         target = folder / path.name
         try:
-            with path.open("rb") as file, opened(file) as image:
+            with PIL.Image.open(path) as image:
                 turned = image.getexif().get(ORIENTATION, 1) != 1
                 if not turned:
                     image.load()
@@ -68,7 +69,7 @@ def copy_photos(photos: Sequence[Path], folder: Path, done: Callable[[int], None
             if not turned and not target.exists():
                 with atomic_path(target) as unfinished:
                     shutil.copyfile(path, unfinished)
-        except (OSError, SyntaxError, ValueError) as error:
+        except DAMAGED as error:
             damaged.append((path, str(error)))
         done(count)
     return damaged

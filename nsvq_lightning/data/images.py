@@ -1,13 +1,11 @@
 """Image files: decoding to RGB bytes and which of them count, and a cache of them with a byte budget."""
 
 import io
-import threading
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future
-from contextlib import contextmanager
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -25,9 +23,13 @@ from nsvq_lightning.data.undistort import Pinhole, Undistortion
 ROUNDED = 0.01
 # EXIF and TIFF tag: how to turn the stored pixels.
 ORIENTATION = 274
+# Its values from here on: stored lying on its side, so that programs that apply it swap width and height.
+ON_ITS_SIDE = 5
 
-# What Pillow raises for a file that is damaged or not a picture.
-_DAMAGED = (OSError, ValueError, SyntaxError, KeyError)
+# Pillow refuses twice as many, and by default fewer than phones have.
+PIL.Image.MAX_IMAGE_PIXELS = 1 << 28
+# What Pillow raises for a file that is damaged, not a picture, or beyond that limit.
+DAMAGED = (OSError, ValueError, SyntaxError, KeyError, PIL.Image.DecompressionBombError)
 
 
 def _undecodable(path: Path, reason: str) -> SceneError:
@@ -41,20 +43,15 @@ class ImageHead(NamedTuple):
     orientation: int
     has_alpha: bool
 
-    @property
-    def lies_on_its_side(self) -> bool:
-        """Whether programs that apply the orientation swap width and height."""
-        return self.orientation >= _TURNED
-
 
 def image_head(path: Path) -> ImageHead:
     """What the head of an image file says.
 
     Raises:
-        SceneError: The file is not an image, or its head declares more pixels than it can hold.
+        SceneError: The file is not an image, or its head declares too many pixels.
     """
     try:
-        with path.open("rb") as file, opened(file) as image:
+        with PIL.Image.open(path) as image:
             width, height = image.size
             # Pillow decodes a whole PNG to look for a tag that is hardly ever there.
             tags = {} if image.format == "PNG" else image.getexif()
@@ -62,45 +59,9 @@ def image_head(path: Path) -> ImageHead:
             if image.format == "TIFF":  # Pillow applies the orientation to their size
                 width, height = int(tags[256]), int(tags[257])
             has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise _undecodable(path, str(error)) from error
     return ImageHead((width, height), orientation, has_alpha)
-
-
-# Pixels that any file may have, however short, such as a white mask; beyond, most pixels per byte of the file. 32
-# leave a quarter of a bit for each. So many are decoded in less than 1 GB.
-_FEW_PIXELS, _MOST_A_BYTE = 1 << 25, 32
-_LIMIT = threading.Lock()
-
-
-@contextmanager
-def opened(file: BinaryIO, room: int = 0) -> Iterator[PIL.Image.Image]:
-    """Open the head of a picture, past Pillow's pixel limit, which phones exceed; nothing is decoded.
-
-    Args:
-        file: The image file, opened for reading.
-        room: Pixels that it may have in any case.
-
-    Raises:
-        OSError: It is not a picture, or its head declares more pixels than that and than the file can hold; the other
-            errors of ``_DAMAGED`` mean the same.
-    """
-    size = file.seek(0, io.SEEK_END)
-    with _LIMIT:
-        usual, PIL.Image.MAX_IMAGE_PIXELS = PIL.Image.MAX_IMAGE_PIXELS, None
-        try:
-            image = PIL.Image.open(file)
-        except PIL.UnidentifiedImageError:
-            raise OSError("its head is that of no known format") from None
-        finally:
-            PIL.Image.MAX_IMAGE_PIXELS = usual
-    with image:
-        if image.width * image.height > max(_FEW_PIXELS, room, _MOST_A_BYTE * size):
-            raise OSError(
-                f"its head declares {image.width}x{image.height} pixels in {size} bytes, more than {_FEW_PIXELS} and "
-                f"than {_MOST_A_BYTE} a byte"
-            )
-        yield image
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -112,16 +73,15 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(_decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH), cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def _decoded(path: Path, flags: int, room: int = 0) -> NDArray[np.uint8]:
+def _decoded(path: Path, flags: int) -> NDArray[np.uint8]:
     """Decode an image as OpenCV does, to 8 bits, with the pixels as stored: those are what COLMAP works on.
 
     Args:
         path: Image file.
         flags: Of ``cv2.imdecode``.
-        room: Pixels that it may have in any case.
 
     Raises:
-        SceneError: The file is damaged, has floating-point pixels, or declares more pixels than it can hold.
+        SceneError: The file is damaged, has floating-point pixels, or declares too many pixels.
     """
     try:
         data = path.read_bytes()  # imread fails on names outside the locale's character set
@@ -131,17 +91,14 @@ def _decoded(path: Path, flags: int, room: int = 0) -> NDArray[np.uint8]:
             "there again"
         ) from error
     try:
-        with opened(io.BytesIO(data), room) as head:
+        with PIL.Image.open(io.BytesIO(data)) as head:
             # OpenCV applies the orientation to TIFFs even when told not to.
             applied = int(head.getexif().get(ORIENTATION, 1)) if head.format == "TIFF" else 1
-    except _DAMAGED as error:
-        raise _undecodable(path, str(error)) from error
-    try:
-        _check_whole(data)
+            _check_whole(data)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             raise OSError("OpenCV cannot decode it")
-    except (*_DAMAGED, cv2.error) as error:
+    except (*DAMAGED, cv2.error) as error:
         reason = f"truncated, damaged, too large or of an unknown format, {len(data)} bytes: {error}"
         raise _undecodable(path, reason) from error
     if image.dtype == np.uint16:
@@ -155,7 +112,7 @@ def _check_whole(data: bytes) -> None:
     """Refuse truncation that OpenCV would not notice.
 
     Raises:
-        OSError: The file is incomplete; the other errors of ``_DAMAGED`` mean the same.
+        OSError: The file is incomplete; the other errors of ``DAMAGED`` mean the same.
     """
     file = io.BytesIO(data)
     if data.startswith(b"\x89PNG"):
@@ -166,13 +123,9 @@ def _check_whole(data: bytes) -> None:
             raise OSError("there is no end marker")  # OpenCV 4 would fill the missing part with grey
 
 
-# EXIF orientation from which on a photo is stored lying on its side.
-_TURNED = 5
-
-
 def _turned_back(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
     """Pixels to which an EXIF orientation was applied, as they were stored."""
-    stored = pixels.swapaxes(0, 1) if orientation >= _TURNED else pixels
+    stored = pixels.swapaxes(0, 1) if orientation >= ON_ITS_SIDE else pixels
     mirrored = {2: (1,), 3: (0, 1), 4: (0,), 6: (0,), 7: (0, 1), 8: (1,)}  # axes
     return np.ascontiguousarray(np.flip(stored, mirrored.get(orientation, ())))
 
@@ -190,7 +143,7 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     Raises:
         SceneError: The file is damaged, or has another aspect ratio than the photo.
     """
-    grey = _decoded(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH, room=width * height)
+    grey = _decoded(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     kept: NDArray[np.uint8] = (grey > int(grey.max()) / 2).astype(np.uint8)
     if abs(kept.shape[1] * height / (kept.shape[0] * width) - 1) > ROUNDED:
         raise SceneError(
@@ -361,16 +314,9 @@ class ImageStore:
             return
         while len(self._coming) > 1:  # prefetched and never requested
             self._coming.pop(next(iter(self._coming)))
-        future: Future[Picture] = Future()
-        self._coming[index] = future
-        threading.Thread(target=_load_into, args=(future, self.sources[index]), name="nsvq-image").start()
+        thread = ThreadPoolExecutor(1, "nsvq-image")
+        self._coming[index] = thread.submit(self.sources[index].load)
+        thread.shutdown(wait=False)
 
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "_coming": {}}
-
-
-def _load_into(future: Future[Picture], source: ImageSource) -> None:
-    try:
-        future.set_result(source.load())
-    except Exception as error:  # passed on to whoever requests the picture
-        future.set_exception(error)

@@ -18,7 +18,7 @@ from torch import Tensor
 from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, larger_models
 from nsvq_lightning.data.frames import PHOTOS
-from nsvq_lightning.data.images import ROUNDED, ImageSource, ImageStore, image_head
+from nsvq_lightning.data.images import ON_ITS_SIDE, ROUNDED, ImageSource, ImageStore, image_head
 from nsvq_lightning.data.transforms import random_points, read_poses
 from nsvq_lightning.data.undistort import rectify
 from nsvq_lightning.rendering.camera import Camera
@@ -302,7 +302,7 @@ def _image_sources(
         camera, head = model.cameras[image.camera_id], image_head(path)
         size, on_its_side = head.size, head.size[::-1]
         # COLMAP calibrates photos as they are stored, other programs as their EXIF orientation shows them.
-        turned = head.lies_on_its_side and not same_shape(camera, *size) and same_shape(camera, *on_its_side)
+        turned = head.orientation >= ON_ITS_SIDE and not same_shape(camera, *size) and same_shape(camera, *on_its_side)
         kinds.append((image.camera_id, on_its_side if turned else size))
         orientations.append(head.orientation if turned else 1)
         transparent.append(head.has_alpha)

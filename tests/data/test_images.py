@@ -76,11 +76,9 @@ def test_the_orientation_of_a_tiff_is_ignored_too(tmp_path: Path, orientation: i
     np.testing.assert_array_equal(read_image(path), picture)
 
 
-def test_a_picture_may_be_larger_than_the_limit_of_pillow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    PIL.Image.fromarray(cv2.resize(RGB, (200, 150))).save(tmp_path / "x.jpg")
-    monkeypatch.setattr(PIL.Image, "MAX_IMAGE_PIXELS", 1000)
-    assert image_head(tmp_path / "x.jpg").size == (200, 150)
-    assert PIL.Image.MAX_IMAGE_PIXELS == 1000
+def test_a_picture_may_have_the_pixels_of_a_phone(tmp_path: Path) -> None:
+    PIL.Image.new("1", (16_320, 12_240)).save(tmp_path / "x.png")
+    assert image_head(tmp_path / "x.png").size == (16_320, 12_240)
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.02, 0.9])
@@ -112,25 +110,13 @@ def _png(width: int, height: int, data: bytes) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
-@pytest.mark.parametrize("side", [12_000, 40_000, 1 << 20])
+@pytest.mark.parametrize("side", [30_000, 1 << 20])
 def test_a_head_that_promises_more_than_the_file_holds(tmp_path: Path, side: int) -> None:
     path = tmp_path / "bomb.png"
     path.write_bytes(_png(side, side, zlib.compress(b"\0" * 1000)))
     for read in (image_head, read_image):
         with pytest.raises(SceneError, match=r"bomb\.png cannot be decoded"):
             read(path)
-
-
-def test_photos_and_masks_of_many_equal_pixels_are_refused_by_their_heads(tmp_path: Path) -> None:
-    """A mask may be as large as its photo, which has been decoded."""
-    side, path, small = 8200, tmp_path / "black.png", tmp_path / "small.png"
-    PIL.Image.new("1", (side, side)).save(path)
-    for read in (image_head, read_image, lambda path: read_mask(path, 820, 820)):
-        with pytest.raises(SceneError, match=r"black\.png cannot be decoded .*8200x8200 pixels in \d+ bytes"):
-            read(path)
-    assert not read_mask(path, side, side).any()
-    PIL.Image.new("1", (5700, 5700)).save(small)
-    assert image_head(small).size == (5700, 5700)
 
 
 def test_a_chunk_longer_than_the_file_is_not_allocated(tmp_path: Path) -> None:
@@ -209,7 +195,7 @@ def test_prefetched_pictures_are_decoded_once_and_elsewhere(sources: list[_Count
     store.prefetch(2)
     store.prefetch(2)
     assert set(store[2].image.flatten().tolist()) == {2}
-    assert sources[2].threads == ["nsvq-image"]
+    assert sources[2].threads == ["nsvq-image_0"]
     for i in range(4):  # announced and never fetched: few are held
         store.prefetch(i)
     assert len(store._coming) <= 2
