@@ -196,17 +196,14 @@ def _no_model(root: Path, folders: Sequence[str], chosen: str | None) -> SceneEr
         absent = [table + suffix for table in TABLES if not (root / folder / f"{table}{suffix}").is_file()]
         if len(absent) < len(TABLES):
             missing.append(f"{folder} has a {suffix} model without {', '.join(absent)}")
-    looked = "looked for cameras, images and points3D (.bin or .txt)"
-    details = "; ".join(missing) or "none of the three files is in any of them"
+    where, advice = root, "nor is there a transforms.json. Run COLMAP on the photos or copy the missing files"
     if chosen is not None:
         others = sorted({str(path.parent.relative_to(root)) for path in (root / "sparse").glob("*/cameras.*")})
-        return SceneError(
-            f"no COLMAP model in {root / folders[0]}: {looked}; {details}. "
-            f"Choose another (--data.model); there is {', '.join(others) or 'none in sparse/'}"
-        )
+        where = root / folders[0]
+        advice = f"choose another (--data.model); there is {', '.join(others) or 'none in sparse/'}"
     return SceneError(
-        f"no COLMAP model in {root}: {looked} in {', '.join(folders)}; {details}; "
-        "nor is there a transforms.json. Run COLMAP on the photos or copy the missing files"
+        f"no COLMAP model in {where}: looked for cameras, images and points3D (.bin or .txt) in {', '.join(folders)}; "
+        f"{'; '.join(missing) or 'none of the three files is in any of them'}; {advice}"
     )
 
 
@@ -215,17 +212,11 @@ def larger_models(root: Path) -> str | None:
 
     COLMAP numbers the parts of a scene that it could not join, not always in the order of their size.
     """
-    counts = {}
-    for path in sorted((root / "sparse").glob("*/images.bin")):
-        with path.open("rb") as file:
-            counts[path.parent.name] = int.from_bytes(file.read(_U64.size), "little")
+    files = sorted((root / "sparse").glob("*/images.bin"))
+    counts = {path.parent.name: int(np.fromfile(path, "<u8", 1).sum()) for path in files}
     larger = [f"sparse/{name} has {count}" for name, count in counts.items() if count > counts.get("0", math.inf)]
-    if not larger:
-        return None
-    return (
-        f"sparse/0 has {counts['0']} images, {', '.join(larger)}: COLMAP could not join them; --data.model=N "
-        "trains on sparse/N"
-    )
+    advice = "COLMAP could not join them; --data.model=N trains on sparse/N"
+    return f"sparse/0 has {counts['0']} images, {', '.join(larger)}: {advice}" if larger else None
 
 
 def _read(files: Mapping[str, Path]) -> Any:

@@ -165,9 +165,7 @@ class ColmapDataModule(LightningDataModule):
         """This process's share of the test views, in the order of their names."""
         return self._ordered(self.scene.test)
 
-    def test_dataloader(self) -> DataLoader[View]:
-        """This process's share of the test views, in the order of their names."""
-        return self._ordered(self.scene.test)
+    test_dataloader = val_dataloader
 
     def predict_dataloader(self) -> DataLoader[View]:
         """This process's share of all views, in the order of their names."""

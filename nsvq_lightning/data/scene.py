@@ -164,14 +164,14 @@ def load_scene(
     if model is None and poses.source == "COLMAP" and (larger := larger_models(root)) is not None:
         log.warning("%s: %s", root, larger)
     views = range(len(poses.images))
-    given = poses.test is not None
-    test = tuple(views[::test_every]) if poses.test is None else poses.test
+    test, split, advice = tuple(views[::test_every]), f"every {test_every}th by name", "register more photos"
+    if poses.test is not None:
+        test, split, advice = poses.test, f"as {poses.source} says", "check what it lists"
     train = tuple(sorted(set(views) - set(test)))
-    split = f"as {poses.source} says" if given else f"every {test_every}th by name"
     if not train or not test:
         raise SceneError(
             f"{len(views)} registered image(s), test views {split}, leave {len(train)} train and {len(test)} test "
-            f"views; at least 1 of each is needed: {'check what it lists' if given else 'register more photos'}"
+            f"views; at least 1 of each is needed: {advice}"
         )
     folder, divisor = _image_folder(root, poses.images_folder or images_folder, factor)
     mask_files: list[Path | None] = [None] * len(views)
@@ -192,11 +192,9 @@ def load_scene(
     distance = float(np.linalg.norm(middle))
     if extent > 0 and distance > _FARTHEST * extent:
         log.warning(
-            "the cameras are %.3g scene units from the origin, %.0f times the extent of the scene: float32 positions "
-            "there are %.1g apart; move the origin near the cameras (colmap model_transformer)",
-            distance,
+            "the cameras are %.0f times the extent of the scene from the origin, where float32 positions are coarse; "
+            "move the origin near the cameras (colmap model_transformer)",
             distance / extent,
-            float(np.spacing(np.float32(distance))),
         )
     usable = _away_from(centres, poses.points, _AT_CAMERA * extent)
     return Scene(
@@ -221,15 +219,11 @@ def _image_folder(root: Path, name: str, factor: int | None) -> tuple[Path, int]
         return scaled, 1
     folder = root / name
     if not folder.is_dir():
-        photos = sorted(path for path in root.glob("*/*") if path.suffix.lower() in PHOTOS)
-        folders = list(dict.fromkeys(path.parent.name for path in photos))
-        scaled_copies = [other for other in folders if other.startswith(f"{name}_")]
-        hint = ": copy the photos there"
-        if folders:
-            hint += f", or set images_folder to one of {', '.join(folders)}"
-        if scaled_copies:
-            hint = f"; there is {', '.join(scaled_copies)}: set factor"
-        raise SceneError(f"image folder {folder} does not exist{hint}")
+        others = sorted({path.parent.name for path in root.glob("*/*") if path.suffix.lower() in PHOTOS})
+        raise SceneError(
+            f"image folder {folder} does not exist: copy the photos there, or set images_folder (or factor, for "
+            f"{name}_2, _4 and _8); there is {', '.join(others) or 'no folder of photos'}"
+        )
     return folder, factor or 1
 
 

@@ -25,8 +25,6 @@ from nsvq_lightning.rendering.camera import Camera
 
 log = logging.getLogger(__name__)
 
-_TRAIN = "transforms_train.json"
-
 
 def read_poses(
     root: Path, model: str | None = None, observations: bool = False, allow_outside: bool = False
@@ -57,10 +55,6 @@ def read_poses(
     for image in poses.images:
         check_name(image.name, f"the COLMAP model of {root}", allow_outside)
     return poses
-
-
-# COLMAP's name of a camera model, width, height, parameters.
-_Lens = tuple[str, int, int, tuple[float, ...]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +102,8 @@ class _Frame:
         check_name(name, f"{self.file}: frame {self.position}", self.allow_outside)
         return name
 
-    def lens(self) -> _Lens:
-        """Its camera.
+    def lens(self) -> tuple[str, int, int, tuple[float, ...]]:
+        """Its camera: COLMAP's name of the model, width, height, parameters.
 
         Raises:
             SceneError: A value is missing or out of range, or the camera's model is not supported.
@@ -130,10 +124,8 @@ class _Frame:
                 "OPENCV_FISHEYE (k1 to k4) can",
                 "export the photos undistorted, as PINHOLE",
             )
-        if radial[2]:
-            return "FULL_OPENCV", width, height, (*pinhole, *radial[:2], *tangential, radial[2], 0.0, 0.0, 0.0)
         if any(radial) or any(tangential):
-            return "OPENCV", width, height, (*pinhole, *radial[:2], *tangential)
+            return "FULL_OPENCV", width, height, (*pinhole, *radial[:2], *tangential, radial[2], 0.0, 0.0, 0.0)
         return "PINHOLE", width, height, pinhole
 
     def _size(self) -> tuple[int, int]:
@@ -217,7 +209,7 @@ def _read_transforms(root: Path, files: list[Path], allow_outside: bool) -> Colm
         source=files[0].name,
         images_folder=folder,
         test=tuple(i for i, name in enumerate(chosen) if name in test) if is_split else None,
-        synthetic=files[0].name == _TRAIN,
+        synthetic=files[0].name == "transforms_train.json",
     )
 
 
