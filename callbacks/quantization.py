@@ -386,7 +386,7 @@ class RateDistortion(SplatCallback):
             squares, image = sensitivity(splats, view.camera, module.render_splats, signs)
             error += (apply_mask(image, view.mask) - eight_bit(view.image)).square().sum(dtype=torch.float64)
             for name, total in shown.items():
-                total += attributes.QUANTIZED[name].rows(getattr(squares, name)).mean(1)
+                total += getattr(squares, name).flatten(1).mean(1)
         error = distributed.sum_over_processes(trainer, error)
         a_bit = self.strength * float(error) / (BITS_A_SPLAT * len(module.splats))
         self.prices = {}

@@ -97,7 +97,7 @@ class Rung:
 
 
 def _sizes(codes: int) -> dict[str, int]:
-    return {name: max(1, int(codes * attribute.code_share)) for name, attribute in QUANTIZED.items()}
+    return {name: max(1, int(codes * share)) for name, share in QUANTIZED.items()}
 
 
 PLAIN = Rung("no codebooks", {})

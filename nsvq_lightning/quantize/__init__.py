@@ -1,7 +1,7 @@
 """Vector quantization of splat attributes."""
 
 from nsvq_lightning.compute.rows import take_rows
-from nsvq_lightning.quantize.attributes import QUANTIZED, QuantizedAttribute, codebook_sizes
+from nsvq_lightning.quantize.attributes import QUANTIZED, codebook_sizes
 from nsvq_lightning.quantize.base import ExtendedQuantizer, Quantizer
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize.kmeans import kmeans
@@ -16,7 +16,6 @@ __all__ = [
     "DiVeQ",
     "ExtendedQuantizer",
     "PostHoc",
-    "QuantizedAttribute",
     "Quantizer",
     "StraightThrough",
     "TrainedStraightThrough",

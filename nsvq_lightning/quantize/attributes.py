@@ -1,7 +1,6 @@
 """Which attributes are quantized, with which codebooks, and a scene whose rows are replaced by their codes."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,41 +11,11 @@ from nsvq_lightning.quantize.base import Quantizer, as_quantizer, held_codes
 from nsvq_lightning.splats.attributes import ATTRIBUTES, QUANTIZABLE, attribute_dims
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
-
-@dataclass(frozen=True)
-class QuantizedAttribute:
-    """One quantized attribute: its name in :class:`nsvq_lightning.Splats` and the shape of a row.
-
-    Attributes:
-        name: Name of the raw attribute.
-        code_share: Number of codes relative to that for scales (paper, section 4: Ks = Kr = 4·Kc = 4·Ksh).
-    """
-
-    name: str
-    code_share: float
-
-    def rows(self, tensor: Tensor) -> Tensor:
-        """The attribute ``[N, ...]`` as rows ``[N, D]``, one vector per splat (a view where possible)."""
-        return tensor.reshape(tensor.shape[0], tensor.shape[1:].numel())
-
-    def unrows(self, rows: Tensor, like: Tensor) -> Tensor:
-        """Rows ``[V, D]`` in the shape of the attribute ``like [N, ...]``: ``[V, ...]``.
-
-        Raises:
-            ValueError: A row does not have as many elements as one splat of ``like``.
-        """
-        if rows.dim() != 2 or rows.shape[1] != like.shape[1:].numel():
-            raise ValueError(
-                f"{self.name}: rows must have shape [V, {like.shape[1:].numel()}] to become [V, "
-                f"{', '.join(map(str, like.shape[1:]))}], got {list(rows.shape)}"
-            )
-        return rows.reshape(rows.shape[0], *like.shape[1:])
-
-
 _DIMS = attribute_dims(sh_degree=3)
-# The quantized attributes by name, those with most codes first. Positions and opacities are not vector quantized.
+# The quantized attributes, those with most codes first, and their numbers of codes relative to that for scales (paper,
+# section 4). Positions and opacities are not vector quantized.
 QUANTIZED = {
-    name: QuantizedAttribute(name, ATTRIBUTES[name].code_share)
+    name: ATTRIBUTES[name].code_share
     for name in sorted(QUANTIZABLE, key=lambda name: (-ATTRIBUTES[name].code_share, _DIMS[name]))
 }
 
@@ -67,7 +36,7 @@ def codebook_sizes(name: str) -> dict[str, int]:
     settings = {"0.5k": 512, "1k": 1024, "2k": 2048, "4k": 4096, "8k": 8192, "16k": 16384}
     if name not in settings:
         raise ValueError(f"unknown codebook setting {name!r}; choose one of {', '.join(settings)}")
-    return {attribute.name: int(settings[name] * attribute.code_share) for attribute in QUANTIZED.values()}
+    return {attribute: int(settings[name] * share) for attribute, share in QUANTIZED.items()}
 
 
 def build_quantizers(
@@ -95,15 +64,15 @@ def build_quantizers(
             continue
         if sizes[name] < 1:
             raise ValueError(f"codebooks: {name} needs at least 1 code, got {sizes[name]}")
-        module = quantizer(sizes[name], dim)
+        built[name] = module = quantizer(sizes[name], dim)
         as_quantizer(module)
-        built[name] = module
     return built
 
 
 def attribute_rows(splats: RawSplats, attribute: str) -> Tensor:
-    """Rows ``[N, D]`` of a quantized attribute, detached."""
-    return QUANTIZED[attribute].rows(getattr(splats, attribute).detach())
+    """Rows ``[N, D]`` of a quantized attribute, one vector per splat, detached."""
+    rows: Tensor = getattr(splats, attribute).detach().flatten(1)
+    return rows
 
 
 def codes_of(splats: RawSplats, attribute: str, quantizer: Quantizer) -> Tensor:
@@ -119,7 +88,7 @@ def codes_of(splats: RawSplats, attribute: str, quantizer: Quantizer) -> Tensor:
 def decoded(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> RawSplats:
     """Every quantized attribute replaced by its codebook rows; gradients reach codebooks, positions and opacities."""
     values = {
-        name: QUANTIZED[name].unrows(quantizer.decode(codes_of(splats, name, quantizer)), getattr(splats, name))
+        name: quantizer.decode(codes_of(splats, name, quantizer)).reshape(getattr(splats, name).shape)
         for name, quantizer in quantizers.items()
     }
     return splats._replace(**values)
@@ -147,9 +116,8 @@ def noisy_rows(
         if name not in quantizers:
             subset[name] = take_rows(tensor, rows)
             continue
-        attribute = QUANTIZED[name]
         # Call the module, not its forward: hooks of user-made quantizers must run.
         call: Callable[..., tuple[Tensor, Tensor]] = quantizers[name]  # type: ignore[assignment]
-        quantized, _ = call(attribute.rows(tensor), noise(name), rows)
-        subset[name] = attribute.unrows(quantized, tensor)
+        quantized, _ = call(tensor.flatten(1), noise(name), rows)
+        subset[name] = quantized.reshape(len(rows), *tensor.shape[1:])
     return RawSplats(**subset)

@@ -15,11 +15,6 @@ from nsvq_lightning.random import generator as seeded
 from nsvq_lightning.skips import is_on
 
 
-def inactive_codes(usage: Tensor, window: Tensor) -> Tensor:
-    """Mask ``[K]`` of the codes hit in fewer than 1 % of the iterations of the window; none in an empty window."""
-    return usage < 0.01 * window
-
-
 def copy_codes(active: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """New codes ``[count, D]`` by the paper's rule: random picks of the active codes ``[A, D]``, plus noise of 1e-12.
 
@@ -128,10 +123,6 @@ class CodebookQuantizer(nn.Module, ABC):
         """Whether :meth:`freeze` has fixed the codes."""
         return self.codes.numel() > 0
 
-    def extra_repr(self) -> str:
-        """Sizes, for ``print(module)``."""
-        return f"num_codes={self.num_codes}, dim={self.dim}, frozen={self.frozen}"
-
     def fit(self, x: Tensor, weight: Tensor | None = None, generator: torch.Generator | None = None) -> None:
         """Place the codebook on rows by k-means; K becomes at most the number of distinct rows.
 
@@ -235,7 +226,7 @@ class CodebookQuantizer(nn.Module, ABC):
         """
         # A non-finite code must not be copied; it is left to `mend`, because its moments are not finite either.
         finite = torch.isfinite(self.codebook).all(1)
-        inactive = inactive_codes(self.usage, self.window)
+        inactive = self.usage < 0.01 * self.window
         replaced = (inactive & finite).nonzero()[:, 0]
         active = self.codebook[~inactive & finite]
         if len(replaced) and not len(active):

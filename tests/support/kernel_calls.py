@@ -226,7 +226,6 @@ NUMBA: dict[str, list[Case]] = {
         Case(lambda: {"codebook": _normal(300, 3)}, rows=("codebook",), columns=("codebook",))
     ],
     f"{_Q}.nearest.cheapest": [Case(_priced, rows=("x", "prices"), types=("x", "codebook"))],
-    f"{_Q}.kmeans.distinct_rows": [Case(lambda: {"x": _tensor(70, 3)}, rows=("x",), columns=("x",), types=("x",))],
     f"{_Q}.scores.score_search": [
         Case(
             lambda: {"x": _normal(70, 12), "codebook": _normal(50, 12, seed=1), "with_lists": True},
@@ -280,9 +279,7 @@ NUMBA: dict[str, list[Case]] = {
 
 
 SCALAR = [
-    name
-    for name in NUMBA
-    if name.startswith(_IO) or name.rpartition(".")[2] in ("sort_into_leaves", "distinct_rows", "sum_by_code")
+    name for name in NUMBA if name.startswith(_IO) or name.rpartition(".")[2] in ("sort_into_leaves", "sum_by_code")
 ]
 """Entry points whose kernels index arrays as Python does, so that Numba can check the bounds."""
 

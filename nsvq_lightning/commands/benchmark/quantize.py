@@ -11,8 +11,8 @@ from torch import Tensor
 from nsvq_lightning.commands.benchmark import Scope
 from nsvq_lightning.commands.benchmark.timing import Measurement, compare, use_threads
 from nsvq_lightning.commands.benchmark.workloads import relative_l2, synthetic_workload, workloads
-from nsvq_lightning.quantize import NSVQ, QUANTIZED, CodebookQuantizer, kmeans, nearest, nearest_reference
-from nsvq_lightning.quantize.attributes import build_quantizers
+from nsvq_lightning.quantize import NSVQ, CodebookQuantizer, kmeans, nearest, nearest_reference
+from nsvq_lightning.quantize.attributes import attribute_rows, build_quantizers
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.optim import LearningRates
@@ -83,7 +83,7 @@ def prepare(splats: RawSplats, codebooks: str) -> dict[str, Attribute]:
     prepared = {}
     for name, module in build_quantizers(lambda k, d: NSVQ(k, d, kmeans_steps=1), codebooks, scene).items():
         quantizer = cast(CodebookQuantizer, module)
-        every = QUANTIZED[name].rows(getattr(scene, name).detach())
+        every = attribute_rows(scene.raw(), name)
         quantizer.fit(every, generator=generator(0, 0, "fit", name))
         x = every.clone().requires_grad_()
         upstream = 1e-6 * torch.randn(len(chosen), x.shape[1], generator=generator(0, 0, "upstream", name))
