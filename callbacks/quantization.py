@@ -15,7 +15,7 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.quantize import attributes
-from nsvq_lightning.quantize.base import ExtendedQuantizer, Quantizer, held_codes, offers
+from nsvq_lightning.quantize.base import Quantizer, held_codes
 from nsvq_lightning.quantize.nearest import cheapest, code_rates
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.canonical_covariance import canonical
@@ -115,7 +115,7 @@ class CodebookInit(SplatCallback):
         )
         for name, quantizer in module.quantizers.items():
             if trainer.is_global_zero:
-                if self.values_per_splat is not None and offers(quantizer, "limit"):
+                if self.values_per_splat is not None and hasattr(quantizer, "limit"):
                     values = self.values_per_splat * len(module.splats)
                     quantizer.limit(max(1, int(values / quantizer.codebook.shape[1])))
                 weight = None if name == "scales" else weights
@@ -240,8 +240,8 @@ def _forget_usage(module: SplatModule) -> None:
 class CodebookRefit(SplatCallback):
     """Refits codebooks to the rows of all splats in the quantize phase, as CompGS does (Navaneet et al. 2024).
 
-    Only quantizers that offer it (:class:`nsvq_lightning.quantize.ExtendedQuantizer`), such as ``StraightThrough``, are
-    refitted. CompGS runs up to 10 steps of k-means every 100 iterations.
+    Only quantizers that have a method ``refit``, such as ``StraightThrough``, are refitted. CompGS runs up to 10 steps
+    of k-means every 100 iterations.
 
     A refit comes between backward pass and update: once a step, also with gradient accumulation, and before other
     callbacks replace codes or evaluate, so the order of the callbacks does not matter.
@@ -293,9 +293,9 @@ class CodebookRefit(SplatCallback):
             log.debug("iteration %d: refitted the codebook of %s", iteration, name)
 
 
-def _refittable(module: SplatModule) -> dict[str, ExtendedQuantizer]:
+def _refittable(module: SplatModule) -> dict[str, Any]:
     """The quantizers that support it, by attribute."""
-    return {name: quantizer for name, quantizer in module.quantizers.items() if offers(quantizer, "refit")}
+    return {name: quantizer for name, quantizer in module.quantizers.items() if hasattr(quantizer, "refit")}
 
 
 # How often sensitivities are measured in the phase.
@@ -320,7 +320,7 @@ class RateDistortion(SplatCallback):
     file is entropy-coded; and training, which renders these codes, makes up for it. The rest of the phase is as
     before, and the codes that splats have in the end are frozen.
 
-    Only quantizers that can hold codes (:class:`nsvq_lightning.quantize.ExtendedQuantizer`) take part.
+    Only quantizers that can hold codes (:meth:`nsvq_lightning.quantize.CodebookQuantizer.hold`) take part.
 
     Args:
         strength: Per cent of squared error worth one per cent of the file.
@@ -376,7 +376,7 @@ class RateDistortion(SplatCallback):
         scene = scene_access.needed_scene(
             trainer, "codes are to be chosen by what shows in the train views", "leave RateDistortion out"
         )
-        taking_part = [name for name, q in module.quantizers.items() if offers(q, "held", "hold")]
+        taking_part = [name for name, q in module.quantizers.items() if hasattr(q, "hold")]
         splats = module.hard_splats(Phase.QUANTIZE)
         shown = {name: torch.zeros_like(splats.opacities) for name in taking_part}
         error = torch.zeros((), dtype=torch.float64, device=module.device)
@@ -399,7 +399,7 @@ class RateDistortion(SplatCallback):
             codes = attributes.codes_of(module.splats.raw(), name, quantizer).clone()
             rates = code_rates(codes, len(quantizer.codebook))
             codes[part] = cheapest(rows[part], quantizer.codebook, rates, price[part])
-            cast(ExtendedQuantizer, quantizer).hold(codes)
+            cast(Any, quantizer).hold(codes)
 
 
 @dataclass(eq=False)
@@ -408,7 +408,7 @@ class FiniteCodes(SplatCallback):
 
     As with non-finite splats (:class:`~nsvq_lightning.callbacks.DensityControl`), the run continues. A code cannot be
     dropped, as that would renumber the others: the quantizer gives it a new value
-    (:class:`nsvq_lightning.quantize.ExtendedQuantizer`), and its Adam moments are reset.
+    (:meth:`nsvq_lightning.quantize.CodebookQuantizer.mend`), and its Adam moments are reset.
 
     Args:
         every: Iterations between two searches; a step whose loss is not finite always causes one.
@@ -444,7 +444,7 @@ class FiniteCodes(SplatCallback):
             if len(broken) == 0:
                 continue
             found = f"step {iteration}: {len(broken)} of {len(quantizer.codebook)} codes of {name} are non-finite"
-            if len(broken) == len(quantizer.codebook) or not offers(quantizer, "mend"):
+            if len(broken) == len(quantizer.codebook) or not hasattr(quantizer, "mend"):
                 raise FloatingPointError(f"{found}; lower the learning rates")
             quantizer.mend(broken, module.rows(name), generator(module.seed, iteration, "mend", name))
             edit.reset_moments(trainer.optimizers[0], optim.codebook_group(name), broken)

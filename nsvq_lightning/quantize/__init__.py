@@ -2,7 +2,7 @@
 
 from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.quantize.attributes import QUANTIZED, codebook_sizes
-from nsvq_lightning.quantize.base import ExtendedQuantizer, Quantizer
+from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest, nearest_reference
@@ -14,7 +14,6 @@ __all__ = [
     "QUANTIZED",
     "CodebookQuantizer",
     "DiVeQ",
-    "ExtendedQuantizer",
     "PostHoc",
     "Quantizer",
     "StraightThrough",

@@ -1,6 +1,6 @@
 """The interface that a quantizer must offer to the callbacks."""
 
-from typing import Protocol, TypeGuard, cast
+from typing import Protocol, cast
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +11,9 @@ class Quantizer(Protocol):
 
     Implementations are ``nn.Module``s whose ``codebook`` is an ``nn.Parameter`` and whose usage counters and frozen
     codes are buffers, so that checkpoints and device moves carry them.
+
+    Callbacks also use what they find of ``held`` and ``hold``, ``refit``, ``limit`` and ``mend`` of
+    :class:`~nsvq_lightning.quantize.CodebookQuantizer`, and leave a quantizer without them alone.
     """
 
     codebook: Tensor
@@ -51,39 +54,6 @@ class Quantizer(Protocol):
 
     def freeze(self, codes: Tensor) -> None:
         """Fix the codes ``[N]``; from now on only the codebook is trained."""
-
-
-class ExtendedQuantizer(Quantizer, Protocol):
-    """What a quantizer may offer, too; callbacks that use a member leave quantizers without it alone."""
-
-    held: Tensor
-    """Codes ``[N]`` int64 that rows have in training, or empty; they count only while the scene has N rows."""
-
-    def hold(self, codes: Tensor) -> None:
-        """Set :attr:`held`, as :class:`nsvq_lightning.callbacks.RateDistortion` does."""
-
-    def refit(self, x: Tensor, steps: int) -> None:
-        """Fit the codebook to the rows ``x [N, D]`` by ``steps`` k-means steps from its current state; K stays.
-
-        For a codebook that gets no gradient; :class:`nsvq_lightning.callbacks.CodebookRefit` does so now and then.
-        """
-
-    def limit(self, codes: int) -> None:
-        """Have at most ``codes`` codes, at least 1, from the next fit on.
-
-        :class:`nsvq_lightning.callbacks.CodebookInit` uses it for scenes with few splats.
-        """
-
-    def mend(self, broken: Tensor, rows: Tensor, generator: torch.Generator) -> None:
-        """Make the codes ``broken [B]`` finite again, given that others are; the scene is ``rows [N, D]``.
-
-        :class:`nsvq_lightning.callbacks.FiniteCodes` uses it; without it, the run ends.
-        """
-
-
-def offers(quantizer: object, *members: str) -> TypeGuard[ExtendedQuantizer]:
-    """Whether a quantizer has members of :class:`ExtendedQuantizer`, given by name."""
-    return all(hasattr(quantizer, member) for member in members)
 
 
 def as_quantizer(module: object) -> Quantizer:

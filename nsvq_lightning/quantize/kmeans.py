@@ -44,12 +44,14 @@ def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtyp
 
     Raises:
         ValueError: The values are not ``[N, D]``, or there is not one code per row.
-        TypeError: The codes are not int64.
+        TypeError: The codes are not int64, or the values neither float32 nor float64.
     """
     if values.dim() != 2 or codes.shape != values.shape[:1]:
         raise ValueError(
             f"values must have shape [N, D] and codes [N], got {list(values.shape)} and {list(codes.shape)}"
         )
+    if values.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"values must be float32 or float64, got {values.dtype}")
     values, dtype = values.detach(), dtype or values.dtype
     if kernels_for(values) == "cuda":
         from nsvq_lightning.quantize.cuda.substitution import sum_rows

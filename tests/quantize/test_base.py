@@ -5,11 +5,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import nn
 
 import nsvq_lightning
-from nsvq_lightning.quantize import NSVQ, DiVeQ, PostHoc, StraightThrough, TrainedStraightThrough
-from nsvq_lightning.quantize.base import Quantizer, as_quantizer, offers
+from nsvq_lightning.quantize import NSVQ
+from nsvq_lightning.quantize.base import Quantizer, as_quantizer
 
 
 def test_what_a_quantizer_lacks_is_named() -> None:
@@ -29,13 +28,6 @@ def test_a_codebook_that_nothing_trains_is_refused() -> None:
     quantizer.register_buffer("codebook", torch.zeros(4, 3))
     with pytest.raises(TypeError, match=r"codebook is an nn\.Parameter"):
         as_quantizer(quantizer)
-
-
-def test_what_quantizers_offer_beyond() -> None:
-    for kind in (NSVQ, DiVeQ, StraightThrough, TrainedStraightThrough, PostHoc):
-        assert offers(as_quantizer(kind(4, 3)), "refit") == (kind is StraightThrough)
-        assert offers(kind(4, 3), "held", "hold", "limit", "mend")
-    assert not offers(nn.Linear(2, 2), "mend")
 
 
 def sources() -> list[Path]:
