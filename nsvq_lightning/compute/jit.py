@@ -49,35 +49,31 @@ class _Compilations(event.Listener):
     def __init__(self) -> None:
         self.watchers: list[Watcher] = []
         self.announced = False
-        self.seconds = self._since = 0.0
+        self.seconds = self.since = 0.0
         # LLVM's level before each compilation in progress, of a kernel and its helpers.
-        self._levels: list[int] = []
-
-    def so_far(self) -> float:
-        """Seconds, including the compilation in progress."""
-        return self.seconds + (time.perf_counter() - self._since if self._levels else 0.0)
+        self.levels: list[int] = []
 
     def on_start(self, compilation: Any) -> None:
-        if not self._levels:
-            self._since = time.perf_counter()
+        if not self.levels:
+            self.since = time.perf_counter()
             self._announce()
         level = numba.config.OPT
-        self._levels.append(level)
+        self.levels.append(level)
         if compilation.data["dispatcher"].targetoptions.get("forceinline"):
             numba.config.OPT = type(level)(min(level, 1))
 
     def on_end(self, _: Any) -> None:
-        numba.config.OPT = self._levels.pop()
-        if not self._levels:
-            self.seconds += time.perf_counter() - self._since
+        numba.config.OPT = self.levels.pop()
+        if not self.levels:
+            self.seconds += time.perf_counter() - self.since
 
     def _announce(self) -> None:
         if not self.announced:
             self.announced = True
             log.info("compiling kernels as they are needed, once on this machine: half a minute to two in all")
-        ready, known = kernels_ready()
+        ready = sum(bool(dispatcher.overloads) for dispatcher in _kernels)  # compiled, or read from the disk
         for watcher in self.watchers:
-            watcher(f"compiling kernels {ready + 1}/{known}, once on this machine")
+            watcher(f"compiling kernels {ready + 1}/{len(_kernels)}, once on this machine")
 
 
 _compilations = _Compilations()
@@ -86,7 +82,8 @@ event.register("numba:compile", _compilations)
 
 def compile_seconds() -> float:
     """Seconds spent compiling CPU kernels in this process so far; cached kernels take none."""
-    return _compilations.so_far()
+    in_progress = time.perf_counter() - _compilations.since if _compilations.levels else 0.0
+    return _compilations.seconds + in_progress
 
 
 @contextlib.contextmanager
@@ -134,11 +131,6 @@ def kernel(function: Callable[..., Any], parallel: bool = True, allocates: bool 
         dispatcher._cache = _Cache(function)
     _kernels.append(dispatcher)
     return dispatcher
-
-
-def kernels_ready() -> tuple[int, int]:
-    """How many kernels are compiled or read from the disk, and how many this process may need as far as is known."""
-    return sum(bool(dispatcher.overloads) for dispatcher in _kernels), len(_kernels)
 
 
 class _Threads(threading.local):

@@ -12,9 +12,7 @@ from torch import Tensor
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
-FLOAT32, FLOAT64, INT32, INT64, UINT8, UINT64 = (
-    np.dtype(kind) for kind in (np.float32, np.float64, np.int32, np.int64, np.uint8, np.uint64)
-)
+FLOAT32, INT32, INT64, UINT8, UINT64 = map(np.dtype, (np.float32, np.int32, np.int64, np.uint8, np.uint64))
 
 
 def flat(tensor: Tensor) -> Array:

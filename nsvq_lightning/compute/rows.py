@@ -87,7 +87,7 @@ def gather_rows(table: Tensor, rows: Tensor) -> Tensor:
     values = flat_checked("table", table.contiguous(), tuple(table.shape))
     numbers = _numbers(rows)
     out = torch.empty(len(numbers), *table.shape[1:])
-    if _gather(thread_count(), len(table), _columns(table), values, numbers, flat(out)):
+    if _gather(thread_count(), len(table), math.prod(table.shape[1:]), values, numbers, flat(out)):
         raise outside("rows", numbers, len(table))
     return out
 
@@ -102,17 +102,13 @@ def spread_rows(values: Tensor, rows: Tensor, count: int) -> Tensor:
     numbers = _numbers(rows)
     table = recycled((count, *values.shape[1:]))
     given = flat_checked("values", values.contiguous(), (len(numbers), *values.shape[1:]))
-    if _spread(thread_count(), count, _columns(values), given, numbers, flat(table)):
+    if _spread(thread_count(), count, math.prod(values.shape[1:]), given, numbers, flat(table)):
         raise outside("rows", numbers, count)
     return table
 
 
 def _numbers(rows: Tensor) -> Array:
     return flat_checked("rows", rows.contiguous(), (rows.numel(),), INT64)
-
-
-def _columns(table: Tensor) -> int:
-    return math.prod(table.shape[1:])
 
 
 def put_rows(values: Tensor, rows: Tensor, count: int) -> Tensor:
