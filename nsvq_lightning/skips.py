@@ -46,11 +46,8 @@ SKIPS = {
         # rendering
         Skip("blocks", "4x4 blocks of pixels", "a splat cannot reach them"),
         Skip("saturated", "blocks of pixels", "all their pixels are opaque"),
-        Skip("sh_bands", "SH bands in the renderer", "they are above the active degree"),
         # quantization
         Skip("distance_bounds", "the nearest code of a splat", "bounds prove that it is the last one"),
-        # training step
-        Skip("metrics", "the PSNR of a training view", "it is not logged in this step"),
     )
 }
 

@@ -10,15 +10,15 @@ from nsvq_lightning.skips import is_on, switch, switched
 def test_switches_are_restored_whatever_happens_in_the_body() -> None:
     def body() -> None:
         with switched(blocks=False):
-            switch(metrics=False)
+            switch(saturated=False)
             assert not is_on("blocks")
-            assert not is_on("metrics")
+            assert not is_on("saturated")
             raise InterruptedError
 
     with pytest.raises(InterruptedError):
         body()
     assert is_on("blocks")
-    assert is_on("metrics")
+    assert is_on("saturated")
 
 
 def test_unknown_switches_are_refused_and_change_nothing() -> None:

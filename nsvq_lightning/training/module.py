@@ -18,7 +18,6 @@ from nsvq_lightning.quantize.straight_through import TrainedStraightThrough
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, visible
-from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training import optim, scene_access
 from nsvq_lightning.training.resume import ResumedModule
@@ -231,7 +230,7 @@ class SplatModule(ResumedModule):
         first, *others = (term(rendered, batch) for term in self.loss_terms.values())
         loss = sum(others, start=first)
         every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]  # Lightning does not type it
-        if (self.global_step + 1) % max(1, every) == 0 or not is_on("metrics"):
+        if (self.global_step + 1) % max(1, every) == 0:
             quality = psnr(eight_bit(rendered.image.detach()), eight_bit(batch.image), batch.mask).float()
             values = {"train/loss": loss.detach(), "train/psnr": quality, "train/splats": float(len(self.splats))}
             self.log_dict(values, batch_size=1)  # type: ignore[arg-type]  # a number among tensors

@@ -140,13 +140,13 @@ def test_runs_with_and_without_a_switch(monkeypatch: pytest.MonkeyPatch) -> None
     seen, measured = set(), train._test_psnr
 
     def seeing_switches(module: SplatModule) -> float:
-        seen.add(is_on("sh_bands"))
+        seen.add(is_on("saturated"))
         return measured(module)
 
     monkeypatch.setattr(train, "_test_psnr", seeing_switches)
-    shipped, exact = rows = list(train.run_rows(_tiny(switches=("sh_bands",))))
+    shipped, exact = rows = list(train.run_rows(_tiny(switches=("saturated",))))
     _checked(rows)
-    assert [row.method for row in rows] == ["as shipped", "no skip of sh_bands"]
+    assert [row.method for row in rows] == ["as shipped", "no skip of saturated"]
     assert seen == {True, False}
     assert shipped.values["other numbers"] == exact.values["other numbers"] == 0
     assert shipped.values["PSNR dB"] == exact.values["PSNR dB"] > 5

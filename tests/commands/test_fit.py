@@ -66,7 +66,7 @@ def test_switches_are_options_that_hold_for_one_command(
     seen: list[tuple[bool, bool]] = []
 
     def look(module: SplatModule) -> None:
-        seen.append((is_on("blocks"), is_on("metrics")))
+        seen.append((is_on("blocks"), is_on("saturated")))
 
     monkeypatch.setattr(SplatModule, "on_train_end", look)
     assert main(fit(demo_scene, tmp_path, "--model.codebooks=null", "--skips.blocks=false", steps=2)) == 0

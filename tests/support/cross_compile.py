@@ -24,7 +24,7 @@ SIGNATURES = {
     "rendering.cpu.projection.project_splats": "void("
     "i8, f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], i4[::1], i4[::1], i8[::1], i8[::1], f4[:, ::1])",
     "rendering.cpu.projection_backward.project_backward": "void("
-    "i8, f4[::1], UniTuple(f4[::1], 4), f4[::1], UniTuple(i8, 3), i4[::1], i8, f4[::1], i4[::1], f4[::1], f4[::1], "
+    "i8, f4[::1], UniTuple(f4[::1], 4), f4[::1], UniTuple(i8, 2), i4[::1], i8, f4[::1], i4[::1], f4[::1], f4[::1], "
     "UniTuple(f4[::1], 6), f4[:, ::1])",
     "quality.ssim_cpu.sweep_image": "void("
     "i8, f4[::1], u1[::1], f4, f4[::1], i8, i8, i8, f4, f4, f4[:, ::1], f4[:, ::1], "

@@ -43,13 +43,6 @@ def coefficients_of(degree):
 
 
 @inline
-def clear_bands(columns, degree, evaluated):
-    """Zero the columns of the bands above ``degree``."""
-    for k in range(coefficients_of(degree), coefficients_of(evaluated)):
-        simd.store(columns, 16 * k, 0)
-
-
-@inline
 def gather_sh(shN, ids, start, stride, count, columns):
     """Gather the first ``count`` coefficients of 16 rows, one vector per column, into the scratch array ``columns``."""
     if stride == SH_ROW:
@@ -129,16 +122,15 @@ def color(degree, d, sh0, columns):
 @inline
 def color_range(camera, means, colors, bands, ids, first, last, records, scratch):
     """Write colours to the records of ``ids[first:last]``; the list is padded to whole vectors."""
-    (sh0, shN), (stride, degree, evaluated) = colors, bands
-    coefficients = coefficients_of(evaluated)
+    (sh0, shN), (stride, degree) = colors, bands
+    coefficients = coefficients_of(degree)
     for start in range(first, last, 16):
         prefetch_sh(shN, ids, start + AHEAD, last, stride, coefficients)
         mean = simd.gather_rows3(means, ids, start)
         direction, _ = unit_direction(camera, mean)
-        if evaluated > 0:
+        if degree > 0:
             gather_sh(shN, ids, start, stride, coefficients, scratch)
-            clear_bands(scratch, degree, evaluated)
-        r, g, b = color(evaluated, direction, simd.gather_rows3(sh0, ids, start), scratch)
+        r, g, b = color(degree, direction, simd.gather_rows3(sh0, ids, start), scratch)
         # This order of arguments keeps NaN, so that the loss shows it.
         simd.store(scratch, 0, simd.vmax(0, r))
         simd.store(scratch, 16, simd.vmax(0, g))
@@ -207,29 +199,27 @@ def scatter_sh(gradient, columns, ids, start, stride, count):
 @inline
 def color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, scratch):
     """Gradients of the SH coefficients; returns that of the mean through the viewing direction."""
-    stride, degree, evaluated = bands
+    stride, degree = bands
     d, inverse = unit_direction(camera, mean)
-    coefficients = coefficients_of(evaluated)
+    coefficients = coefficients_of(degree)
     columns, gradient, e = scratch[:768], scratch[768:1536], scratch[1536:]
-    if evaluated > 0:
+    if degree > 0:
         gather_sh(shN, ids, start, stride, coefficients, columns)
-        clear_bands(columns, degree, evaluated)
     simd.scatter_rows3(g_sh0, ids, start, rec.scale3(C0, rgb))
-    if evaluated == 0:
+    if degree == 0:
         scatter_sh(g_shN, gradient, ids, start, stride, 0)
         return simd.broadcast(0), simd.broadcast(0), simd.broadcast(0)
     b1 = bands1(d)
     for i in range(3):
         put_band(gradient, e, columns, i, b1[i], rgb)
-    if evaluated > 1:
+    if degree > 1:
         b2 = bands2(d)
         for i in range(5):
             put_band(gradient, e, columns, 3 + i, b2[i], rgb)
-    if evaluated > 2:
+    if degree > 2:
         b3 = bands3(d)
         for i in range(7):
             put_band(gradient, e, columns, 8 + i, b3[i], rgb)
-    clear_bands(gradient, degree, evaluated)
     scatter_sh(g_shN, gradient, ids, start, stride, coefficients)
-    g = direction_gradient(evaluated, d, e)
+    g = direction_gradient(degree, d, e)
     return rec.scale3(inverse, rec.fma3(-rec.dot3(g, d), d, g))

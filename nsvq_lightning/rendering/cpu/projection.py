@@ -224,7 +224,7 @@ def find_visible(threads, camera, means, quats, scales, logits, found, runs, scr
 def finish_records(threads, camera, means, colors, bands, runs, records, integers, listed, means2d, radii, scratch):
     """Join the runs of all threads into ``ids`` (ascending rows, padded by 16), number the slots and add the colours.
 
-    ``colors`` are sh0 and shN, ``bands`` the floats in a row of shN, the degree that counts, and the one evaluated;
+    ``colors`` are sh0 and shN, ``bands`` the floats in a row of shN and the degree that counts;
     ``runs`` are what :func:`project_splats` found, ``listed`` ids, keys, order and boxes.
 
     Also writes, by place in ``ids``, the depths as ``keys``, the places themselves as ``order`` and the tiles that a

@@ -110,7 +110,7 @@ def project_backward(
     """
     means, quats, scales, logits = geometry
     g_means, g_quats, g_scales, g_logits, g_sh0, g_shN = gradients
-    stride, coefficients = bands[0], coefficients_of(bands[2])
+    stride, coefficients = bands[0], coefficients_of(bands[1])
     for thread in prange(threads):
         work = scratch[thread]
         slot = work[2048:].view(np.int32)

@@ -15,7 +15,7 @@ from nsvq_lightning.rendering.cpu import blend as blending
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.attributes import ATTRIBUTES
-from nsvq_lightning.splats.splats import SplatTensors, sh_degree_of
+from nsvq_lightning.splats.splats import SplatTensors
 
 PROJECTION_SCRATCH = 2048 + 64
 
@@ -52,7 +52,7 @@ class _Frame:
         if work is not None:
             work.give_back()
 
-    def project(self, colors: tuple[Array, Array], bands: tuple[int, int, int], means2d: Array, radii: Array) -> None:
+    def project(self, colors: tuple[Array, Array], bands: tuple[int, int], means2d: Array, radii: Array) -> None:
         """Write the records; list the visible splats by row (``ids``) and, as places in it, by depth (``order``)."""
         found = self.work.array("found", self.n, np.int32)
         counts, slots = (self.work.array(name, self.threads, np.int64) for name in ("counts", "slot_counts"))
@@ -119,8 +119,7 @@ class _Project(torch.autograd.Function):
         means, *_, sh0, shN = attributes
         means2d = means.new_zeros(frame.n, 2)
         radii = torch.zeros(frame.n, dtype=torch.int32)
-        # Bands above the active degree count as zero, whether they are skipped or evaluated.
-        bands = 3 * shN.shape[1], degree, degree if is_on("sh_bands") else sh_degree_of(shN)
+        bands = 3 * shN.shape[1], degree
         ctx.frame, ctx.bands, ctx.shapes = frame, bands, tuple(tuple(tensor.shape) for tensor in attributes)
         ctx.save_for_backward(*attributes)
         frame.project(_colors(frame.n, sh0, shN), bands, flat(means2d), flat(radii))
