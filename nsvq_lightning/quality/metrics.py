@@ -1,16 +1,14 @@
 """Image quality as the published tables measure it: PSNR, SSIM, LPIPS; and after colour correction.
 
-Rendered images are rounded to 8 bit first, as if read back from a PNG. Every metric is the mean over images of a value
-per image.
+Rendered images are rounded to 8 bit first (:func:`eight_bit`), as if read back from a PNG. SSIM is that of the loss,
+:func:`nsvq_lightning.quality.loss.ssim`. The figure of a scene is the mean over its images.
 """
-
-from typing import Any
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric, MetricCollection
+from torchmetrics import Metric
 
-from nsvq_lightning.quality.loss import apply_mask, mean_of_kept, ssim
+from nsvq_lightning.quality.loss import apply_mask, mean_of_kept
 from nsvq_lightning.quality.ssim import check_pair
 
 
@@ -67,75 +65,14 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
         image: ``[H, W, 3]`` in [0, 1].
         target: ``[H, W, 3]`` in [0, 1].
         mask: Which pixels count ``[H, W]`` bool; None if all do.
+
+    Raises:
+        ValueError: The shapes differ.
     """
+    check_pair(image, target, mask)
     # The norm sums in float64 without making a float64 copy of the images.
     error = torch.linalg.vector_norm(apply_mask(image - target, mask), dtype=torch.float64)
     return -10.0 * torch.log10(mean_of_kept(error.square() / image.numel(), mask))
-
-
-class _MeanOverImages(Metric):
-    """Mean of one value per image; sums and counts are added across processes."""
-
-    is_differentiable = False
-    higher_is_better = True
-    full_state_update = False
-    total: Tensor
-    images: Tensor
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_state("total", default=torch.tensor(0.0, dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("images", default=torch.tensor(0), dist_reduce_fx="sum")
-
-    def update(self, image: Tensor, target: Tensor, mask: Tensor | None = None) -> None:
-        """Add one image.
-
-        Args:
-            image: Rendered image ``[H, W, 3]``, float in any range or uint8.
-            target: Photo ``[H, W, 3]``, uint8 or float in [0, 1].
-            mask: Which pixels count ``[H, W]`` bool; None if all do.
-
-        Raises:
-            ValueError: The shapes differ.
-        """
-        check_pair(image, target, mask)
-        self.total += self._score(eight_bit(image), eight_bit(target), mask)
-        self.images += 1
-
-    def compute(self) -> Tensor:
-        """Mean over the images so far, scalar float32."""
-        return (self.total / self.images).float()
-
-    def _score(self, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
-        raise NotImplementedError
-
-
-class PSNR(_MeanOverImages):
-    """Mean over images of the PSNR of each, see :func:`psnr`.
-
-    Example:
-        >>> metric = PSNR()
-        >>> metric.update(torch.full((2, 2, 3), 0.6), torch.full((2, 2, 3), 0.5))
-        >>> round(float(metric.compute()), 2)
-        20.0
-    """
-
-    def _score(self, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
-        return psnr(image, target, mask)
-
-
-class SSIM(_MeanOverImages):
-    """Mean over images of the structural similarity of the training loss (11×11 Gaussian window, zero padding)."""
-
-    def _score(self, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
-        score: Tensor = ssim(image, target, mask).double()
-        return score
-
-
-def image_metrics() -> MetricCollection:
-    """PSNR and SSIM under the names ``psnr`` and ``ssim``; calling it scores one image and adds it to the mean."""
-    # Their states have the same shapes, so torchmetrics would group them and share the states.
-    return MetricCollection({"psnr": PSNR(), "ssim": SSIM()}, compute_groups=False)
 
 
 def build_lpips() -> tuple[Metric | None, str | None]:

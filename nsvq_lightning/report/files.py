@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.distributed
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -19,8 +20,8 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.header import read_header
 from nsvq_lightning.io.nsvq.paper import paper_header
 from nsvq_lightning.io.ply import plain_ply_bytes
-from nsvq_lightning.quality.loss import apply_mask
-from nsvq_lightning.quality.metrics import image_metrics
+from nsvq_lightning.quality.loss import apply_mask, ssim
+from nsvq_lightning.quality.metrics import eight_bit, psnr
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.report.figures import new_figure
 from nsvq_lightning.training.resume import ResumedModule
@@ -60,18 +61,21 @@ def evaluate(
     Raises:
         ValueError: There are no views.
     """
-    metrics, shown = image_metrics().to(device), False
+    sums = torch.zeros(3, dtype=torch.float64, device=device)  # of PSNR, of SSIM, and of views
     for view in views:
-        photo = view.to(device)
-        image = apply_mask(render_image(photo.camera), photo.mask)
-        if show is not None and not shown:
-            show(image, photo.image)
-        shown = True
-        metrics.update(image, photo.image, photo.mask)
-    if not shown:
+        view = view.to(device)
+        image = apply_mask(render_image(view.camera), view.mask)
+        if show is not None:
+            show(image, view.image)
+            show = None
+        pair = eight_bit(image), eight_bit(view.image)
+        sums += torch.stack([psnr(*pair, view.mask), ssim(*pair, view.mask).double(), sums.new_ones(())])
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        torch.distributed.all_reduce(sums)
+    if sums[2] == 0:
         raise ValueError("there are no views to evaluate; the scene needs at least one test view")
-    mean = metrics.compute()
-    return float(mean["psnr"]), float(mean["ssim"])
+    mean_psnr, mean_ssim = (sums[:2] / sums[2]).float().tolist()
+    return mean_psnr, mean_ssim
 
 
 def summarize(

@@ -12,7 +12,7 @@ from nsvq_lightning.compute.devices import AsyncScalar, to_device
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.quality.loss import photometric_loss
-from nsvq_lightning.quality.metrics import eight_bit, image_metrics, psnr
+from nsvq_lightning.quality.metrics import eight_bit, psnr
 from nsvq_lightning.quantize.attributes import build_quantizers, decoded, noisy_rows
 from nsvq_lightning.quantize.straight_through import TrainedStraightThrough
 from nsvq_lightning.random import generator
@@ -113,7 +113,6 @@ class SplatModule(ResumedModule):
         self.evaluation_splats = None
         self.history: list[dict[str, Any]] = []
         """Evaluations so far, one plain dictionary each; checkpoints carry it."""
-        self.view_metrics = image_metrics()
         self._step_rates = self.rates
         self._rate_factors: dict[str, float] = {}
         self._updates = True

@@ -8,14 +8,13 @@ from typing import Any, cast
 import torch
 from lightning.pytorch import LightningModule
 from torch import Tensor, nn
-from torchmetrics import MetricCollection
 
 from nsvq_lightning.compression.stored import to_compressed
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.precision import Storage
-from nsvq_lightning.quality.loss import apply_mask
-from nsvq_lightning.quality.metrics import eight_bit
+from nsvq_lightning.quality.loss import apply_mask, ssim
+from nsvq_lightning.quality.metrics import eight_bit, psnr
 from nsvq_lightning.quantize.attributes import attribute_rows, decoded
 from nsvq_lightning.quantize.base import Quantizer
 from nsvq_lightning.rendering.camera import Camera
@@ -55,7 +54,6 @@ class SceneModule(LightningModule):
     seed: int
     evaluation_splats: SplatTensors | None
     """What validation, test and prediction render instead of the module's own splats."""
-    view_metrics: MetricCollection
 
     @property
     def quantizers(self) -> Mapping[str, Quantizer]:
@@ -136,9 +134,9 @@ class SceneModule(LightningModule):
         return eight_bit(self.render_splats(self.evaluation_splats, camera).image)
 
     def _evaluate(self, view: View, prefix: str) -> dict[str, Any]:
-        image = apply_mask(self._evaluated_image(view.camera), view.mask)
-        scores = self.view_metrics(image, view.image, view.mask)
-        self.log_dict({f"{prefix}/{name}": metric for name, metric in self.view_metrics.items()}, batch_size=1)
+        image, photo = apply_mask(self._evaluated_image(view.camera), view.mask), eight_bit(view.image)
+        scores = {"psnr": psnr(image, photo, view.mask).float(), "ssim": ssim(image, photo, view.mask)}
+        self.log_dict({f"{prefix}/{name}": score for name, score in scores.items()}, batch_size=1, sync_dist=True)
         return {"image": image, **scores}
 
     def validation_step(self, batch: View, batch_idx: int) -> dict[str, Any]:
