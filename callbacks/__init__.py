@@ -6,8 +6,8 @@ another. :func:`standard` makes those of ``nsvq fit``.
 
 from .checkpoint import RunCheckpoint
 from .density import DensityControl
+from .exposure import ExposureCompensation
 from .growth import BudgetedGrowth, SplatBudget
-from .options import ExposureCompensation, FrequencyLimit
 from .outputs import ExportScene, LiveScene, RenderWriter
 from .precompile import CompileAhead
 from .progress import SplatProgressBar
@@ -39,7 +39,6 @@ __all__ = [
     "ExposureCompensation",
     "FiniteCodes",
     "FreezeCodes",
-    "FrequencyLimit",
     "LearningRateDecay",
     "LiveScene",
     "MetricReport",

@@ -114,12 +114,6 @@ def change_coordinates(splats: Splats, optimizer: Optimizer, name: str, values: 
             state[key] = (factors * state[key][:, None, :]).sum(2)
 
 
-@torch.no_grad()
-def raise_scales(splats: Splats, floor: float | Tensor) -> None:
-    """Raise all log-scales below ``floor`` (or each splat's, ``[N, 1]``) to it, in place; the moments stay."""
-    splats.scales.clamp_(min=floor)
-
-
 def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -> None:
     """Set the Adam moments of the group ``name`` to zero, for all rows or for ``rows`` (indices or a mask)."""
     state = optimizer.state.get(find_group(optimizer, name)["params"][0], {})

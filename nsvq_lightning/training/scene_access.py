@@ -2,7 +2,6 @@
 
 import logging
 import os
-from collections.abc import Iterator
 
 import torch
 from lightning.pytorch import Trainer
@@ -12,7 +11,6 @@ from nsvq_lightning.compression.importance import contributions
 from nsvq_lightning.compute.environment import threads_spin
 from nsvq_lightning.data.scene import ONE_PLACE, Scene
 from nsvq_lightning.io.formats import load
-from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.edit import finite_splats
@@ -44,28 +42,15 @@ def needed_scene(trainer: Trainer, need: str, otherwise: str) -> Scene:
     return scene
 
 
-def train_cameras(trainer: Trainer, *, share: bool = False) -> Iterator[Camera]:
-    """Cameras of the train views; with ``share`` only this process's part of them.
-
-    Raises:
-        ValueError: The trainer has no data module with a scene.
-    """
-    scene = needed_scene(
-        trainer,
-        "contributions of splats and the smallest scales need the train views",
-        "leave weights by contribution and FrequencyLimit off",
-    )
-    indices = scene.train[trainer.global_rank :: trainer.world_size] if share else scene.train
-    return (scene.cameras[index] for index in indices)
-
-
 def train_contributions(trainer: Trainer, module: SceneModule) -> Tensor:
     """Blending weight ``[N]`` of each splat in all train views (:mod:`nsvq_lightning.compression.importance`).
 
     Raises:
         ValueError: The trainer has no data module with a scene.
     """
-    cameras = train_cameras(trainer, share=True)
+    need = "contributions of splats need the train views"
+    scene = needed_scene(trainer, need, "leave weights by contribution off")
+    cameras = (scene.cameras[index] for index in scene.train[trainer.global_rank :: trainer.world_size])
     return sum_over_processes(trainer, contributions(module.splats, cameras, module.render_splats))
 
 

@@ -18,7 +18,6 @@ from nsvq_lightning.callbacks import (
     DensityControl,
     ExposureCompensation,
     FiniteCodes,
-    FrequencyLimit,
     LearningRateDecay,
     MetricReport,
     OpacityRegularization,
@@ -127,7 +126,6 @@ OUT_OF_RANGE = [
     (MetricReport, {"every": -1}, "every must be at least 0, got -1"),
     (RunCheckpoint, {"every": -1}, "every must be at least 0, got -1"),
     (ExposureCompensation, {"rate": math.inf}, "rate must be above 0, got inf"),
-    (FrequencyLimit, {"pixels": 0.0}, "pixels must be above 0, got 0.0"),
 ]
 
 

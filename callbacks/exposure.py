@@ -1,20 +1,17 @@
-"""Options beyond the recipe: exposures of photos, and the 3D limit of anti-aliasing."""
+"""An option beyond the recipe: exposures of photos."""
 
 import logging
-import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from lightning.pytorch import Trainer
-from torch import Tensor
 
-from nsvq_lightning.compression.importance import pixel_sizes
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.rendering.rasterize import Render
-from nsvq_lightning.training import distributed, edit, scene_access
+from nsvq_lightning.training import distributed, scene_access
 from nsvq_lightning.training.module import LossTerm, SplatModule
-from nsvq_lightning.training.schedule import Phase, next_iteration
+from nsvq_lightning.training.schedule import next_iteration
 
 from .base import SplatCallback
 
@@ -131,65 +128,3 @@ class ExposureCompensation(SplatCallback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from there."""
         self._loaded = state_dict or None
-
-
-# Iterations after which the sizes of pixels are looked at anew, as splats move; those of new splats are at once.
-EVERY = 100
-# Side table: size of a pixel in the photo that sees the splat closest, scene units; 0 where not yet looked at.
-PIXEL_SIZES = "pixel_sizes"
-# Size for splats that no photo sees.
-NO_LIMIT = 1e-30
-
-
-@dataclass(eq=False)
-class FrequencyLimit(SplatCallback):
-    """Until the quantize phase, keeps scales at or above a share of a pixel in the photo that sees the splat closest.
-
-    A splat smaller than the pixels of every photo is a guess, which shows when a camera comes closer: it turns into a
-    dot or a needle. Mip-Splatting (Yu et al. 2024) widens every splat by a 3D filter of variance 0.2 pixels² for that;
-    here the scales themselves are kept from falling below √0.2 pixels, so that files and viewers need to know nothing.
-    Use it with ``antialiased`` of :class:`nsvq_lightning.SplatModule`.
-
-    Args:
-        pixels: Smallest scale, in pixels of the photo that sees the splat closest.
-
-    Raises:
-        ValueError: ``pixels`` is not positive and finite.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import FrequencyLimit, standard
-        >>> callbacks = [*standard(), FrequencyLimit()]  # --trainer.callbacks+=FrequencyLimit
-        >>> round(callbacks[-1].pixels, 3)
-        0.447
-    """
-
-    pixels: float = math.sqrt(0.2)
-    _floor: Tensor | None = field(default=None, init=False)
-    _edits: int = field(default=0, init=False)
-
-    def __post_init__(self) -> None:
-        self.check({"above 0": ("pixels",)})
-
-    def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
-        """Look at the splats anew; what is known of them is in a side table."""
-        self._floor = None
-
-    def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
-        """Raise the scales that have become too small."""
-        if module.schedule.phase_at(iteration + 1) >= Phase.QUANTIZE:
-            return
-        splats = module.splats
-        if self._floor is None or splats.edits != self._edits or iteration % EVERY == 0:
-            sizes = splats.add_table(PIXEL_SIZES)
-            if iteration % EVERY == 0:
-                sizes.zero_()
-            new = (sizes == 0).nonzero()[:, 0]
-            sizes[new] = pixel_sizes(splats.means.detach()[new], scene_access.train_cameras(trainer)).nan_to_num(
-                posinf=NO_LIMIT
-            )
-            self._floor, self._edits = (self.pixels * sizes).log()[:, None], splats.edits
-        edit.raise_scales(splats, self._floor)
-
-    def on_train_end(self, trainer: Trainer, module: SplatModule) -> None:
-        """Forget the limits."""
-        self._floor = None
