@@ -3,11 +3,12 @@
 import logging
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, is_dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from lightning.pytorch import Callback, Trainer
@@ -21,7 +22,7 @@ from nsvq_lightning.io.atomic import atomic_path
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_trial, run_folder
-from nsvq_lightning.training.schedule import Phase, Schedule
+from nsvq_lightning.training.schedule import Schedule
 
 from .base import WritingCallback
 
@@ -103,18 +104,6 @@ class GracefulStop:
 Fingerprint = list[tuple[int, int, int]]
 
 
-class _Count(NamedTuple):
-    """A counter of codes, its version when it was copied, and the copy."""
-
-    tensor: Tensor
-    version: int
-    copy: Tensor
-
-    @property
-    def is_current(self) -> bool:
-        return self.tensor._version == self.version
-
-
 class StepSnapshot:
     """Remembers what an iteration changes before its update, so that an incomplete one can be undone.
 
@@ -127,47 +116,32 @@ class StepSnapshot:
     def __init__(self) -> None:
         self.iteration = -1
         self._kept: Fingerprint | None = None
-        self._loop: object = None
-        self._places: list[dict[str, Any]] = []
-        self._progress: list[dict[str, int]] = []
-        self._callbacks: dict[str, Any] = {}
-        self._scalars = Phase.WARMUP, 0
-        self._counts: list[_Count] = []
+        self._undo: list[Callable[[], object]] = []
 
     def take(self, trainer: Trainer, module: SplatModule) -> None:
         """Remember the state now, at the end of an iteration."""
         self.iteration = trainer.global_step
         self._kept = _fingerprint(trainer, module)
-        if self._loop is not trainer.fit_loop:
-            self._loop, self._places = trainer.fit_loop, list(_places(trainer.fit_loop))
-        self._progress = [{k: v for k, v in place.items() if type(v) in (int, bool)} for place in self._places]
+        self._undo = [partial(vars(module).update, phase=module.phase, active_sh_degree=module.active_sh_degree)]
+        self._undo += [partial(tensor.copy_, tensor.clone()) for tensor in _counters(module)]
+        for place in _places(trainer.fit_loop):
+            numbers = {name: value for name, value in place.items() if type(value) in (int, bool)}
+            self._undo.append(partial(place.update, numbers))
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
-        states = {callback.state_key: callback.state_dict() for callback in callbacks}
-        self._callbacks = {key: state for key, state in states.items() if state}
-        self._scalars = module.phase, module.active_sh_degree
-        before = {id(count.tensor): count for count in self._counts if count.is_current}
-        self._counts = [
-            before.get(id(tensor)) or _Count(tensor, tensor._version, tensor.clone()) for tensor in _counters(module)
-        ]
+        states = ((callback, callback.state_dict()) for callback in callbacks)
+        self._undo += [partial(callback.load_state_dict, state) for callback, state in states if state]
 
     def drop(self) -> None:
         """Forget the state: it can no longer be restored."""
         self._kept = None
 
     def restore(self, trainer: Trainer, module: SplatModule) -> bool:
-        """Restore the state of module and trainer; returns whether that was possible."""
+        """Restore the state of module, trainer and callbacks; returns whether that was possible."""
         if self._kept is None or self._kept != _fingerprint(trainer, module):
             return False
-        module.phase, module.active_sh_degree = self._scalars
-        for count in self._counts:
-            count.tensor.copy_(count.copy)
-        for place, numbers in zip(self._places, self._progress, strict=True):
-            place.update(numbers)
+        for undo in self._undo:
+            undo()
         return True
-
-    def amend(self, checkpoint: dict[str, Any]) -> None:
-        """Restore the states of callbacks in a checkpoint that is about to be written."""
-        checkpoint["callbacks"] = self._callbacks
 
 
 def _fingerprint(trainer: Trainer, module: SplatModule) -> Fingerprint:
@@ -241,7 +215,6 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     """Path of ``last_path`` under the name by which Lightning looks for ``ckpt_path="best"``."""
     _saved: int = field(default=-1, init=False)
     _training: bool = field(default=False, init=False)
-    _amending: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
         self.check({"at least 0": ("every",)})
@@ -314,22 +287,14 @@ class RunCheckpoint(WritingCallback, Checkpoint):
             return
         self._training = False
         if self._snapshot.iteration != self._saved and self._snapshot.restore(trainer, module):
-            self._amending = True
             try:
                 self._save(trainer, module)
             except Exception as error:  # the user must see what stopped the run
                 log.warning("the checkpoint of iteration %d could not be written: %s", self._snapshot.iteration, error)
-            finally:
-                self._amending = False
         if self.last_path is not None:
             log.warning("stopped; the last checkpoint is of iteration %d: %s", self._saved, self.last_path)
         else:
             log.warning("stopped before the first checkpoint")
-
-    def on_save_checkpoint(self, trainer: Trainer, module: SplatModule, checkpoint: dict[str, Any]) -> None:
-        """After an incomplete iteration, store counters and callbacks as they were before it."""
-        if self._amending:
-            self._snapshot.amend(checkpoint)
 
     def teardown(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Restore the signal handlers in any case."""
