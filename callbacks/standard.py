@@ -3,8 +3,7 @@
 from importlib import import_module
 from typing import Any
 
-from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint, ProgressBar, RichProgressBar, TQDMProgressBar
+from lightning.pytorch import Callback
 
 from nsvq_lightning.top_level import folder_of
 
@@ -40,46 +39,11 @@ STANDARD: dict[str, type[Callback]] = {
 OPTIONAL = frozenset({"opacity", "codebook_refit", "rate_distortion"})
 
 
-class _IfWanted(Callback):
-    """Stands for our progress bar or checkpoints until the trainer has read its flags, which may refuse either.
-
-    The trainer has then made a plain one of its own, whose place ours takes, or none. Checkpoints also come beside a
-    checkpoint callback of the user's; a progress bar of the user's is the only one.
-    """
-
-    def __init__(self, callback: Callback) -> None:
-        self._callback = callback
-        self._kind = Checkpoint if isinstance(callback, Checkpoint) else ProgressBar
-
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Take the place, once."""
-        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
-        if not any(isinstance(each, self._kind) for each in callbacks):
-            return
-        place = callbacks.index(self)
-        # In place, and only behind this one: Lightning is going through the list.
-        plain = [each for each in callbacks[place:] if _is_plain(each, self._kind)]
-        for each in plain:
-            callbacks.remove(each)
-        if plain or self._kind is Checkpoint:
-            callbacks[place] = self._callback
-            self._callback.setup(trainer, pl_module, stage)
-
-
-def _is_plain(callback: Callback, kind: type[Callback]) -> bool:
-    """Whether the callback is like those that a trainer makes for itself."""
-    if kind is ProgressBar:
-        return type(callback) in (TQDMProgressBar, RichProgressBar)
-    if type(callback) is not ModelCheckpoint:
-        return False
-    return all(vars(callback)[name] == value for name, value in vars(ModelCheckpoint()).items())
-
-
 def standard(config: str | None = None, /, **replaced: Callback | None) -> list[Callback]:
     """The callbacks of ``nsvq fit``, with their defaults or with the settings of a config.
 
-    Progress bar and checkpoints take the place of the trainer's own, unless its flags (``enable_progress_bar``,
-    ``enable_checkpointing``, ``barebones``) leave them out. Those that you name are in the list as they are.
+    A trainer with ``enable_progress_bar=False`` or ``enable_checkpointing=False`` refuses those of them that it is not
+    to have: leave them out with ``progress=None`` or ``checkpoint=None``.
 
     Args:
         config: Name of a config that comes with the package, such as ``small`` or ``paper``.
@@ -100,18 +64,9 @@ def standard(config: str | None = None, /, **replaced: Callback | None) -> list[
     if unknown:
         raise ValueError(f"there is no standard callback {', '.join(unknown)}; there are {', '.join(STANDARD)}")
     settings = {} if config is None else _callbacks_of(config)
-    made = []
-    for name, kind in STANDARD.items():
-        if name in replaced:
-            callback = replaced[name]
-        elif name in settings:
-            callback = settings[name]
-        else:
-            callback = None if name in OPTIONAL else kind()
-        if callback is not None:
-            takes_place = name not in replaced and isinstance(callback, Checkpoint | ProgressBar)
-            made.append(_IfWanted(callback) if takes_place else callback)
-    return made
+    given = dict.fromkeys(OPTIONAL) | settings | replaced
+    chosen = (given[name] if name in given else kind() for name, kind in STANDARD.items())
+    return [callback for callback in chosen if callback is not None]
 
 
 def _callbacks_of(config: str) -> dict[str, Callback | None]:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import pytest
-from lightning.pytorch import Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch import Callback, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
 
 from nsvq_lightning.callbacks import (
     DensityControl,
@@ -22,9 +20,8 @@ from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.training.module import SplatModule
 
 
-def fit(scene: Path, folder: Path, *more: Any, **flags: Any) -> Trainer:
-    """Ten iterations with the standard callbacks, and a test of the best checkpoint if there is one."""
-    flags = {"logger": False, "enable_model_summary": False} | flags
+def fit(scene: Path, folder: Path, *more: Callback) -> Trainer:
+    """Ten iterations with the standard callbacks, and a test of the best checkpoint."""
     callbacks = [*standard(report=MetricReport(every=5, lpips=False, pictures=False)), *more]
     trainer = Trainer(
         max_steps=10,
@@ -33,42 +30,27 @@ def fit(scene: Path, folder: Path, *more: Any, **flags: Any) -> Trainer:
         accelerator="cpu",
         default_root_dir=folder,
         callbacks=callbacks,
-        **flags,
+        logger=False,
     )
     module, data = SplatModule(sh_degree=0, codebooks={"scales": 4}), ColmapDataModule(str(scene), factor=4)
     trainer.fit(module, data)
-    if trainer.checkpoint_callback is not None:
-        trainer.test(module, data, ckpt_path="best", verbose=False)
+    trainer.test(module, data, ckpt_path="best", verbose=False)
     return trainer
-
-
-@pytest.mark.parametrize(
-    ("flags", "kinds"),
-    [
-        ({}, [SplatProgressBar, RunCheckpoint]),
-        ({"enable_progress_bar": False}, [RunCheckpoint]),
-        ({"enable_checkpointing": False}, [SplatProgressBar]),
-        ({"barebones": True}, []),
-    ],
-)
-def test_a_trainer_has_the_bar_and_the_checkpoints_that_its_flags_allow(
-    flags: dict[str, Any], kinds: list[type], demo_scene: Path, tmp_path: Path
-) -> None:
-    trainer = fit(demo_scene, tmp_path, **flags)
-    callbacks = trainer.callbacks  # type: ignore[attr-defined]
-    found = [type(each) for each in callbacks if isinstance(each, TQDMProgressBar | ModelCheckpoint | RunCheckpoint)]
-    assert found == kinds
-    names = {path.name for path in tmp_path.rglob("*.ckpt")}
-    assert names == ({"last.ckpt"} if RunCheckpoint in kinds else set())
 
 
 def test_a_checkpoint_callback_of_the_users_is_the_trainers(demo_scene: Path, tmp_path: Path) -> None:
     best = ModelCheckpoint(monitor="report/psnr", mode="max", dirpath=tmp_path / "best")
-    trainer = fit(demo_scene, tmp_path, best, enable_progress_bar=False)
+    trainer = fit(demo_scene, tmp_path, best)
+    assert isinstance(trainer.progress_bar_callback, SplatProgressBar)
     assert trainer.checkpoint_callbacks[0] is best
     assert Path(best.best_model_path).is_file()
     assert isinstance(trainer.checkpoint_callbacks[-1], RunCheckpoint)
     assert trainer.checkpoint_callbacks[-1].last_path is not None
+
+
+def test_a_trainer_makes_none_of_its_own(demo_scene: Path, tmp_path: Path) -> None:
+    fit(demo_scene, tmp_path)
+    assert {path.name for path in tmp_path.rglob("*.ckpt")} == {"last.ckpt"}
 
 
 def test_a_shipped_config_gives_its_callbacks() -> None:
