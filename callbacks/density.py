@@ -19,7 +19,7 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training import distributed, edit, memory_estimate, scene_access
+from nsvq_lightning.training import distributed, edit, scene_access
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase, next_iteration
 
@@ -89,7 +89,7 @@ class Densification(SplatCallback, ABC):
             )
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
-        """Say on a CPU how much memory the run will take, and remove splats if there are already too many.
+        """Remove splats if there are already too many.
 
         Raises:
             ValueError: There are more than :meth:`limit`, and the trainer has no data module whose views show which
@@ -98,8 +98,6 @@ class Densification(SplatCallback, ABC):
         limit, count = self.limit(module), len(module.splats)
         if limit is None:
             return
-        if module.device.type == "cpu" and trainer.is_global_zero:
-            memory_estimate.say_footprint(trainer, limit)
         if count > limit and module.phase > Phase.PRUNE:
             log.warning(f"{self.limit_name}={limit} comes too late for {count} splats with codebooks; all are kept")
         elif count > limit:

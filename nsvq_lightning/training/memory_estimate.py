@@ -1,15 +1,9 @@
 """The memory that a run takes, before it takes it."""
 
-import logging
 import re
 from pathlib import Path
 
-from lightning.pytorch import Trainer
-
 from nsvq_lightning.data.scene import Scene
-from nsvq_lightning.training.scene_access import scene_of
-
-log = logging.getLogger(__name__)
 
 # Default of ``--data.cache_bytes``.
 CACHE_BYTES = 4 << 30
@@ -30,23 +24,6 @@ def run_bytes(scene: Scene, splats: int, cache_bytes: int = CACHE_BYTES) -> floa
     return base + min(scene.images.nbytes, cache_bytes) + a_splat * splats + a_pixel * pixels
 
 
-def say_footprint(trainer: Trainer, splats: int) -> None:
-    """Log how much memory a run of at most so many splats will take; warn if the machine has not got it."""
-    scene = scene_of(trainer)
-    if scene is None:
-        return
-    needed = run_bytes(scene, splats, getattr(trainer.datamodule, "cache_bytes", CACHE_BYTES))  # type: ignore[attr-defined]
-    free, own = available_memory(), _resident()
-    said = f"memory: at most about {readable_bytes(needed)} with up to {splats:,} splats"
-    if free is None or needed <= free + own:
-        log.info(said)
-    else:
-        log.warning(
-            f"{said}, but only {readable_bytes(free + own)} are available: ask for fewer (--quality, --splats), or "
-            "lower --data.max_width or --data.cache_bytes"
-        )
-
-
 def readable_bytes(count: float) -> str:
     """A number of bytes in readable form."""
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
@@ -54,19 +31,13 @@ def readable_bytes(count: float) -> str:
 
 def available_memory() -> int | None:
     """Bytes that this process may still allocate: of the machine, or of its control group if less."""
-    limits = [_kilobytes("/proc/meminfo", "MemAvailable"), _group_available()]
+    limits = [_machine_available(), _group_available()]
     return min((limit for limit in limits if limit is not None), default=None)
 
 
-def _resident() -> int:
-    """Bytes that this process occupies already."""
-    return _kilobytes("/proc/self/status", "VmRSS") or 0
-
-
-def _kilobytes(table: str, name: str) -> int | None:
-    """An entry of a table of the system, in bytes; None where there is none."""
+def _machine_available() -> int | None:
     try:
-        found = re.search(rf"^{name}:\s+(\d+)", Path(table).read_text(encoding="ascii"), re.MULTILINE)
+        found = re.search(r"^MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text(encoding="ascii"), re.MULTILINE)
     except OSError:
         return None
     return 1024 * int(found[1]) if found else None

@@ -9,7 +9,6 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import Recipe, RunFactory
 
 from nsvq_lightning.callbacks import DensityControl
-from nsvq_lightning.training import memory_estimate
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.scene_access import train_contributions
 
@@ -55,18 +54,3 @@ def test_the_limit_comes_too_late_for_codebooks(
     limited(20).on_train_start(trainer, module)
     assert len(module.splats) == count
     assert f"max_splats=20 comes too late for {count} splats" in caplog.text
-
-
-def test_the_memory_of_the_run_is_said_before_it(
-    run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(memory_estimate, "_resident", lambda: 0)
-    with caplog.at_level("INFO"):
-        for free, level, words in ((8 << 30, "INFO", ""), (1 << 30, "WARNING", "only 1.1 GB are available")):
-            caplog.clear()
-            monkeypatch.setattr(memory_estimate, "available_memory", lambda free=free: free)
-            run(recipe(density=limited(100_000)).values(), max_steps=1)
-            (said,) = [record for record in caplog.records if "memory: at most about 1.3 GB" in record.getMessage()]
-            assert said.levelname == level
-            assert "with up to 100,000 splats" in said.getMessage()
-            assert words in said.getMessage()
