@@ -8,10 +8,9 @@ from typing import Any, ClassVar
 from lightning.pytorch import Callback, Trainer
 
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.training import edit
+from nsvq_lightning.training import row_ops
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.run_folder import hold, is_trial, let_go, run_folder, take
-from nsvq_lightning.training.schedule import next_iteration
+from nsvq_lightning.training.run_folder import hold, is_fast_dev_run, let_go, run_folder, take
 
 # What a setting may be, by how an error says it.
 BOUNDS: dict[str, Callable[[float], bool]] = {
@@ -85,7 +84,7 @@ class SplatCallback(Callback):
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Call :meth:`before_step`."""
-        iteration = next_iteration(trainer)
+        iteration = trainer.global_step + 1
         if self._first_time("before", iteration):
             self.before_step(trainer, module, iteration)
 
@@ -138,9 +137,9 @@ class WritingCallback(SplatCallback):
             return
         if self.folder is None:
             folder = run_folder(trainer)
-            if trainer.is_global_zero and not is_trial(trainer):
+            if trainer.is_global_zero and not is_fast_dev_run(trainer):
                 hold(folder)  # again, if an earlier stage of the run has ended
-        elif trainer.is_global_zero and not is_trial(trainer):
+        elif trainer.is_global_zero and not is_fast_dev_run(trainer):
             take(Path(self.folder), trainer.ckpt_path)
 
     def teardown(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
@@ -166,7 +165,7 @@ def finite_search_is_due(trainer: Trainer, every: int) -> bool:
 
 
 def keep_finite_splats(trainer: Trainer, module: SplatModule) -> None:
-    """Drop non-finite splats, with their frozen codes (:func:`nsvq_lightning.training.edit.drop_non_finite`).
+    """Drop non-finite splats, with their frozen codes (:func:`nsvq_lightning.training.row_ops.drop_non_finite`).
 
     The replicas of several processes are equal, so all drop the same splats without communication. Dropping splats
     loses gradients: call it between an update and the next backward pass.
@@ -174,7 +173,7 @@ def keep_finite_splats(trainer: Trainer, module: SplatModule) -> None:
     Raises:
         FloatingPointError: No finite splat is left.
     """
-    kept = edit.drop_non_finite(module.splats, trainer.optimizers[0], trainer.global_step)
+    kept = row_ops.drop_non_finite(module.splats, trainer.optimizers[0], trainer.global_step)
     if len(module.splats) == len(kept):
         return
     for quantizer in module.quantizers.values():

@@ -21,7 +21,7 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import atomic_path
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.run_folder import is_trial, run_folder
+from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 from nsvq_lightning.training.schedule import Schedule
 
 from .base import WritingCallback
@@ -283,7 +283,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     def on_exception(self, trainer: Trainer, module: SplatModule, exception: BaseException) -> None:
         """Save the last complete iteration if it still exists; say where to continue from."""
         self._stop.release()
-        if not self._training or is_trial(trainer):
+        if not self._training or is_fast_dev_run(trainer):
             return
         self._training = False
         if self._snapshot.iteration != self._saved and self._snapshot.restore(trainer, module):
@@ -302,7 +302,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
         self._stop.release()
 
     def _save(self, trainer: Trainer, module: SplatModule) -> None:
-        if is_trial(trainer):
+        if is_fast_dev_run(trainer):
             return
         folder = run_folder(trainer) / "checkpoints" if self.folder is None else Path(self.folder)
         with module.stopwatch.paused(module.device):

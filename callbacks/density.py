@@ -19,9 +19,9 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training import distributed, edit, scene_access
+from nsvq_lightning.training import distributed, row_ops, scene_access
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.schedule import Phase, next_iteration
+from nsvq_lightning.training.schedule import Phase
 
 from .base import SplatCallback, finite_search_is_due, keep_finite_splats
 
@@ -102,14 +102,14 @@ class Densification(SplatCallback, ABC):
             log.warning(f"{self.limit_name}={limit} comes too late for {count} splats with codebooks; all are kept")
         elif count > limit:
             kept = most_contributing(scene_access.train_contributions(trainer, module), limit)
-            edit.keep_rows(module.splats, trainer.optimizers[0], kept)
+            row_ops.keep_rows(module.splats, trainer.optimizers[0], kept)
             distributed.check_replicas(trainer, "the limit of splats")
             log.info("kept %d of %d splats, those that contribute most to the train views", limit, count)
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Ask for what the statistics need while they are needed."""
         super().on_train_batch_start(trainer, module, batch, batch_idx)
-        self._counts = self.ask(module, next_iteration(trainer), batch)
+        self._counts = self.ask(module, trainer.global_step + 1, batch)
 
     def on_train_batch_end(
         self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, batch_idx: int
@@ -136,7 +136,7 @@ class Densification(SplatCallback, ABC):
                 "rates, or check the camera poses"
             )
             return 0
-        edit.keep_rows(module.splats, trainer.optimizers[0], ~mask)
+        row_ops.keep_rows(module.splats, trainer.optimizers[0], ~mask)
         return count
 
     @torch.no_grad()
@@ -144,8 +144,8 @@ class Densification(SplatCallback, ABC):
         """Lower all opacities to at most ``ceiling``, and forget their moments."""
         optimizer = trainer.optimizers[0]
         lowered = module.splats.opacities.clamp(max=math.log(ceiling / (1.0 - ceiling)))
-        edit.replace_attribute(module.splats, optimizer, "opacities", lowered)
-        edit.reset_moments(optimizer, "opacities")
+        row_ops.replace_attribute(module.splats, optimizer, "opacities", lowered)
+        row_ops.reset_moments(optimizer, "opacities")
 
     def _view(self, trainer: Trainer, module: SplatModule, outputs: dict[str, Any]) -> Render | None:
         """The step's rendering; None if there is none, its loss is not finite, or the splats have changed since."""
@@ -325,8 +325,8 @@ class DensityControl(Densification):
         )
         children = split(parents, self.children, self.shrink, generator(module.seed, iteration, "split"))
         new = (torch.cat(pair) for pair in zip(clones, children, strict=True))
-        edit.append_rows(splats, optimizer, RawSplats(*new)._asdict())
-        edit.keep_rows(splats, optimizer, torch.cat([~divided, divided.new_ones(len(splats) - before)]))
+        row_ops.append_rows(splats, optimizer, RawSplats(*new)._asdict())
+        row_ops.keep_rows(splats, optimizer, torch.cat([~divided, divided.new_ones(len(splats) - before)]))
         for name in self.tables:
             splats.add_table(name).zero_()
         return len(splats) - before

@@ -11,7 +11,6 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.training import distributed, scene_access
 from nsvq_lightning.training.module import LossTerm, SplatModule
-from nsvq_lightning.training.schedule import next_iteration
 
 from .base import SplatCallback
 
@@ -92,7 +91,7 @@ class ExposureCompensation(SplatCallback):
         """Take a step; a loss that is not finite changes nothing."""
         if self._adam is None:
             return
-        share = next_iteration(trainer) / max(1, module.schedule.total)
+        share = (trainer.global_step + 1) / max(1, module.schedule.total)
         self._adam.param_groups[0]["lr"] = self.rate * self.final ** min(1.0, share)
         gradient = torch.zeros_like(self._changes) if self._changes.grad is None else self._changes.grad
         self._changes.grad = distributed.sum_over_processes(trainer, gradient.nan_to_num_(0.0, 0.0, 0.0))

@@ -17,7 +17,7 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training import distributed, edit, scene_access
+from nsvq_lightning.training import distributed, row_ops, scene_access
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
@@ -350,8 +350,8 @@ class BudgetedGrowth(Densification):
         divided = draw_rows(candidates, room, generator(module.seed, iteration, "grow"))
         before = len(splats)
         parents = RawSplats(*(tensor.detach()[divided] for tensor in splats.raw()))
-        edit.append_rows(splats, trainer.optimizers[0], split_longest(parents)._asdict())
-        edit.keep_rows(splats, trainer.optimizers[0], torch.cat([~divided, divided.new_ones(len(splats) - before)]))
+        row_ops.append_rows(splats, trainer.optimizers[0], split_longest(parents)._asdict())
+        row_ops.keep_rows(splats, trainer.optimizers[0], torch.cat([~divided, divided.new_ones(len(splats) - before)]))
         for name in self.tables:
             splats.add_table(name).zero_()
         return room, len(splats) - before

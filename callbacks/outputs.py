@@ -17,7 +17,7 @@ from nsvq_lightning.io.nsvq.file import as_stored
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.report import pictures, viewer
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.run_folder import is_trial, run_folder
+from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 from nsvq_lightning.training.scene_access import scene_of
 
 from .base import WritingCallback
@@ -64,7 +64,7 @@ class ExportScene(WritingCallback):
     def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Write the files, on the first process."""
         folder = run_folder(trainer) if self.folder is None else Path(self.folder)
-        if is_trial(trainer) or not trainer.is_global_zero:
+        if is_fast_dev_run(trainer) or not trainer.is_global_zero:
             return
         scene = module.compressed().finite()
         # The files of viewers hold what the compressed one decodes to: found once, however many there are.
@@ -114,12 +114,12 @@ class RenderWriter(BasePredictionWriter):
     def on_predict_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Make the folder in a hook that all processes call: some have fewer views than others."""
         self._target = run_folder(trainer) / "predictions" if self.folder is None else Path(self.folder)
-        if not is_trial(trainer):
+        if not is_fast_dev_run(trainer):
             self._target.mkdir(parents=True, exist_ok=True)
 
     def write_on_batch_end(self, trainer: Trainer, module: SplatModule, prediction: Any, *args: Any) -> None:
         """Write one picture."""
-        if is_trial(trainer):
+        if is_fast_dev_run(trainer):
             return
         scene = scene_of(trainer)
         stem = pictures.file_stem(prediction["name"], scene.names if scene is not None else ())
@@ -127,7 +127,7 @@ class RenderWriter(BasePredictionWriter):
 
     def on_predict_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Say where the pictures are."""
-        if not is_trial(trainer):
+        if not is_fast_dev_run(trainer):
             log.info("rendered views are in %s", self._target)
 
 
@@ -157,7 +157,7 @@ class LiveScene(WritingCallback):
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Forget who asked an earlier part of the run."""
-        self._running = not is_trial(trainer)
+        self._running = not is_fast_dev_run(trainer)
         self._answered, self._next = viewer.live_asked(run_folder(trainer)), 0.0
 
     def on_train_batch_end(

@@ -12,7 +12,7 @@ from lightning.pytorch import Trainer
 
 from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.compute.jit import compile_watcher
-from nsvq_lightning.training import rehearsal
+from nsvq_lightning.training import precompile
 from nsvq_lightning.training.module import SplatModule
 
 from .base import SplatCallback
@@ -24,7 +24,7 @@ class CompileAhead(SplatCallback):
     """Compiles the kernels of quantization and of the file in a second process.
 
     The first kernel that the fit compiles starts that process: where all kernels are cached, nothing happens. It goes
-    through the later phases on a handful of splats (:mod:`nsvq_lightning.training.rehearsal`) at a low priority, and
+    through the later phases on a handful of splats (:mod:`nsvq_lightning.training.precompile`) at a low priority, and
     leaves its kernels in Numba's cache. If it fails, the fit compiles them itself when it needs them. It ends with the
     fit.
 
@@ -46,14 +46,14 @@ class CompileAhead(SplatCallback):
         if not module.quantizers or module.device.type != "cpu":
             return
         if trainer.is_global_zero and usable_cores() > 1:
-            self._settings = rehearsal.settings_of(module)
+            self._settings = precompile.settings_of(module)
             self._watching.enter_context(compile_watcher(self._start))
 
     def _start(self, _: str) -> None:
         if self._settings is None:
             return
         settings, self._settings = self._settings, None
-        command = [sys.executable, "-m", rehearsal.__name__]
+        command = [sys.executable, "-m", precompile.__name__]
         pipe, silence = subprocess.PIPE, subprocess.DEVNULL
         try:
             self._process = subprocess.Popen(command, stdin=pipe, stdout=silence, stderr=silence, env=_environment())
@@ -80,6 +80,6 @@ class CompileAhead(SplatCallback):
 
 def _environment() -> dict[str, str]:
     """That of this process; the package is found where this process has found it, and one thread is enough."""
-    root = str(Path(rehearsal.__file__).parents[2])
+    root = str(Path(precompile.__file__).parents[2])
     paths = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
     return os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}

@@ -10,9 +10,9 @@ from torch import Tensor
 from nsvq_lightning.compression.importance import most_contributing
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import generator
-from nsvq_lightning.training import distributed, edit
+from nsvq_lightning.training import distributed, row_ops
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.schedule import Phase, next_iteration
+from nsvq_lightning.training.schedule import Phase
 
 from .base import SplatCallback
 from .growth import draw_rows
@@ -48,7 +48,7 @@ class OpacityRegularization(SplatCallback):
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Turn the term on and off."""
         module.loss_terms.pop("opacity", None)
-        if module.schedule.phase_at(next_iteration(trainer)) is Phase.PRUNE:
+        if module.schedule.phase_at(trainer.global_step + 1) is Phase.PRUNE:
             weight = module.schedule.strength(self.weight)
             module.loss_terms["opacity"] = lambda *_: weight * module.splats.opacities.sigmoid().sum()
 
@@ -131,10 +131,10 @@ class OpacitySelection(SplatCallback):
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """While the opacities compete, raise their learning rate, and press on them when due."""
         module.loss_terms.pop("selection", None)
-        if self._is_selecting(module, next_iteration(trainer)):
+        if self._is_selecting(module, trainer.global_step + 1):
             module.scale_rate("opacities", self.rate)
             super().on_train_batch_start(trainer, module, batch, batch_idx)
-            since, length = self._place(module, next_iteration(trainer))
+            since, length = self._place(module, trainer.global_step + 1)
             if since % self._every(length) == 0:
                 module.loss_terms["selection"] = lambda *_: self._pressure(module, gentle=since < self.gentle * length)
 
@@ -174,7 +174,7 @@ class OpacitySelection(SplatCallback):
             kept = opacities.sigmoid() >= self.min_opacity
             # Never below the budget: the pressure may have been too strong.
             if int(kept.sum()) >= min(budget, len(kept)):
-                edit.keep_rows(module.splats, optimizer, kept)
+                row_ops.keep_rows(module.splats, optimizer, kept)
         count = len(module.splats)
         if count >= self.close * budget and since + 1 < length:
             return
@@ -184,7 +184,7 @@ class OpacitySelection(SplatCallback):
             few = count < self.close * budget
             draws = generator(module.seed, iteration, "select")
             kept = most_contributing(weight, budget) if few else draw_rows(weight, budget, draws)
-            edit.keep_rows(module.splats, optimizer, kept)
+            row_ops.keep_rows(module.splats, optimizer, kept)
         self.done = True
         distributed.check_replicas(trainer, "the selection")
         log.info("iteration %d: the selection is done, %d splats are left", iteration, len(module.splats))

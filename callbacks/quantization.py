@@ -19,9 +19,9 @@ from nsvq_lightning.quantize.base import Quantizer, held_codes
 from nsvq_lightning.quantize.nearest import cheapest, code_rates
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.canonical_covariance import canonical
-from nsvq_lightning.training import distributed, edit, optim, scene_access
+from nsvq_lightning.training import distributed, optim, row_ops, scene_access
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.schedule import Phase, next_iteration
+from nsvq_lightning.training.schedule import Phase
 
 from .base import SplatCallback, finite_search_is_due, keep_finite_splats
 
@@ -60,8 +60,8 @@ class CanonicalCovariance(SplatCallback):
             return
         optimizer, splats = trainer.optimizers[0], module.splats
         new = canonical(splats.scales.detach(), splats.quats.detach())
-        edit.change_coordinates(splats, optimizer, "scales", new.scales, new.scale_maps)
-        edit.change_coordinates(splats, optimizer, "quats", new.quats, new.quat_maps)
+        row_ops.change_coordinates(splats, optimizer, "scales", new.scales, new.scale_maps)
+        row_ops.change_coordinates(splats, optimizer, "quats", new.quats, new.quat_maps)
         log.info("iteration %d: canonical covariances", iteration)
 
 
@@ -204,7 +204,7 @@ class CodebookReplacement(SplatCallback):
                 replaced = quantizer.replace_unused(draws, rows=module.rows(name), jitter=self.jitter)
             values[f"codebook/{name}_replaced"] = float(len(replaced))
             if self.reset_moments:
-                edit.reset_moments(trainer.optimizers[0], optim.codebook_group(name), replaced)
+                row_ops.reset_moments(trainer.optimizers[0], optim.codebook_group(name), replaced)
             log.debug("iteration %d: replaced %d codes of %s", iteration, len(replaced), name)
         distributed.check_replicas(trainer, "the replacement of codes")
         module.log_dict(dict(values), batch_size=1)
@@ -283,7 +283,7 @@ class CodebookRefit(SplatCallback):
 
     def on_before_optimizer_step(self, trainer: Trainer, module: SplatModule, optimizer: Optimizer) -> None:
         """Refit when due, on the first process."""
-        iteration = next_iteration(trainer)
+        iteration = trainer.global_step + 1
         if not self.is_due(module, iteration):
             return
         for name, quantizer in _refittable(module).items():
@@ -307,7 +307,7 @@ TURNS = 8
 # What a splat takes in a file, about; with the strength it makes the price of a bit independent of the scene.
 BITS_A_SPLAT = 64
 # Share of the mean that no splat's sensitivity is below: a test view may see what no train view sees.
-LEAST = 0.05
+MIN_SENSITIVITY = 0.05
 
 
 @dataclass(eq=False)
@@ -391,7 +391,7 @@ class RateDistortion(SplatCallback):
         a_bit = self.strength * float(error) / (BITS_A_SPLAT * len(module.splats))
         self.prices = {}
         for name, total in shown.items():
-            self.prices[name] = a_bit / row_weights(distributed.sum_over_processes(trainer, total), LEAST)
+            self.prices[name] = a_bit / row_weights(distributed.sum_over_processes(trainer, total), MIN_SENSITIVITY)
 
     def _choose(self, module: SplatModule, part: slice) -> None:
         for name, price in (self.prices or {}).items():
@@ -447,7 +447,7 @@ class FiniteCodes(SplatCallback):
             if len(broken) == len(quantizer.codebook) or not hasattr(quantizer, "mend"):
                 raise FloatingPointError(f"{found}; lower the learning rates")
             quantizer.mend(broken, module.rows(name), generator(module.seed, iteration, "mend", name))
-            edit.reset_moments(trainer.optimizers[0], optim.codebook_group(name), broken)
+            row_ops.reset_moments(trainer.optimizers[0], optim.codebook_group(name), broken)
             rows = ", ".join(map(str, broken[:5].tolist())) + ", …" * (len(broken) > 5)
             log.warning("%s (rows %s); mended", found, rows)
 
@@ -486,7 +486,7 @@ class FreezeCodes(SplatCallback):
         Raises:
             RuntimeError: A codebook has never been placed.
         """
-        iteration, first = next_iteration(trainer), module.schedule.first_of(Phase.FINETUNE)
+        iteration, first = trainer.global_step + 1, module.schedule.first_of(Phase.FINETUNE)
         if first is None or iteration < first:
             return
         if iteration == first and self._first_time("before", iteration):
@@ -519,7 +519,7 @@ class FreezeCodes(SplatCallback):
             # Only now: some quantizers place their codebooks when rows are encoded.
             if not getattr(quantizer, "fitted", True):
                 raise RuntimeError(
-                    f"iteration {next_iteration(trainer)}: the codebook of {name} has never been placed, so its codes "
+                    f"iteration {trainer.global_step + 1}: the codebook of {name} has never been placed, so its codes "
                     "cannot be frozen; add CodebookInit to the callbacks"
                 )
             quantizer.freeze(distributed.from_first_process(trainer, codes))

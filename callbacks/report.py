@@ -28,9 +28,8 @@ from nsvq_lightning.report import figures, files, pictures
 from nsvq_lightning.report.page import write_page
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.run_folder import is_trial, run_folder
+from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 from nsvq_lightning.training.scene_access import scene_of
-from nsvq_lightning.training.schedule import next_iteration
 
 from .base import WritingCallback
 
@@ -113,7 +112,7 @@ class MetricReport(WritingCallback):
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Evaluate the last iteration, now that all callbacks have finished with it."""
-        iteration = next_iteration(trainer) - 1
+        iteration = trainer.global_step
         if self.is_due(module, iteration):
             self._evaluate_once(trainer, module, iteration)
 
@@ -125,7 +124,7 @@ class MetricReport(WritingCallback):
         """Evaluate the end of the run if no epoch has ended, and draw the curve."""
         self._evaluate_once(trainer, module, trainer.global_step)
         folder = run_folder(trainer)
-        if trainer.is_global_zero and module.history and not is_trial(trainer):
+        if trainer.is_global_zero and module.history and not is_fast_dev_run(trainer):
             with module.stopwatch.paused(module.device):
                 figures.write_csv(folder / "curve.csv", module.history)
                 figures.write_figure(folder / "curve.png", files.curve_figure(module.history, module.schedule))
@@ -138,7 +137,7 @@ class MetricReport(WritingCallback):
     def _evaluate_once(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Evaluate an iteration that was not evaluated yet, and notify the callbacks that monitor it."""
         done = module.history[-1]["iteration"] if module.history else 0
-        if iteration <= done or is_trial(trainer):
+        if iteration <= done or is_fast_dev_run(trainer):
             return
         datamodule = getattr(trainer, "datamodule", None)
         if datamodule is None or not datamodule.scene.test:
@@ -191,7 +190,7 @@ class MetricReport(WritingCallback):
     def on_test_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Write the file, read it back, and let the module test the decoded scene; a trial tests the one in memory."""
         self._scene, self._scores = None, []
-        if is_trial(trainer):
+        if is_fast_dev_run(trainer):
             return
         # All processes call this hook; later ones differ, as some have fewer views than others.
         self._folder = run_folder(trainer)

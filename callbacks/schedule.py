@@ -8,7 +8,7 @@ from lightning.pytorch import Trainer
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.training import scene_access
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.schedule import Phase, Schedule, next_iteration
+from nsvq_lightning.training.schedule import Phase, Schedule
 
 from .base import SplatCallback
 
@@ -131,7 +131,7 @@ class PhaseSchedule(SplatCallback):
         """Write the phase of the iteration that starts; end the run earlier by what its warm-up has saved."""
         if self._steps > 0:
             trainer.fit_loop.epoch_loop.max_steps = self._steps - module.schedule.saved
-        module.phase = module.schedule.phase_at(next_iteration(trainer))
+        module.phase = module.schedule.phase_at(trainer.global_step + 1)
 
 
 @dataclass(eq=False)
@@ -159,7 +159,7 @@ class ShDegreeSchedule(SplatCallback):
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Set the degree of the iteration that starts."""
-        degree = module.schedule.sh_degree_at(next_iteration(trainer), self.every, module.splats.sh_degree)
+        degree = module.schedule.sh_degree_at(trainer.global_step + 1, self.every, module.splats.sh_degree)
         # A run that starts from a trained scene keeps its degree.
         module.active_sh_degree = max(degree, module.active_sh_degree)
 
@@ -194,7 +194,7 @@ class LearningRateDecay(SplatCallback):
         """Scale the rates of this iteration."""
         if self.final == 1.0:
             return
-        iteration = next_iteration(trainer)
+        iteration = trainer.global_step + 1
         ends = module.schedule.ends
         start = ends[Phase.QUANTIZE] if self.start is None else self.start * module.schedule.scale
         end = ends[Phase.FINETUNE]

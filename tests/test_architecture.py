@@ -105,7 +105,7 @@ def test_imports_go_down(sources: dict[str, str]) -> None:
         ("compute.rows", "from ..splats.splats import Splats", "no floor below"),
         ("training.optim", "from nsvq_lightning import __version__", "front door"),
         ("splats.canonical_covariance", "def late():\n    from nsvq_lightning.splats.splats import Splats", None),
-        ("training.optim", "from nsvq_lightning.training.edit import keep_rows", "circle"),
+        ("training.optim", "from nsvq_lightning.training.row_ops import keep_rows", "circle"),
     ],
 )
 def test_the_rule_sees_a_planted_import(sources: dict[str, str], module: str, line: str, problem: str | None) -> None:

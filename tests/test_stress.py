@@ -27,8 +27,8 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats, Splats
-from nsvq_lightning.training.edit import LARGEST_LOG_SCALE, drop_non_finite
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
+from nsvq_lightning.training.row_ops import LARGEST_LOG_SCALE, drop_non_finite
 
 SCENES = extremes()
 BACKENDS = ("cpu", "reference")

@@ -31,7 +31,7 @@ from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.skips import SKIPS, switch, switched
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.resume import check_settings, read_checkpoint
-from nsvq_lightning.training.run_folder import is_trial, reserve, run_folder
+from nsvq_lightning.training.run_folder import is_fast_dev_run, reserve, run_folder
 from nsvq_lightning.training.trainer import SplatTrainer
 
 TRAINER_DEFAULTS: dict[str, Any] = {
@@ -126,7 +126,7 @@ class RunStart(SaveConfigCallback):
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Open it as soon as the scene has been loaded, before anything is logged."""
         folder = run_folder(trainer)  # a collective of all processes
-        if self.already_saved or is_trial(trainer):
+        if self.already_saved or is_fast_dev_run(trainer):
             return
         self.already_saved = True
         if self.config.trainer.logger in (None, True):
@@ -298,7 +298,7 @@ class SplatCLI(LightningCLI):
 
     def after_fit(self) -> None:
         """Test the decoded file, and print a summary."""
-        if is_trial(self.trainer) or self.trainer.interrupted:
+        if is_fast_dev_run(self.trainer) or self.trainer.interrupted:
             return
         self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
         self._print_summary()

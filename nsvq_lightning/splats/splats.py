@@ -63,7 +63,7 @@ class Splats(nn.Module):
     """N Gaussian splats as six trainable raw attributes (3D Gaussian Splatting, Kerbl et al. 2023).
 
     Side tables (:meth:`add_table`) hold one row per splat, for example the statistics of density control; they are
-    buffers, so checkpoints carry them, and :mod:`nsvq_lightning.training.edit` keeps their rows together with the
+    buffers, so checkpoints carry them, and :mod:`nsvq_lightning.training.row_ops` keeps their rows together with the
     attributes.
 
     Attributes:

@@ -62,7 +62,7 @@ def run_folder(trainer: Trainer) -> Path:
     return folder
 
 
-def is_trial(trainer: Trainer) -> bool:
+def is_fast_dev_run(trainer: Trainer) -> bool:
     """Whether this is ``fast_dev_run``, which must leave no files."""
     return bool(getattr(trainer, "fast_dev_run", False))
 
@@ -78,7 +78,7 @@ def reserve(trainer: Trainer, checkpoint: str | Path | None) -> None:
         FileExistsError: The folder holds another run.
     """
     folder = _given(trainer)
-    if folder is not None and trainer.is_global_zero and not is_trial(trainer):
+    if folder is not None and trainer.is_global_zero and not is_fast_dev_run(trainer):
         take(folder, checkpoint)
         _RESERVED[trainer] = folder
 
@@ -208,7 +208,7 @@ def _given(trainer: Trainer) -> Path | None:
 
 
 def _choose(trainer: Trainer) -> Path:
-    if is_trial(trainer):
+    if is_fast_dev_run(trainer):
         return Path(trainer.default_root_dir)
     if trainer in _RESERVED:
         return _RESERVED.pop(trainer)

@@ -13,7 +13,7 @@ from nsvq_lightning.data.scene import ONE_PLACE, Scene
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training.distributed import sum_over_processes
-from nsvq_lightning.training.edit import finite_splats
+from nsvq_lightning.training.row_ops import finite_splats
 from nsvq_lightning.training.scene_module import SceneModule
 
 log = logging.getLogger(__name__)

@@ -34,7 +34,7 @@ class SceneModule(LightningModule):
     """
 
     splats: Splats
-    """The splats; rows are edited only through :mod:`nsvq_lightning.training.edit`."""
+    """The splats; rows are edited only through :mod:`nsvq_lightning.training.row_ops`."""
     codebooks: nn.ModuleDict
     """Quantizer by attribute; empty for a run without quantization."""
     schedule: Schedule

@@ -37,10 +37,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from lightning.pytorch import Trainer
 
 
 class Phase(IntEnum):
@@ -238,8 +234,3 @@ def _times(schedule: Schedule, start: float, last: float, stride: float) -> tupl
     """Cached, because callbacks ask in every step."""
     count = math.floor((last - start) / stride + 1e-9) + 1
     return tuple(dict.fromkeys(schedule.iteration(start + k * stride) for k in range(count)))
-
-
-def next_iteration(trainer: Trainer) -> int:
-    """1-based number of the iteration that starts (or runs) now; at the end of a step, that of the next one."""
-    return trainer.global_step + 1

@@ -20,8 +20,8 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.distributed import ViewParallelStrategy
-from nsvq_lightning.training.edit import append_rows, keep_rows
 from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.row_ops import append_rows, keep_rows
 from nsvq_lightning.training.schedule import Schedule
 
 

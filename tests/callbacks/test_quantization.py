@@ -25,8 +25,8 @@ from nsvq_lightning.callbacks.quantization import perplexity
 from nsvq_lightning.quantize import NSVQ, StraightThrough
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.splats import Splats
-from nsvq_lightning.training.edit import append_rows, keep_rows
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
+from nsvq_lightning.training.row_ops import append_rows, keep_rows
 from nsvq_lightning.training.schedule import Phase, Schedule
 
 

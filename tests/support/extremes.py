@@ -27,8 +27,8 @@ from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.report.figures import markdown_table
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, Splats
-from nsvq_lightning.training.edit import trainable_rows
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
+from nsvq_lightning.training.row_ops import trainable_rows
 
 __all__ = [
     "BROKEN_ROWS",

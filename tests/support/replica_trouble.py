@@ -10,8 +10,6 @@ from typing import Any
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from nsvq_lightning.training.schedule import next_iteration
-
 SECOND = 1
 """Number of the view in its step that trouble comes with: that of the second process, or the second micro-batch."""
 
@@ -29,7 +27,7 @@ class SpoiltViews(Callback):
         micro_batch = batch_idx % trainer.accumulate_grad_batches
         self._view = micro_batch * trainer.world_size + trainer.global_rank
         self._weight = module.dssim_weight
-        if next_iteration(trainer) in self.losses and self._view == SECOND:
+        if trainer.global_step + 1 in self.losses and self._view == SECOND:
             module.dssim_weight = float("nan")
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *args: Any) -> None:
@@ -38,7 +36,7 @@ class SpoiltViews(Callback):
 
     def on_after_backward(self, trainer: Trainer, pl_module: LightningModule) -> None:
         module: Any = pl_module
-        if next_iteration(trainer) in self.gradients and self._view == SECOND:
+        if trainer.global_step + 1 in self.gradients and self._view == SECOND:
             module.splats.means.grad[5, 1] = torch.inf
 
 
@@ -49,7 +47,7 @@ class Stopped(Callback):
         self.iteration, self.by = iteration, by
 
     def on_after_backward(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if next_iteration(trainer) != self.iteration:
+        if trainer.global_step + 1 != self.iteration:
             return
         if self.by == "SIGTERM" and trainer.is_global_zero:
             os.killpg(os.getpgrp(), signal.SIGTERM)

@@ -15,7 +15,7 @@ from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, StraightThrough
 from nsvq_lightning.rendering.rasterize import render, visible
 from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training.rehearsal import rehearse
+from nsvq_lightning.training.precompile import compile_kernels
 
 
 def rendering() -> None:
@@ -31,8 +31,8 @@ def quantizing() -> None:
     """Codebooks from the start to the file and back."""
     for degree in (1, 3):
         for quantizer in (NSVQ, StraightThrough):
-            rehearse({"sh_degree": degree, "quantizer": quantizer, "codebooks": dict.fromkeys(QUANTIZED, 300)})
-    rehearse({"codebooks": None})
+            compile_kernels({"sh_degree": degree, "quantizer": quantizer, "codebooks": dict.fromkeys(QUANTIZED, 300)})
+    compile_kernels({"codebooks": None})
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import Recipe, RunFactory, paper_phases
 
-from nsvq_lightning.training.edit import append_rows, keep_rows
+from nsvq_lightning.training.row_ops import append_rows, keep_rows
 
 STEPS = 60
 AMOUNT = 7

@@ -14,7 +14,7 @@ from runs import Recipe, RunFactory
 from nsvq_lightning.callbacks import CompileAhead
 from nsvq_lightning.callbacks import precompile as callback_module
 from nsvq_lightning.quantize import NSVQ, CodebookQuantizer, DiVeQ, PostHoc, StraightThrough, TrainedStraightThrough
-from nsvq_lightning.training import rehearsal
+from nsvq_lightning.training import precompile
 from nsvq_lightning.training.module import SplatModule
 
 CODES = {"scales": 24, "quats": 24, "sh0": 16, "shN": 16}
@@ -28,13 +28,13 @@ CODES = {"scales": 24, "quats": 24, "sh0": 16, "shN": 16}
     ],
 )
 def test_every_quantizer_can_be_rehearsed(quantizer: type[CodebookQuantizer], degree: int, codebooks: Any) -> None:
-    settings = rehearsal.settings_of(SplatModule(degree, quantizer, codebooks))
+    settings = precompile.settings_of(SplatModule(degree, quantizer, codebooks))
     assert settings is not None
-    rehearsal.rehearse(pickle.loads(settings))
+    precompile.compile_kernels(pickle.loads(settings))
 
 
 def test_a_module_of_the_command_line_is_made_from_its_configuration() -> None:
-    rehearsal.rehearse({  # as LightningCLI stores it
+    precompile.compile_kernels({  # as LightningCLI stores it
         "sh_degree": 1,
         "codebooks": {"sh0": 16},
         "quantizer": {"class_path": "nsvq_lightning.quantize.StraightThrough", "init_args": {"kmeans_steps": 3}},
@@ -44,7 +44,7 @@ def test_a_module_of_the_command_line_is_made_from_its_configuration() -> None:
 
 
 def test_what_cannot_be_sent_is_not_rehearsed() -> None:
-    assert rehearsal.settings_of(SplatModule(0, lambda codes, dim: NSVQ(codes, dim), {"sh0": 16})) is None
+    assert precompile.settings_of(SplatModule(0, lambda codes, dim: NSVQ(codes, dim), {"sh0": 16})) is None
 
 
 class Compiles(Callback):
@@ -89,10 +89,10 @@ def test_the_first_compilation_starts_one_process_that_ends_with_the_fit(
 ) -> None:
     run([*recipe(kernels=CompileAhead()).values(), Compiles()], max_steps=3)
     (process,) = processes
-    assert process.command[1:] == ["-m", "nsvq_lightning.training.rehearsal"]
+    assert process.command[1:] == ["-m", "nsvq_lightning.training.precompile"]
     assert process.options["env"]["OMP_NUM_THREADS"] == "1"
     assert process.calls == ["sent", "terminate", "wait"]
-    rehearsal.rehearse(pickle.loads(process.stdin.getvalue()))
+    precompile.compile_kernels(pickle.loads(process.stdin.getvalue()))
 
 
 def test_an_error_ends_the_process(recipe: Recipe, run: RunFactory, processes: list[Process]) -> None:

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import Splats
-from nsvq_lightning.training.edit import (
+from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
+from nsvq_lightning.training.row_ops import (
     append_rows,
     change_coordinates,
     drop_non_finite,
@@ -18,7 +19,6 @@ from nsvq_lightning.training.edit import (
     replace_attribute,
     reset_moments,
 )
-from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 
 
 def make(n: int, seed: int = 0) -> Splats:

@@ -1,6 +1,6 @@
 """The later phases of a run on a handful of splats, so that their kernels are compiled before the run gets there.
 
-``python -m nsvq_lightning.training.rehearsal`` reads the settings of a module from its standard input, as
+``python -m nsvq_lightning.training.precompile`` reads the settings of a module from its standard input, as
 :func:`settings_of` wrote them, and leaves nothing behind but compiled kernels on the disk.
 """
 
@@ -26,7 +26,7 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
 # Splats, so that some search trees have more than one level.
-FEWEST = 600
+MIN_SPLATS = 600
 
 
 def settings_of(module: SplatModule) -> bytes | None:
@@ -37,7 +37,7 @@ def settings_of(module: SplatModule) -> bytes | None:
         return None
 
 
-def rehearse(settings: dict[str, Any]) -> None:
+def compile_kernels(settings: dict[str, Any]) -> None:
     """Place the codebooks, train a step with noise and one with frozen codes, write the file and read it back.
 
     Nothing is drawn: the kernels of drawing are those of the first phase, which the run itself compiles meanwhile.
@@ -45,7 +45,7 @@ def rehearse(settings: dict[str, Any]) -> None:
     # A module that the command line has made keeps what it was made from, not what became of it.
     from_config = settings.pop("_instantiator", None) is not None
     module = instantiate_module(SplatModule, settings) if from_config else SplatModule(**settings)
-    count = max([FEWEST, *(q.codebook.shape[0] + 1 for q in module.quantizers.values())])
+    count = max([MIN_SPLATS, *(q.codebook.shape[0] + 1 for q in module.quantizers.values())])
     module.splats = _random_splats(count, module.splats.sh_degree)
     module.phase = Phase.QUANTIZE
     for name, quantizer in module.quantizers.items():
@@ -79,4 +79,4 @@ def _random_splats(count: int, sh_degree: int) -> Splats:
 if __name__ == "__main__":
     if hasattr(os, "nice"):
         os.nice(10)
-    rehearse(pickle.load(sys.stdin.buffer))
+    compile_kernels(pickle.load(sys.stdin.buffer))
