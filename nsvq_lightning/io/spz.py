@@ -37,7 +37,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,15 +46,23 @@ from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, rotated
 from nsvq_lightning.io.errors import FormatError, check_room, naming_file
 from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, opacity_of
-from nsvq_lightning.splats import conventions as conventions
+from nsvq_lightning.splats import conventions
+
+logger = logging.getLogger(__name__)
 
 _MAGIC = b"NGSP"
 # First bytes: those of gzip up to version 3, those of the plain header from version 4 on.
 SPZ_MAGICS = (b"\x1f\x8b", _MAGIC)
-# Versions that are written.
+# Versions that are written; every reader of the format supports the default.
 SPZ_VERSIONS = (3, 4)
-# Largest number of fractional bits of a position.
-MOST_FRACTION = 30
+DEFAULT_VERSION = 3
+# Axes that are written; viewers take a file to have the default, whatever it says.
+SPZ_AXES = ("rdf", "rub")
+DEFAULT_AXES = "rdf"
+# Bits of a position, and the largest number of them that are fractional.
+_POSITION, MOST_FRACTION = 24, 30
+_USUAL_FRACTION = 12
+_COLOR = 0.15
 
 # Magic, version, N, SH degree, fractional bits, flags, and number of streams (0 up to version 3).
 _HEADER = struct.Struct("<4sIIBBBB")
@@ -64,10 +72,8 @@ _HEAD = _HEADER.size + _TABLE_OFFSET.size
 _ENTRY = struct.Struct("<QQ")
 # Bytes of extensions that are read; those in use have less than a hundred.
 _MOST_EXTENDED = 1 << 20
-# The flag of a scene that was trained with anti-aliasing.
-ANTIALIASED = 1
-# The flag of extensions.
-_EXTENDED = 2
+# The flags of a scene that was trained with anti-aliasing, and of extensions.
+ANTIALIASED, _EXTENDED = 1, 2
 # Type and length, then the number of the axes.
 _EXTENSION = struct.Struct("<III")
 # The extension that states the axes.
@@ -77,6 +83,8 @@ _SYSTEMS = (
     *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
     *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
 )
+# Coordinates that the real spherical harmonics of degree 1 to 3 are odd functions of.
+_ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 
 
 @dataclass(frozen=True)
@@ -112,115 +120,72 @@ class SpzHeader:
         """Bytes of each array that is not empty, in file order: the streams of version 4."""
         return {name: self.count * size for name, size in self.sizes.items() if self.count * size}
 
-    def pack(self) -> bytes:
-        """The 16 bytes that all versions have."""
-        streams, flags = len(self.streams) if self.version == 4 else 0, self.flags | (_EXTENDED if self.axes else 0)
-        return _HEADER.pack(_MAGIC, self.version, self.count, self.sh_degree, self.fraction_bits, flags, streams)
 
-
-def write_frame(path: str | os.PathLike[str], header: SpzHeader, arrays: Mapping[str, NDArray[Any]]) -> int:
-    """Write the file, replaced atomically; the same content gives the same bytes.
-
-    Args:
-        path: File to write.
-        header: Of one of :data:`SPZ_VERSIONS`.
-        arrays: By the names of :attr:`SpzHeader.sizes`, ``[N, ...]`` with that many bytes per splat.
-
-    Returns:
-        Bytes of the file.
-
-    Raises:
-        FormatError: Version 4 needs Zstandard, and it is not installed.
-    """
+def _write_frame(path: str | os.PathLike[str], header: SpzHeader, arrays: Mapping[str, NDArray[Any]]) -> int:
+    """Write header and arrays, by the names of :attr:`SpzHeader.sizes`; returns the bytes of the file."""
     contents = [np.ascontiguousarray(arrays[name]).data.cast("B") for name in header.streams]
     axes = _EXTENSION.pack(_AXES, 4, _SYSTEMS.index(header.axes)) if header.axes else b""
+    flags, count = header.flags | (_EXTENDED if axes else 0), len(contents) if header.version == 4 else 0
+    start = _HEADER.pack(_MAGIC, header.version, header.count, header.sh_degree, header.fraction_bits, flags, count)
     with atomic_write(path) as file:
         if header.version == 4:
             with naming_file(path):
                 streams = [zstd_compress(content) for content in contents]
             table = (_ENTRY.pack(len(s), len(c)) for s, c in zip(streams, contents, strict=True))
-            file.writelines([header.pack(), _TABLE_OFFSET.pack(_HEAD + len(axes)), axes, *table, *streams])
+            file.writelines([start, _TABLE_OFFSET.pack(_HEAD + len(axes)), axes, *table, *streams])
         else:
             # No file name and no time stamp: the same scene gives the same bytes.
             with gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as stream:
-                stream.writelines([header.pack(), *contents, axes])
+                stream.writelines([start, *contents, axes])
         return file.tell()
 
 
-def read_frame(path: str | os.PathLike[str]) -> tuple[SpzHeader, dict[str, NDArray[np.uint8]]]:
-    """Header and arrays ``[N, bytes per splat]`` by name; extensions other than that of the axes are ignored.
-
-    Raises:
-        FormatError: The file is truncated, altered, of another version, or not a ``.spz`` file; or version 4 needs
-            Zstandard, and it is not installed.
-    """
-    data = Path(path).read_bytes()
-    with naming_file(path):
-        header, contents = _unpack(data) if data.startswith(_MAGIC) else _unzip(data)
-        shapes = {name: (header.count, size) for name, size in header.sizes.items()}
-        return header, {
-            name: np.frombuffer(contents.get(name, b""), np.uint8).reshape(shape) for name, shape in shapes.items()
-        }
-
-
 def read_spz_header(path: str | os.PathLike[str]) -> tuple[SpzHeader, dict[str, int]]:
-    """Header, and the size in bytes of each part of the file.
-
-    The arrays are not decoded; up to version 3 they are unpacked where extensions follow them.
+    """Header, and the size in bytes of each part of the file; needs no Zstandard.
 
     Raises:
         FormatError: The file is truncated, of another version, or not a ``.spz`` file.
     """
-    total = os.path.getsize(path)
-    with naming_file(path), open(path, "rb") as file:
-        start = file.read(1 << 12)
-        if not start.startswith(_MAGIC):
-            header = _parse_stream(zlib.decompressobj(wbits=31), start, total)
-            return _unzip(start + file.read())[0] if header.flags & _EXTENDED else header, {"all": total}
-        header, offset = _parse_head(start, total)
-        file.seek(_HEAD)
-        header = _with_axes(header, file.read(offset - _HEAD))
-        lengths = _lengths(header, file.read(_ENTRY.size * len(header.streams)), total - offset)
-    return header, {"header": total - sum(lengths.values()), **lengths}
+    data = Path(path).read_bytes()
+    with naming_file(path):
+        if not data.startswith(_MAGIC):
+            return _unzip(data)[0], {"all": len(data)}
+        header, lengths = _table(data)
+    return header, {"header": len(data) - sum(lengths.values()), **lengths}
 
 
 def _unpack(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
     """Header and arrays of version 4."""
-    header, offset = _parse_head(data, len(data))
-    header = _with_axes(header, data[_HEAD:offset])
-    start = offset + _ENTRY.size * len(header.streams)
-    contents = {}
-    for name, length in _lengths(header, data[offset:start], len(data) - offset).items():
+    header, lengths = _table(data)
+    start, contents = len(data) - sum(lengths.values()), {}
+    for name, length in lengths.items():
         contents[name] = zstd_decompress(memoryview(data)[start : start + length], header.streams[name])
         start += length
     return header, contents
 
 
-def _parse_head(start: bytes, file_bytes: int) -> tuple[SpzHeader, int]:
-    """Header of version 4 and offset of its table, which must be entirely in the file."""
-    header = _parse(start[: _HEADER.size])
-    if header.version < 4 or len(start) < _HEAD:
-        raise FormatError(f"truncated or damaged: version {header.version} in {file_bytes} bytes without gzip")
-    check_room("splats", header.count, file_bytes)
-    streams, (offset,) = start[_HEADER.size - 1], _TABLE_OFFSET.unpack_from(start, _HEADER.size)
+def _table(data: bytes) -> tuple[SpzHeader, dict[str, int]]:
+    """Header of version 4, and the compressed bytes of each stream; the streams fill the rest of the file."""
+    header = _parse(data[: _HEADER.size], len(data))
+    if header.version < 4 or len(data) < _HEAD:
+        raise FormatError(f"truncated or damaged: version {header.version} in {len(data)} bytes without gzip")
+    streams, (offset,) = data[_HEADER.size - 1], _TABLE_OFFSET.unpack_from(data, _HEADER.size)
     if streams != len(header.streams):
         raise FormatError(f"damaged: {streams} streams where there must be {len(header.streams)}")
-    if not _HEAD <= offset <= file_bytes - _ENTRY.size * streams:
-        raise FormatError(f"truncated or damaged: a table of {streams} streams at {offset}, of {file_bytes} bytes")
-    return header, offset
-
-
-def _lengths(header: SpzHeader, table: bytes, rest: int) -> dict[str, int]:
-    """Compressed bytes of each stream; table and streams must fill the ``rest`` of the file."""
-    entries = dict(zip(header.streams, _ENTRY.iter_unpack(table), strict=True))
-    for name, (length, size) in entries.items():
+    start = offset + _ENTRY.size * streams
+    if not _HEAD <= offset <= start <= len(data):
+        raise FormatError(f"truncated or damaged: a table of {streams} streams at {offset}, of {len(data)} bytes")
+    lengths = {}
+    for (name, expected), (length, size) in zip(
+        header.streams.items(), _ENTRY.iter_unpack(data[offset:start]), strict=True
+    ):
         # One byte of Zstandard expands to 32 KiB at most: a block of 128 KiB of equal bytes takes four.
-        if size != header.streams[name] or size > length << 15:
+        if size != expected or size > length << 15:
             raise FormatError(f"damaged: {name} of {header.count} splats cannot be {size} bytes in {length}")
-    lengths = {name: length for name, (length, _) in entries.items()}
-    if len(table) + sum(lengths.values()) != rest:
-        raise FormatError(f"truncated or damaged: streams of {sum(lengths.values())} bytes in {rest - len(table)}")
-    return lengths
+        lengths[name] = length
+    if start + sum(lengths.values()) != len(data):
+        raise FormatError(f"truncated or damaged: streams of {sum(lengths.values())} bytes in {len(data) - start}")
+    return _with_axes(header, data[_HEAD:offset]), lengths
 
 
 def zstd_compress(data: memoryview) -> bytes:
@@ -272,7 +237,9 @@ def _with_axes(header: SpzHeader, extensions: bytes) -> SpzHeader:
 def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
     """Header and arrays of versions 1 to 3."""
     gunzip = zlib.decompressobj(wbits=31)
-    header = _parse_stream(gunzip, data, len(data))
+    header = _parse(_inflate(gunzip, data, _HEADER.size), len(data))
+    if header.version > 3:
+        raise FormatError(f"damaged: version {header.version} in a gzip stream, which only versions 1 to 3 are")
     contents = {}
     for name, size in header.streams.items():
         contents[name] = _inflate(gunzip, gunzip.unconsumed_tail, size)
@@ -285,15 +252,6 @@ def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
     return _with_axes(header, extensions), contents
 
 
-def _parse_stream(gunzip: "zlib._Decompress", data: bytes, file_bytes: int) -> SpzHeader:
-    """Header of versions 1 to 3; refuses more splats than the file can hold."""
-    header = _parse(_inflate(gunzip, data, _HEADER.size))
-    if header.version > 3:
-        raise FormatError(f"damaged: version {header.version} in a gzip stream, which only versions 1 to 3 are")
-    check_room("splats", header.count, file_bytes)
-    return header
-
-
 def _inflate(gunzip: "zlib._Decompress", data: bytes, most: int) -> bytes:
     """At most ``most`` bytes of the stream; ``most`` must be above 0, which zlib takes as no limit."""
     try:
@@ -302,7 +260,8 @@ def _inflate(gunzip: "zlib._Decompress", data: bytes, most: int) -> bytes:
         raise FormatError(f"damaged, or not a .spz file: no valid gzip stream ({error})") from None
 
 
-def _parse(start: bytes) -> SpzHeader:
+def _parse(start: bytes, file_bytes: int) -> SpzHeader:
+    """Header of any version; refuses more splats than a file of that many bytes can hold."""
     if len(start) < _HEADER.size or start[:4] != _MAGIC:
         raise FormatError("not a .spz file: it does not start with a whole header 'NGSP'")
     _, version, count, sh_degree, fraction_bits, flags, _ = _HEADER.unpack(start)
@@ -314,46 +273,21 @@ def _parse(start: bytes) -> SpzHeader:
         raise FormatError(f"damaged, or of a degree that this release does not read: SH degree {sh_degree}, not 0 to 3")
     if fraction_bits > MOST_FRACTION:
         raise FormatError(f"damaged: {fraction_bits} fractional bits, more than {MOST_FRACTION}")
+    check_room("splats", count, file_bytes)
     return SpzHeader(version, count, sh_degree, fraction_bits, flags)
 
 
-logger = logging.getLogger(__name__)
+def _signs(axes: str, sh_degree: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """What changes sign between right, down, front and other axes.
 
-# The version that every reader of the format supports.
-DEFAULT_VERSION = 3
-# Axes that are written.
-SPZ_AXES = ("rdf", "rub")
-# The axes that viewers take a file to have, whatever it says.
-DEFAULT_AXES = "rdf"
-_POSITION = 24
-_USUAL_FRACTION = 12
-_COLOR = 0.15
-# Coordinates that the real spherical harmonics of degree 1 to 3 are odd functions of.
-_ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
-
-
-@dataclass(frozen=True)
-class _Signs:
-    """What changes sign between right, down, front and other axes: coordinates ``[3]``, and what follows from them."""
-
-    axes: NDArray[np.float32]
-
-    @classmethod
-    def of(cls, axes: str) -> Self:
-        return cls(np.array([1 if a == b else -1 for a, b in zip(axes, "RDF", strict=True)], np.float32))
-
-    @property
-    def quats(self) -> NDArray[np.float32]:
-        """Of quaternions wxyz ``[4]``; a rotation's axis does not mirror as positions do."""
-        return np.array([1, *(self.axes.prod() * self.axes)], np.float32)
-
-    def harmonics(self, sh_degree: int) -> NDArray[np.float32]:
-        """Of the spherical harmonics ``[coefficients, 1]``."""
-        signs = [
-            math.prod(self.axes["xyz".index(axis)] for axis in odd)
-            for odd in _ODD[: conventions.sh_coefficients(sh_degree)]
-        ]
-        return np.array(signs, np.float32)[:, None]
+    Returns:
+        Signs of positions ``[3]``, of quaternions wxyz ``[4]``, and of all spherical harmonics ``[D]``.
+    """
+    xyz = np.array([1 if a == b else -1 for a, b in zip(axes, "RDF", strict=True)], np.float32)
+    odd = _ODD[: conventions.sh_coefficients(sh_degree)]
+    harmonics = np.array([math.prod(xyz["xyz".index(axis)] for axis in names) for names in odd], np.float32)
+    # A rotation's axis does not mirror as positions do.
+    return xyz, np.array([1, *(xyz.prod() * xyz)], np.float32), harmonics.repeat(3)
 
 
 def in_spz_order(scene: CompressedScene) -> CompressedScene:
@@ -394,23 +328,22 @@ def write_spz(
     if axes not in SPZ_AXES:
         raise ValueError(f"axes of .spz must be {' or '.join(SPZ_AXES)}, got {axes!r}")
     scene = in_spz_order(scene)
-    clamped, signs = Clamped(), _Signs.of(axes.upper())
+    clamped, (xyz, quats, harmonics) = Clamped(), _signs(axes.upper(), scene.sh_degree)
     flags, fraction = ANTIALIASED * scene.antialiased, _fraction_bits(scene)
     # Viewers expect version 3 to be silent, in the default axes; Babylon.js turns a scene that says so upside down.
     stated = axes.upper() if version == 4 or axes != DEFAULT_AXES else ""
-    header = SpzHeader(version, len(scene), scene.sh_degree, fraction, flags, stated)
+    end = 1 << _POSITION - 1
+    means = clamped.nearest("means", scene.means * xyz * (1 << fraction), (-end, end - 1))
     arrays: dict[str, NDArray[Any]] = {
-        "means": _packed_means(scene.means * signs.axes, fraction, clamped),
+        "means": means.astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3],
         "opacities": np.rint(255 * opacity_of(scene.opacities)).astype(np.uint8),
         "sh0": _packed(scene, "sh0", _COLOR * 255, 127.5, clamped),
         "scales": _packed(scene, "scales", 16, 160, clamped),
-        "quats": scene.spread("quats", lambda rows, _: _packed_quats(rows * signs.quats)),
-        "shN": scene.spread(
-            "shN", lambda rows, uses: _packed_sh(rows, uses, signs.harmonics(scene.sh_degree), clamped)
-        ),
+        "quats": scene.spread("quats", lambda rows, _: _packed_quats(rows * quats)),
+        "shN": _packed(scene, "shN", 128 * harmonics, 128, clamped),
     }
     clamped.warn(path, len(scene))
-    return write_frame(path, header, arrays)
+    return _write_frame(path, SpzHeader(version, len(scene), scene.sh_degree, fraction, flags, stated), arrays)
 
 
 def _fraction_bits(scene: CompressedScene) -> int:
@@ -428,16 +361,18 @@ def _fraction_bits(scene: CompressedScene) -> int:
     return min(max(min(needed, fits), min(_USUAL_FRACTION, mostly_fits), 0), MOST_FRACTION)
 
 
-def _packed_means(means: NDArray[np.float32], fraction: int, clamped: Clamped) -> NDArray[np.uint8]:
-    end = 1 << _POSITION - 1
-    fixed = clamped.nearest("means", means * (1 << fraction), (-end, end - 1))
-    return fixed.astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3]
+def _packed(
+    scene: CompressedScene, name: str, factor: float | NDArray[np.float32], zero: float, clamped: Clamped
+) -> NDArray[np.uint8]:
+    def packed(rows: NDArray[np.float32], uses: NDArray[np.int64] | None) -> NDArray[np.uint8]:
+        found = np.empty(rows.shape, np.uint8)
+        for start in range(0, len(rows), 1 << 16):  # so that temporary arrays stay small
+            block = slice(start, start + (1 << 16))
+            some = None if uses is None else uses[block]
+            found[block] = clamped.nearest(name, factor * rows[block] + zero, (0, 255), some)
+        return found
 
-
-def _packed(scene: CompressedScene, name: str, factor: float, zero: float, clamped: Clamped) -> NDArray[np.uint8]:
-    return scene.spread(
-        name, lambda rows, uses: clamped.nearest(name, factor * rows + zero, (0, 255), uses=uses).astype(np.uint8)
-    )
+    return scene.spread(name, packed)
 
 
 def _packed_quats(rows: NDArray[np.float32]) -> NDArray[np.uint32]:
@@ -449,19 +384,6 @@ def _packed_quats(rows: NDArray[np.float32]) -> NDArray[np.uint32]:
     return packed.astype("<u4")
 
 
-def _packed_sh(
-    rows: NDArray[np.float32], uses: NDArray[np.int64] | None, signs: NDArray[np.float32], clamped: Clamped
-) -> NDArray[np.uint8]:
-    values = rows.reshape(len(rows), len(signs), 3)
-    packed = np.empty(values.shape, np.uint8)
-    for start in range(0, len(rows), 1 << 16):
-        block = slice(start, start + (1 << 16))
-        packed[block] = clamped.nearest(
-            "shN", 128 * signs * values[block] + 128, (0, 255), None if uses is None else uses[block]
-        )
-    return packed
-
-
 def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
     """Read a ``.spz`` file of version 1 to 4, with any axes; other extensions are ignored.
 
@@ -469,7 +391,13 @@ def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
         FormatError: The file is truncated, altered, of another version, or not a ``.spz`` file; or version 4 needs
             Zstandard, and it is not installed.
     """
-    header, arrays = read_frame(path)
+    data = Path(path).read_bytes()
+    with naming_file(path):
+        header, contents = _unpack(data) if data.startswith(_MAGIC) else _unzip(data)
+    arrays = {
+        name: np.frombuffer(contents.get(name, b""), np.uint8).reshape(header.count, size)
+        for name, size in header.sizes.items()
+    }
     if not header.axes:
         taken = (
             "taken as right, down, front, as in .ply. If it is upside down: nsvq convert --up minus-y --up-from 0 1 0"
@@ -479,16 +407,15 @@ def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
     turn = axes[1] in "FB"
     if turn:  # z is up or down: signs first, then a quarter turn, as Niantic's library does it, which writes such files
         axes = axes[0] + axes[2] + {"F": "B", "B": "F"}[axes[1]]
-    signs = _Signs.of(axes)
-    sh = (arrays["shN"].astype(np.float32) - 128) / 128
+    xyz, quats, harmonics = _signs(axes, header.sh_degree)
     scene = CompressedScene(
-        means=(_unpacked_means(header, arrays["means"]) * signs.axes).astype(np.float32),
+        means=(_unpacked_means(header, arrays["means"]) * xyz).astype(np.float32),
         opacities=logits_of_bytes(arrays["opacities"][:, 0]),
         raw={
-            "quats": _unpacked_quats(header, arrays["quats"]) * signs.quats,
+            "quats": _unpacked_quats(header, arrays["quats"]) * quats,
             "scales": (arrays["scales"] / 16 - 10).astype(np.float32),
             "sh0": ((arrays["sh0"] / 255 - 0.5) / _COLOR).astype(np.float32),
-            "shN": (sh * signs.harmonics(header.sh_degree).repeat(3, 1).ravel()).astype(np.float32),
+            "shN": ((arrays["shN"].astype(np.float32) - 128) / 128 * harmonics).astype(np.float32),
         },
         sh_degree=header.sh_degree,
         config={"antialiased": True} if header.flags & ANTIALIASED else {},
