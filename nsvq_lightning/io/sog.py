@@ -26,8 +26,8 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any, Self
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,11 @@ from nsvq_lightning.splats.conventions import from_smallest_three, sh_coefficien
 
 META = "meta.json"
 ZIP_MAGIC = b"PK\x03\x04"
+# Number of rows that a 16-bit label can address.
+PALETTE_LIMIT = 1 << 16
+_ROWS_A_LINE = 64
+_LEVELS = 256
+_LARGEST = float(np.finfo(np.float32).max)
 
 
 def picture_shape(count: int) -> tuple[int, int]:
@@ -49,19 +54,10 @@ def picture_shape(count: int) -> tuple[int, int]:
     return max(4, 4 * math.ceil(count / width / 4)), width
 
 
-def write_archive(
+def _write_archive(
     path: str | os.PathLike[str], meta: Mapping[str, Any], pictures: Mapping[str, NDArray[np.uint8]]
 ) -> int:
-    """Write the file, replaced atomically; the same content gives the same bytes.
-
-    Args:
-        path: File to write.
-        meta: Content of ``meta.json``.
-        pictures: Texels ``[H, W, 4]`` by name.
-
-    Returns:
-        Bytes of the file.
-    """
+    """Write ``meta.json`` and pictures ``[H, W, 4]`` by name; returns the bytes of the file."""
     from PIL import Image
 
     contents = {META: json.dumps(meta, separators=(",", ":"), allow_nan=False).encode()}
@@ -79,77 +75,40 @@ def write_archive(
         return file.tell()
 
 
-class SogArchive:
-    """A ``.sog`` file opened for reading; use it in a ``with`` block.
+class _Archive:
+    """The content of a ``.sog`` file: what ``meta.json`` says, and texels.
 
-    Args:
-        path: File.
+    Attributes:
+        meta: Content of ``meta.json``.
+        count: Number of splats.
+        sh_degree: Degree of the spherical harmonics, 0 to 3.
+        sizes: Compressed size in bytes of each entry, by name.
 
     Raises:
-        FormatError: It is truncated, altered, or not a zip archive with a ``meta.json``.
+        FormatError: It is truncated, altered, of another version, or not a zip archive with a ``meta.json``.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self._size = os.path.getsize(path)
+    def __init__(self, data: bytes) -> None:
+        self._size = len(data)
         try:
-            self._zip = zipfile.ZipFile(path)
+            self._zip = zipfile.ZipFile(io.BytesIO(data))
         except (zipfile.BadZipFile, ValueError, NotImplementedError, EOFError) as error:
             raise FormatError(f"truncated, or not a .sog file: no valid zip archive ({error})") from None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._zip.close()
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Compressed size in bytes of each entry, by name."""
-        return {entry.filename: entry.compress_size for entry in self._zip.infolist()}
-
-    def meta(self) -> dict[str, Any]:
-        """Content of ``meta.json``.
-
-        Raises:
-            FormatError: It is missing, damaged, or not a JSON object.
-        """
+        self.sizes = {entry.filename: entry.compress_size for entry in self._zip.infolist()}
         text = self._bytes(META, 1 << 20)
         try:
-            meta = json.loads(text)
+            self.meta = json.loads(text)
         except (ValueError, RecursionError) as error:
             raise FormatError(f"damaged: {META} is not JSON ({error})") from None
-        if not isinstance(meta, dict):
+        if not isinstance(self.meta, dict):
             raise FormatError(f"damaged: {META} is not a JSON object")
-        return meta
-
-    def check_count(self, texels: int) -> None:
-        """Refuse more texels than a file of this size can hold.
-
-        Raises:
-            FormatError: There are too many.
-        """
-        check_room("splats or texels", texels, self._size)
-
-    def texels(self, name: str, count: int) -> NDArray[np.uint8]:
-        """The first ``count`` texels ``[count, 4]`` of a picture.
-
-        Raises:
-            FormatError: It is missing, damaged, or too small.
-        """
-        from PIL import Image
-
-        # Twice the bytes that uncompressed texels have.
-        data = self._bytes(name, 8 * max(FEW_SPLATS, self._size // 2))
-        try:
-            with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
-                if image.width * image.height < count:
-                    raise FormatError(f"damaged: {name} has {image.width} x {image.height} texels, {count} are needed")
-                self.check_count(image.width * image.height)
-                return np.asarray(image.convert("RGBA")).reshape(-1, 4)[:count]
-        except FormatError:
-            raise
-        except Exception as error:  # damage can make Pillow's decoders raise anything
-            raise FormatError(f"damaged: {name} is not a picture ({error})") from None
+        if (version := self.meta.get("version", 1)) != 2:
+            raise FormatError(
+                f"version {version} of the format; this release reads version 2", "save it as that or as .ply"
+            )
+        self.count = self._integer(self.meta, "count", 0, 1 << 40)
+        check_room("splats or texels", self.count, self._size)
+        self.sh_degree = self._integer(self._entry("shN"), "bands", 0, 3) if "shN" in self.meta else 0
 
     def _bytes(self, name: str, most: int) -> bytes:
         try:
@@ -167,12 +126,82 @@ class SogArchive:
         except (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, ValueError, struct.error) as error:
             raise FormatError(f"damaged: {name} cannot be unpacked ({error})") from None
 
+    def _entry(self, name: str) -> dict[str, Any]:
+        entry = self.meta.get(name)
+        if not isinstance(entry, dict):
+            raise FormatError(f"damaged: {META} has no object {name!r}")
+        return entry
 
-# Number of rows that a 16-bit label can address.
-PALETTE_LIMIT = 1 << 16
-_ROWS_A_LINE = 64
-_LEVELS = 256
-_FARTHEST = math.log1p(float(np.finfo(np.float32).max))
+    @staticmethod
+    def _integer(entry: Mapping[str, Any], name: str, low: int, high: int) -> int:
+        value = entry.get(name)
+        if type(value) is not int or not low <= value <= high:
+            raise FormatError(f"damaged: {name!r} in {META} must be an integer in {low}..{high}, got {str(value)[:40]}")
+        return value
+
+    def _numbers(self, attribute: str, name: str, count: range, largest: float) -> NDArray[np.float64]:
+        values = self._entry(attribute).get(name)
+        if not isinstance(values, list) or len(values) not in count:
+            raise FormatError(f"damaged: {name!r} in {META} must be a list of {count[0]} to {count[-1]} numbers")
+        if not all(type(value) in (int, float) and abs(value) <= largest for value in values):
+            raise FormatError(f"damaged: {name!r} in {META} must hold numbers of at most {largest:.4g}")
+        return np.array(values, np.float64)
+
+    def texels(self, attribute: str, number: int = 0, count: int | None = None) -> NDArray[np.uint8]:
+        """The first ``count`` texels ``[count, 4]`` of one of the pictures of an attribute; one a splat if None."""
+        from PIL import Image
+
+        files, count = self._entry(attribute).get("files"), self.count if count is None else count
+        if not (isinstance(files, list) and len(files) > number and isinstance(files[number], str)):
+            raise FormatError(f"damaged: {META} does not name the pictures of {attribute!r}")
+        name = files[number]
+        # Twice the bytes that uncompressed texels have.
+        data = self._bytes(name, 8 * max(FEW_SPLATS, self._size // 2))
+        try:
+            with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
+                if image.width * image.height < count:
+                    raise FormatError(f"damaged: {name} has {image.width} x {image.height} texels, {count} are needed")
+                check_room("splats or texels", image.width * image.height, self._size)
+                return np.asarray(image.convert("RGBA")).reshape(-1, 4)[:count]
+        except FormatError:
+            raise
+        except Exception as error:  # damage can make Pillow's decoders raise anything
+            raise FormatError(f"damaged: {name} is not a picture ({error})") from None
+
+    def values(self, attribute: str, texels: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """The values ``[N, 3]`` of an attribute that texels have the level indices of."""
+        levels, indices = self._numbers(attribute, "codebook", range(1, _LEVELS + 1), _LARGEST), texels[:, :3]
+        if indices.size and indices.max() >= len(levels):
+            raise FormatError(f"damaged: level {indices.max()} of {attribute}, there are {len(levels)}")
+        return levels.astype(np.float32)[indices]
+
+    def means(self) -> NDArray[np.float32]:
+        """Positions ``[N, 3]``."""
+        mins, maxs = (self._numbers("means", name, range(3, 4), math.log1p(_LARGEST)) for name in ("mins", "maxs"))
+        low, high = (self.texels("means", number)[:, :3] for number in range(2))
+        logs = mins + (maxs - mins) * ((low + 256.0 * high) / 65535)
+        # The logarithm of the largest float32 may round up, beyond it.
+        return np.clip(np.copysign(np.expm1(np.abs(logs)), logs), -3.4e38, 3.4e38).astype(np.float32)
+
+    def quats(self) -> NDArray[np.float32]:
+        """Rotations ``[N, 4]``."""
+        texels = self.texels("quats")
+        if len(texels) and texels[:, 3].min() < 252:
+            raise FormatError(f"damaged: a rotation has the mark {texels[:, 3].min()}, not 252 to 255")
+        others = (texels[:, :3] / 127.5 - 1) / math.sqrt(2)
+        return from_smallest_three((texels[:, 3] - 252).astype(np.intp), others)
+
+    def palette(self) -> tuple[NDArray[np.float32], NDArray[np.uint16]]:
+        """Palette of the spherical harmonics ``[K, D]`` and the label of each splat ``[N]``."""
+        rows = self._integer(self._entry("shN"), "count", 1, PALETTE_LIMIT)
+        coefficients = sh_coefficients(self.sh_degree)
+        centroids = self.texels("shN", 0, math.ceil(rows / _ROWS_A_LINE) * _ROWS_A_LINE * coefficients)
+        palette = self.values("shN", centroids[: rows * coefficients]).reshape(rows, 3 * coefficients)
+        texels = self.texels("shN", 1)
+        labels = texels[:, 0] + (texels[:, 1].astype(np.uint16) << 8)
+        if self.count and labels.max() >= rows:
+            raise FormatError(f"damaged: label {labels.max()} of a palette of {rows} rows")
+        return palette, labels
 
 
 def in_sog_order(scene: CompressedScene) -> CompressedScene:
@@ -204,7 +233,7 @@ def write_sog(path: str | os.PathLike[str], scene: CompressedScene, *, palette: 
     """
     if not 1 <= palette <= PALETTE_LIMIT:
         raise ValueError(f"palette must be in 1..{PALETTE_LIMIT}, got {palette}")
-    scene = _with_palette(in_sog_order(scene), palette)
+    scene = in_sog_order(scene)
     count = len(scene)
     low, high, means = _packed_means(scene.means)
     scales, scale_levels = _leveled(scene, "scales")
@@ -230,43 +259,25 @@ def write_sog(path: str | os.PathLike[str], scene: CompressedScene, *, palette: 
     }
     pictures = {name: _picture(values, picture_shape(count)) for name, values in texels.items()}
     if scene.sh_degree:
-        meta["shN"], sh_pictures = _packed_sh(scene)
+        meta["shN"], sh_pictures = _packed_sh(*_palette(scene, palette), scene.sh_degree)
         pictures |= sh_pictures
-    return write_archive(path, meta, pictures)
+    return _write_archive(path, meta, pictures)
 
 
-def _with_palette(scene: CompressedScene, most: int) -> CompressedScene:
-    """The scene with an SH codebook, all of whose rows are in use; one row if there are no splats."""
-    if scene.sh_degree == 0:
-        return scene
-    if len(scene):
-        from nsvq_lightning.io.palette import in_order_of_use
-
-        rows, codes = in_order_of_use(*_palette(scene, most))
-    else:
-        rows, codes = np.zeros((1, 3 * sh_coefficients(scene.sh_degree)), np.float32), np.zeros(0, np.int64)
-    raw = {name: values for name, values in scene.raw.items() if name != "shN"}
-    return replace(
-        scene,
-        raw=raw,
-        codes={**scene.codes, "shN": codes},
-        codebooks={**scene.codebooks, "shN": rows},
-        stored_bytes=None,
-    )
-
-
-def _palette(scene: CompressedScene, most: int) -> tuple[NDArray[np.float32], NDArray[np.integer]]:
-    """Palette rows of spherical harmonics ``[K, D]``, and the row of each splat ``[N]``."""
-    from nsvq_lightning.io.palette import find_palette  # imports Numba, which readers do without
+def _palette(scene: CompressedScene, most: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Palette of spherical harmonics ``[K, D]`` in order of first use, and the row of each splat ``[N]``."""
+    from nsvq_lightning.io.palette import find_palette, in_order_of_use  # imports Numba, which readers do without
 
     rows, codes = scene.table("shN")
+    if len(scene) == 0:
+        return np.zeros((1, rows.shape[1]), np.float32), np.zeros(0, np.int64)
     if codes is None:
-        return find_palette(rows, _visibility(scene), most)
+        return in_order_of_use(*find_palette(rows, _visibility(scene), most))
     used, codes = np.unique(codes, return_inverse=True)
     if len(used) <= PALETTE_LIMIT:
-        return rows[used], codes
+        return in_order_of_use(rows[used], codes)
     rows, labels = find_palette(rows[used], np.bincount(codes, _visibility(scene)), most)
-    return rows, labels[codes]
+    return in_order_of_use(rows, labels[codes])
 
 
 def _visibility(scene: CompressedScene) -> NDArray[np.float64]:
@@ -304,30 +315,28 @@ def _packed_quats(rows: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 def _leveled(scene: CompressedScene, name: str) -> tuple[NDArray[np.uint8], list[float]]:
     """Level indices ``[N, D]`` of an attribute, and the levels."""
-    levels = _levels(scene, name)
+    uses = scene.uses(name)
+    levels = scalar_kmeans(scene.table(name)[0], None if uses is None else uses[:, None], _LEVELS)
     return scene.spread(name, lambda rows, _: nearest_level(rows, levels)), _decimals(levels)
 
 
-def _levels(scene: CompressedScene, name: str) -> NDArray[np.float32]:
-    rows, uses = scene.table(name)[0], scene.uses(name)
-    return scalar_kmeans(rows, None if uses is None else uses[:, None], _LEVELS)
-
-
-def _packed_sh(scene: CompressedScene) -> tuple[dict[str, Any], dict[str, NDArray[np.uint8]]]:
-    rows, labels = scene.codebooks["shN"], scene.codes["shN"]
-    levels = _levels(scene, "shN")
-    coefficients = sh_coefficients(scene.sh_degree)
-    centroids = nearest_level(rows, levels).reshape(-1, 3)
-    lines = math.ceil(len(rows) / _ROWS_A_LINE)
-    numbers = np.stack([labels & 255, labels >> 8], axis=1).astype(np.uint8)
+def _packed_sh(
+    rows: NDArray[np.float32], labels: NDArray[np.int64], sh_degree: int
+) -> tuple[dict[str, Any], dict[str, NDArray[np.uint8]]]:
+    """What ``meta.json`` says of a palette ``[K, D]`` and labels ``[N]``, and their pictures by name."""
+    levels = scalar_kmeans(rows, np.bincount(labels, minlength=len(rows))[:, None], _LEVELS)
+    line = _ROWS_A_LINE * sh_coefficients(sh_degree)
     meta = {
         "count": len(rows),
-        "bands": scene.sh_degree,
+        "bands": sh_degree,
         "codebook": _decimals(levels),
         "files": ["shN_centroids.webp", "shN_labels.webp"],
     }
+    numbers = np.stack([labels & 255, labels >> 8], axis=1).astype(np.uint8)
     return meta, {
-        "shN_centroids.webp": _picture(centroids, (lines, _ROWS_A_LINE * coefficients)),
+        "shN_centroids.webp": _picture(
+            nearest_level(rows, levels).reshape(-1, 3), (math.ceil(len(rows) / _ROWS_A_LINE), line)
+        ),
         "shN_labels.webp": _picture(numbers, picture_shape(len(labels))),
     }
 
@@ -351,25 +360,20 @@ def read_sog(path: str | os.PathLike[str]) -> CompressedScene:
     Raises:
         FormatError: The file is truncated, altered, of another version, or not a ``.sog`` file.
     """
-    with naming_file(path), SogArchive(path) as archive:
-        meta = archive.meta()
-        count, degree = _checked(meta, archive)
-        raw = {
-            "quats": _unpacked_quats(archive.texels(_file(meta, "quats"), count)),
-            "scales": _look_up(meta, "scales", archive.texels(_file(meta, "scales"), count)[:, :3]),
-        }
-        colors = archive.texels(_file(meta, "sh0"), count)
-        raw["sh0"] = _look_up(meta, "sh0", colors[:, :3])
+    with naming_file(path):
+        archive = _Archive(Path(path).read_bytes())
+        colors = archive.texels("sh0")
+        raw = {"quats": archive.quats(), "scales": archive.values("scales", archive.texels("scales"))}
+        raw["sh0"] = archive.values("sh0", colors)
         codes, codebooks = {}, {}
-        if degree:
-            codebooks["shN"], codes["shN"] = _unpacked_sh(meta, archive, count, degree)
+        if archive.sh_degree:
+            codebooks["shN"], codes["shN"] = archive.palette()
         else:
-            raw["shN"] = np.zeros((count, 0), np.float32)
-        means = _unpacked_means(meta, *(archive.texels(_file(meta, "means", i), count) for i in range(2)))
-        opacities = logits_of_bytes(colors[:, 3])
-        antialiased = meta.get("model") == "antialiased" or meta.get("antialias") is True
+            raw["shN"] = np.zeros((archive.count, 0), np.float32)
+        antialiased = archive.meta.get("model") == "antialiased" or archive.meta.get("antialias") is True
         config = {"antialiased": True} if antialiased else {}
-        return CompressedScene(means, opacities, codes, codebooks, raw, degree, config)
+        opacities = logits_of_bytes(colors[:, 3])
+        return CompressedScene(archive.means(), opacities, codes, codebooks, raw, archive.sh_degree, config)
 
 
 def read_sog_header(path: str | os.PathLike[str]) -> tuple[int, int, dict[str, int]]:
@@ -378,87 +382,6 @@ def read_sog_header(path: str | os.PathLike[str]) -> tuple[int, int, dict[str, i
     Raises:
         FormatError: The file is truncated, of another version, or not a ``.sog`` file.
     """
-    with naming_file(path), SogArchive(path) as archive:
-        return *_checked(archive.meta(), archive), archive.sizes
-
-
-def _checked(meta: Mapping[str, Any], archive: SogArchive) -> tuple[int, int]:
-    """Number of splats and SH degree."""
-    version = meta.get("version", 1)
-    if version != 2:
-        raise FormatError(
-            f"version {version} of the format; this release reads version 2", "save it as that or as .ply"
-        )
-    count = _integer(meta, "count", 0, 1 << 40)
-    archive.check_count(count)
-    return count, _integer(_entry(meta, "shN"), "bands", 0, 3) if "shN" in meta else 0
-
-
-def _entry(meta: Mapping[str, Any], name: str) -> dict[str, Any]:
-    entry = meta.get(name)
-    if not isinstance(entry, dict):
-        raise FormatError(f"damaged: {META} has no object {name!r}")
-    return entry
-
-
-def _integer(entry: Mapping[str, Any], name: str, low: int, high: int) -> int:
-    value = entry.get(name)
-    if type(value) is not int or not low <= value <= high:
-        raise FormatError(f"damaged: {name!r} in {META} must be an integer in {low}..{high}, got {str(value)[:40]}")
-    return value
-
-
-def _numbers(entry: Mapping[str, Any], name: str, count: range, largest: float) -> NDArray[np.float64]:
-    values = entry.get(name)
-    if not isinstance(values, list) or len(values) not in count:
-        raise FormatError(f"damaged: {name!r} in {META} must be a list of {count[0]} to {count[-1]} numbers")
-    if not all(type(value) in (int, float) and abs(value) <= largest for value in values):
-        raise FormatError(f"damaged: {name!r} in {META} must hold numbers of at most {largest:.4g}")
-    return np.array(values, np.float64)
-
-
-def _file(meta: Mapping[str, Any], name: str, number: int = 0) -> str:
-    files = _entry(meta, name).get("files")
-    if isinstance(files, list) and len(files) > number and isinstance(files[number], str):
-        return str(files[number])
-    raise FormatError(f"damaged: {META} does not name the pictures of {name!r}")
-
-
-def _look_up(meta: Mapping[str, Any], name: str, numbers: NDArray[np.uint8]) -> NDArray[np.float32]:
-    levels = _numbers(_entry(meta, name), "codebook", range(1, _LEVELS + 1), float(np.finfo(np.float32).max))
-    if numbers.size and numbers.max() >= len(levels):
-        raise FormatError(f"damaged: level {numbers.max()} of {name}, there are {len(levels)}")
-    return levels.astype(np.float32)[numbers]
-
-
-def _unpacked_means(meta: Mapping[str, Any], low: NDArray[np.uint8], high: NDArray[np.uint8]) -> NDArray[np.float32]:
-    entry = _entry(meta, "means")
-    mins, maxs = (_numbers(entry, name, range(3, 4), _FARTHEST) for name in ("mins", "maxs"))
-    numbers = low[:, :3] + 256.0 * high[:, :3]
-    logs = mins + (maxs - mins) * (numbers / 65535)
-    # The logarithm of the largest float32 may round up, beyond it.
-    positions = np.clip(np.copysign(np.expm1(np.abs(logs)), logs), -3.4e38, 3.4e38)
-    return positions.astype(np.float32)
-
-
-def _unpacked_quats(texels: NDArray[np.uint8]) -> NDArray[np.float32]:
-    if len(texels) and texels[:, 3].min() < 252:
-        raise FormatError(f"damaged: a rotation has the mark {texels[:, 3].min()}, not 252 to 255")
-    others = (texels[:, :3] / 127.5 - 1) / math.sqrt(2)
-    return from_smallest_three((texels[:, 3] - 252).astype(np.intp), others)
-
-
-def _unpacked_sh(
-    meta: Mapping[str, Any], archive: SogArchive, count: int, degree: int
-) -> tuple[NDArray[np.float32], NDArray[np.uint16]]:
-    """Palette ``[K, D]`` and labels ``[N]``."""
-    rows = _integer(_entry(meta, "shN"), "count", 1, PALETTE_LIMIT)
-    coefficients = sh_coefficients(degree)
-    lines = math.ceil(rows / _ROWS_A_LINE)
-    centroids = archive.texels(_file(meta, "shN", 0), lines * _ROWS_A_LINE * coefficients)
-    palette = _look_up(meta, "shN", centroids[: rows * coefficients, :3]).reshape(rows, 3 * coefficients)
-    texels = archive.texels(_file(meta, "shN", 1), count)
-    labels = texels[:, 0] + (texels[:, 1].astype(np.uint16) << 8)
-    if count and labels.max() >= rows:
-        raise FormatError(f"damaged: label {labels.max()} of a palette of {rows} rows")
-    return palette, labels
+    with naming_file(path):
+        archive = _Archive(Path(path).read_bytes())
+    return archive.count, archive.sh_degree, archive.sizes
