@@ -3,23 +3,18 @@
 Nothing here imports torch before a scene is turned into :class:`nsvq_lightning.Splats`.
 """
 
-from nsvq_lightning.io.atomic import atomic_path, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.io.formats import FORMATS, Format, load, read_scene, save
+from nsvq_lightning.io.formats import FORMATS, load, read_scene, save
 from nsvq_lightning.io.nsvq.file import read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.header import read_header
-from nsvq_lightning.io.ply import plain_ply_bytes, read_ply, write_ply
+from nsvq_lightning.io.ply import read_ply, write_ply
 
 __all__ = [
     "FORMATS",
     "CompressedScene",
-    "Format",
     "FormatError",
-    "atomic_path",
-    "atomic_write",
     "load",
-    "plain_ply_bytes",
     "read_header",
     "read_nsvq",
     "read_ply",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from nsvq_lightning.io import ply, sog, splat, spz
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_finite
+from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.precision import Storage
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def _format_of(path: Path, action: str) -> Format:
 # Formats by suffix; a new format is one more entry.
 FORMATS: dict[str, Format] = {
     ".ply": Format("3D Gaussian Splatting", ply.read_ply, ply.write_ply),
-    ".nsvq": Format("compressed scene of this package", read_nsvq, write_finite, native=True),
+    ".nsvq": Format("compressed scene of this package", read_nsvq, write_nsvq, native=True),
     ".sog": Format("PlayCanvas, SuperSplat", sog.read_sog, sog.write_sog, in_order=sog.in_sog_order),
     ".spz": Format("Niantic", spz.read_spz, spz.write_spz, in_order=spz.in_spz_order),
     ".splat": Format(

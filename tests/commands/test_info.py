@@ -12,6 +12,7 @@ from splat_scenes import random_splats
 
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.io import CompressedScene, write_nsvq, write_ply
+from nsvq_lightning.io.nsvq.precision import Storage
 
 
 def _plain(n: int) -> CompressedScene:
@@ -27,7 +28,7 @@ def _scene(n: int) -> CompressedScene:
 
 def test_text_for_a_compressed_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "x.nsvq"
-    write_nsvq(path, _scene(1000), "paper")
+    write_nsvq(path, _scene(1000), Storage("paper"))
     assert main(["info", str(path)]) == 0
     text = capsys.readouterr().out
     lines = [line.split() for line in text.splitlines()]

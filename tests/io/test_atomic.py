@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import nsvq_lightning
-from nsvq_lightning.io import atomic_path, atomic_write
+from nsvq_lightning.io.atomic import atomic_path, atomic_write
 from nsvq_lightning.top_level import folder_of
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from compressed_scenes import arrays_of, scene_of
 
-from nsvq_lightning.io import CompressedScene, FormatError, plain_ply_bytes, read_ply, write_ply
+from nsvq_lightning.io import CompressedScene, FormatError, read_ply, write_ply
+from nsvq_lightning.io.ply import plain_ply_bytes
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_shapes
 
 

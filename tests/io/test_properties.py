@@ -63,7 +63,7 @@ def test_compact_keeps_every_splat_where_it_promises(tmp_path: Path) -> None:
     path, precision = tmp_path / "scene.nsvq", Precision()
     for seed in range(CASES):
         scene = any_scene(seed)
-        write_nsvq(path, scene, level="compact", precision=precision)
+        write_nsvq(path, scene, Storage(precision=precision))
         back = read_nsvq(path)
         assert len(back) == len(scene), f"seed {seed}"
         if len(scene) == 0:

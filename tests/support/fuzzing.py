@@ -188,10 +188,11 @@ def _read_ply(path: Path) -> object:
 
 def _build_nsvq(folder: Path) -> list[Path]:
     from nsvq_lightning.io.nsvq.file import write_nsvq
+    from nsvq_lightning.io.nsvq.precision import Storage
 
     files = [folder / "compact.nsvq", folder / "paper.nsvq"]
     for path in files:
-        write_nsvq(path, _scene(40), path.stem)  # type: ignore[arg-type]
+        write_nsvq(path, _scene(40), Storage(path.stem))  # type: ignore[arg-type]
     return files
 
 

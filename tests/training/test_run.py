@@ -67,7 +67,7 @@ def test_the_file_has_the_size_of_the_formula(paper: Whole, tmp_path: Path) -> N
     # 16 N + ⌈N·Σ bits / 8⌉ + Σ 4·K·D + header; 24 and 16 codes have 5 and 4 bits.
     path, n = tmp_path / "paper.nsvq", len(paper.module.splats)
     codebooks = 4 * (24 * 3 + 24 * 4 + 16 * 3 + 16 * 9)
-    write_nsvq(path, paper.module.compressed(), "paper")
+    write_nsvq(path, paper.module.compressed(), Storage("paper"))
     assert path.stat().st_size == 16 * n + (n * 18 + 7) // 8 + codebooks + read_header(path).size
     assert len(load(paper.folder / "scene.ply")) == n
 

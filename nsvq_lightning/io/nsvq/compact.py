@@ -195,11 +195,8 @@ def _check_tables(header: Header) -> None:
 
 
 def _possible(entry: AttributeEntry) -> bool:
-    if entry.name == "means" or entry.storage == "steps":
-        allowed = entry.storage == "cells" if entry.name == "means" else entry.name in QUANTIZABLE
-        return allowed and entry.codes == 0 and entry.step > 0
-    if not 1 <= entry.codes <= 1 << 32:
-        return False
-    if entry.name == "opacities":
-        return entry.storage == "levels" and entry.codes <= MOST_OPACITY_LEVELS and entry.step == 0
-    return entry.storage == "codes" and entry.step > 0 and entry.dim > 0
+    own = {"means": "cells", "opacities": "levels"}.get(entry.name, "steps")
+    coded = entry.storage == "codes" and entry.name in QUANTIZABLE and entry.dim > 0
+    most = {"codes": 1 << 32, "levels": MOST_OPACITY_LEVELS}.get(entry.storage, 0)
+    numbers = min(most, 1) <= entry.codes <= most and (entry.step > 0) == (entry.storage != "levels")
+    return (coded or entry.storage == own) and numbers

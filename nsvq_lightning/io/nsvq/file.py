@@ -8,7 +8,7 @@ from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.nsvq.header import Header, frame, read_frame
-from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Precision, Storage
+from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.splats.attributes import listed
 
 
@@ -32,37 +32,26 @@ def encode(scene: CompressedScene, storage: Storage) -> tuple[Header, dict[str, 
     return encode_paper(scene)
 
 
-def write_nsvq(
-    path: str | os.PathLike[str],
-    scene: CompressedScene,
-    level: str = DEFAULT_LEVEL,
-    precision: Precision | None = None,
-) -> int:
+def write_nsvq(path: str | os.PathLike[str], scene: CompressedScene, storage: Storage | None = None) -> int:
     """Write a scene to a file, replaced atomically; the same arguments give the same bytes.
 
     Args:
         path: File to write.
-        scene: The scene.
-        level: ``compact`` or ``paper``.
-        precision: Largest errors of level ``compact``; level ``paper`` has none.
+        scene: The scene; :func:`nsvq_lightning.save` leaves out non-finite splats, which level ``compact`` refuses.
+        storage: Level and precision.
 
     Returns:
         Bytes of the file.
 
     Raises:
-        ValueError: Unknown level, ``config`` is not made of JSON values, or level ``compact`` cannot store a value.
+        ValueError: ``config`` is not made of JSON values, or level ``compact`` cannot store a value.
     """
-    storage = Storage(level, precision or Precision())
-    if level == "compact" and (culprits := scene.finite_rows()[1]):
+    storage = storage or Storage()
+    if storage.level == "compact" and (culprits := scene.finite_rows()[1]):
         raise ValueError(
             f"numbers that are not finite ({listed(culprits)}): drop those splats, or use level 'paper', which stores "
             "float32 as it is"
         )
-    return write_finite(path, scene, storage)
-
-
-def write_finite(path: str | os.PathLike[str], scene: CompressedScene, storage: Storage) -> int:
-    """:func:`write_nsvq` for a scene whose values are known to be finite."""
     parts = frame(*encode(scene, storage))
     with atomic_write(path) as file:
         file.writelines(parts)

@@ -24,11 +24,6 @@ from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims
 _CHUNK = 1 << 14
 
 
-def packed_bytes(rows: int, widths: Sequence[int]) -> int:
-    """Length of the packed stream, ⌈rows · Σ widths / 8⌉ bytes."""
-    return -(-rows * sum(widths) // 8)
-
-
 def pack_fields(fields: Sequence[NDArray[np.integer]], widths: Sequence[int]) -> bytes:
     """Pack one record per row: field after field, lowest bit first, rows without any padding between them.
 
@@ -40,7 +35,7 @@ def pack_fields(fields: Sequence[NDArray[np.integer]], widths: Sequence[int]) ->
         widths: Bits of each field, 0 to 32. A field of 0 bits holds only zeros and takes no space.
 
     Returns:
-        :func:`packed_bytes` bytes.
+        ⌈N · Σ widths / 8⌉ bytes.
     """
     chunks = []
     for start in range(0, len(fields[0]), _CHUNK):
@@ -57,7 +52,7 @@ def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) ->
     """Invert :func:`pack_fields`.
 
     Args:
-        data: The packed stream, :func:`packed_bytes` bytes.
+        data: The packed stream.
         rows: N.
         widths: Bits of each field, 0 to 32.
 
@@ -74,9 +69,9 @@ def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) ->
         bits = np.unpackbits(chunk, count=count * record, bitorder="little").reshape(count, record)
         first = 0
         for field, width in zip(fields, widths, strict=True):
-            number_bytes = np.packbits(bits[:, first : first + width], axis=1, bitorder="little")
-            for position, column in enumerate(number_bytes.T):
-                field[start : start + count] |= column.astype(field.dtype) << np.array(8 * position, field.dtype)
+            number = np.zeros((count, 32), np.uint8)
+            number[:, :width] = bits[:, first : first + width]
+            field[start : start + count] = np.packbits(number, axis=1, bitorder="little").view("<u4")[:, 0]
             first += width
     return fields
 
@@ -138,9 +133,10 @@ def _dims(sh_degree: int) -> dict[str, int]:
 def _layout(n: int, attributes: tuple[AttributeEntry, ...]) -> tuple[StreamEntry, ...]:
     """The streams: raw attributes, codes, codebooks."""
     coded = [entry for entry in attributes if entry.storage == "codes"]
+    bits = sum(entry.bits for entry in coded)
     return (
         *(StreamEntry(entry.name, 4 * n * entry.dim, "float32") for entry in attributes if entry.storage == "raw"),
-        *([StreamEntry("codes", packed_bytes(n, [entry.bits for entry in coded]), "bits")] if coded else []),
+        *([StreamEntry("codes", -(-n * bits // 8), "bits")] if coded else []),
         *(StreamEntry(f"{entry.name}.codebook", 4 * entry.codes * entry.dim, "float32") for entry in coded),
     )
 

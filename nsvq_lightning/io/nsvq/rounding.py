@@ -17,6 +17,7 @@ from nsvq_lightning.io.nsvq.codebook_order import sibling_distance, tree_order
 from nsvq_lightning.io.nsvq.header import AttributeEntry
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.io.numbers import coarsest_power, nearest_power, opacity_of
+from nsvq_lightning.splats.conventions import unit
 
 
 class Stored(NamedTuple):
@@ -82,24 +83,16 @@ def _codebook_step(name: str, rows: NDArray[np.float32], error: float) -> float:
         error: Largest error, as a share of how much neighbouring codes typically differ.
     """
     lattice = coarsest_power(rows)
-    distinct = np.unique(_unit(rows) if name == "quats" else rows, axis=0)
+    distinct = np.unique(unit(rows).astype(np.float32) if name == "quats" else rows, axis=0)
     wanted = nearest_power(2 * error * sibling_distance(distinct[tree_order(distinct)]) or 2.0**-16)
     return lattice if 4 * lattice >= wanted else wanted
-
-
-def _unit(quats: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Unit quaternions ``[N, 4]`` of the same rotations; zero becomes the identity, as in rendering."""
-    rows = quats.astype(np.float64)
-    norm = np.linalg.norm(rows, axis=1, keepdims=True)
-    identity = np.array([1.0, 0.0, 0.0, 0.0])
-    return np.where(norm > 0, rows / np.where(norm > 0, norm, 1), identity).astype(np.float32)
 
 
 def _integers(name: str, rows: NDArray[np.float32], step: float) -> NDArray[np.int64]:
     """The rows ``[N, D]`` as multiples of a step; quaternions are normalised first, unless they are multiples of it."""
     values = np.rint(rows.astype(np.float64) / step)
     if name == "quats" and not np.array_equal((values * step).astype(np.float32), rows):
-        values = np.rint(_unit(rows).astype(np.float64) / step)
+        values = np.rint(unit(rows).astype(np.float32).astype(np.float64) / step)
     if not (np.abs(values) < 2.0**52).all():
         raise ValueError(f"{name}: {np.abs(rows).max():.3g} is too large for steps of {step:.3g}; use level 'paper'")
     return values.astype(np.int64)

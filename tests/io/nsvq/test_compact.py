@@ -41,7 +41,7 @@ def test_errors_stay_within_the_precision(tmp_path: Path, sizes: dict[str, int])
         tmp_path / "x.nsvq",
     )
     precision = Precision(position=0.1, opacity=1 / 64, scales=0.05, quats=0.01, sh0=0.02, shN=0.005)
-    assert write_nsvq(path, original, precision=precision) == path.stat().st_size
+    assert write_nsvq(path, original, Storage(precision=precision)) == path.stat().st_size
     read = read_nsvq(path)
     assert (read.config, read.metrics, read.origin) == (original.config, original.metrics, original.origin)
     assert read.stored_bytes == path.stat().st_size
@@ -82,7 +82,7 @@ def test_a_file_that_is_read_and_written_again_loses_nothing_more(tmp_path: Path
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(second, name), getattr(first, name), err_msg=name)
     # A coarser precision rounds again.
-    write_nsvq(twice, read_nsvq(once), precision=Precision(position=0.4, opacity=1 / 16))
+    write_nsvq(twice, read_nsvq(once), Storage(precision=Precision(position=0.4, opacity=1 / 16)))
     assert twice.stat().st_size < once.stat().st_size
 
 
@@ -90,7 +90,7 @@ def test_finer_precision_is_nearer_and_larger(tmp_path: Path) -> None:
     original, path = scene(2000), tmp_path / "x.nsvq"
     sizes, errors = [], []
     for position in (0.4, 0.1, 0.025):
-        sizes.append(write_nsvq(path, original, precision=Precision(position=position)))
+        sizes.append(write_nsvq(path, original, Storage(precision=Precision(position=position))))
         back = arrays_of(read_nsvq(path))
         rows = matched(arrays_of(original), back)
         errors.append(np.abs(back.means - original.means[rows]).mean())
@@ -228,13 +228,13 @@ def test_precision_must_be_positive_and_readable(bad: dict[str, float]) -> None:
 
 def test_the_finest_opacities_are_read_back(tmp_path: Path) -> None:
     original, path = scene(30), tmp_path / "x.nsvq"
-    write_nsvq(path, original, precision=Precision(opacity=OPACITY_ERRORS[0]))
+    write_nsvq(path, original, Storage(precision=Precision(opacity=OPACITY_ERRORS[0])))
     assert len(read_nsvq(path)) == 30
 
 
 def test_it_is_much_smaller_than_the_level_paper(tmp_path: Path) -> None:
     original = scene(20_000, {"quats": 512, "scales": 512, "sh0": 128, "shN": 128})
-    paper = write_nsvq(tmp_path / "p.nsvq", original, "paper")
+    paper = write_nsvq(tmp_path / "p.nsvq", original, Storage("paper"))
     compact = write_nsvq(tmp_path / "c.nsvq", original)
     # Random codes have no structure to use: what is saved is in positions, opacities and codebooks.
     assert compact < 0.55 * paper

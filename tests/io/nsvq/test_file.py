@@ -15,8 +15,9 @@ import pytest
 from nsvq_lightning import io
 from nsvq_lightning.io import CompressedScene, FormatError, read_header, read_nsvq
 from nsvq_lightning.io.nsvq.header import VERSION
+from nsvq_lightning.io.nsvq.precision import Storage
 
-write_nsvq = partial(io.write_nsvq, level="paper")
+write_nsvq = partial(io.write_nsvq, storage=Storage("paper"))
 
 DIMS = {"quats": 4, "scales": 3, "sh0": 3, "shN": 45}
 SIZES_16K = {"quats": 16384, "scales": 16384, "sh0": 4096, "shN": 4096}
@@ -242,4 +243,4 @@ def test_settings_must_be_json_and_metrics_may_be_infinite(tmp_path: Path) -> No
     write_nsvq(path, scene(2, {}, metrics={"psnr": float("inf"), "ssim": 1.0}))
     assert read_nsvq(path).metrics == {"psnr": None, "ssim": 1.0}
     with pytest.raises(ValueError, match="unknown compression level 'tiny'; there are compact, paper"):
-        write_nsvq(path, scene(2, {}), level="tiny")
+        Storage("tiny")

@@ -18,7 +18,7 @@ from compressed_scenes import SIZES, arrays_of, scene
 
 from nsvq_lightning.io import CompressedScene, FormatError, read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.header import read_frame
-from nsvq_lightning.io.nsvq.precision import LEVELS, Precision
+from nsvq_lightning.io.nsvq.precision import LEVELS, Precision, Storage
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -75,7 +75,7 @@ def test_numbers_are_those_of_the_package(tmp_path: Path, level: str, degree: in
     for sizes in (SIZES, {}, {"shN": 8, "scales": 1}):
         kept = {name: count for name, count in sizes.items() if degree or name != "shN"}
         paths.append(tmp_path / f"{len(paths)}.nsvq")
-        write_nsvq(paths[-1], scene(120, kept, degree), level)
+        write_nsvq(paths[-1], scene(120, kept, degree), Storage(level))
     compare(*paths)
 
 
@@ -83,7 +83,7 @@ def test_numbers_are_those_of_the_package(tmp_path: Path, level: str, degree: in
 def test_few_splats(tmp_path: Path, level: str) -> None:
     paths = [tmp_path / f"{count}.nsvq" for count in (0, 1, 2, 17)]
     for path in paths:
-        write_nsvq(path, scene(int(path.stem)), level)
+        write_nsvq(path, scene(int(path.stem)), Storage(level))
     compare(*paths)
 
 
@@ -92,7 +92,7 @@ def test_far_splats_at_any_precision(tmp_path: Path) -> None:
     fine = Precision(position=1e-4, opacity=1e-4, codebook=1e-3, scales=1e-4)
     paths = [tmp_path / f"{index}.nsvq" for index in range(3)]
     for path, precision in zip(paths, (Precision(), coarse, fine), strict=True):
-        write_nsvq(path, with_far_splats(), "compact", precision)
+        write_nsvq(path, with_far_splats(), Storage(precision=precision))
     compare(*paths)
 
 
@@ -103,14 +103,14 @@ def test_large_codebooks(tmp_path: Path) -> None:
     made.means[:] = generator.normal(size=made.means.shape).astype(np.float32)
     made.codes["quats"][:] = generator.permutation(70_000) % 69_000
     made.codebooks["quats"][:] = generator.normal(size=(69_000, 4)).astype(np.float32)
-    write_nsvq(tmp_path / "a.nsvq", made, "compact", Precision(codebook=1e-3))
+    write_nsvq(tmp_path / "a.nsvq", made, Storage(precision=Precision(codebook=1e-3)))
     compare(tmp_path / "a.nsvq")
 
 
 def test_not_a_number_keeps_its_bits(tmp_path: Path) -> None:
     made = scene(20)
     made.means.view(np.uint32)[0] = 0x7FC12345, 0xFF800000, 0x80000000
-    write_nsvq(tmp_path / "a.nsvq", made, "paper")
+    write_nsvq(tmp_path / "a.nsvq", made, Storage("paper"))
     compare(tmp_path / "a.nsvq")
 
 
@@ -194,7 +194,7 @@ def test_another_version_is_told(tmp_path: Path, version: int) -> None:
 def test_noise_in_the_streams_ends_with_an_error_or_numbers(tmp_path: Path) -> None:
     path = tmp_path / "a.nsvq"
     for seed in range(12):
-        write_nsvq(path, scene(60), LEVELS[seed % 2])
+        write_nsvq(path, scene(60), Storage(LEVELS[seed % 2]))
         data = path.read_bytes()
         (length,) = struct.unpack_from("<I", data, 28)
         body = np.frombuffer(data[32 + length :], np.uint8).copy()
@@ -259,7 +259,7 @@ def test_all_readers_refuse_the_same_files(tmp_path: Path) -> None:
         with pytest.raises(FormatError, match=words):
             read_nsvq(path)
     for seed, path in enumerate(paths[len(CHANGES) :]):
-        write_nsvq(path, scene(60, SIZES if seed % 3 else {}), LEVELS[seed % 2])
+        write_nsvq(path, scene(60, SIZES if seed % 3 else {}), Storage(LEVELS[seed % 2]))
         generator = np.random.default_rng(seed)
         name = str(generator.choice([name for name, stream in read_frame(path)[1].items() if len(stream)]))
 
