@@ -11,7 +11,7 @@ from nsvq_lightning.commands.benchmark import SUITES, render, timing
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.skips import SKIPS
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+DOCS = Path(__file__).resolve().parents[3] / "docs"
 
 
 def test_results_are_printed_and_written(
