@@ -24,7 +24,7 @@ from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_bit, psnr
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.report import figures, files, pictures
+from nsvq_lightning.report import files, pictures
 from nsvq_lightning.report.page import write_page
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.module import SplatModule
@@ -126,8 +126,8 @@ class MetricReport(WritingCallback):
         folder = run_folder(trainer)
         if trainer.is_global_zero and module.history and not is_fast_dev_run(trainer):
             with module.stopwatch.paused(module.device):
-                figures.write_csv(folder / "curve.csv", module.history)
-                figures.write_figure(folder / "curve.png", files.curve_figure(module.history, module.schedule))
+                files.write_csv(folder / "curve.csv", module.history)
+                files.write_figure(folder / "curve.png", files.curve_figure(module.history, module.schedule))
 
     def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Catch up for a run that was stopped after its last iteration: when continued, it trains no further."""
@@ -167,7 +167,7 @@ class MetricReport(WritingCallback):
         }
         module.history.append(entry)
         if trainer.is_global_zero:
-            figures.write_csv(folder / "curve.csv", module.history)
+            files.write_csv(folder / "curve.csv", module.history)
             write_page(folder, module.history, module.schedule, self._other_seconds())
         values = {f"report/{name}": float(entry[name]) for name in ("psnr", "ssim", "splats")}
         trainer.callback_metrics.update({name: torch.tensor(value) for name, value in values.items()})
@@ -251,7 +251,7 @@ class MetricReport(WritingCallback):
                 lpips = fmean(score.lpips for score in scores if score.lpips is not None), None
             metrics = files.summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper_level)
             files.write_metrics(folder / "metrics.json", metrics)
-            figures.write_csv(folder / "views.csv", [asdict(score) for score in scores])
+            files.write_csv(folder / "views.csv", [asdict(score) for score in scores])
             paths = [self._picture(trainer, score.name) for score in scores]
             views = [asdict(score) | {"picture": path.name} for score, path in zip(scores, paths, strict=True)]
             page = write_page(folder, module.history, module.schedule, self._other_seconds(), metrics, views)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
 from functools import cache
 from itertools import chain
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from nsvq_lightning.top_level import folder_of
@@ -23,6 +23,22 @@ if TYPE_CHECKING:
 def names(text: str) -> tuple[str, ...]:
     """The entries of ``A,B``, each once."""
     return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+
+
+def some_of(known: Iterable[str]) -> Callable[[str], tuple[str, ...]]:
+    """A function that reads ``A,B``, of known names, or ``all`` of them.
+
+    Raises:
+        argparse.ArgumentTypeError: By the function: an entry is none of them.
+    """
+
+    def parse(text: str) -> tuple[str, ...]:
+        chosen = tuple(known) if text == "all" else names(text)
+        if not chosen or not set(chosen) <= set(known):
+            raise argparse.ArgumentTypeError(f"choose some of {', '.join(known)}, or all, got {text!r}")
+        return chosen
+
+    return parse
 
 
 def integers(text: str) -> tuple[int, ...]:
@@ -78,26 +94,30 @@ def joined(arguments: Sequence[str]) -> list[str]:
 
 
 def expand(arguments: Sequence[str]) -> list[str]:
-    """The joined arguments with every shorthand replaced by what it stands for: its own number, and none of the others.
+    """The joined arguments, configs that are no files as paths of shipped ones, shorthands as what they stand for.
+
+    That is their own number, and none of the others.
 
     Raises:
         ValueError: Two shorthands are given, of which only one can hold, or one without its number.
     """
     expanded: list[str] = []
     given: str | None = None
-    for argument in arguments:
+    for argument in joined(arguments):
         option, _, value = argument.partition("=")
         name = option.removeprefix("--")
-        if not option.startswith("--") or name not in SHORTHANDS:
+        if argument.startswith(CONFIG):
+            expanded.append(CONFIG + find_config(value))
+        elif not option.startswith("--") or name not in SHORTHANDS:
             expanded.append(argument)
-            continue
-        if given not in (None, name):
+        elif given not in (None, name):
             raise ValueError(f"--{given} and --{name} both say how large the scene is to be: give one of them")
-        if not value:
+        elif not value:
             raise ValueError(f"{option} needs a number")
-        given = name
-        others = [other for other in ("splats", "bytes") if other != name]
-        expanded += [f"{BUDGET}.{name}={value}", *(f"{BUDGET}.{other}=null" for other in others)]
+        else:
+            given = name
+            expanded.append(f"{BUDGET}.{name}={value}")
+            expanded += [f"{BUDGET}.{other}=null" for other in ("splats", "bytes") if other != name]
     return expanded
 
 
@@ -157,72 +177,51 @@ CONFIG = "--config="
 _MOST_BYTES, _MOST_VALUES = 1 << 17, 100_000
 
 
-def resolve_configs(arguments: Sequence[str]) -> list[str]:
-    """The joined arguments, with every ``--config=NAME`` that is not a file replaced by the shipped config."""
-    return [
-        CONFIG + find_config(argument.removeprefix(CONFIG)) if argument.startswith(CONFIG) else argument
-        for argument in joined(arguments)
-    ]
-
-
-def configs_among(arguments: Sequence[str]) -> list[str]:
-    """The values of ``--config`` among joined arguments."""
-    return [argument.removeprefix(CONFIG) for argument in arguments if argument.startswith(CONFIG)]
-
-
 def check_config(path: str) -> dict[str, Any]:
     """Settings of a config, none where the name is not that of a file, which the parser reports.
 
     Raises:
-        ValueError: It is not text, not YAML, or not a table of settings.
+        ValueError: It is not text, not YAML, too large, or not a table of settings.
     """
+    import yaml
+
     if not Path(path).is_file():
         return {}
-    settings = read_config(Path(path))
+    if (size := Path(path).stat().st_size) > _MOST_BYTES:
+        raise ValueError(f"config {path} has {size} bytes, more than {_MOST_BYTES}: give another file")
+    try:
+        # Not the parser's loader: what is nested too deep would overflow its stack.
+        settings = yaml.load(Path(path).read_text(encoding="utf-8"), _limited(type("Loader", (yaml.SafeLoader,), {})))
+    except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error
     if not isinstance(settings, dict):
         found = "nothing" if settings is None else type(settings).__name__
         raise ValueError(f"config {path} holds {found}: give settings by name, like 'trainer: {{max_steps: 1000}}'")
     return settings
 
 
-def read_config(path: Path) -> object:
-    """Content of a YAML file of settings.
-
-    Raises:
-        ValueError: It is not text or not YAML, or too large; what aliases repeat counts as often as they are named.
-    """
-    import yaml
-
-    if path.stat().st_size > _MOST_BYTES:
-        raise ValueError(f"config {path} has {path.stat().st_size} bytes, more than {_MOST_BYTES}: give another file")
-    try:
-        loader = yaml.SafeLoader(path.read_text(encoding="utf-8"))
-        node = loader.get_single_node()
-        values = _values(node, {})
-        settings = None if node is None or values > _MOST_VALUES else loader.construct_document(node)
-    except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error
-    if values > _MOST_VALUES:
-        raise ValueError(f"config {path} has more than {_MOST_VALUES} values by its aliases (*name): correct the file")
-    return settings
-
-
 @cache  # otherwise, each call would wrap the loader once more
 def limit_aliases() -> None:
-    """Let the parser refuse what :func:`read_config` does, in files that a config names and in its texts, too."""
-    import yaml
+    """Let the parser refuse what aliases make too large, in files that a config names and in its texts, too."""
     from jsonargparse._loaders_dumpers import get_yaml_default_loader  # all of its ways to read YAML use this class
 
-    loader = get_yaml_default_loader()  # type: ignore[no-untyped-call]
+    _limited(get_yaml_default_loader())  # type: ignore[no-untyped-call]
+
+
+def _limited(loader: Any) -> Any:
+    """A loader of YAML, which from now on refuses more values than a config has."""
+    import yaml
+
     compose = loader.get_single_node
 
     def checked(self: object) -> Node | None:
         node: Node | None = compose(self)
         if _values(node, {}) > _MOST_VALUES:
-            raise yaml.YAMLError(f"more than {_MOST_VALUES} values by aliases (*name): correct it")
+            raise yaml.YAMLError(f"more than {_MOST_VALUES} values by aliases (*name)")
         return node
 
     loader.get_single_node = checked
+    return loader
 
 
 def _values(node: Node | None, known: dict[int, float]) -> float:
@@ -237,32 +236,19 @@ def _values(node: Node | None, known: dict[int, float]) -> float:
     return known[id(node)]
 
 
-def written_by_run(path: str) -> bool:
-    """Whether a file is the ``config.yaml`` that a run leaves; Lightning writes its version on the first line."""
-    return Path(path).is_file() and Path(path).read_text(encoding="utf-8").startswith("# lightning")
-
-
 def find_config(name: str) -> str:
     """Path of a config: a given file, otherwise one shipped with the package (``paper``, ``configs/paper.yaml``).
 
     A name that is neither is returned unchanged, for the parser to report.
     """
-    if Path(name).exists():
-        return name
-    plain = _without_folder(Path(name))
-    for shipped in (folder_of("configs") / plain, folder_of("configs") / f"{plain}.yaml"):
-        if shipped.is_file():
-            return str(shipped)
-    return name
+    plain = Path(name).as_posix().removeprefix("configs/")
+    shipped = folder_of("configs") / plain, folder_of("configs") / f"{plain}.yaml"
+    return next((str(path) for path in (Path(name), *shipped) if path.is_file()), name)
 
 
 def shipped_configs() -> list[str]:
     """Names of the configs that come with the package, without their suffix."""
     return sorted(path.stem for path in folder_of("configs").glob("*.yaml"))
-
-
-def _without_folder(path: PurePath) -> str:
-    return path.as_posix().removeprefix("configs/")
 
 
 def scene_file(path: Path) -> Path:

@@ -18,12 +18,11 @@ import os
 import platform
 import shutil
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from importlib.metadata import packages_distributions, version
-from importlib.util import find_spec
+from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -41,7 +40,7 @@ if TYPE_CHECKING:
 OPENCV = "opencv-contrib-python-headless"
 # Bytes; less may not hold checkpoints and report.
 SMALL_DISK = 2 << 30
-# Of what is timed; for the time of a run, of as many views.
+# Views that are rendered for the time of a run, each as often.
 REPEATS = 3
 
 
@@ -124,26 +123,15 @@ def attempt(subject: str, check: Iterator[Finding]) -> Iterator[Finding]:
 
 
 def check_machine() -> Iterator[Finding]:
-    """The processor, and the versions of Python and of the packages that results depend on."""
-    from nsvq_lightning.commands.benchmark.report import describe_machine
-    from nsvq_lightning.compute.simd import WIDTH
+    """The machine, and the versions of Python and of the packages that results depend on."""
+    from nsvq_lightning.commands.benchmark import timing
 
-    machine = describe_machine()
-    yield judged("machine", f"{machine['system']}, {machine['cpu']}")
-    bits, simd = machine["simd_bits"], machine["simd"]
-    text = f"{WIDTH} floats at a time in {bits}-bit registers ({', '.join(simd) or 'no vector extension'})"
-    # ARM64 has no wider ones.
-    narrow = bits < 256 and "neon" not in simd and "a processor with AVX2 or AVX-512 is about twice as fast"
-    fused = not {"fma", "neon"}.isdisjoint(simd)
-    split = not fused and "somewhat slower without fused multiply-add, last digits may differ"
-    yield judged("cpu", text, narrow, split)
-    more = ("lightning", "torchmetrics", "jsonargparse", "scipy", "pycolmap")
-    versions = machine["versions"] | {name: version(name) for name in more}
-    yield judged("versions", ", ".join(f"{name} {number}" for name, number in versions.items()))
+    for subject, facts in timing.describe_machine().items():
+        yield judged(subject, timing.listed(facts))
 
 
 def check_packages() -> Iterator[Finding]:
-    """OpenCV, once: several packages overwrite each other's files; and what a run uses if it is installed."""
+    """OpenCV, once: several packages overwrite each other's files."""
     packages = sorted(set(packages_distributions().get("cv2", ())))
     try:
         import cv2
@@ -153,10 +141,6 @@ def check_packages() -> Iterator[Finding]:
         text = f"{cv2.__version__} ({' and '.join(packages) or 'not from pip'})"
         advice = f"they overwrite each other's files; uninstall all of them, then pip install {OPENCV}"
         yield judged("opencv", text, len(packages) > 1 and advice)
-    for extra, package in (("lpips", "torchvision"), ("tensorboard", "tensorboard")):
-        missing = find_spec(package) is None
-        advice = f"optional, pip install 'nsvq-lightning[{extra}]'"
-        yield judged(extra, f"{package} is {'not ' * missing}installed", missing and advice)
 
 
 def check_threads() -> Iterator[Finding]:
@@ -215,7 +199,7 @@ def check_backends() -> Iterator[Finding]:
     """Image and gradients of every usable back-end against the float64 oracle, which takes seconds."""
     import torch
 
-    from nsvq_lightning.commands.benchmark import render, timing, workloads
+    from nsvq_lightning.commands.benchmark import render, workloads
     from nsvq_lightning.compute.devices import fast_backends
     from nsvq_lightning.compute.kernel_cache import kernel_folder
     from nsvq_lightning.splats.splats import RawSplats
@@ -230,20 +214,16 @@ def check_backends() -> Iterator[Finding]:
     for device in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
         here = small.to(device)
         for backend in fast_backends(here.splats.means):
-            run = partial(results, here, backend, torch.float32)
-            times = [timing.milliseconds(run, device) for _ in range(REPEATS)]
-            errors = {name: workloads.relative_l2(value.cpu(), truth[name]) for name, value in run().items()}
-            # Rounding stays below 1e-4, but a splat that crosses α = 1/255 costs more. "not <", so that NaN fails.
-            wrong = [f"{name} {error:.1e}" for name, error in errors.items() if not error < 1e-3]
-            if wrong:
-                text = f"{backend}: relative error against the float64 oracle: {', '.join(wrong)}; do not trust a run; "
-                text += f"remove {kernel_folder()}, and if that does not help report it with nsvq doctor --json"
-                yield problem("self-test", text)
-            else:
-                image, *gradients = errors.values()
-                text = f"{backend}: image to {image:.1e}, gradients to {max(gradients):.1e} of the float64 oracle; "
-                text += f"{min(times):.1f} ms for 4,000 splats at {here.size}"
+            found = results(here, backend, torch.float32)
+            errors = {name: workloads.relative_l2(value.cpu(), truth[name]) for name, value in found.items()}
+            text = f"{backend}: relative errors against the float64 oracle: "
+            text += ", ".join(f"{name} {error:.1e}" for name, error in errors.items())
+            # Rounding stays below 1e-4, but a splat that crosses α = 1/255 costs more; NaN is never below.
+            if all(error < 1e-3 for error in errors.values()):
                 yield judged("self-test", text)
+            else:
+                advice = f"do not trust a run; remove {kernel_folder()}, and if that does not help report it with "
+                yield problem("self-test", f"{text}: {advice}nsvq doctor --json")
 
 
 def check_folder(root: Path) -> Iterator[Finding]:
@@ -361,23 +341,21 @@ def check_sizes(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
         yield problem("sizes", f"{text}{OTHER_SHAPE}")
     else:
         yield judged("sizes", f"{text}are scaled from what {model.source} says, their cameras with them")
-    undistorted = sum(source.undistortion is not None for source in sources)
-    yield judged("distortion", f"{undistorted} of {len(sources)} photos are undistorted when they are decoded")
 
 
 def check_photos(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
-    """Decode all photos, in parallel: whether that works, which are not in the model, and what they look like."""
+    """Decode all photos, in parallel: whether that works, how much masks exclude, and which are not in the model."""
     import torch
 
     from nsvq_lightning.data.frames import PHOTOS
 
-    def read(index: int) -> tuple[float, float, float] | str:
+    def read(index: int) -> float | str:
+        """The share of a photo that counts, or why it cannot be used."""
         try:
-            image, mask = scene.images.sources[index].load()
+            _, mask = scene.images.sources[index].load()
         except (ValueError, OSError) as error:
             return str(error)
-        kept = torch.ones(image.shape[:2], dtype=torch.bool) if mask is None else mask
-        return float(image[kept].float().mean()), exposure_of(image, index, scene, model), float(kept.float().mean())
+        return 1.0 if mask is None else float(mask.float().mean())
 
     with ThreadPoolExecutor(max_workers=torch.get_num_threads()) as pool:
         photos = dict(zip(scene.names, pool.map(read, range(len(scene))), strict=True))
@@ -386,70 +364,22 @@ def check_photos(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
         yield problem("photos", f"{len(broken)} of {len(photos)} cannot be used; first: {broken[0]}")
     else:
         yield judged("photos", f"all {len(photos)} registered photos can be read")
+    masked = {name: photo for name, photo in photos.items() if isinstance(photo, float) and photo < 1}
+    if masked:
+        share = 1 - sum(masked.values()) / len(masked)
+        text = f"{len(masked)} of {len(photos)} photos have pixels that do not count, {100 * share:.0f} % of them"
+        most = min(masked, key=lambda name: masked[name])
+        advice = f"most in {most}; masks are white where the photo counts; if not, invert them"
+        yield judged("masks", text, share > 0.7 and advice)
     folder = scene.root / (model.images_folder or "images")
     known = {Path(name).with_suffix("") for name in scene.names}
     # The folder of a NeRF-synthetic scene also holds maps and further views.
     found = folder.rglob("*") if folder != scene.root else ()
     files = [path.relative_to(folder) for path in found if path.suffix.lower() in PHOTOS]
-    extra = sorted(str(path) for path in files if path.with_suffix("") not in known)
+    extra = [path for path in files if path.with_suffix("") not in known]
     if extra:
         text = f"{len(extra)} of {len(files)} files in {folder} are not in the model"
         yield judged("registered", text, "they are not used; if many, photos lack overlap or sharpness")
-    if len(broken) < len(photos):
-        usable = {name: photo for name, photo in photos.items() if not isinstance(photo, str)}
-        yield from attempt("exposure", check_exposure(usable))
-
-
-def exposure_of(image: torch.Tensor, index: int, scene: Scene, model: ColmapModel) -> float:
-    """Median over points of log2(light in a photo / light of the point's colour, its mean over all photos).
-
-    Args:
-        image: The photo ``[H, W, 3]`` uint8 RGB.
-        index: Its place in the scene and in the model.
-        scene: The scene that has its camera.
-        model: The model that has the points and says which it saw.
-
-    Returns:
-        Stops; NaN if it saw too few points that are neither black nor outside the picture.
-    """
-    import torch
-
-    if model.observations is None:
-        return math.nan
-    rows, camera = model.observations[model.observations[:, 1] == index, 0], scene.cameras[index]
-    view = camera.viewmat.double()
-    local = (torch.from_numpy(model.points[rows]) @ view[:3, :3].T + view[:3, 3]) @ camera.K.double().T
-    x, y = (local[:, :2] / local[:, 2:]).floor().T
-    inside = (local[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
-    here = image[y[inside].long(), x[inside].long()].double().mean(1)
-    usual = torch.from_numpy(model.colors[rows[inside.numpy()]]).double().mean(1)
-    clear = (here > 4.0) & (usual > 4.0)  # darker grey says nothing of exposure, nor do few points
-    gamma = 2.2
-    return float(gamma * (here[clear] / usual[clear]).log2().median()) if int(clear.sum()) >= 30 else math.nan
-
-
-def check_exposure(photos: Mapping[str, tuple[float, float, float]]) -> Iterator[Finding]:
-    """How much masks exclude, and whether photos were exposed alike: splats have one colour for all of them.
-
-    Args:
-        photos: By name, the mean grey level, 0 to 255, :func:`exposure_of`, and the share of the pixels that count.
-    """
-    names, (grey, stops, counts) = list(photos), np.array(list(photos.values())).T
-    masked = int((counts < 1).sum())
-    if masked:
-        share = 1 - float(counts[counts < 1].mean())
-        text = f"{masked} of {len(names)} photos have pixels that do not count, {100 * share:.0f} % of them"
-        advice = f"most in {names[counts.argmin()]}; masks are white where the photo counts; if not, invert them"
-        yield judged("masks", text, share > 0.7 and advice)
-    text = "mean grey level {:.0f} to {:.0f}".format(*np.quantile(grey, (0.1, 0.9)))
-    if np.isnan(stops).mean() > 0.5:
-        yield judged("exposure", f"{text}; without observations, exposure and content of a photo cannot be separated")
-        return
-    low, high = map(float, np.nanquantile(stops, (0.1, 0.9)))
-    text += f"; the same points are {low:+.2f} to {high:+.2f} stops from their usual brightness"
-    brightest = names[np.nanargmax(stops)]
-    advice = f"colours disagree, {brightest} is brightest; lock exposure and white balance, or equalize the photos"
-    yield judged("exposure", text, high - low > 0.5 and advice)
 
 
 def check_budget(scene: Scene) -> Iterator[Finding]:
@@ -471,9 +401,7 @@ def check_budget(scene: Scene) -> Iterator[Finding]:
     # A step is a render forward and backward, and as long again for loss, optimizer and codebooks.
     step, paper_step = (2.0 * render_seconds(scene, count) for count in (fast, paper))
     text = f"about {4000 * step / 60:.0f} min for fast.yaml (4,000 steps, {fast:,} splats on average), "
-    text += (
-        f"{45_000 * paper_step / 3600:.1f} h for the paper's run (45,000, {paper:,}), with the machine as busy as now"
-    )
+    text += f"{45_000 * paper_step / 3600:.1f} h for the paper's run (45,000, {paper:,}), on a machine as busy as now"
     yield judged("run time", text)
 
 

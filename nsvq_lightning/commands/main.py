@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             meant = given.nearest(arguments[0], COMMANDS)
             sys.stderr.write(f"error: there is no command {arguments[0]!r}{meant}\nAll commands: nsvq --help\n")
             return 2
-        return _run_lightning(given.resolve_configs(arguments))
+        return _run_lightning(arguments)
     except KeyboardInterrupt:
         sys.stderr.write("\n")  # below the ^C that the terminal shows
         return INTERRUPTED
@@ -159,12 +159,14 @@ def _run_lightning(arguments: list[str]) -> int:
     _quiet_lightning()
     if os.getcwd() not in sys.path:  # last, unlike `python -m`: for the user's own quantizers and callbacks
         sys.path.append(os.getcwd())
-    configs = given.configs_among(arguments)
     given.limit_aliases()
+    configs: list[str] = []
     try:
+        arguments = given.expand(arguments)
+        configs += [argument.removeprefix(given.CONFIG) for argument in arguments if argument.startswith(given.CONFIG)]
         for config in configs:
             given.check_config(config)
-        SplatCLI(given.expand(arguments))
+        SplatCLI(arguments)
     except SIGTERMException:  # a kind of SystemExit
         return 128 + signal.SIGTERM  # Lightning itself would exit with the status of success
     except SystemExit as end:
@@ -172,11 +174,6 @@ def _run_lightning(arguments: list[str]) -> int:
             return INTERRUPTED
         if end.code == 2 and configs:  # the parser's messages name the option, not the file it came from
             sys.stderr.write(f"Settings came from {', '.join(configs)} and the command line\n")
-            if old := [config for config in configs if given.written_by_run(config)]:
-                sys.stderr.write(
-                    f"A run has written {', '.join(old)}: if that was an earlier version of this package, what the "
-                    "error names may have another name now; remove it from that file\n"
-                )
         raise
     except Exception as error:
         names_file = isinstance(error, FileNotFoundError) or (isinstance(error, OSError) and error.filename is not None)

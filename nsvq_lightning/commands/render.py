@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from nsvq_lightning.commands.arguments import cameras_of, names, photos_of, positive, scene_file
+from nsvq_lightning.commands.arguments import cameras_of, photos_of, positive, scene_file, some_of
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
@@ -49,9 +49,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     help_ = "folder of the photos, whose cameras the path follows; that of the run by default"
     add("--data.root", dest="root", type=Path, metavar="FOLDER", help=help_)
     add("--path", help="through, cameras, orbit or a .json; through by default, orbit without photos")
-    help_ = f"of {', '.join(WHAT)}, with commas; color by default. PNGs of the depth are also written with 16 bits, "
-    help_ += f"{UNIT} steps a scene unit"
-    add("--what", type=_kinds, default=("color",), metavar="NAMES", help=help_)
+    help_ = f"of {', '.join(WHAT)}, with commas, or all; color by default. PNGs of the depth are also written with 16 "
+    help_ += f"bits, {UNIT} steps a scene unit"
+    add("--what", type=some_of(WHAT), default=("color",), metavar="NAMES", help=help_)
     add("--size", type=_size, metavar="WxH", help="pixels; those of the cameras by default")
     length = parser.add_mutually_exclusive_group().add_argument
     length("--frames", type=positive(int), metavar="N", help="number of frames, of through and orbit")
@@ -59,13 +59,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--fps", type=positive(float), metavar="F", help=f"frames per second; {FPS:g} by default")
     add("--background", type=_color, default="black", metavar="COLOR", help="black, white, or R,G,B in [0, 1]")
     add("--backend", default="auto", metavar="NAME", help="auto, cpu, cuda or reference")
-
-
-def _kinds(text: str) -> tuple[str, ...]:
-    found = names(text)
-    if not found or not set(found) <= set(WHAT):
-        raise argparse.ArgumentTypeError(f"takes {', '.join(WHAT)}, with commas, got {text!r}")
-    return found
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -98,13 +91,13 @@ def run(options: argparse.Namespace) -> int:
 
     from nsvq_lightning.io.formats import read_scene
     from nsvq_lightning.rendering.rasterize import render
-    from nsvq_lightning.report.video import SUFFIX
+    from nsvq_lightning.report.pictures import VIDEO
 
     file = scene_file(options.scene)
     output = options.output or file.with_name("render.mp4")
-    is_video = output.suffix.lower() == SUFFIX
+    is_video = output.suffix.lower() == VIDEO
     if output.suffix and not is_video:
-        raise ValueError(f"{output}: name a video ({SUFFIX}), or a folder for PNGs")
+        raise ValueError(f"{output}: name a video ({VIDEO}), or a folder for PNGs")
     outputs = {kind: output.with_stem(f"{output.stem}_{kind}") for kind in options.what}
     outputs[options.what[0]] = output
     scene = read_scene(file)
@@ -216,7 +209,7 @@ def _writer(path: Path, kind: str, size: tuple[int, int], fps: float) -> Iterato
 
     from nsvq_lightning.data.images import encode_png
     from nsvq_lightning.io.atomic import atomic_write
-    from nsvq_lightning.report.video import video_writer
+    from nsvq_lightning.report.pictures import video_writer
 
     if path.suffix:
         path.parent.mkdir(parents=True, exist_ok=True)

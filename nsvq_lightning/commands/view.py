@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-import threading
 import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,9 +25,6 @@ from nsvq_lightning.commands.arguments import cameras_of, photos_of, scene_file
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
-
-# Connections at a time; more are closed at once.
-MOST = 64
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -150,25 +146,7 @@ def _cameras(options: argparse.Namespace, source: Source) -> dict[str, Camera]:
 
 
 class _Server(ThreadingHTTPServer):
-    """Serves a bounded number of connections, and says nothing of those that break."""
-
-    request_queue_size = MOST
-
-    def __init__(self, *arguments: Any) -> None:
-        self._free = threading.BoundedSemaphore(MOST)
-        super().__init__(*arguments)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        if self._free.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._free.release()
+    """Says nothing of connections that break."""
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         if not isinstance(sys.exception(), OSError):  # a client that hangs up, or takes nothing any more

@@ -1,8 +1,10 @@
-"""The numbers of a report, from the scores of views to ``metrics.json``, and the curve of ``curve.png``."""
+"""The numbers of a report: from the scores of views to ``metrics.json``, tables, and the curve of ``curve.png``."""
 
+import csv
+import io
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ from torch import Tensor
 
 from nsvq_lightning.compression.stored import formula_bytes
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.io.atomic import write_text
+from nsvq_lightning.io.atomic import atomic_write, write_text
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.header import read_header
 from nsvq_lightning.io.nsvq.paper import paper_header
@@ -23,7 +25,6 @@ from nsvq_lightning.io.ply import plain_ply_bytes
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import eight_bit, psnr
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.report.figures import new_figure
 from nsvq_lightning.training.resume import ResumedModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 
@@ -140,6 +141,48 @@ def paper_level(scene: CompressedScene) -> dict[str, Any]:
 def write_metrics(path: Path, metrics: Mapping[str, Any]) -> None:
     """Write the numbers as JSON, atomically; an infinite PSNR (no error at all) becomes null."""
     write_text(path, json.dumps(_json_value(metrics), indent=2, allow_nan=False) + "\n")
+
+
+def new_figure(width: float, height: float) -> Any:
+    """An empty figure, size in inches; pyplot is not used, as it keeps global state and may look for a display."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def figure_png(figure: Any) -> bytes:
+    """A figure as a PNG file, cropped to its content."""
+    data = io.BytesIO()
+    figure.savefig(data, format="png", bbox_inches="tight")
+    return data.getvalue()
+
+
+def write_figure(path: Path, figure: Any) -> None:
+    """Write a figure as PNG, atomically."""
+    with atomic_write(path) as file:
+        file.write(figure_png(figure))
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows with the same keys as CSV, atomically; the keys of the first row, in order, are the header."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: Collection[str]) -> str:
+    """A Markdown table that also reads well as plain text; columns named in ``words`` align left, numbers right."""
+    lines = [list(head), *map(list, rows)]
+    widths = [max(3, *map(len, column)) for column in zip(*lines, strict=True)]
+    left = [name in words for name in head]
+    rule = ["-" * width if word else "-" * (width - 1) + ":" for word, width in zip(left, widths, strict=True)]
+    padded = [
+        [cell.ljust(width) if word else cell.rjust(width) for word, cell, width in zip(left, line, widths, strict=True)]
+        for line in lines
+    ]
+    return "\n".join(f"| {' | '.join(line)} |" for line in [padded[0], rule, *padded[1:]])
 
 
 def curve_figure(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> Any:

@@ -11,12 +11,12 @@ from string import Template
 from typing import Any
 
 import cv2
+import numpy as np
 import torch
 from cv2.typing import MatLike
 
 from nsvq_lightning.io.atomic import write_text
-from nsvq_lightning.report.figures import figure_png
-from nsvq_lightning.report.files import curve_figure
+from nsvq_lightning.report.files import curve_figure, figure_png
 from nsvq_lightning.training.schedule import Schedule
 from nsvq_lightning.version import __version__
 
@@ -172,7 +172,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _read(path: Path) -> MatLike:
-    picture = cv2.imdecode(torch.frombuffer(bytearray(path.read_bytes()), dtype=torch.uint8).numpy(), cv2.IMREAD_COLOR)
+    picture = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
         raise OSError(f"{path} is not a picture any more; run 'nsvq test' again")
     return picture

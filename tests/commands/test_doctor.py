@@ -13,7 +13,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from llvmlite import binding
 
 from nsvq_lightning.commands import doctor
 from nsvq_lightning.commands.benchmark import render as rendering
@@ -44,8 +43,8 @@ def test_json_has_every_finding_and_the_verdict(capsys: pytest.CaptureFixture[st
     document = json.loads(capsys.readouterr().out)
     subjects = {finding["subject"] for finding in document["findings"]}
     assert document["ok"]
-    assert subjects >= {"machine", "cpu", "versions", "opencv", "lpips", "tensorboard", "threads", "waiting"}
-    assert subjects >= {"memory", "disk", "gpu", "self-test"}
+    checked = {"machine", "versions", "opencv", "threads", "waiting", "memory", "disk", "gpu", "self-test"}
+    assert subjects >= checked
 
 
 def test_a_bad_folder_gives_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -110,13 +109,6 @@ def test_one_opencv_of_any_name_is_wanted(monkeypatch: pytest.MonkeyPatch) -> No
     assert (finding.verdict, "pip install opencv" in finding.text) == ("problem", True)
 
 
-def test_neon_is_no_reason_to_look_for_another_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(binding, "get_host_cpu_features", dict)  # LLVM says nothing, as on a Mac
-    for processor, verdict in (("arm64", "good"), ("x86_64", "note")):
-        monkeypatch.setattr(platform, "machine", lambda processor=processor: processor)
-        assert list(doctor.check_machine())[1].verdict == verdict
-
-
 def test_little_memory_and_disk_are_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory_estimate, "available_memory", lambda: 10**9)
     monkeypatch.setattr(doctor, "SMALL_DISK", 1 << 70)
@@ -125,10 +117,10 @@ def test_little_memory_and_disk_are_noted(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_the_cpu_kernels_pass() -> None:
     finding = next(doctor.check_backends())
-    errors = re.match(r"cpu: image to (\S+), gradients to (\S+) of the float64 oracle", finding.text)
-    assert errors is not None
-    assert finding.verdict == "good"
-    assert 0 < max(map(float, errors.groups())) < 1e-4
+    assert finding.text.startswith("cpu: relative errors against the float64 oracle: image ")
+    errors = [float(part.split()[-1]) for part in finding.text.partition("image")[2].split(",")]
+    assert (finding.verdict, len(errors)) == ("good", 7)
+    assert 0 < max(errors) < 1e-4
 
 
 @pytest.mark.parametrize("factor", [1.01, float("nan")])
@@ -150,7 +142,7 @@ def test_a_sound_scene_has_no_problem(scene: Path) -> None:
     assert "96x72, for 9 registered photos" in findings["cameras"].text
     assert findings["tracks"].text.startswith("100 % of the points")  # the demo scene makes no others
     assert str(findings["split"]).startswith("note     split        7 train and 2 test photos")
-    assert findings["photos"].verdict == findings["exposure"].verdict == "good"
+    assert findings["photos"].verdict == "good"
     assert findings["run time"] is GOOD
 
 
@@ -204,28 +196,15 @@ def test_files_outside_the_model_and_of_another_shape_are_named(scene: Path) -> 
     assert (findings["sizes"].verdict, "; 1 of 9 files" in findings["sizes"].text) == ("problem", True)
 
 
-def test_exposure_is_measured_in_stops_where_points_were_seen(scene: Path) -> None:
-    def stops() -> list[float]:
-        loaded = load_scene(scene)
-        return [doctor.exposure_of(loaded.images[i].image, i, loaded, model) for i in range(len(loaded))]
-
-    model, path = read_model(scene, observations=True), scene / "images/view_004.png"
-    before = stops()
-    assert max(map(abs, before)) < 0.3
-    assert cv2.imwrite(str(path), np.round(cv2.imread(str(path)) * 0.5).astype(np.uint8))
-    after = stops()
-    # half the grey level is 2.2 stops under a gamma of 2.2
-    assert after[4] - before[4] == pytest.approx(-2.2, abs=0.1)
-    assert after[:4] + after[5:] == before[:4] + before[5:]
-    model.points[0] = np.linalg.inv(model.images[3].viewmat)[:3, 3]  # at a camera's centre: the scene leaves it out
-    assert stops() == pytest.approx(after, abs=0.02)
-
-
-def test_photos_that_disagree_and_masks_that_exclude_most_are_noted() -> None:
-    photos = {"a.png": (50.0, -1.0, 0.2), "b.png": (90.0, 0.0, 0.1), "c.png": (200.0, 1.0, 1.0)}
-    masks, exposure = doctor.check_exposure(photos)
-    assert (masks.verdict, masks.text[:6], "most in b.png" in masks.text) == ("note", "2 of 3", True)
-    assert (exposure.verdict, "c.png is brightest" in exposure.text) == ("note", True)
+def test_masks_that_exclude_most_are_noted(scene: Path) -> None:
+    (scene / "masks").mkdir()
+    for index, white in enumerate((4, 2)):
+        mask = np.zeros((72, 96), np.uint8)
+        mask[:, :white] = 255
+        assert cv2.imwrite(str(scene / f"masks/view_00{index}.png"), mask)
+    finding = _by_subject(scene)["masks"]
+    assert finding.verdict == "note"
+    assert finding.text.startswith("2 of 9 photos have pixels that do not count, 97 % of them: most in view_001.png")
 
 
 def test_a_larger_model_beside_the_first_is_a_problem(scene: Path) -> None:

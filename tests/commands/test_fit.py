@@ -13,7 +13,7 @@ import yaml
 from demo_room import write_synthetic_scene
 
 from nsvq_lightning.commands import main as cli
-from nsvq_lightning.commands.arguments import check_config, find_config, resolve_configs
+from nsvq_lightning.commands.arguments import check_config, expand, find_config
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.io.formats import load
@@ -233,17 +233,17 @@ def test_only_the_command_line_names_what_is_imported(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     mark = tmp_path / "mark"
-    (tmp_path / "foreign.py").write_text(
+    (tmp_path / "elsewhere.py").write_text(
         f"from nsvq_lightning import quantize\nopen({str(mark)!r}, 'w')\nclass Mine(quantize.NSVQ): ...\n"
     )
     checkpoint = torch.load(finished / "checkpoints" / "last.ckpt", weights_only=True)
-    checkpoint["hyper_parameters"]["quantizer"]["class_path"] = "foreign.Mine"
+    checkpoint["hyper_parameters"]["quantizer"]["class_path"] = "elsewhere.Mine"
     torch.save(checkpoint, tmp_path / "last.ckpt")
     for command in (["export"], ["predict", "--data.root=nowhere"]):
         assert main([*command, "--ckpt_path=last.ckpt"]) == 1
-        assert "name it: --model.quantizer=foreign.Mine, or" in capsys.readouterr().err
+        assert "name it: --model.quantizer=elsewhere.Mine, or" in capsys.readouterr().err
         assert not mark.exists()
-    assert main(["export", "--ckpt_path=last.ckpt", "--model.quantizer=foreign.Mine"]) == 0
+    assert main(["export", "--ckpt_path=last.ckpt", "--model.quantizer=elsewhere.Mine"]) == 0
     assert mark.exists()
     assert read_nsvq(tmp_path / "scene.nsvq").config["quantizers"]["sh0"] == "Mine"
 
@@ -371,7 +371,7 @@ def test_configs_are_found_as_files_first_then_by_name(tmp_path: Path) -> None:
     assert find_config("configs/paper.yaml").endswith("configs/paper.yaml")
     assert find_config("no_such_config") == "no_such_config"
     arguments = ["fit", "--config", "paper", "--config=paper", "-c", str(mine), "--data.root", "paper"]
-    assert resolve_configs(arguments) == [
+    assert expand(arguments) == [
         *("fit", f"--config={shipped}", f"--config={shipped}", f"--config={mine}", "--data.root=paper")
     ]
 
@@ -391,9 +391,10 @@ def _nines(first: str, next_: str) -> bytes:
         (b"a: [1, {", "is not YAML .*: correct the file"),
         (b"\xff\xfe\0", "is not YAML .*can't decode"),
         (b"#" * 200_000, "has 200000 bytes"),
-        (b"a: &a {b: *a}", "has more than 100000 values by its aliases"),
-        (_nines("[1]", "[%s]"), "has more than 100000 values"),
-        (_nines("{c: 1}", "{<<: [%s]}"), "has more than 100000 values"),
+        (b"[" * 100_000, "is not YAML .*recursion"),
+        (b"a: &a {b: *a}", "is not YAML .*more than 100000 values by aliases"),
+        (_nines("[1]", "[%s]"), "is not YAML .*more than 100000 values"),
+        (_nines("{c: 1}", "{<<: [%s]}"), "is not YAML .*more than 100000 values"),
     ],
 )
 def test_what_cannot_be_a_config(tmp_path: Path, content: bytes, message: str) -> None:
@@ -414,19 +415,15 @@ def test_a_config_that_a_config_names_may_not_explode_either(
     assert re.search(r"inner\.yaml: more than 100000 values by aliases", capsys.readouterr().err)
 
 
-@pytest.mark.parametrize("head", ["", "# lightning.pytorch==2.6.6\n"])
-def test_wrong_settings_name_the_file_they_came_from(
-    tmp_path: Path, head: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_settings_name_the_file_they_came_from(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "mine.yaml"
-    path.write_text(head + "model: {nonsense: 3}")
+    path.write_text("model: {nonsense: 3}")
     with pytest.raises(SystemExit) as stop:
         main(["fit", "--config", str(path), "--data.root=x"])
     assert stop.value.code == 2
     message = capsys.readouterr().err
     assert "nonsense" in message
     assert f"Settings came from {path} and the command line" in message
-    assert (f"A run has written {path}: if that was an earlier version" in message) == bool(head)
 
 
 @pytest.mark.parametrize(
@@ -456,7 +453,7 @@ def test_wrong_settings_name_the_file_they_came_from(
             "fats.yaml; did you mean fast?\nShipped ones: best, ",
         ),
         (["view", "{folder}", "--prot=3"], "did you mean --port?"),
-        (["benchmark", "render", "--repeat=2", "--ouput=x"], "did you mean --output?"),
+        (["benchmark", "render", "--repeat=2", "--treads=x"], "did you mean --threads?"),
     ],
 )
 def test_likely_slips_are_told_what_was_meant(

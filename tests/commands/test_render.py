@@ -150,7 +150,7 @@ def test_folders_and_checkpoints_without_a_scene_are_told(tmp_path: Path, capsys
         (["--frames", "0"], "must be above 0"),
         (["--frames", "5", "--seconds", "2"], "not allowed with"),
         (["--size", "12"], "must be like 1280x720"),
-        (["--what", "color,sound"], "color, depth, alpha"),
+        (["--what", "color,sound"], "choose some of color, depth, alpha, or all, got 'color,sound'"),
         (["--background", "2,0,0"], "three numbers from 0 to 1"),
     ],
 )

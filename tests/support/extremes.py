@@ -17,14 +17,14 @@ from torch import Tensor
 from nsvq_lightning.commands.benchmark.quantize import Attribute, step_errors
 from nsvq_lightning.commands.benchmark.quantize import step as quantize_step
 from nsvq_lightning.commands.benchmark.render import Painter, errors_of, gradients_of, painter, trace
-from nsvq_lightning.commands.benchmark.report import number
+from nsvq_lightning.commands.benchmark.timing import number
 from nsvq_lightning.commands.benchmark.workloads import Workload
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
-from nsvq_lightning.report.figures import markdown_table
+from nsvq_lightning.report.files import markdown_table
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups

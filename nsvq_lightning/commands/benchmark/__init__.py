@@ -46,7 +46,6 @@ class Scope:
         steps: Iterations of each run of ``train``, at least 4: a phase has one at least.
         switches: Names of :data:`nsvq_lightning.skips.SKIPS` that ``train`` inverts one by one.
         config: Config of the runs of ``train``; by default ``fast.yaml``, without photos ``demo.yaml``.
-        beside: Files of the same scene by other programs, which ``codec`` measures, too.
     """
 
     threads: tuple[int, ...]
@@ -59,7 +58,6 @@ class Scope:
     steps: int = 1000
     switches: tuple[str, ...] = ()
     config: str | None = None
-    beside: tuple[Path, ...] = ()
 
     @property
     def photos(self) -> Path | None:

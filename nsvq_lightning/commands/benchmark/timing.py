@@ -1,16 +1,27 @@
-"""Fair times on a shared machine: what is compared takes turns, and a matrix product takes part."""
+"""Fair times on a shared machine (what is compared takes turns, and a matrix product takes part), and their tables."""
 
 import gc
+import importlib.metadata
+import json
+import os
+import platform
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
+from llvmlite import binding
 
 from nsvq_lightning.commands.benchmark import Scope
+from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.random import generator
+from nsvq_lightning.report.files import markdown_table
+from nsvq_lightning.version import __version__
 
 SGEMM_SIDE = 2048
 
@@ -38,9 +49,7 @@ class Timing:
     @property
     def quartiles(self) -> tuple[float, float]:
         """First and third quartile, ms; the sample itself where there is only one."""
-        if len(self.samples) == 1:
-            return self.samples[0], self.samples[0]
-        first, _, third = statistics.quantiles(self.samples, n=4, method="inclusive")
+        first, third = map(float, np.quantile(self.samples, (0.25, 0.75)))
         return first, third
 
     @property
@@ -182,3 +191,104 @@ def sgemm(device: str = "cpu") -> Call:
     left, right = (torch.randn(SGEMM_SIDE, SGEMM_SIDE, generator=draw).to(device) for _ in range(2))
     out = torch.empty_like(left)
     return lambda: torch.mm(left, right, out=out)
+
+
+def describe_machine() -> dict[str, dict[str, Any]]:
+    """The machine and how busy it is, and the versions of packages that results depend on, as JSON values."""
+    # The platform module knows only the architecture of the processor on Linux.
+    about = Path("/proc/cpuinfo")
+    lines = about.read_text(encoding="utf-8").splitlines() if about.is_file() else []
+    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    has = binding.get_host_cpu_features()
+    notable = ("avx512f", "avx512_bf16", "avx512bf16", "amx-tile", "avx2", "fma", "f16c", "neon", "sve")
+    machine = {
+        "cpu": next(models, platform.processor() or platform.machine()),
+        "llvm": binding.get_host_cpu_name(),
+        "simd": " ".join(name for name in notable if has.get(name)) or None,
+        "cores": f"{usable_cores()} of {os.cpu_count()}",
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "system": f"{platform.system()} {platform.machine()}",
+        "load": round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None,
+    }
+    packages = ("numpy", "torch", "numba", "llvmlite", "lightning", "torchmetrics", "jsonargparse", "scipy", "pycolmap")
+    versions = {"nsvq-lightning": __version__, "python": platform.python_version()}
+    return {"machine": machine, "versions": versions | {name: importlib.metadata.version(name) for name in packages}}
+
+
+def listed(facts: Mapping[str, Any]) -> str:
+    """What is known of some facts, on one line."""
+    return ", ".join(f"{name} {value}" for name, value in facts.items() if value is not None)
+
+
+# Measurements by the name of their suite.
+Suites = Mapping[str, Sequence[Measurement]]
+
+
+def as_json(facts: Mapping[str, Mapping[str, Any]], scope: Scope, suites: Suites) -> str:
+    """Everything that was measured, samples included.
+
+    Args:
+        facts: From :func:`describe_machine`.
+        scope: What was measured, and how thoroughly.
+        suites: Measurements.
+    """
+    rows = []
+    for suite, found in suites.items():
+        for row in found:
+            times = {"median_ms": row.timing.median, "quartiles_ms": row.timing.quartiles}
+            rows.append({"suite": suite, **asdict(row), **times, "sgemm_ratio": row.timing.ratio})
+    document = {**facts, "settings": asdict(scope), "rows": rows}
+    return json.dumps(document, indent=2, ensure_ascii=False, default=str) + "\n"  # paths are not JSON
+
+
+def as_markdown(facts: Mapping[str, Mapping[str, Any]], scope: Scope, suites: Suites) -> str:
+    """The machine, then one table for every operation of every suite."""
+    parts = ["# nsvq benchmark", *map(listed, facts.values())]
+    parts.append(
+        f"Rounds: {scope.repeats}; threads: {', '.join(map(str, scope.threads))}{'; quick' * scope.quick}. "
+        "ms: median of the calls; quartiles and n beside it. sgemm: the median as a multiple of a 2048³ float32 matrix "
+        "product of torch that took turns with it."
+    )
+    for suite, rows in suites.items():
+        parts.append(f"## {suite}")
+        for operation in dict.fromkeys(row.operation for row in rows):
+            parts += _table([row for row in rows if row.operation == operation])
+    return "\n\n".join(parts) + "\n"
+
+
+def _table(rows: Sequence[Measurement]) -> Iterator[str]:
+    """Title, table and notes of one operation; what is the same in all rows is said once, in the title."""
+    own = ["workload", "method", "threads"]
+    title = f"### {rows[0].operation}"
+    if len({row.workload for row in rows}) == 1:
+        own.remove("workload")
+        title += f", {rows[0].workload}"
+    if len({row.threads for row in rows}) == 1:
+        own.remove("threads")
+        title += f", {rows[0].threads} thread{'s' * (rows[0].threads != 1)}"
+    yield title
+    names = list(dict.fromkeys(name for row in rows for name in row.values))
+    cells = []
+    for row in rows:
+        timing = row.timing
+        times = [number(timing.median), "–".join(map(number, timing.quartiles)), number(min(timing.samples))]
+        times += [str(len(timing.samples)), number(timing.ratio)]
+        values = [number(row.values[name]) if name in row.values else "" for name in names]
+        cells.append([*(str(getattr(row, name)) for name in own), *times, *values])
+    head = [*own, "ms", "quartiles", "min", "n", "sgemm", *names]
+    yield markdown_table(head, cells, words=("workload", "method"))
+    notes = dict.fromkeys(row.note for row in rows if row.note)
+    for note in notes:
+        about = dict.fromkeys(row.workload for row in rows if row.note == note)
+        yield f"{'; '.join(about)}: {note}." if len(notes) > 1 else f"{note[0].upper()}{note[1:]}."
+
+
+def number(value: float) -> str:
+    """Three significant digits, counts in full: ``0.0123``, ``4.1e-07``, ``80,000``."""
+    if value == 0:
+        return "0"
+    if value == round(value) and abs(value) < 1e15:
+        return f"{value:,.0f}"
+    if abs(value) < 1e-3 or abs(value) >= 1e7:
+        return f"{value:.2g}"
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"

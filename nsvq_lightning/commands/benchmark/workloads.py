@@ -13,9 +13,8 @@ from torch import Tensor
 from nsvq_lightning.commands.benchmark import SIZES, Scope
 from nsvq_lightning.compression.viewpoints import look_at, middle_of
 from nsvq_lightning.data.scene import load_scene
-from nsvq_lightning.io.formats import load
+from nsvq_lightning.io.formats import read_scene
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.splats.attributes import finite_rows
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
 Floats = NDArray[np.float64]
@@ -92,11 +91,10 @@ def workloads(scope: Scope) -> list[Workload]:
         return [synthetic_workload(name) for name in scope.workloads]
     name, scene = path.resolve().name, None if scope.photos is None else load_scene(scope.photos)
     if file is not None:
-        splats = RawSplats(*(tensor.detach() for tensor in load(file).raw()))
-        finite, _ = finite_rows(splats._asdict())
-        if not bool(finite.any()):
+        found = read_scene(file).finite()
+        if len(found) == 0:
             raise ValueError(f"{file} holds no splat with finite numbers; there is nothing to measure")
-        splats = RawSplats(*(tensor[finite] for tensor in splats))
+        splats = RawSplats(*(tensor.detach() for tensor in found.decode().raw()))
         name += f" {file.name}" if scene is not None else ""
     elif scene is not None:
         raw = Splats.from_points(scene.points, scene.colors, sh_degree=3).raw()

@@ -139,7 +139,7 @@ def resolve(arguments: Sequence[str]) -> Settings:
     with warnings.catch_warnings():
         # Lightning warns of arguments that are not the process's, jsonargparse of the name `skip_none`.
         warnings.simplefilter("ignore")
-        reader = _Reader(["fit", *given.expand(given.resolve_configs(arguments))])
+        reader = _Reader(["fit", *given.expand(arguments)])
         text = reader._parser("fit").dump(reader.config["fit"], skip_none=False, format="json")
     settings: Settings = json.loads(text)
     if settings["ckpt_path"] is not None:

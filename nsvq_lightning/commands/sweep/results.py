@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from nsvq_lightning.io.atomic import write_text
-from nsvq_lightning.report import figures
+from nsvq_lightning.report import files
 from nsvq_lightning.version import __version__
 
 Row = dict[str, Any]
@@ -47,7 +47,7 @@ def row_of(names: Row, folder: Path, error: str = "") -> Row:
 def write_results(output: Path, rows: Sequence[Row]) -> None:
     """Write ``results.csv``, ``results.md`` and ``results.png``; nothing without rows."""
     if rows:
-        figures.write_csv(output / "results.csv", rows)
+        files.write_csv(output / "results.csv", rows)
         write_text(output / "results.md", as_markdown(rows))
         draw_sweep(output / "results.png", rows)
 
@@ -97,7 +97,7 @@ def as_markdown(rows: Sequence[Row]) -> str:
         lines.append(line)
     parts = ["# nsvq sweep"]
     if lines:
-        parts.append(figures.markdown_table([*NAMES, "runs", *table], lines, words=NAMES))
+        parts.append(files.markdown_table([*NAMES, "runs", *table], lines, words=NAMES))
         parts.append(
             "Mean ± standard deviation over the seeds. PSNR and SSIM are those of the decoded file on the test views; "
             "before: of the plain splats."
@@ -109,7 +109,7 @@ def as_markdown(rows: Sequence[Row]) -> str:
 
 
 def draw_sweep(path: Path, rows: Sequence[Row]) -> None:
-    """Draw PSNR over file size, and beside it over training time: a row and a marker for each scene.
+    """Draw PSNR over file size, and beside it over training time: a row for each scene.
 
     The colour tells quantizers or configurations apart. Over the size, a point is the mean over the seeds, its whiskers
     the standard deviation; lines join the codebook sizes. Runs without codebooks, whose files are many times as large,
@@ -123,23 +123,26 @@ def draw_sweep(path: Path, rows: Sequence[Row]) -> None:
     rows = [row for row in rows if row["psnr"] is not None and row["bytes"] is not None]
     if not rows:
         return
+    from matplotlib.lines import Line2D
+
     rows = [row | {"series": name} for row, name in zip(rows, series_of(rows), strict=True)]
-    colours = figures.colours_of(list(dict.fromkeys(row["series"] for row in rows)))
-    markers = figures.markers_of(list(dict.fromkeys(row["scene"] for row in rows)))
-    figure, axes = figures.panels(2 * len(markers), 4.6, max(len(colours), len(markers)))
-    for (scene, marker), over_size, over_time in zip(markers.items(), axes[::2], axes[1::2], strict=True):
+    colours = {name: f"C{index}" for index, name in enumerate(dict.fromkeys(row["series"] for row in rows))}
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    figure = files.new_figure(12.8, 4.6 * len(scenes) + 0.19 * len(colours))  # inches; a line of the legend
+    for scene, (over_size, over_time) in zip(scenes, figure.subplots(len(scenes), 2, squeeze=False), strict=True):
         shown = [row for row in rows if row["scene"] == scene]
-        _draw_sizes(over_size, shown, colours, marker)
+        _draw_sizes(over_size, shown, colours)
         over_size.set(title=scene, xlabel="size of the file, MB", ylabel="test PSNR of the decoded file, dB")
-        _draw_times(over_time, shown, colours, marker)
+        _draw_times(over_time, shown, colours)
         over_time.set(xlabel="training, minutes", ylabel="test PSNR, dB")
         for axis in (over_size, over_time):
             axis.grid(alpha=0.3)
-    figures.draw_keys(figure, colours, markers)
-    figures.write_figure(path, figure)
+    keys = [Line2D([], [], marker="o", linestyle="", color=colour, label=name) for name, colour in colours.items()]
+    figure.legend(handles=keys, loc="outside lower left", fontsize=8, frameon=False)
+    files.write_figure(path, figure)
 
 
-def _draw_sizes(axis: Any, rows: Sequence[Row], colours: dict[str, Any], marker: str) -> None:
+def _draw_sizes(axis: Any, rows: Sequence[Row], colours: dict[str, str]) -> None:
     """Test PSNR over the size of the file, a line for each series."""
     are_points = not any(row["codebooks"] for row in rows)
     style = {"linewidth": 1, "elinewidth": 0.8, "capsize": 2, "markersize": 5}
@@ -158,7 +161,7 @@ def _draw_sizes(axis: Any, rows: Sequence[Row], colours: dict[str, Any], marker:
         points.sort(key=lambda group: moments(group, "bytes"))
         x, x_spread = np.reshape([moments(group, "bytes", 1e-6) for group in points], (-1, 2)).T
         y, y_spread = np.reshape([moments(group, "psnr") for group in points], (-1, 2)).T
-        axis.errorbar(x, y, xerr=x_spread, yerr=y_spread, fmt=f"{marker}-", color=colour, **style)
+        axis.errorbar(x, y, xerr=x_spread, yerr=y_spread, fmt="o-", color=colour, **style)
         sizes = tuple(group[0]["codebooks"] for group in points)
         if sizes not in labelled:  # the first curve of these sizes speaks for the others
             labelled.add(sizes)
@@ -166,12 +169,12 @@ def _draw_sizes(axis: Any, rows: Sequence[Row], colours: dict[str, Any], marker:
                 axis.annotate(size, place, (4, 5), **note)
 
 
-def _draw_times(axis: Any, rows: Sequence[Row], colours: dict[str, Any], marker: str) -> None:
+def _draw_times(axis: Any, rows: Sequence[Row], colours: dict[str, str]) -> None:
     """Test PSNR over the minutes of training, a line for each run."""
     for row in rows:
         if (path := row["folder"] / "curve.csv").is_file():
             curve = np.genfromtxt(path, delimiter=",", names=True, encoding="utf-8")
             axis.plot(curve["seconds"] / 60, curve["psnr"], color=colours[row["series"]], linewidth=1)
-        axis.plot([row["seconds"] / 60], [row["psnr"]], marker, color=colours[row["series"]], markersize=5)
+        axis.plot([row["seconds"] / 60], [row["psnr"]], "o", color=colours[row["series"]], markersize=5)
     # What comes before that is steep and the same for all.
     axis.set_ylim(bottom=min(row["psnr"] for row in rows) - 2.0)

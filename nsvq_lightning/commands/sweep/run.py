@@ -24,11 +24,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nsvq_lightning.commands.arguments import integers, names
-from nsvq_lightning.commands.sweep import results
 from nsvq_lightning.io.atomic import write_text
 
 if TYPE_CHECKING:
     from nsvq_lightning.commands.sweep.plan import Run, Settings
+    from nsvq_lightning.commands.sweep.results import Row
 
 log = logging.getLogger(__name__)
 
@@ -196,7 +196,7 @@ def commands(output: Path, runs: Sequence[Run]) -> Iterator[str]:
                 log.info("%s", error)
 
 
-def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> list[results.Row]:
+def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> list[Row]:
     """Train what is not finished yet; a run that fails does not keep the others from theirs.
 
     The tables are written anew after each run, so they are complete whenever this is interrupted.
@@ -209,6 +209,8 @@ def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> 
     Returns:
         A row for each run, in their order.
     """
+    from nsvq_lightning.commands.sweep import results
+
     folders = {folder_of(output, run): run for run in runs}
     finished = [folder for folder in folders if (folder / "metrics.json").is_file()]
     rows = {folder: results.row_of(folders[folder].names, folder) for folder in finished}

@@ -1,14 +1,18 @@
 from __future__ import annotations
 
+import dataclasses
 import gc
+import json
 import time
+from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
 import torch
 
 from nsvq_lightning.commands.benchmark import Scope, timing
-from nsvq_lightning.commands.benchmark.timing import Timing, measure
+from nsvq_lightning.commands.benchmark.timing import Measurement, Timing, as_json, as_markdown, measure, number
 
 
 @pytest.fixture(autouse=True)
@@ -61,3 +65,51 @@ def test_summary_of_known_samples() -> None:
     known = Timing((5.0, 1.0, 2.0, 4.0, 3.0), (10.0, 30.0, 20.0))
     assert (known.median, known.quartiles, known.ratio) == (3.0, (2.0, 4.0), 0.15)
     assert Timing((7.0,), (7.0,)).quartiles == (7.0, 7.0)
+
+
+FACTS: dict[str, dict[str, Any]] = {
+    "machine": {"cpu": "Abacus 1", "gpu": None, "load": 0.2},
+    "versions": {"torch": "9"},
+}
+
+
+def _row(method: str, ms: float, operation: str, note: str = "", **values: float) -> Measurement:
+    return Measurement(operation, "W", method, 1, Timing((ms, 2 * ms, 3 * ms), (10.0,)), values, note)
+
+
+ROWS = [
+    _row("fast", 1.0, "search", wrong=0.0),
+    _row("slow", 300.0, "search", wrong=1e-6),
+    _row("slow", 5.0, "other", "only half", wrong=12.0, extra=1.0),
+]
+
+
+def test_numbers_have_three_digits() -> None:
+    texts = {0.0: "0", 8e4: "80,000", 0.01234: "0.0123", 4.123e-7: "4.1e-07", 12.345: "12.3", 1234.5: "1,234"}
+    assert {value: number(value) for value in texts} == texts
+
+
+def test_tables_name_the_machine_and_every_operation() -> None:
+    text = as_markdown(FACTS, Scope((1, 2), quick=True), {"quantize": ROWS})
+    for said in ("\n\ncpu Abacus 1, load 0.2\n\ntorch 9\n\n", "Rounds: 15; threads: 1, 2; quick."):
+        assert said in text
+    assert text.count("### search, W, 1 thread\n") == text.count("### other, W, 1 thread\n") == 1
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
+    assert lines[0] == ["method", "ms", "quartiles", "min", "n", "sgemm", "wrong"]
+    assert lines[2] == ["fast", "2", "1.5–2.5", "1", "3", "0.2", "0"]
+    assert lines[3] == ["slow", "600", "450–750", "300", "3", "60", "1e-06"]
+    assert lines[4][-2:] == ["wrong", "extra"]
+    assert text.endswith("\n\nOnly half.\n")
+    other = [dataclasses.replace(ROWS[0], workload="V"), dataclasses.replace(ROWS[0], threads=2), ROWS[0]]
+    assert "### search\n\n| workload | method | threads |" in as_markdown(FACTS, Scope((1, 2)), {"quantize": other})
+
+
+def test_json_has_the_samples_and_nothing_but_plain_values() -> None:
+    results = json.loads(as_json(timing.describe_machine(), Scope((1,), scene=Path("a/b.ply")), {"quantize": ROWS}))
+    assert results["versions"]["torch"] == torch.__version__
+    assert results["settings"]["scene"] == "a/b.ply"
+    first, _, last = results["rows"]
+    assert first["suite"] == "quantize"
+    assert first["timing"] == {"samples": [1, 2, 3], "sgemm": [10]}
+    assert (first["median_ms"], first["sgemm_ratio"]) == (2, pytest.approx(0.2))
+    assert last["values"] == {"wrong": 12, "extra": 1}

@@ -9,8 +9,9 @@ from nsvq_lightning import save
 from nsvq_lightning.commands.benchmark import Scope
 from nsvq_lightning.commands.benchmark.workloads import relative_l2, synthetic_workload, workloads
 from nsvq_lightning.data.scene import load_scene
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.splats import RawSplats, Splats
+from nsvq_lightning.splats.splats import RawSplats
 
 
 def test_a_name_always_gives_the_same_numbers() -> None:
@@ -43,7 +44,8 @@ def test_scene_file_is_seen_whole_and_without_broken_splats(tmp_path: Path, monk
     assert float((render(whole.splats, whole.camera).radii > 0).float().mean()) > 0.7
     # Our own writer drops such rows; files of others have them.
     source.opacities[3] = torch.nan
-    monkeypatch.setattr("nsvq_lightning.commands.benchmark.workloads.load", lambda _: Splats.from_tensors(*source))
+    read = "nsvq_lightning.commands.benchmark.workloads.read_scene"
+    monkeypatch.setattr(read, lambda _: CompressedScene.from_splats(source))
     assert len(workloads(scope)[0].splats.means) == 499
     source.opacities.fill_(torch.nan)
     with pytest.raises(ValueError, match="no splat"):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nsvq_lightning.commands.sweep.results import Row, as_markdown, draw_sweep, grouped, moments, series_of
-from nsvq_lightning.report.figures import write_csv
+from nsvq_lightning.report.files import write_csv
 
 
 def row(seed: int = 0, psnr: float | None = 30.0, **other: object) -> Row:
