@@ -19,6 +19,7 @@ LIMITS = {
     "files under 60 lines": 25,
     "lines before the first definition": 3_640,
     "private functions used once": 250,
+    "lines of README.md": 100,
     "lines of the longest config": 25,
     "commands, per cent of the code": 18,
     "training/module.py": 270,
@@ -62,6 +63,7 @@ def measured() -> dict[str, int]:
     code = {path: code_lines(source) for path, source in sources.items()}
     commands = sum(lines for path, lines in code.items() if path.is_relative_to(PACKAGE / "commands"))
     long = {path: source.count("\n") for path, source in sources.items()}
+    readme = ROOT / "README.md"
     configs = [path.read_text(encoding="utf-8") for path in (ROOT / "configs").rglob("*.yaml")]
     return {
         "code lines": sum(code.values()),
@@ -69,6 +71,7 @@ def measured() -> dict[str, int]:
         "files under 60 lines": sum(count < 60 and path.name != "__init__.py" for path, count in long.items()),
         "lines before the first definition": sum(map(lines_before_the_first_definition, sources.values())),
         "private functions used once": sum(map(private_functions_used_once, sources.values())),
+        "lines of README.md": readme.read_text(encoding="utf-8").count("\n") if readme.exists() else 0,
         "lines of the longest config": max(config.count("\n") for config in configs),
         "commands, per cent of the code": round(100 * commands / sum(code.values())),
         "training/module.py": long[PACKAGE / "training" / "module.py"],
