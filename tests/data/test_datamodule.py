@@ -117,17 +117,6 @@ def test_setup_is_idempotent_and_prints_the_split_once(
     assert "7 train views, 2 test views (every 8th by name: 000.png, 008.png)" in texts[0]
 
 
-def test_order_does_not_depend_on_the_cache(make_scene: SceneFactory) -> None:
-    alone = ColmapDataModule(str(make_scene("alone", views=2)), cache_bytes=0)
-    assert [view.name for view in islice(alone.train_dataloader(), 3)] == ["001.png"] * 3
-    root = str(make_scene())
-    for cache_bytes in (0, 10_000):
-        views = list(islice(ColmapDataModule(root, cache_bytes=cache_bytes).train_dataloader(), 30))
-        expected = list(islice(ColmapDataModule(root).train_dataloader(), 30))
-        assert [view.name for view in views] == [view.name for view in expected]
-        assert all(torch.equal(a.image, b.image) for a, b in zip(views, expected, strict=True))
-
-
 def test_demo_is_read_where_it_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     before = {path: path.stat().st_mtime_ns for path in DEMO.rglob("*")}
@@ -152,17 +141,12 @@ def test_known_order() -> None:
     assert list(islice(view_order(5, seed=0), 10)) == [4, 0, 1, 3, 2, 2, 4, 0, 3, 1]
 
 
-@pytest.mark.parametrize("start", [0, 1, 10, 11, 57])
-def test_starts_at_any_draw(start: int) -> None:
-    whole = list(islice(view_order(11, seed=1), 80))
-    assert list(islice(view_order(11, seed=1, start=start), 80 - start)) == whole[start:]
-
-
-@pytest.mark.parametrize("world_size", [2, 3, 4])
-def test_ranks_share_one_sequence(world_size: int) -> None:
-    whole = list(islice(view_order(7, seed=5), 12 * world_size))
-    ranks = [list(islice(view_order(7, 5, rank, world_size), 12)) for rank in range(world_size)]
-    assert [view for draws in zip(*ranks, strict=True) for view in draws] == whole
+@pytest.mark.parametrize(("start", "ranks"), [(0, 1), (10, 1), (11, 1), (57, 1), (0, 2), (5, 3)])
+def test_ranks_share_one_sequence_from_any_draw(start: int, ranks: int) -> None:
+    whole = list(islice(view_order(11, seed=1), 100))
+    for rank in range(ranks):
+        found = list(islice(view_order(11, 1, rank, ranks, start), 20))
+        assert found == whole[start * ranks + rank :: ranks][:20]
 
 
 ELSEWHERE = torch.device("meta")

@@ -122,34 +122,26 @@ def test_points_at_a_camera_centre_are_left_out(make_scene: SceneFactory, caplog
 
 
 @pytest.mark.parametrize(
-    ("arguments", "size"),
+    ("file", "arguments", "size"),
     [
-        ({}, (40, 32)),
-        ({"max_width": 30}, (30, 24)),
-        ({"max_width": None}, (40, 32)),
-        ({"factor": 1, "max_width": 30}, (40, 32)),
-        ({"factor": 2}, (20, 16)),
-        ({"factor": 8}, (5, 4)),
+        ((40, 32), {}, (40, 32)),
+        ((40, 32), {"max_width": 30}, (30, 24)),
+        ((40, 32), {"max_width": None}, (40, 32)),
+        ((40, 32), {"factor": 1, "max_width": 30}, (40, 32)),
+        ((40, 32), {"factor": 2}, (20, 16)),
+        ((40, 32), {"factor": 8}, (5, 4)),
+        ((20, 8), {}, (20, 8)),  # not what the model says
+        ((1700, 100), {}, (1600, 94)),  # the published rule for wide pictures
     ],
 )
-def test_size_and_intrinsics(make_scene: SceneFactory, arguments: dict[str, int], size: tuple[int, int]) -> None:
-    view = load_scene(make_scene(), **arguments).view(1)  # type: ignore[arg-type]
+def test_size_and_intrinsics(
+    make_scene: SceneFactory, file: tuple[int, int], arguments: dict[str, int], size: tuple[int, int]
+) -> None:
+    view = load_scene(make_scene(views=2, image_size=file), **arguments).view(1)  # type: ignore[arg-type]
     assert tuple(view.image.shape) == (size[1], size[0], 3)
     assert (view.camera.width, view.camera.height) == size
-    s = size[0] / 40
-    assert view.camera.intrinsics == pytest.approx((30 * s, 31 * s, 21 * s, 15 * s))
-
-
-def test_pictures_of_another_size_than_the_model_says(make_scene: SceneFactory) -> None:
-    camera = load_scene(make_scene(image_size=(20, 8))).cameras[0]
-    assert (camera.width, camera.height) == (20, 8)
-    assert camera.intrinsics == pytest.approx((15, 31 / 4, 10.5, 15 / 4))
-
-
-def test_published_rule_for_wide_pictures(make_scene: SceneFactory) -> None:
-    camera = load_scene(make_scene(views=2, image_size=(1700, 100))).cameras[0]
-    assert (camera.width, camera.height) == (1600, 94)
-    assert camera.intrinsics == pytest.approx((30 * 40, 31 * 94 / 32, 21 * 40, 15 * 94 / 32))
+    x, y = size[0] / 40, size[1] / 32
+    assert view.camera.intrinsics == pytest.approx((30 * x, 31 * y, 21 * x, 15 * y))
 
 
 def test_downscaled_folder_is_used_where_there_is_one(make_scene: SceneFactory) -> None:

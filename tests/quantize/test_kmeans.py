@@ -12,9 +12,9 @@ from nsvq_lightning.random import generator
 
 def test_rows_are_drawn_by_squared_distance() -> None:
     rows = torch.tensor([[1.0, 0, 0], [0, -3.0, 0], [0, 0, 0]])
-    drawn = [int(draw_far_rows(rows, torch.zeros(1, 3), 1, generator(seed))) for seed in range(1000)]
-    assert 60 < drawn.count(0) < 140  # 1 in 10, deviation 9.5
-    assert drawn.count(0) + drawn.count(1) == 1000
+    drawn = [int(draw_far_rows(rows, torch.zeros(1, 3), 1, generator(seed))) for seed in range(300)]
+    assert 10 < drawn.count(0) < 50  # 1 in 10, deviation 5.2
+    assert drawn.count(0) + drawn.count(1) == 300
 
 
 def test_rows_on_their_codes_are_never_drawn() -> None:

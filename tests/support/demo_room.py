@@ -25,8 +25,6 @@ from skimage import data as photos
 from nsvq_lightning.data.colmap import import_pycolmap
 from nsvq_lightning.random import generator
 
-__all__ = ["Lens", "demo_poses", "demo_room", "render_view", "surface_points", "write_synthetic_scene"]
-
 _SUPERSAMPLING = 2
 _POINT_NOISE = 0.002  # metres; about the error of a triangulated point at this size
 _VIEWS_A_POINT = 3  # COLMAP's mapper does not keep points with shorter tracks
@@ -154,14 +152,7 @@ def _pictures() -> list[Surface]:
 
 
 def _box(centre: tuple[float, float], size: tuple[float, float, float], turn: float, texture: Array) -> list[Surface]:
-    """Four sides and the lid of a box on the floor, its sides textured alike.
-
-    Args:
-        centre: x and z of its middle.
-        size: Width, height and depth.
-        turn: Rotation about the vertical, radians.
-        texture: Stretched over each face.
-    """
+    """Four sides and the lid of a box on the floor, its middle at x and z; the texture is stretched over each face."""
     width, height, depth = size
     right = _vector(np.cos(turn), 0, np.sin(turn)) * width
     away = _vector(-np.sin(turn), 0, np.cos(turn)) * depth
@@ -260,32 +251,17 @@ def write_synthetic_scene(
     width: int = 320,
     height: int = 240,
     points: int = 4000,
-    seed: int = 0,
     suffix: str = ".png",
     tracks: bool = True,
 ) -> Path:
-    """Render the demo room and write it as a COLMAP scene (``images/*``, ``sparse/0/*.bin``).
-
-    Args:
-        root: Folder to create.
-        views: Number of views on an orbit around the room's middle.
-        width: Image width in pixels.
-        height: Image height in pixels.
-        points: Number of sparse points.
-        seed: Seed of the points; the pictures do not depend on it.
-        suffix: Format of the pictures.
-        tracks: Whether the model says which view sees which point, and where.
-
-    Returns:
-        ``root``.
-    """
+    """Render the demo room and write it as a COLMAP scene, with or without tracks, to ``root``, which is returned."""
     room, lens, poses = demo_room(), Lens(width, height), demo_poses(views)
     names = [f"view_{i:03d}{suffix}" for i in range(views)]
     (root / "images").mkdir(parents=True)
     for name, pose in zip(names, poses, strict=True):
         picture = PIL.Image.fromarray(render_view(room, pose, width, height))
         picture.save(root / "images" / name, quality=92, method=6)  # as WebP; PNG knows no quality
-    found = surface_points(room, lens, poses, points, seed)
+    found = surface_points(room, lens, poses, points)
     found.seen[:] &= tracks
     _write_model(root / "sparse" / "0", lens, names, poses, found)
     return root
@@ -302,9 +278,9 @@ def _centre(pose: NDArray[np.float64]) -> Array:
     return (-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32)
 
 
-def surface_points(room: Room, lens: Lens, poses: NDArray[np.float64], count: int, seed: int) -> _Points:
+def surface_points(room: Room, lens: Lens, poses: NDArray[np.float64], count: int) -> _Points:
     """Random surface points that at least three views see (or all views, if there are fewer)."""
-    rng = generator(seed, 0, "demo points")
+    rng = generator(0, 0, "demo points")
     candidates = 3 * count
     areas = torch.tensor([s.size[0] * s.size[1] * (0.0 if s.glow else 1.0) for s in room.surfaces])
     # the square root favours small things, as corners and texture do in a real reconstruction
@@ -322,13 +298,11 @@ def surface_points(room: Room, lens: Lens, poses: NDArray[np.float64], count: in
     return _Points(xyz[chosen] + noise[chosen], rgb[chosen], pixels[:, chosen], seen[:, chosen])
 
 
-def _sight(
-    room: Room, lens: Lens, pose: NDArray[np.float64], xyz: Array
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _sight(room: Room, lens: Lens, pose: Any, xyz: Array) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Pixels ``[P, 2]`` of points ``[P, 3]``, and whether the view sees them unoccluded."""
     pixels, inside = lens.project(pose, xyz)
     centre = _centre(pose)
-    inside[inside] = room.trace(centre, xyz[inside] - centre).t > 0.995
+    inside[inside] = room.trace(centre, xyz[inside] - centre)[0] > 0.995
     return pixels, inside
 
 
@@ -346,18 +320,14 @@ def _write_model(folder: Path, lens: Lens, names: list[str], poses: NDArray[np.f
             tracks[row].append((number, column))
         image = pycolmap.Image(name=name, keypoints=points.pixels[number - 1, rows], camera_id=1, image_id=number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
-    for xyz, rgb, track in zip(points.xyz, points.rgb, tracks, strict=True):
-        model.add_point3D(xyz.astype(np.float64), _track(pycolmap, track), rgb)
+    for xyz, rgb, elements in zip(points.xyz, points.rgb, tracks, strict=True):
+        track = pycolmap.Track()
+        for image, point in elements:
+            track.add_element(image, point)
+        model.add_point3D(xyz.astype(np.float64), track, rgb)
     model.update_point_3d_errors()
     folder.mkdir(parents=True)
     model.write_binary(str(folder))
-
-
-def _track(pycolmap: Any, elements: list[tuple[int, int]]) -> Any:
-    track = pycolmap.Track()
-    for image, point in elements:
-        track.add_element(image, point)
-    return track
 
 
 def main() -> None:

@@ -8,12 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-
-__all__ = ["Array", "Lamp", "Quad", "Room", "Sphere", "Surface"]
 
 Array = NDArray[np.float32]
 
@@ -22,38 +19,13 @@ NEAR = 1e-3
 """Hits nearer than this ray parameter are on the surface where the ray starts, and ignored."""
 
 
-class Surface(Protocol):
-    """A surface with coordinates ``uv [M, 2]`` in [0, 1]; all points and lengths in scene units."""
-
-    texture: Array
-    """Linear albedo ``[h, w, 3]`` in [0, 1]."""
-    wraps: bool
-    """Whether u = 0 and u = 1 are the same line."""
-    gloss: float
-    """Strength of the Phong highlight, 0 for a matt surface."""
-    glow: float
-    """Emitted light, 0 for all but the lamp's panel."""
-
-    @property
-    def size(self) -> tuple[float, float]:
-        """Lengths along u and v."""
-
-    def intersect(self, origin: Array, direction: Array) -> Array:
-        """Ray parameters ``[M]`` of the first hits of rays ``[3] or [M, 3]``, ``[M, 3]``; infinite where missed."""
-
-    def coordinates(self, points: Array) -> Array:
-        """``uv [M, 2]`` of points ``[M, 3]`` on the surface."""
-
-    def points(self, uv: Array) -> Array:
-        """Points ``[M, 3]`` at ``uv [M, 2]``."""
-
-    def normals(self, points: Array) -> Array:
-        """Unit outward normals ``[M, 3]`` at points on the surface."""
-
-
 @dataclass(eq=False)
 class Quad:
-    """Parallelogram ``corner + u·across + v·along``, lit on the side where ``across`` is right and ``along`` down."""
+    """Parallelogram ``corner + u·across + v·along``, lit on the side where ``across`` is right and ``along`` down.
+
+    A surface has coordinates ``uv [M, 2]`` in [0, 1], a texture of linear albedo ``[h, w, 3]``, the strength of its
+    Phong highlight and of the light that it emits, and says whether u = 0 and u = 1 are the same line.
+    """
 
     corner: Array
     across: Array
@@ -71,11 +43,11 @@ class Quad:
 
     @property
     def size(self) -> tuple[float, float]:
-        """Lengths of the sides."""
+        """Lengths along u and v."""
         return float(np.linalg.norm(self.across)), float(np.linalg.norm(self.along))
 
     def intersect(self, origin: Array, direction: Array) -> Array:
-        """See :class:`Surface`."""
+        """Ray parameters ``[M]`` of the first hits of rays ``[3] or [M, 3]``, ``[M, 3]``; infinite where missed."""
         from_corner = origin - self.corner
         with np.errstate(divide="ignore", invalid="ignore"):
             t = -(from_corner @ self.normal) / (direction @ self.normal)
@@ -85,16 +57,13 @@ class Quad:
         return np.where(inside, t, np.float32(np.inf))
 
     def coordinates(self, points: Array) -> Array:
-        """See :class:`Surface`."""
         return np.stack([(points - self.corner) @ self._u, (points - self.corner) @ self._v], axis=-1)
 
     def points(self, uv: Array) -> Array:
-        """See :class:`Surface`."""
         points: Array = self.corner + uv[:, :1] * self.across + uv[:, 1:] * self.along
         return points
 
     def normals(self, points: Array) -> Array:
-        """See :class:`Surface`."""
         return np.broadcast_to(self.normal, points.shape)
 
 
@@ -115,7 +84,6 @@ class Sphere:
         return 2 * np.pi * self.radius, np.pi * self.radius
 
     def intersect(self, origin: Array, direction: Array) -> Array:
-        """See :class:`Surface`."""
         offset = origin - self.centre
         a = np.einsum("ij,ij->i", direction, direction)
         b = direction @ offset if offset.ndim == 1 else np.einsum("ij,ij->i", direction, offset)
@@ -126,22 +94,22 @@ class Sphere:
         return np.where((b * b > a * c) & (t > NEAR), t, np.float32(np.inf))
 
     def coordinates(self, points: Array) -> Array:
-        """See :class:`Surface`."""
         n = self.normals(points)
         u = np.arctan2(n[:, 2], n[:, 0]) / (2 * np.pi) + 0.5
         v = np.arccos(np.clip(-n[:, 1], -1, 1)) / np.pi
         return np.stack([u, v], axis=-1)
 
     def points(self, uv: Array) -> Array:
-        """See :class:`Surface`."""
         azimuth, polar = (uv[:, 0] - 0.5) * (2 * np.pi), uv[:, 1] * np.pi
         ring = np.sin(polar)
         n = np.stack([ring * np.cos(azimuth), -np.cos(polar), ring * np.sin(azimuth)], axis=-1)
         return (self.centre + self.radius * n).astype(np.float32)
 
     def normals(self, points: Array) -> Array:
-        """See :class:`Surface`."""
         return ((points - self.centre) / self.radius).astype(np.float32)
+
+
+Surface = Quad | Sphere
 
 
 def sample(texture: Array, uv: Array, wraps: bool) -> Array:
@@ -162,11 +130,8 @@ def sample(texture: Array, uv: Array, wraps: bool) -> Array:
 class Lamp:
     """Rectangular lamp under the ceiling, shining down (+y).
 
-    Attributes:
-        centre: ``[3]``.
-        side: Side length.
-        power: Irradiance at distance 1 straight below it.
-        ambient: Irradiance from all other directions where nothing is near.
+    ``power`` is the irradiance at distance 1 straight below it, ``ambient`` that from all other directions where
+    nothing is near.
     """
 
     centre: Array
@@ -175,28 +140,9 @@ class Lamp:
     ambient: float
 
 
-@dataclass(frozen=True, eq=False)
-class Hit:
-    """First hits of M rays.
-
-    Attributes:
-        t: Ray parameters ``[M]``, infinite where nothing was hit.
-        surface: Indices of the surfaces ``[M]``.
-    """
-
-    t: Array
-    surface: NDArray[np.int16]
-
-
 @dataclass(eq=False)
 class Room:
-    """Surfaces, a lamp and the baked light maps.
-
-    Attributes:
-        surfaces: All surfaces of the room.
-        lamp: The lamp that lights it.
-        texels: Light map resolution, texels per scene unit.
-    """
+    """Surfaces, a lamp and the baked light maps, of so many ``texels`` per scene unit."""
 
     surfaces: Sequence[Surface]
     lamp: Lamp
@@ -206,27 +152,26 @@ class Room:
     def __post_init__(self) -> None:
         self.light = self._bake()
 
-    def trace(self, origin: Array, direction: Array) -> Hit:
-        """First hits of rays from ``origin [3]`` or ``[M, 3]`` along ``direction [M, 3]`` (any length)."""
+    def trace(self, origin: Array, direction: Array) -> tuple[Array, NDArray[np.int16]]:
+        """First hits of rays from ``origin [3]`` along ``direction [M, 3]``: parameters, or infinity, and surfaces."""
         t = np.full(len(direction), np.inf, np.float32)
         hit = np.zeros(len(direction), np.int16)
         for start in range(0, len(direction), _RAYS_AT_ONCE):
             block = slice(start, start + _RAYS_AT_ONCE)
-            rays_from = origin if origin.ndim == 1 else origin[block]
             for number, surface in enumerate(self.surfaces):
-                distance = surface.intersect(rays_from, direction[block])
+                distance = surface.intersect(origin, direction[block])
                 closer = distance < t[block]
                 t[block][closer] = distance[closer]
                 hit[block][closer] = number
-        return Hit(t, hit)
+        return t, hit
 
     def colours(self, origin: Array, direction: Array) -> Array:
         """Linear RGB ``[M, 3]`` seen from ``origin [3]`` along unit directions ``[M, 3]``."""
-        hit = self.trace(origin, direction)
+        t, hit = self.trace(origin, direction)
         out = np.zeros((len(direction), 3), np.float32)
         for number, surface in enumerate(self.surfaces):
-            rays = np.flatnonzero((hit.surface == number) & np.isfinite(hit.t))
-            points = origin + hit.t[rays, None] * direction[rays]
+            rays = np.flatnonzero((hit == number) & np.isfinite(t))
+            points = origin + t[rays, None] * direction[rays]
             out[rays] = self.diffuse(number, surface.coordinates(points))
             if surface.gloss:
                 out[rays] += surface.gloss * self._highlight(surface, points, direction[rays])[:, None]
