@@ -60,16 +60,11 @@ def test_a_larger_model_beside_the_first_is_named(make_scene: SceneFactory, capl
     assert "sparse/0 has 9 images, sparse/1 has 10: COLMAP could not join them; --data.model=N" in caplog.text
 
 
-def test_every_eighth_name_is_a_test_view(make_scene: SceneFactory) -> None:
-    scene = load_scene(make_scene(views=18))
-    assert scene.names == tuple(f"{i:03d}.png" for i in range(18))
+def test_view_carries_its_own_name_pose_and_picture(make_scene: SceneFactory) -> None:
+    root = make_scene(views=18)
+    scene = load_scene(root)
     assert scene.test == (0, 8, 16)
     assert sorted(scene.train + scene.test) == list(range(18))
-
-
-def test_view_carries_its_own_name_pose_and_picture(make_scene: SceneFactory) -> None:
-    root = make_scene()
-    scene = load_scene(root)
     reconstruction = import_pycolmap().Reconstruction(str(root / "sparse" / "0"))
     for i in range(len(scene)):
         view = scene.view(i)

@@ -15,12 +15,19 @@ import pytest
 import torch
 from transforms_scenes import APPLIED, opengl_matrix, write_blender, write_nerfstudio
 
+from nsvq_lightning.data import transforms
 from nsvq_lightning.data.colmap import SceneError, read_model
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import Scene, load_scene
-from nsvq_lightning.data.transforms import RANDOM_POINTS, random_points, read_points, share_seen
+from nsvq_lightning.data.transforms import random_points, read_points, share_seen
 
 SceneFactory = Callable[..., Path]
+FEW = 500
+
+
+@pytest.fixture(autouse=True)
+def few_random_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transforms, "RANDOM_POINTS", FEW)
 
 
 def change(path: Path, frame: dict[str, Any] | None = None, **head: Any) -> None:
@@ -126,14 +133,14 @@ def test_blender_scenes_have_their_own_split_and_random_points(
     root = write_blender(demo_scene, tmp_path / "lego")
     caplog.set_level("INFO", logger="nsvq_lightning")
     scene = load_scene(root)
-    assert f"has no points: {RANDOM_POINTS} random ones" in caplog.text
+    assert f"has no points: {FEW} random ones" in caplog.text
     colmap = read_model(demo_scene)
     assert [scene.names[i] for i in scene.test] == ["test/r_0.png", "test/r_1.png", "test/r_2.png"]
     assert len(scene.train) == 6
     assert scene.split == "as transforms_train.json says"
     np.testing.assert_allclose(scene.cameras[1].viewmat, colmap.images[4].viewmat, atol=1e-6)
     assert scene.cameras[0].intrinsics == pytest.approx((0.78 * 96, 0.78 * 96, 36, 36))
-    assert len(scene.points) == RANDOM_POINTS
+    assert len(scene.points) == FEW
     assert torch.equal(scene.points, load_scene(root).points)
     (root / "transforms_test.json").rename(root / "transforms_val.json")
     assert len(load_scene(root).test) == 3

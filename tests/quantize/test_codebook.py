@@ -243,13 +243,12 @@ def test_refusals() -> None:
         quantizer.freeze(torch.zeros(0, dtype=torch.int64))
     with pytest.raises(TypeError, match="int64"):
         quantizer.freeze(torch.tensor([0], dtype=torch.int32))
-
-
-def test_codes_are_not_mended_by_rows_that_they_do_not_belong_to() -> None:
-    quantizer = NSVQ(3, 2)
+    with pytest.raises(ValueError, match=r"codes must be in \[0, 8\), got 0 to 8"):
+        quantizer.hold(torch.arange(9))
+    quantizer.hold(torch.zeros(0, dtype=torch.int64))
     quantizer.freeze(torch.tensor([0, 1, 2, 2]))
     with pytest.raises(ValueError, match="codes are frozen for 4 rows, got 3"):
-        quantizer.mend(torch.tensor([1]), torch.zeros(3, 2), generator(0))
+        quantizer.mend(torch.tensor([1]), torch.zeros(3, 3), generator(0))
 
 
 def test_held_codes_replace_the_nearest_ones_until_they_are_frozen() -> None:
@@ -268,12 +267,3 @@ def test_held_codes_replace_the_nearest_ones_until_they_are_frozen() -> None:
     assert torch.equal(quantizer(x[:50])[1], quantizer.encode(x[:50]))
     quantizer.freeze(held)
     assert len(quantizer.held) == 0
-
-
-def test_only_codes_of_the_codebook_can_be_held() -> None:
-    quantizer, _ = fitted()
-    with pytest.raises(ValueError, match=r"codes must be in \[0, 8\), got 0 to 8"):
-        quantizer.hold(torch.arange(9))
-    with pytest.raises(TypeError, match="int64"):
-        quantizer.hold(torch.zeros(3))
-    quantizer.hold(torch.zeros(0, dtype=torch.int64))

@@ -90,7 +90,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.mark.parametrize(
     ("dim", "size", "programs"),
-    [(3, 0.0, 4096), (3, 1e-4, 1), (4, 1e-2, 4096), (45, 1e-4, 4096), (45, 1e-2, 4096), (9, 0.3, 1)],
+    [(3, 0.0, 4096), (3, 1e-4, 1), (45, 1e-4, 4096), (45, 1e-2, 4096), (9, 0.3, 1)],
 )
 def test_codes_that_a_bound_proves_are_those_of_a_search(
     dim: int, size: float, programs: int, searched: list[int], monkeypatch: pytest.MonkeyPatch
@@ -134,9 +134,7 @@ def test_few_codes_and_more_rows_on_the_device() -> None:
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
-@pytest.mark.parametrize(
-    ("n", "k", "dim"), [(100, 9, 3), (40, 5, 45), (30, 2, 70), (0, 4, 3), (50, 1, 1), (3000, 3, 4)]
-)
+@pytest.mark.parametrize(("n", "k", "dim"), [(100, 9, 3), (30, 2, 70), (0, 4, 3), (3000, 3, 4)])
 def test_sums_by_code(n: int, k: int, dim: int, dtype: torch.dtype, tolerance: float) -> None:
     draw = torch.Generator().manual_seed(n)
     values, codes = torch.randn(n, dim, generator=draw), torch.randint(0, k, (n,), generator=draw)
@@ -165,7 +163,7 @@ def test_frozen_codes_are_sorted_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sorted_codes == [4, 4, 5]
 
 
-@pytest.mark.parametrize("num_codes", [32_767, 32_768, 32_769, 40_001])
+@pytest.mark.parametrize("num_codes", [32_767, 32_768, 40_001])
 def test_codes_beyond_sixteen_bits(num_codes: int) -> None:
     last = num_codes - 1
     order, offsets = sorted_by_code(torch.tensor([last, 0, last, 32_766], device=DEVICE), num_codes)
@@ -178,8 +176,7 @@ def test_codes_beyond_sixteen_bits(num_codes: int) -> None:
     assert starts[-1] == 4
 
 
-@pytest.mark.parametrize("seed", [5, 2**31 - 1, 2**63 - 1])
-@pytest.mark.parametrize(("n", "dim"), [(300, 3), (21, 45), (0, 3)])
+@pytest.mark.parametrize(("seed", "n", "dim"), [(5, 300, 3), (2**31 - 1, 21, 45), (2**63 - 1, 21, 45), (5, 0, 3)])
 @pytest.mark.parametrize(("aim", "spread"), [(0.0, 1.0), (1.0, 1e-3)])
 def test_substitution_is_that_of_the_cpu(seed: int, n: int, dim: int, aim: float, spread: float) -> None:
     x, codebook = rows_and_codes(2 * n, 7, dim)
