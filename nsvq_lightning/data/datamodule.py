@@ -1,7 +1,6 @@
 """Lightning data modules: a scene folder, and the embedded demo scene."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import cached_property, partial
 from itertools import count, pairwise
 from pathlib import Path
@@ -11,7 +10,6 @@ import torch
 from lightning.pytorch import LightningDataModule
 from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
 from lightning.pytorch.utilities import rank_zero_info
-from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from nsvq_lightning.data.colmap import SceneError
@@ -55,7 +53,7 @@ class DevicePhotos:
     def __init__(self, most_bytes: int) -> None:
         self._most, self._free = most_bytes, 0
         self._device = torch.device("cpu")
-        self._kept: dict[int, tuple[Tensor, View]] = {}
+        self._kept: dict[int, View] = {}
 
     def move(self, view: View, device: torch.device) -> View:
         """The view with its photo and mask on the device."""
@@ -63,12 +61,11 @@ class DevicePhotos:
             return view.to(device)
         if device != self._device:
             self._device, self._kept, self._free = device, {}, min(self._most, _spare(device))
-        host, there = self._kept.get(view.index, (None, None))
-        if there is not None and host is view.image:
-            return replace(view, image=there.image, mask=there.mask)
+        if view.index in self._kept:
+            return self._kept[view.index]
         moved = view.to(device)
-        if there is None and (taken := Picture(moved.image, moved.mask).nbytes) <= self._free:
-            self._kept[view.index] = view.image, moved
+        if (taken := Picture(moved.image, moved.mask).nbytes) <= self._free:
+            self._kept[view.index] = moved
             self._free -= taken
         return moved
 
