@@ -179,10 +179,6 @@ class Densification(SplatCallback, ABC):
             table.add_(total)
 
 
-# Side tables of the splats: sum of the screen-space gradient norms, and number of views that saw the splat.
-GRADIENTS, VIEWS = "gradient_sum", "view_count"
-
-
 @dataclass(eq=False)
 class DensityControl(Densification):
     """Clones, splits and prunes splats (Kerbl et al. 2023, section 5), and drops those that become NaN or infinite.
@@ -233,7 +229,7 @@ class DensityControl(Densification):
         [200000]
     """
 
-    tables: ClassVar[tuple[str, ...]] = (GRADIENTS, VIEWS)
+    tables: ClassVar[tuple[str, ...]] = ("gradient_sum", "view_count")
     limit_name: ClassVar[str] = "max_splats"
 
     max_splats: int | None = None

@@ -128,11 +128,6 @@ def add_observed(
     weights.add_(edges / mean.clamp_min(torch.finfo(edges.dtype).tiny) * seen)
 
 
-def budget_at(progress: float, budget: int) -> int:
-    """How many splats there may be at ``progress`` (0 to 1) of the growth: budget · √progress."""
-    return int(budget * math.sqrt(min(max(progress, 0.0), 1.0)))
-
-
 def draw_rows(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Mask ``[N]`` of ``count`` rows drawn without replacement in proportion to their weight; never one of weight 0.
 
@@ -178,8 +173,6 @@ def lowest_share(opacities: Tensor, share: float) -> Tensor:
     mask[opacities.argsort(stable=True)[: int(share * opacities.shape[0])]] = True
     return mask
 
-
-GRADIENTS, VIEWS, EDGES = "gradient_sum", "view_count", "edge_sum"
 
 # Growth is idle if it adds at most this share of what it may add, or of what there is.
 IDLE = 0.01
@@ -235,7 +228,7 @@ class BudgetedGrowth(Densification):
         [100000]
     """
 
-    tables: ClassVar[tuple[str, ...]] = (GRADIENTS, VIEWS, EDGES)
+    tables: ClassVar[tuple[str, ...]] = ("gradient_sum", "view_count", "edge_sum")
     limit_name: ClassVar[str] = "the budget"
 
     budget: int | None = None
@@ -346,7 +339,8 @@ class BudgetedGrowth(Densification):
         weight = statistic if late else edges
         threshold = self.late_threshold if late else self.grad_threshold
         candidates = torch.where(statistic >= threshold, weight, torch.zeros_like(weight))
-        room = budget_at((reference - self.start) / (self.full - self.start), self.limit(module)) - len(splats)
+        progress = min(max((reference - self.start) / (self.full - self.start), 0.0), 1.0)
+        room = int(self.limit(module) * math.sqrt(progress)) - len(splats)
         divided = draw_rows(candidates, room, generator(module.seed, iteration, "grow"))
         before = len(splats)
         parents = RawSplats(*(tensor.detach()[divided] for tensor in splats.raw()))

@@ -25,10 +25,6 @@ from .base import WritingCallback
 log = logging.getLogger(__name__)
 
 
-# Formats that can be written.
-EXPORT_FORMATS = tuple(suffix.removeprefix(".") for suffix in FORMATS)
-
-
 @dataclass(eq=False)
 class ExportScene(WritingCallback):
     """Writes the scene when training ends.
@@ -56,9 +52,9 @@ class ExportScene(WritingCallback):
     folder: str | None = None
 
     def __post_init__(self) -> None:
-        unknown = sorted(set(self.formats) - set(EXPORT_FORMATS))
-        if unknown:
-            raise ValueError(f"unknown export formats {', '.join(unknown)}; choose from {', '.join(EXPORT_FORMATS)}")
+        known = [suffix.removeprefix(".") for suffix in FORMATS]
+        if unknown := sorted(set(self.formats) - set(known)):
+            raise ValueError(f"unknown export formats {', '.join(unknown)}; choose from {', '.join(known)}")
         self.formats = tuple(self.formats)
 
     def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
@@ -74,7 +70,7 @@ class ExportScene(WritingCallback):
             path = folder / f"scene.{suffix}"
             size = save(scene, path, module.storage) if suffix == "nsvq" else save(decoded, path)
             log.info("wrote %s (%d bytes)", path, size)
-        photos = getattr(getattr(trainer, "datamodule", None), "scene", None)
+        photos = scene_of(trainer)
         if "nsvq" in self.formats and photos is not None:
             page = folder / "viewer.html"
             title = page.resolve().parent.parent.name

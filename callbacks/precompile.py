@@ -55,31 +55,24 @@ class CompileAhead(SplatCallback):
         settings, self._settings = self._settings, None
         command = [sys.executable, "-m", precompile.__name__]
         pipe, silence = subprocess.PIPE, subprocess.DEVNULL
+        # The package is found where this process has found it, and one thread is enough.
+        paths = os.pathsep.join(filter(None, (str(Path(precompile.__file__).parents[2]), os.environ.get("PYTHONPATH"))))
+        environment = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
         try:
-            self._process = subprocess.Popen(command, stdin=pipe, stdout=silence, stderr=silence, env=_environment())
+            self._process = subprocess.Popen(command, stdin=pipe, stdout=silence, stderr=silence, env=environment)
             self._process.stdin.write(settings)
             self._process.stdin.close()
         except OSError as error:
             log.info("the kernels of later phases are compiled when they are needed: %s", error)
 
-    def _stop(self) -> None:
+    def on_fit_end(self, *_: Any) -> None:
+        """End the process."""
         self._watching.close()
         if self._process is not None:
             self._process.terminate()
             self._process.wait()
             self._process = None
 
-    def on_fit_end(self, *_: Any) -> None:
-        """End the process."""
-        self._stop()
-
     def on_exception(self, *_: Any) -> None:
         """End the process."""
-        self._stop()
-
-
-def _environment() -> dict[str, str]:
-    """That of this process; the package is found where this process has found it, and one thread is enough."""
-    root = str(Path(precompile.__file__).parents[2])
-    paths = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
-    return os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+        self.on_fit_end()

@@ -48,7 +48,7 @@ class SplatProgressBar(TQDMProgressBar):
         self.smoothing = smoothing
         self._psnr: float | None = None
         self._is_plain = False
-        self._started = self._compiled_before = 0.0
+        self._start = 0.0  # of the clock that stops while kernels are compiled
         self._watching = ExitStack()
 
     @property
@@ -76,7 +76,7 @@ class SplatProgressBar(TQDMProgressBar):
         done = trainer.global_step
         self.train_progress_bar.reset(total=self.total_train_batches)
         self.train_progress_bar.initial = self.train_progress_bar.n = done  # (n - initial) / time is the speed
-        self._started, self._compiled_before = time.time(), compile_seconds()
+        self._start = time.time() - compile_seconds()
         self._watching.enter_context(compile_watcher(self._show_compilation))
 
     def on_train_epoch_start(self, trainer: Trainer, *args: Any) -> None:
@@ -93,7 +93,7 @@ class SplatProgressBar(TQDMProgressBar):
         text = self._text(trainer, module)
         if self._is_plain:
             total = trainer.max_steps
-            seconds = time.time() - self._start_without_compilation()
+            seconds = time.time() - self._start - compile_seconds()
             left = seconds * (total - done) / max(1.0, done - self.train_progress_bar.initial)
             elapsed, remaining = Tqdm.format_interval(seconds), Tqdm.format_interval(left)
             progress = f"iteration {done} of {total} ({100 * done // total} %), {elapsed} elapsed, {remaining} left"
@@ -101,7 +101,7 @@ class SplatProgressBar(TQDMProgressBar):
             sys.stdout.flush()
             return
         bar = self.train_progress_bar
-        bar.start_t = self._start_without_compilation()
+        bar.start_t = self._start + compile_seconds()
         bar.n = done
         bar.set_postfix_str(text)
 
@@ -124,9 +124,6 @@ class SplatProgressBar(TQDMProgressBar):
         bar = super().init_train_tqdm()
         bar.set_description_str("", refresh=False)
         return bar
-
-    def _start_without_compilation(self) -> float:
-        return self._started + compile_seconds() - self._compiled_before
 
     def _text(self, trainer: Trainer, module: SplatModule) -> str:
         parts = [f"{module.phase.name.lower()} {_rounded(len(module.splats))} splats"]

@@ -5,7 +5,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -23,7 +22,6 @@ from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_bit, psnr
-from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.report import files, pictures
 from nsvq_lightning.report.page import write_page
 from nsvq_lightning.splats.splats import RawSplats
@@ -149,14 +147,15 @@ class MetricReport(WritingCallback):
     @torch.no_grad()
     def _evaluate(self, trainer: Trainer, module: SplatModule, iteration: int, views: Any) -> None:
         phase = module.schedule.phase_at(iteration)
-        splats = module.hard_splats(phase)
+        splats, folder = module.hard_splats(phase), run_folder(trainer)
 
-        def render_image(camera: Camera) -> Tensor:
-            return module.render_splats(splats, camera).image
+        def show(image: Tensor, photo: Tensor) -> None:
+            if self.pictures and trainer.is_global_zero:
+                pictures.write_png(folder / "preview.png", torch.cat([eight_bit(photo), image], dim=1))
 
-        folder = run_folder(trainer)
-        show = partial(_preview, folder / "preview.png") if self.pictures and trainer.is_global_zero else None
-        mean_psnr, mean_ssim = files.evaluate(render_image, views, module.device, show)
+        mean_psnr, mean_ssim = files.evaluate(
+            lambda camera: module.render_splats(splats, camera).image, views, module.device, show
+        )
         entry: dict[str, Any] = {
             "iteration": iteration,
             "phase": phase.name.lower(),
@@ -259,11 +258,6 @@ class MetricReport(WritingCallback):
             if self.pictures:
                 pictures.log_pictures(trainer.loggers, paths, trainer.global_step)
         self._scene, self._lpips = None, None
-
-
-def _preview(path: Path, image: Tensor, photo: Tensor) -> None:
-    """Write the photo beside the render."""
-    pictures.write_png(path, torch.cat([eight_bit(photo), image], dim=1))
 
 
 def _gathered(trainer: Trainer, scores: list[files.ViewScore]) -> list[files.ViewScore]:

@@ -19,10 +19,8 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, visible
 from nsvq_lightning.splats.splats import RawSplats, Splats
-from nsvq_lightning.training import optim, scene_access
-from nsvq_lightning.training.resume import ResumedModule
+from nsvq_lightning.training import optim, resume, scene_access, stopwatch
 from nsvq_lightning.training.schedule import Phase, Schedule
-from nsvq_lightning.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +28,7 @@ log = logging.getLogger(__name__)
 LossTerm = Callable[[Render, View], Tensor]
 
 
-class SplatModule(ResumedModule):
+class SplatModule(resume.ResumedModule):
     """Trains 3D Gaussian splats and the codebooks that store them (NSVQ-GS).
 
     A step renders one view and computes the sum of :attr:`loss_terms`. What it renders depends on the phase:
@@ -88,7 +86,6 @@ class SplatModule(ResumedModule):
         self.quantizer_settings = {
             name: {"quantizer": type(q).__name__, "codes": q.codebook.shape[0]} for name, q in self.quantizers.items()
         }
-        """Class and number of codes by attribute, as requested; k-means and checkpoints may give fewer codes."""
         self.background: str = background
         self.dssim_weight = dssim_weight
         # A checkpoint stores these two as plain dictionaries.
@@ -102,7 +99,7 @@ class SplatModule(ResumedModule):
         self.phase = Phase.WARMUP
         self.active_sh_degree = 0 if splats is None else splats.sh_degree
         self.extent = 0.0
-        self.stopwatch = Stopwatch()
+        self.stopwatch = stopwatch.Stopwatch()
         self.schedule = Schedule()
         self.loss_terms: dict[str, LossTerm] = {"photometric": self._photometric_term}
         """Terms of the loss by name; callbacks add some, or wrap the first."""
@@ -112,7 +109,6 @@ class SplatModule(ResumedModule):
         """How many splats the scene is to have in the end; None for as many as density control makes."""
         self.evaluation_splats = None
         self.history: list[dict[str, Any]] = []
-        """Evaluations so far, one plain dictionary each; checkpoints carry it."""
         self._step_rates = self.rates
         self._rate_factors: dict[str, float] = {}
         self._updates = True
@@ -134,11 +130,10 @@ class SplatModule(ResumedModule):
             camera: Where to look from.
             observe: Strength of each pixel ``[H, W]``, see :func:`nsvq_lightning.render`.
         """
-        splats = self._phase_splats(camera)
+        options: dict[str, Any] = {"observe": observe}
         if self.training and self.background == "random":
-            background = to_device(torch.rand(3, generator=self._generator("background")), self.device)
-            return self.render_splats(splats, camera, observe=observe, background=background)
-        return self.render_splats(splats, camera, observe=observe)
+            options["background"] = to_device(torch.rand(3, generator=self._generator("background")), self.device)
+        return self.render_splats(self._phase_splats(camera), camera, **options)
 
     def _phase_splats(self, camera: Camera) -> RawSplats:
         raw = self.splats.raw()
@@ -173,11 +168,9 @@ class SplatModule(ResumedModule):
         scene = scene_access.scene_of(self.trainer)
         if scene is not None:
             self.background = scene_access.background_of(scene, self.background)
-        if stage != "fit":
-            return
-        if self.extent == 0.0:
+        if stage == "fit" and self.extent == 0.0:
             self.extent = scene_access.extent_of(scene)
-        if len(self.splats) == 0:
+        if stage == "fit" and len(self.splats) == 0:
             splats = scene_access.first_splats(self.init_from, scene, self.splats.sh_degree)
             self.splats = splats.to(self.device)
             self.active_sh_degree = 0 if self.init_from is None else self.splats.sh_degree
@@ -202,11 +195,10 @@ class SplatModule(ResumedModule):
             self._updates = True
         rates, end = self._step_rates, self.schedule.position_decay_end
         for group in self.trainer.optimizers[0].param_groups:
-            name = group["name"]
-            rate = optim.group_lr(name, rates, self.extent)
-            if name == "means":
+            rate = optim.group_lr(group["name"], rates, self.extent)
+            if group["name"] == "means":
                 rate = optim.position_lr(self.global_step + 1, self.extent, rates, end)
-            group["lr"] = rate * self._rate_factors.pop(name, 1.0)
+            group["lr"] = rate * self._rate_factors.pop(group["name"], 1.0)
 
     def _photometric_term(self, rendered: Render, view: View) -> Tensor:
         """(1 - w)·L1 + w·(1 - SSIM) of picture and photo (paper, section 3.3)."""
@@ -228,8 +220,7 @@ class SplatModule(ResumedModule):
             rendered.means2d.retain_grad()
         first, *others = (term(rendered, batch) for term in self.loss_terms.values())
         loss = sum(others, start=first)
-        every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]  # Lightning does not type it
-        if (self.global_step + 1) % max(1, every) == 0:
+        if (self.global_step + 1) % max(1, self.trainer.log_every_n_steps) == 0:  # type: ignore[attr-defined]
             quality = psnr(eight_bit(rendered.image.detach()), eight_bit(batch.image), batch.mask).float()
             values = {"train/loss": loss.detach(), "train/psnr": quality, "train/splats": float(len(self.splats))}
             self.log_dict(values, batch_size=1)  # type: ignore[arg-type]  # a number among tensors
@@ -249,7 +240,7 @@ class SplatModule(ResumedModule):
         return False
 
     def on_after_backward(self) -> None:
-        """Look at a loss whose number was still on its way when the backward pass was launched."""
+        """Look at a loss that was still on its way when the backward pass was launched."""
         if self._late_loss is not None:
             self._has_finite_loss(*self._late_loss)
             self._late_loss = None

@@ -81,19 +81,12 @@ def branch_optimizer_state(stored: Mapping[str, Any], fresh: Mapping[str, Any]) 
         stored: ``state_dict()`` of the trained optimiser; its groups are named.
         fresh: ``state_dict()`` of a new optimiser, with the desired groups.
     """
-    groups = {group["name"]: group for group in stored["param_groups"]}
-    merged: dict[str, Any] = {"state": {}, "param_groups": []}
-    for group in fresh["param_groups"]:
-        if group["name"] not in ATTRIBUTES:
-            merged["param_groups"].append(dict(group))
-            continue
-        old = groups[group["name"]]
-        merged["param_groups"].append({**old, "params": list(group["params"])})
-        # A state dict refers to parameters by index in the list of all; codebooks before them would shift it.
-        for place, old_place in zip(group["params"], old["params"], strict=True):
-            if old_place in stored["state"]:
-                merged["state"][place] = stored["state"][old_place]
-    return merged
+    groups = {group["name"]: group for group in stored["param_groups"] if group["name"] in ATTRIBUTES}
+    merged = [groups.get(group["name"], group) | {"params": group["params"]} for group in fresh["param_groups"]]
+    # A state dict refers to parameters by index in the list of all; codebooks before them would shift it.
+    places = {group["params"][0]: groups[group["name"]]["params"][0] for group in merged if group["name"] in groups}
+    state = {place: stored["state"][old] for place, old in places.items() if old in stored["state"]}
+    return {"state": state, "param_groups": merged}
 
 
 def continued_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> Schedule:
@@ -149,12 +142,12 @@ def check_continuation(
             f"the checkpoint is of a run with SH degree {degrees[0]}, this one has {degrees[1]}; pass "
             f"--model.sh_degree={degrees[0]}"
         )
-    trained = checkpoint.get(QUANTIZER_SETTINGS)
-    if trained is not None and trained != quantizers and not _is_unquantized(checkpoint):
+    trained = checkpoint[QUANTIZER_SETTINGS]
+    if trained != quantizers and not _is_unquantized(checkpoint):
         raise ValueError(
             f"the checkpoint has quantized with {_described(trained)}, and this run would with "
-            f"{_described(quantizers)}; that can change only before the quantize phase: pass "
-            f"{_options(trained)}, or a checkpoint from before it"
+            f"{_described(quantizers)}; that can change only before the quantize phase: pass the --model.quantizer and "
+            "--model.codebooks that it was trained with, or a checkpoint from before it"
         )
     # The splats' side tables may differ.
     stored, wanted = ({name for name in values if not name.startswith(SPLATS)} for values in (state, own))
@@ -168,28 +161,14 @@ def check_continuation(
 
 def _described(settings: Mapping[str, Mapping[str, Any]]) -> str:
     """The quantizers of a run, for a message."""
-    return f"{_kinds(settings)} ({_sizes(settings)})" if settings else "no codebooks"
-
-
-def _options(settings: Mapping[str, Mapping[str, Any]]) -> str:
-    """The command-line options that select these quantizers."""
-    if not settings:
-        return "--model.codebooks=null"
-    return f"--model.quantizer={_kinds(settings)} --model.codebooks='{{{_sizes(settings)}}}'"
-
-
-def _kinds(settings: Mapping[str, Mapping[str, Any]]) -> str:
-    return ", ".join(sorted({str(one["quantizer"]) for one in settings.values()}))
-
-
-def _sizes(settings: Mapping[str, Mapping[str, Any]]) -> str:
-    return ", ".join(f"{name}: {one['codes']}" for name, one in settings.items())
+    kinds = ", ".join(sorted({str(one["quantizer"]) for one in settings.values()}))
+    sizes = ", ".join(f"{name}: {one['codes']}" for name, one in settings.items())
+    return f"{kinds} ({sizes})" if settings else "no codebooks"
 
 
 def _is_unquantized(checkpoint: Mapping[str, Any]) -> bool:
     """Whether a checkpoint is from before the quantize phase."""
-    state = checkpoint["state_dict"]
-    return RUN in state and Phase(int(state[RUN][0])) < Phase.QUANTIZE
+    return Phase(int(checkpoint["state_dict"][RUN][0])) < Phase.QUANTIZE
 
 
 def _some(names: set[str]) -> str:
@@ -256,6 +235,8 @@ def _check_contents(path: Path, checkpoint: Any) -> None:
     if not {"splats.means", RUN} <= state.keys():
         first = ", ".join(list(state)[:3]) or "nothing"
         raise FormatError(f"{path}: a checkpoint of another model, which has {first} but no splats", WAY_OUT)
+    if missing := {"history", "schedule", QUANTIZER_SETTINGS} - checkpoint.keys():
+        raise FormatError(f"{path}: a checkpoint of another version, without {', '.join(sorted(missing))}", WAY_OUT)
 
 
 def check_settings(path: Any, settings: Mapping[str, Any], named: Collection[str] = ()) -> None:
@@ -381,7 +362,7 @@ class ResumedModule(SceneModule):
     configure_optimizers: Callable[[], Optimizer]
     stopwatch: Stopwatch
     history: list[dict[str, Any]]
-    """Evaluations so far, one plain dictionary each."""
+    """Evaluations so far, one plain dictionary each; checkpoints carry it."""
 
     @_restricted_classmethod
     def load_from_checkpoint(cls, checkpoint_path: Any, *args: Any, **settings: Any) -> Self:
@@ -440,15 +421,13 @@ class ResumedModule(SceneModule):
         scene = scene_of(self._trainer)
         if scene is not None and SCENE in checkpoint and not getattr(self._trainer, "allow_other_scene", False):
             check_scene(checkpoint, scene)
-        self.history = list(checkpoint.get("history", []))
+        self.history = list(checkpoint["history"])
         if self._trainer is None or self._trainer.state.fn != "fit":
-            if "schedule" in checkpoint:
-                self.schedule = Schedule(**checkpoint["schedule"])
+            self.schedule = Schedule(**checkpoint["schedule"])
             return
-        if "schedule" in checkpoint:
-            self.schedule = continued_schedule(checkpoint, self.schedule)
-            if (change := changed_schedule(checkpoint, self.schedule)) is not None:
-                log.warning(change)
+        self.schedule = continued_schedule(checkpoint, self.schedule)
+        if (change := changed_schedule(checkpoint, self.schedule)) is not None:
+            log.warning(change)
         if can_branch(checkpoint, self.codebooks):
             branch_checkpoint(checkpoint, self.codebooks, self.configure_optimizers())
         check_continuation(checkpoint, self.state_dict(), self.quantizer_settings)

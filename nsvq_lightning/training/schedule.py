@@ -1,33 +1,7 @@
 """The four phases of a run, and how the paper's iteration numbers scale to a shorter or longer run.
 
 Only this module decides what scales. Every other part of the package uses the paper's numbers (for a run of 45 000
-iterations) and asks the :class:`Schedule` for the numbers of this run:
-
-===============================  ==========================================================================
-what                             how it scales with ``total / reference_total``
-===============================  ==========================================================================
-ends of the phases               proportionally; a phase that exists in the reference never vanishes
-length of the fine-tune phase    proportionally, not below ``min_finetune`` unless that is more than half of what
-                                 follows the prune phase: it brings back what the codes cost, which takes its time.
-                                 Test PSNR after 1500 iterations with 67 / 300 of them: 28.04 / 28.21 dB
-steps of the SH degree           proportionally
-density control: start, stop     proportionally
-density control: interval        proportionally, not below ``min_density_interval`` (its statistic is a mean over
-                                 the views of one interval, and a mean over two views is noise). Test PSNR after
-                                 2000 of 4500 iterations with 50 / 100: 29.98 dB with 105 k splats / 30.26 dB with
-                                 73 k where SfM left 13 k points, 25.44 dB with 162 k / 23.06 dB with 81 k where it
-                                 left 5.5 k (25: 25.44 dB with 209 k): fewer times starve a sparse start, so 50
-opacity resets                   proportionally, interval not below ``min_reset_interval`` (opacities need some
-                                 hundred steps of Adam to come back)
-pruning in the prune phase       proportionally
-replacement, refits of codes     proportionally, interval not below ``min_replacement_interval`` (a code is called
-                                 unused after a window of views, also the first time: after the three views of an
-                                 unlimited one in 1500 iterations, a fifth of the SH codes were replaced; to refit
-                                 codes takes as long as some steps)
-decay of the position's rate     proportionally (30 000 of 45 000)
-λ of the opacities               inversely: what it takes from an opacity in a whole phase stays the same
-learning rates, thresholds       not at all
-===============================  ==========================================================================
+iterations) and asks the :class:`Schedule` for the numbers of this run.
 """
 
 from __future__ import annotations
@@ -58,6 +32,32 @@ class Schedule:
 
     Iterations are 1-based: iteration 1 is the first optimiser step, ``phase_at(1)`` is ``WARMUP``. A phase covers the
     iterations after the end of the one before, up to and including its own end. Equal ends skip a phase.
+
+    ===============================  ==========================================================================
+    what                             how it scales with ``total / reference_total``
+    ===============================  ==========================================================================
+    ends of the phases               proportionally; a phase that exists in the reference never vanishes
+    length of the fine-tune phase    proportionally, not below ``min_finetune`` unless that is more than half of what
+                                     follows the prune phase: it brings back what the codes cost, which takes its time.
+                                     Test PSNR after 1500 iterations with 67 / 300 of them: 28.04 / 28.21 dB
+    steps of the SH degree           proportionally
+    density control: start, stop     proportionally
+    density control: interval        proportionally, not below ``min_density_interval`` (its statistic is a mean over
+                                     the views of one interval, and a mean over two views is noise). Test PSNR after
+                                     2000 of 4500 iterations with 50 / 100: 29.98 dB with 105 k splats / 30.26 dB with
+                                     73 k where SfM left 13 k points, 25.44 dB with 162 k / 23.06 dB with 81 k where it
+                                     left 5.5 k (25: 25.44 dB with 209 k): fewer times starve a sparse start, so 50
+    opacity resets                   proportionally, interval not below ``min_reset_interval`` (opacities need some
+                                     hundred steps of Adam to come back)
+    pruning in the prune phase       proportionally
+    replacement, refits of codes     proportionally, interval not below ``min_replacement_interval`` (a code is called
+                                     unused after a window of views, also the first time: after the three views of an
+                                     unlimited one in 1500 iterations, a fifth of the SH codes were replaced; to refit
+                                     codes takes as long as some steps)
+    decay of the position's rate     proportionally (30 000 of 45 000)
+    λ of the opacities               inversely: what it takes from an opacity in a whole phase stays the same
+    learning rates, thresholds       not at all
+    ===============================  ==========================================================================
 
     Attributes:
         total: Iterations of this run.

@@ -10,7 +10,7 @@ import torch
 from density_stage import Stage, make_splats
 
 from nsvq_lightning.callbacks import BudgetedGrowth
-from nsvq_lightning.callbacks.growth import add_observed, budget_at, draw_rows, lowest_share, split_longest
+from nsvq_lightning.callbacks.growth import add_observed, draw_rows, lowest_share, split_longest
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
@@ -45,10 +45,6 @@ def test_the_kernel_adds_what_plain_torch_adds(count: int) -> None:
     add_observed(*exact, observed.double(), radii, width=80, height=60)
     for ours, theirs in zip(fast, exact, strict=True):
         torch.testing.assert_close(ours.double(), theirs, rtol=1e-6, atol=1e-6)
-
-
-def test_the_budget_opens_with_the_root_of_time() -> None:
-    assert [budget_at(progress, 1000) for progress in (-1.0, 0.0, 0.25, 0.81, 1.0, 7.0)] == [0, 0, 500, 900, 1000, 1000]
 
 
 def test_rows_are_drawn_without_replacement_in_proportion_to_their_weight() -> None:

@@ -28,7 +28,8 @@ SCENE = {"splats.means": torch.arange(300.0).view(100, 3), "_extra_state": torch
 
 def write(path: Path, state: dict[str, Tensor] = SCENE, **more: Any) -> bytes:
     """Write a checkpoint; returns its bytes."""
-    torch.save({"state_dict": state, "global_step": 7, "pytorch-lightning_version": "2.6.6", **more}, path)
+    own = {"history": [], "schedule": {}, "quantizer_settings": {}}
+    torch.save({"state_dict": state, "global_step": 7, "pytorch-lightning_version": "2.6.6", **own, **more}, path)
     return path.read_bytes()
 
 
@@ -147,6 +148,9 @@ def test_what_is_no_checkpoint_of_this_package_is_refused(tmp_path: Path) -> Non
     path = tmp_path / "a.ckpt"
     write(path, nn.Linear(2, 3).state_dict())
     with pytest.raises(FormatError, match=rf"^{path}: a checkpoint of another model, which has weight, bias but"):
+        read_checkpoint(path)
+    torch.save({"state_dict": SCENE, "pytorch-lightning_version": "2.6.6", "history": []}, path)
+    with pytest.raises(FormatError, match=rf"^{path}: a checkpoint of another version, without quantizer_sett"):
         read_checkpoint(path)
     torch.save({"weights": torch.ones(2)}, path)
     with pytest.raises(FormatError, match=rf"^{path}: not a checkpoint of Lightning"):

@@ -361,12 +361,10 @@ def test_checkpoints_of_an_earlier_fit_hide_none_of_the_next(run: RunFactory, re
     assert iteration_of(checkpoint.last_path) == 12
 
 
-@pytest.mark.parametrize(
-    "iteration", [pytest.param(i, marks=[] if i == 9 else pytest.mark.slow) for i in (4, 6, 9, 12)]
-)
 def test_a_killed_process_leaves_its_periodic_checkpoint(
-    iteration: int, command_scene: bytes, demo_scene: Path, tmp_path: Path
+    command_scene: bytes, demo_scene: Path, tmp_path: Path
 ) -> None:
+    iteration = 9
     arguments = arguments_of(demo_scene, tmp_path, "--callbacks.checkpoint.every=2")
     script = [sys.executable, "-c", KILLED.format(iteration=iteration), *arguments]
     killed = subprocess.run(script, capture_output=True, timeout=300, check=False)

@@ -6,10 +6,9 @@ from typing import Any
 
 import pytest
 from lightning.pytorch import Callback, LightningModule, Trainer
-from runs import Recipe, RunFactory
+from runs import Recipe, RunFactory, Whole
 
 from nsvq_lightning.callbacks import DensityControl
-from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.scene_access import train_contributions
 
 
@@ -27,9 +26,8 @@ def limited(most: int | None) -> DensityControl:
     return DensityControl(grad_threshold=5e-6, max_splats=most)
 
 
-@pytest.mark.parametrize("most", [100, 400])
-def test_no_iteration_has_more(run: RunFactory, recipe: Recipe, most: int) -> None:
-    counts = Counts()
+def test_no_iteration_has_more(run: RunFactory, recipe: Recipe) -> None:
+    counts, most = Counts(), 400
     _, module = run([*recipe(density=limited(most)).values(), counts])
     assert counts.seen[0] == most  # the scene has 500 points
     assert max(counts.seen) == most
@@ -45,12 +43,8 @@ def test_what_stays_is_what_the_photos_see(run: RunFactory, recipe: Recipe) -> N
     assert same.sum() > 45  # one step of the other attributes has moved the order a little
 
 
-def test_the_limit_comes_too_late_for_codebooks(
-    run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
-) -> None:
-    trainer, module = run(recipe().values())
-    assert isinstance(module, SplatModule)
-    count = len(module.splats)
-    limited(20).on_train_start(trainer, module)
-    assert len(module.splats) == count
+def test_the_limit_comes_too_late_for_codebooks(paper: Whole, caplog: pytest.LogCaptureFixture) -> None:
+    count = len(paper.module.splats)
+    limited(20).on_train_start(paper.trainer, paper.module)
+    assert len(paper.module.splats) == count
     assert f"max_splats=20 comes too late for {count} splats" in caplog.text

@@ -46,7 +46,7 @@ def test_splats_grow_and_are_selected_down_to_the_budget(fast: Whole) -> None:
     assert all(len(quantizer.held) == 0 for quantizer in fast.module.codebooks.values())  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("iteration", [8, 16, 24, 32, 40, 44, 48, 52])
+@pytest.mark.parametrize("iteration", [16, 32, 44, 48])
 def test_a_resumed_run_is_the_run_not_interrupted(fast: Whole, run: RunFactory, recipe: Recipe, iteration: int) -> None:
     callbacks = recipe(**recipe_options(checkpoint=RunCheckpoint(every=0))).values()
     resumed, _ = run(callbacks, fast.checkpoint(iteration), RECIPE_MODULE)
@@ -234,12 +234,11 @@ def bits(module: SplatModule) -> float:
 
 
 def test_codes_take_fewer_bits_the_stronger_rate_and_distortion_is(run: RunFactory, recipe: Recipe) -> None:
-    found = []
-    for choice in (None, RateDistortion(0.01), RateDistortion(0.1)):
-        _, module = run(recipe(rate_distortion=choice).values(), module=RECIPE_MODULE)
-        found.append(bits(module))
-    assert found[0] > found[1] + 0.3
-    assert found[1] > found[2] + 0.3
+    few, fewer = (
+        bits(run(recipe(rate_distortion=RateDistortion(strength)).values(), module=RECIPE_MODULE)[1])
+        for strength in (0.01, 0.1)
+    )
+    assert few > fewer + 0.3
 
 
 def test_splats_that_are_dropped_have_codes_chosen_anew(run: RunFactory, recipe: Recipe) -> None:
@@ -264,13 +263,13 @@ def test_a_shorthand_replaces_the_configs_budget(tmp_path: Path, demo_scene: Pat
     assert (written["splats"], written["bytes"]) == (60, None)
 
 
-@pytest.mark.parametrize("name", ["fast", "best", "small"])
+@pytest.mark.parametrize("name", ["best", "small"])
 def test_the_shipped_configs_run(
     name: str, demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = [f"--data.root={demo_scene}", "--data.factor=4", f"--trainer.default_root_dir={tmp_path}"]
-    quiet = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
-    assert main(["fit", f"--config={name}", *arguments, *quiet, "--trainer.max_steps=20", "--model.sh_degree=1"]) == 0
+    quiet = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu", "--callbacks.report.every=0"]
+    assert main(["fit", f"--config={name}", *arguments, *quiet, "--trainer.max_steps=8", "--model.sh_degree=1"]) == 0
     assert "rendered from the decoded file" in capsys.readouterr().out
     config = yaml.safe_load(next(tmp_path.rglob("config.yaml")).read_text())
     assert config["model"]["quantizer"]["class_path"].endswith(".TrainedStraightThrough")

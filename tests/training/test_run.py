@@ -137,7 +137,7 @@ def measured(module: SplatModule) -> list[tuple[int, int, float]]:
     return [(entry["iteration"], entry["splats"], entry["psnr"]) for entry in module.history]
 
 
-@pytest.mark.parametrize("iteration", [8, 24, 28, 57])
+@pytest.mark.parametrize("iteration", [24, 57])
 def test_a_resumed_run_is_the_run_not_interrupted(
     paper: Whole, run: RunFactory, recipe: Recipe, iteration: int
 ) -> None:
@@ -185,12 +185,10 @@ def test_learning_rates_can_follow_the_views_of_a_step(run: RunFactory, recipe: 
         assert groups["means"] == pytest.approx(factor * positions)
 
 
-def test_callbacks_of_an_earlier_fit_act_again(run: RunFactory, recipe: Recipe) -> None:
-    def stored(callbacks: dict[str, Callback]) -> bytes:
-        return scene_bytes(run(callbacks.values(), module=RECIPE_MODULE)[0])
-
-    callbacks = recipe(**recipe_options())
-    assert stored(callbacks) == stored(callbacks)
+def test_callbacks_of_an_earlier_fit_act_again(fast: Whole, run: RunFactory, recipe: Recipe) -> None:
+    callbacks = recipe(**recipe_options()).values()
+    run(callbacks, module=RECIPE_MODULE, max_steps=20)
+    assert scene_bytes(run(callbacks, module=RECIPE_MODULE)[0]) == fast.scene
 
 
 def test_codes_of_a_codebook_that_was_never_placed_are_not_frozen(run: RunFactory, recipe: Recipe) -> None:
@@ -201,7 +199,7 @@ def test_codes_of_a_codebook_that_was_never_placed_are_not_frozen(run: RunFactor
 
 
 def test_a_run_without_codebooks_is_plain_splatting(run: RunFactory, recipe: Recipe, demo_scene: Path) -> None:
-    trainer, module = run(recipe().values(), module={"codebooks": None, "storage": Storage("paper")})
+    trainer, module = run(recipe().values(), module={"codebooks": None, "storage": Storage("paper")}, max_steps=20)
     trainer.test(module, datamodule=ColmapDataModule(str(demo_scene), factor=2), verbose=False)
     folder = run_folder(trainer)
     metrics = json.loads((folder / "metrics.json").read_text())
@@ -211,8 +209,8 @@ def test_a_run_without_codebooks_is_plain_splatting(run: RunFactory, recipe: Rec
     assert all(torch.equal(getattr(decoded, n), p.detach()) for n, p in module.splats.attributes().items())
 
 
-@pytest.mark.parametrize("codebooks", [{"scales": 8}, {"quats": 5, "shN": 3}])
-def test_any_subset_of_attributes_can_be_quantized(run: RunFactory, recipe: Recipe, codebooks: dict[str, int]) -> None:
+def test_any_subset_of_attributes_can_be_quantized(run: RunFactory, recipe: Recipe) -> None:
+    codebooks = {"quats": 5, "shN": 3}
     trainer, _ = run(recipe().values(), module={"codebooks": codebooks}, max_steps=20)
     stored = read_nsvq(run_folder(trainer) / "scene.nsvq")
     # Codes that no splat uses are not in the file.

@@ -214,7 +214,7 @@ def test_what_one_process_meets_both_decide_alike(two: Finished) -> None:
 @pytest.mark.parametrize(
     ("by", "iteration", "left"),
     [
-        ("exception", 16, 15),
+        pytest.param("exception", 16, 15, marks=pytest.mark.slow),
         pytest.param("SIGTERM", 41, 41, marks=pytest.mark.long),
         pytest.param("SIGKILL", 59, 50, marks=pytest.mark.long),
     ],
