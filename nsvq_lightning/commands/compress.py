@@ -26,7 +26,7 @@ from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
 
 if TYPE_CHECKING:
-    from nsvq_lightning.compression.ladder import Candidate
+    from nsvq_lightning.compression.presets import Candidate
     from nsvq_lightning.io.compressed import CompressedScene
     from nsvq_lightning.rendering.camera import Camera
 
@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
         wrong = f"--tune must be at least 0, got {options.tune}"
     if wrong:
         raise argparse.ArgumentError(None, wrong)
-    from nsvq_lightning.compression.ladder import Compressor
+    from nsvq_lightning.compression.presets import Compressor
     from nsvq_lightning.compression.viewpoints import decibels, views_of
     from nsvq_lightning.io.formats import read_scene
     from nsvq_lightning.io.nsvq.header import with_origin
@@ -92,10 +92,10 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError(f"{source} holds no finite splat; there is nothing to compress")
     cameras = views_of(scene.decode(), options.root, VIEWS)
     candidate, pictures = _candidate(options, scene, cameras)
-    data, error, settings = candidate.data, candidate.error, candidate.rung.name
+    data, error, settings = candidate.data, candidate.error, candidate.preset.name
     options.output.parent.mkdir(parents=True, exist_ok=True)
     trains = options.root is not None and options.max_steps != 0
-    if trains and not candidate.rung.codebooks:
+    if trains and not candidate.preset.codebooks:
         log.info("nothing to train: %s has no codebooks", settings)
     elif trains:
         folder = claim_version(options.output.parent / f"{options.output.stem}_training")
@@ -128,17 +128,17 @@ def run(options: argparse.Namespace) -> int:
 
 def _candidate(options: argparse.Namespace, scene: CompressedScene, cameras: list[Camera]) -> tuple[Candidate, int]:
     """The scene as the options ask for it, and the number of pictures in which its error was measured."""
-    from nsvq_lightning.compression import ladder
+    from nsvq_lightning.compression import presets
 
-    compressor = ladder.Compressor(scene, cameras, Storage(options.level), options.seed, options.tune)
+    compressor = presets.Compressor(scene, cameras, Storage(options.level), options.seed, options.tune)
     if options.max_error is not None:
-        candidate = ladder.smallest_within(compressor, options.max_error)
+        candidate = presets.smallest_within(compressor, options.max_error)
     elif options.target_bytes is not None:
-        candidate = ladder.finest_within(compressor, options.target_bytes)
+        candidate = presets.finest_within(compressor, options.target_bytes)
     else:
-        rungs = {rung.name: rung for rung in ladder.LADDER} | {"none": ladder.PLAIN}
-        candidate = compressor.at(rungs[options.codebooks])
-    return candidate, compressor.pictures
+        named = {preset.name: preset for preset in presets.PRESETS} | {"none": presets.PLAIN}
+        candidate = compressor.at(named[options.codebooks])
+    return candidate, len(compressor.cameras)
 
 
 def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> int:
@@ -149,7 +149,7 @@ def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> i
     """
     from nsvq_lightning.commands.main import main
 
-    codebooks = ", ".join(f"{name}: {codes}" for name, codes in candidate.rung.codebooks.items())
+    codebooks = ", ".join(f"{name}: {codes}" for name, codes in candidate.preset.codebooks.items())
     return main(
         [
             "fit",

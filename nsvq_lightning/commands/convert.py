@@ -171,7 +171,7 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
 
 def _measure(source: Path, output: Path, root: Path | None) -> None:
     """Say how pictures of two files differ."""
-    from nsvq_lightning.compression.ladder import MEASURED
+    from nsvq_lightning.compression.presets import MEASURED
     from nsvq_lightning.compression.viewpoints import decibels, picture_error, pictures, views_of
 
     original = formats.read_scene(source).finite()

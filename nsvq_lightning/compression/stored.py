@@ -43,17 +43,6 @@ def to_compressed(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> Com
     return scene.take(_numpy(finite))
 
 
-def formula_bytes(scene: CompressedScene, header_bytes: int) -> int:
-    """Bytes the paper's count gives: 16·N + ⌈N·Σ bits / 8⌉ + Σ 4·K·D + header, plus 4·N·D for what is not quantized.
-
-    It is computed from the scene's counts alone, independently of the code that writes the file.
-    """
-    n = len(scene)
-    bits = sum((len(codebook) - 1).bit_length() for codebook in scene.codebooks.values())
-    floats = sum(codebook.size for codebook in scene.codebooks.values()) + sum(raw.size for raw in scene.raw.values())
-    return 16 * n + (n * bits + 7) // 8 + 4 * floats + header_bytes
-
-
 def _numpy(tensor: Tensor) -> NDArray[Any]:
     array: NDArray[Any] = tensor.detach().cpu().numpy()
     return array

@@ -17,7 +17,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import decode, encode
 from nsvq_lightning.io.nsvq.header import frame, unframe
 from nsvq_lightning.io.nsvq.precision import OPACITY_ERRORS, Precision, Storage
-from nsvq_lightning.quantize import NSVQ, QUANTIZED, Quantizer, codebook_sizes
+from nsvq_lightning.quantize import NSVQ, QUANTIZED, Quantizer
 from nsvq_lightning.quantize.attributes import attribute_rows
 from nsvq_lightning.quantize.kmeans import lookup
 from nsvq_lightning.random import generator
@@ -27,8 +27,13 @@ from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.canonical_covariance import canonical
 from nsvq_lightning.splats.splats import RawSplats, detached
 
+log = logging.getLogger(__name__)
 
-def tuned(
+# Largest number of views in which errors are measured.
+MEASURED = 24
+
+
+def finetune_codebooks(
     scene: CompressedScene, original: RawSplats, cameras: Sequence[Camera], steps: int, seed: int
 ) -> CompressedScene:
     """The scene with codebooks, opacities and positions adapted so that its pictures resemble those of the original.
@@ -75,14 +80,8 @@ def tuned(
     return replace(scene, means=means, opacities=opacities, codebooks=found)
 
 
-log = logging.getLogger(__name__)
-
-# Largest number of views in which errors are measured.
-MEASURED = 24
-
-
 @dataclass(frozen=True)
-class Rung:
+class Preset:
     """One compression setting, between large and exact, and small.
 
     Attributes:
@@ -96,58 +95,56 @@ class Rung:
     coarseness: float = 1.0
 
 
-def _sizes(codes: int) -> dict[str, int]:
-    return {name: max(1, int(codes * share)) for name, share in QUANTIZED.items()}
+def _sizes(thousands: float) -> dict[str, int]:
+    return {name: int(1024 * thousands * share) for name, share in QUANTIZED.items()}
 
 
-PLAIN = Rung("no codebooks", {})
+PLAIN = Preset("no codebooks", {})
 # Settings without codebooks. They need no k-means, and give smaller files where splats are few.
-PLAINS: tuple[Rung, ...] = (Rung("no codebooks, a quarter of the errors", {}, 0.25), PLAIN)
+PLAINS: tuple[Preset, ...] = (Preset("no codebooks, a quarter of the errors", {}, 0.25), PLAIN)
 
 # Settings with codebooks, from the most exact to the smallest.
-LADDER: tuple[Rung, ...] = (
-    *(Rung(f"{codes // 1024}k", _sizes(codes), 0.5) for codes in (1 << 17, 1 << 16, 1 << 15)),
-    *(Rung(name, codebook_sizes(name)) for name in ("16k", "8k", "4k", "2k", "1k", "0.5k")),
-    Rung("0.5k, twice the errors", codebook_sizes("0.5k"), 2.0),
-    Rung("0.25k, four times the errors", _sizes(256), 4.0),
+PRESETS: tuple[Preset, ...] = (
+    *(Preset(f"{size:g}k", _sizes(size), 0.5) for size in (128, 64, 32)),
+    *(Preset(f"{size:g}k", _sizes(size)) for size in (16, 8, 4, 2, 1, 0.5)),
+    Preset("0.5k, twice the errors", _sizes(0.5), 2.0),
+    Preset("0.25k, four times the errors", _sizes(0.25), 4.0),
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A scene compressed at one rung.
+    """A scene compressed at one preset.
 
     Attributes:
-        rung: The setting.
+        preset: The setting.
         scene: What is stored.
         storage: How it is stored.
         data: The file's bytes.
         error: Root mean square difference between its pictures and those of the original, for channels in [0, 1].
     """
 
-    rung: Rung
+    preset: Preset
     scene: CompressedScene
     storage: Storage
     data: bytes
     error: float
 
-    @property
-    def psnr(self) -> float:
-        """The error in dB."""
-        return decibels(self.error)
-
 
 class Compressor:
-    """Compresses one scene at any rung, each at most once.
+    """Compresses one scene at any preset, each at most once.
 
     Before k-means, scales too small to be visible are raised, and scales and rotations take their canonical form;
     k-means weights rotations and colours by how much each splat contributes to the pictures. After
     it, the scene is tuned until its pictures resemble those of the original.
 
+    Attributes:
+        cameras: Views in which errors are measured.
+
     Args:
         scene: The scene, finite.
         cameras: Views in which the scene is tuned; in some of them errors and contributions are measured.
-        storage: Level, and the precision, which rungs make coarser or finer.
+        storage: Level, and the precision, which presets make coarser or finer.
         seed: Seed of k-means.
         tuning: Steps of tuning, 0 for none.
 
@@ -166,54 +163,45 @@ class Compressor:
         if len(scene) == 0 or not cameras:
             raise ValueError(f"cannot compress {len(scene)} splats seen by {len(cameras)} cameras")
         self._splats, self._origin, self._antialiased = detached(scene.decode()), scene.origin, scene.antialiased
-        self._views, self._cameras = cameras, cameras[:: -(-len(cameras) // MEASURED)]
+        self._views, self.cameras = cameras, cameras[:: -(-len(cameras) // MEASURED)]
         self._storage, self._seed, self._tuning = storage, seed, tuning
-        self._pictures = pictures(self._splats, self._cameras, self._antialiased)
+        self._pictures = pictures(self._splats, self.cameras, self._antialiased)
         if not any(bool(picture.any()) for picture in self._pictures):
             raise ValueError(
-                f"all {len(self._cameras)} pictures of the scene are black, so no error can be measured: photos "
+                f"all {len(self.cameras)} pictures of the scene are black, so no error can be measured: photos "
                 "(--data.root) must be of this scene, in its coordinates"
             )
         self._done: dict[str, Candidate] = {}
 
     @cached_property
-    def _weights(self) -> Tensor:
-        """k-means weight of each splat ``[N]``; only codebooks need it."""
-        return row_weights(contributions(self._splats, self._cameras, render))
+    def _for_codebooks(self) -> tuple[RawSplats, Tensor]:
+        """The splats in the form that codebooks are made for, and the weight of each ``[N]`` in k-means."""
+        floor = scale_floor(self._splats.means, self.cameras)
+        visible = self._splats.scales if floor is None else self._splats.scales.clamp(min=floor)
+        scales, quats, *_ = canonical(visible, self._splats.quats)
+        weights = row_weights(contributions(self._splats, self.cameras, render))
+        return self._splats._replace(scales=scales, quats=quats), weights
 
-    @cached_property
-    def _log_floor(self) -> float | None:
-        """Log-scale below which a splat's extent is not visible."""
-        return scale_floor(self._splats.means, self._cameras)
-
-    def at(self, rung: Rung) -> Candidate:
-        """The scene at a rung."""
-        if rung.name not in self._done:
-            self._done[rung.name] = self._compressed(rung)
-            found = self._done[rung.name]
-            log.info("%s: %s bytes, error %.4g (%.2f dB)", rung.name, f"{len(found.data):,}", found.error, found.psnr)
-        return self._done[rung.name]
-
-    @property
-    def pictures(self) -> int:
-        """Number of pictures in which errors are measured."""
-        return len(self._pictures)
-
-    def error(self, data: bytes) -> float:
-        """Root mean square difference between the pictures of a ``.nsvq`` file and those of the scene."""
-        return picture_error(decode(*unframe(data)).decode(), self._cameras, self._pictures, self._antialiased)
-
-    def _compressed(self, rung: Rung) -> Candidate:
-        scene = self._quantized(rung.codebooks)
-        errors = {name: rung.coarseness * value for name, value in vars(self._storage.precision).items()}
+    def at(self, preset: Preset) -> Candidate:
+        """The scene at a preset."""
+        if preset.name in self._done:
+            return self._done[preset.name]
+        scene = self._quantized(preset.codebooks)
+        errors = {name: preset.coarseness * value for name, value in vars(self._storage.precision).items()}
         least, most = OPACITY_ERRORS
         errors["opacity"] = min(max(errors["opacity"], least), most)
         storage = replace(self._storage, precision=Precision(**errors))
         data = b"".join(frame(*encode(scene, storage)))
-        return Candidate(rung, scene, storage, data, self.error(data))
+        error = self.error(data)
+        log.info("%s: %s bytes, error %.4g (%.2f dB)", preset.name, f"{len(data):,}", error, decibels(error))
+        return self._done.setdefault(preset.name, Candidate(preset, scene, storage, data, error))
+
+    def error(self, data: bytes) -> float:
+        """Root mean square difference between the pictures of a ``.nsvq`` file and those of the scene."""
+        return picture_error(decode(*unframe(data)).decode(), self.cameras, self._pictures, self._antialiased)
 
     def _quantized(self, codebooks: Mapping[str, int]) -> CompressedScene:
-        splats = self._canonical(codebooks)
+        splats, weights = self._for_codebooks if codebooks else (self._splats, None)
         quantizers: dict[str, Quantizer] = {}
         for name, codes in codebooks.items():
             rows = attribute_rows(splats, name)
@@ -222,23 +210,13 @@ class Compressor:
             # Scales cover many sizes, all of which count; weights would leave no codes for the small ones.
             scales = name == "scales"
             quantizer = NSVQ(codes, rows.shape[1], start="spread" if scales else "sample")
-            weight = None if scales else self._weights
-            quantizer.fit(rows, weight, generator(self._seed, 0, "kmeans", name))
+            quantizer.fit(rows, None if scales else weights, generator(self._seed, 0, "kmeans", name))
             quantizers[name] = cast(Quantizer, quantizer)
         config: dict[str, object] = {"codebooks": {name: len(q.codebook) for name, q in quantizers.items()}}
         if self._antialiased:
             config["antialiased"] = True
         scene = replace(to_compressed(splats, quantizers), config=config, origin=self._origin)
-        return tuned(scene, splats, self._views, self._tuning, self._seed) if quantizers else scene
-
-    def _canonical(self, codebooks: Mapping[str, int]) -> RawSplats:
-        if not {"scales", "quats"} & codebooks.keys():
-            return self._splats
-        scales = self._splats.scales
-        if "scales" in codebooks and self._log_floor is not None:
-            scales = scales.clamp(min=self._log_floor)
-        scales, quats, *_ = canonical(scales, self._splats.quats)
-        return self._splats._replace(scales=scales, quats=quats)
+        return finetune_codebooks(scene, splats, self._views, self._tuning, self._seed) if quantizers else scene
 
 
 def smallest_within(compressor: Compressor, error: float) -> Candidate:
@@ -247,8 +225,8 @@ def smallest_within(compressor: Compressor, error: float) -> Candidate:
     Raises:
         ValueError: Even the most exact one has a larger one.
     """
-    last = _last(lambda rung: compressor.at(rung).error <= error)
-    candidates = [compressor.at(rung) for rung in (*PLAINS, last or LADDER[0])]
+    last = _last(lambda preset: compressor.at(preset).error <= error)
+    candidates = [compressor.at(preset) for preset in (*PLAINS, last or PRESETS[0])]
     within = [candidate for candidate in candidates if candidate.error <= error]
     if not within:
         best = min(candidates, key=_error_first)
@@ -265,12 +243,12 @@ def finest_within(compressor: Compressor, target: int) -> Candidate:
     Raises:
         ValueError: Even the smallest one has more.
     """
-    last = _last(lambda rung: len(compressor.at(rung).data) > target)
-    first = 0 if last is None else LADDER.index(last) + 1
-    candidates = [compressor.at(rung) for rung in (*PLAINS, *LADDER[first:][:1])]
+    last = _last(lambda preset: len(compressor.at(preset).data) > target)
+    first = 0 if last is None else PRESETS.index(last) + 1
+    candidates = [compressor.at(preset) for preset in (*PLAINS, *PRESETS[first:][:1])]
     within = [candidate for candidate in candidates if len(candidate.data) <= target]
     if not within:
-        least = min(len(candidate.data) for candidate in (*candidates, compressor.at(LADDER[-1])))
+        least = min(len(candidate.data) for candidate in (*candidates, compressor.at(PRESETS[-1])))
         raise ValueError(
             f"the smallest file of this scene has {least} bytes, more than {target}; most of them are positions: "
             "train with fewer splats (--splats)"
@@ -282,10 +260,10 @@ def _error_first(candidate: Candidate) -> tuple[float, int]:
     return candidate.error, len(candidate.data)
 
 
-def _last(holds: Callable[[Rung], bool]) -> Rung | None:
-    """The last rung for which a condition holds, or None; it must hold up to some rung and not after it."""
-    low, high = -1, len(LADDER)
+def _last(holds: Callable[[Preset], bool]) -> Preset | None:
+    """The last preset for which a condition holds, or None; it must hold up to some preset and not after it."""
+    low, high = -1, len(PRESETS)
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if holds(LADDER[middle]) else (low, middle)
-    return LADDER[low] if low >= 0 else None
+        low, high = (middle, high) if holds(PRESETS[middle]) else (low, middle)
+    return PRESETS[low] if low >= 0 else None

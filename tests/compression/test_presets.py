@@ -1,4 +1,4 @@
-"""Compressing a scene that is trained already: tuning, the ladder, and ``nsvq compress``."""
+"""Compressing a scene that is trained already: tuning, presets, and ``nsvq compress``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,14 @@ from ring import cameras_around
 from splat_scenes import ball
 
 from nsvq_lightning.commands.main import main
-from nsvq_lightning.compression.ladder import LADDER, PLAINS, Compressor, finest_within, smallest_within, tuned
+from nsvq_lightning.compression.presets import (
+    PLAINS,
+    PRESETS,
+    Compressor,
+    finest_within,
+    finetune_codebooks,
+    smallest_within,
+)
 from nsvq_lightning.compression.viewpoints import middle_of, picture_error, pictures
 from nsvq_lightning.io import CompressedScene, read_header, read_nsvq, write_ply
 from nsvq_lightning.io.formats import load, save
@@ -39,7 +46,7 @@ def error(scene: CompressedScene) -> float:
 
 
 def test_pictures_come_nearer_in_other_views_too(quantized: CompressedScene) -> None:
-    found = tuned(quantized, ORIGINAL, VIEWS, 60, 0)
+    found = finetune_codebooks(quantized, ORIGINAL, VIEWS, 60, 0)
     assert error(found) < 0.92 * error(quantized)
     for name, codes in quantized.codes.items():
         np.testing.assert_array_equal(found.codes[name], codes)
@@ -47,16 +54,16 @@ def test_pictures_come_nearer_in_other_views_too(quantized: CompressedScene) -> 
 
 
 def test_no_steps_change_nothing_and_the_same_steps_give_the_same_bits(quantized: CompressedScene) -> None:
-    assert tuned(quantized, ORIGINAL, VIEWS, 0, 0) is quantized
-    first, second, other = (tuned(quantized, ORIGINAL, VIEWS, 3, seed) for seed in (0, 0, 1))
+    assert finetune_codebooks(quantized, ORIGINAL, VIEWS, 0, 0) is quantized
+    first, second, other = (finetune_codebooks(quantized, ORIGINAL, VIEWS, 3, seed) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first.codebooks["quats"], second.codebooks["quats"])
     np.testing.assert_array_equal(first.means, second.means)
     assert not np.array_equal(first.means, other.means)
 
 
 def test_the_compressor_tunes_what_has_codebooks() -> None:
-    rung = LADDER[-1]
-    plain, steps = (Compressor(ball(600), VIEWS, Storage(), tuning=count).at(rung) for count in (0, 40))
+    preset = PRESETS[-1]
+    plain, steps = (Compressor(ball(600), VIEWS, Storage(), tuning=count).at(preset) for count in (0, 40))
     assert steps.error < 0.95 * plain.error
 
 
@@ -83,7 +90,7 @@ def test_cameras_stand_around_and_look_at_the_middle() -> None:
 
 def test_a_candidate_is_what_its_bytes_hold(compressor: Compressor, tmp_path: Path) -> None:
     """Oracle: the file, read and rendered here."""
-    candidate = compressor.at(LADDER[-3])
+    candidate = compressor.at(PRESETS[-3])
     (tmp_path / "x.nsvq").write_bytes(candidate.data)
     decoded, original = load(tmp_path / "x.nsvq"), ball().decode()
     squares = []
@@ -92,29 +99,28 @@ def test_a_candidate_is_what_its_bytes_hold(compressor: Compressor, tmp_path: Pa
             pair = [render(splats, camera).image.clamp(0, 1).double() for splats in (decoded, original)]
         squares.append(float((pair[0] - pair[1]).square().mean()))
     assert candidate.error == pytest.approx(math.sqrt(np.mean(squares)), rel=1e-6)
-    assert candidate.psnr == pytest.approx(-10 * math.log10(np.mean(squares)), rel=1e-6)
-    assert compressor.at(LADDER[-3]) is candidate
+    assert compressor.at(PRESETS[-3]) is candidate
 
 
-def test_the_ladder_goes_from_exact_to_small() -> None:
+def test_the_presets_go_from_exact_to_small() -> None:
     scene = ball(4000)
-    ladder = Compressor(scene, cameras_around(scene.means, 2, 96, 64), Storage())
-    found = [ladder.at(rung) for rung in LADDER]
+    compressor = Compressor(scene, cameras_around(scene.means, 2, 96, 64), Storage())
+    found = [compressor.at(preset) for preset in PRESETS]
     sizes, errors = [len(c.data) for c in found], [c.error for c in found]
     assert sizes == sorted(sizes, reverse=True)
     assert errors == sorted(errors)
 
 
 def test_the_smallest_file_within_an_error_and_the_best_within_bytes(compressor: Compressor) -> None:
-    """Oracle: all settings. Those without codebooks are smaller here than the first rungs, and worse."""
-    every = [compressor.at(rung) for rung in (*PLAINS, *LADDER)]
+    """Oracle: all settings. Those without codebooks are smaller here than the first presets, and worse."""
+    every = [compressor.at(preset) for preset in (*PLAINS, *PRESETS)]
     for aim in every:
         found = smallest_within(compressor, aim.error)
         assert len(found.data) == min(len(c.data) for c in every if c.error <= aim.error)
         found = finest_within(compressor, len(aim.data))
         assert found.error == min(c.error for c in every if len(c.data) <= len(aim.data))
     assert finest_within(compressor, 10**9).error == min(c.error for c in every)
-    assert smallest_within(compressor, 10.0).rung is LADDER[-1]
+    assert smallest_within(compressor, 10.0).preset is PRESETS[-1]
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.01, 100.0])
@@ -123,7 +129,7 @@ def test_an_error_does_not_depend_on_the_unit_of_the_scene(scale: float) -> None
     for factor in (1.0, scale):
         means, scales = scene.means * np.float32(factor), scene.raw["scales"] + np.float32(math.log(factor))
         scaled = replace(scene, means=means, raw={**scene.raw, "scales": scales})
-        errors.append(Compressor(scaled, cameras_around(means, 2, 96, 64), Storage()).at(LADDER[-1]).error)
+        errors.append(Compressor(scaled, cameras_around(means, 2, 96, 64), Storage()).at(PRESETS[-1]).error)
     assert errors[0] > 0.01
     assert errors[1] == pytest.approx(errors[0], rel=0.2)
 
@@ -233,10 +239,10 @@ def test_photos_keep_to_the_aim(
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # One rung: a looser aim must not bring larger codebooks.
-    monkeypatch.setattr("nsvq_lightning.compression.ladder.PLAINS", ())
+    # One preset: a looser aim must not bring larger codebooks.
+    monkeypatch.setattr("nsvq_lightning.compression.presets.PLAINS", ())
     monkeypatch.setattr(
-        "nsvq_lightning.compression.ladder.LADDER", tuple(rung for rung in LADDER if rung.name == "0.5k")
+        "nsvq_lightning.compression.presets.PRESETS", tuple(preset for preset in PRESETS if preset.name == "0.5k")
     )
     source, output = tmp_path / "scene.ply", tmp_path / "out.nsvq"
     write_ply(source, ball(400, degree=0))
@@ -270,9 +276,9 @@ def test_photos_keep_to_the_aim(
     assert "the trained file" not in caplog.text
 
 
-def test_precision_of_a_rung_follows_that_of_the_user() -> None:
+def test_precision_of_a_preset_follows_that_of_the_user() -> None:
     scene = ball(200)
     storage = Storage(precision=Precision(position=0.2, opacity=0.1))
-    found = Compressor(scene, cameras_around(scene.means, 1, 40, 30), storage).at(LADDER[-1])
+    found = Compressor(scene, cameras_around(scene.means, 1, 40, 30), storage).at(PRESETS[-1])
     assert found.storage.precision.position == pytest.approx(0.8)
     assert found.storage.precision.opacity == 0.25
