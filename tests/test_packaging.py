@@ -155,21 +155,3 @@ def test_callbacks_configs_and_type_marker_are_found_in_the_package() -> None:
     assert specification.origin == str(folder_of("callbacks") / "__init__.py")
     assert (Path(nsvq_lightning.__file__).parent / "py.typed").is_file()
     assert any(entry.suffix == ".yaml" for entry in folder_of("configs").iterdir())
-
-
-@pytest.mark.parametrize("block", ["test", "demo"])
-def test_readme_has_the_blocks_that_continuous_integration_runs(block: str) -> None:
-    runner = ROOT / ".ci" / "run"
-    if not runner.exists():
-        pytest.skip("a source distribution has no .ci")
-    assert os.access(runner, os.X_OK)
-    assert f"readme_block {block}" in runner.read_text(encoding="utf-8")
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert len(re.findall(rf"^<!-- ci:{block} -->\n```\w*\n(?!```)", readme, flags=re.MULTILINE)) == 1
-
-
-def test_continuous_integration_is_a_valid_shell_script() -> None:
-    runner = ROOT / ".ci" / "run"
-    if not runner.exists():
-        pytest.skip("a source distribution has no .ci")
-    subprocess.run(["bash", "-n", str(runner)], check=True)

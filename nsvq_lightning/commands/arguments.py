@@ -17,8 +17,6 @@ from nsvq_lightning.top_level import folder_of
 if TYPE_CHECKING:
     from yaml.nodes import Node
 
-    from nsvq_lightning.rendering.camera import Camera
-
 
 def names(text: str) -> tuple[str, ...]:
     """The entries of ``A,B``, each once."""
@@ -53,17 +51,17 @@ def integers(text: str) -> tuple[int, ...]:
         raise argparse.ArgumentTypeError(f"expected whole numbers with commas between them, got {text!r}") from None
 
 
-def positive(kind: type[int] | type[float]) -> Callable[[str], int | float]:
+def positive(kind: type[int] | type[float], zero: bool = False) -> Callable[[str], int | float]:
     """A function that reads a number of this kind.
 
     Raises:
-        argparse.ArgumentTypeError: By the function: it is not above 0, or not finite.
+        argparse.ArgumentTypeError: By the function: it is not above 0, or with ``zero`` not at least 0, or not finite.
     """
 
     def parse(text: str) -> int | float:
         value = kind(text)
-        if not 0 < value < float("inf"):
-            raise argparse.ArgumentTypeError(f"must be above 0, got {text}")
+        if not (0 < value < float("inf") or (zero and value == 0)):
+            raise argparse.ArgumentTypeError(f"must be {'at least' if zero else 'above'} 0, got {text}")
         return value
 
     parse.__name__ = kind.__name__  # argparse says "invalid float value"
@@ -283,15 +281,3 @@ def photos_of(path: Path) -> Path | None:
     data = data.get("init_args", data) if isinstance(data, dict) else None
     root = data.get("root") if isinstance(data, dict) else None
     return Path(root) if isinstance(root, str) and Path(root).is_dir() else None
-
-
-def cameras_of(path: Path) -> dict[str, Camera]:
-    """Cameras by name that the run has recorded that a scene lies in, for when its photos are gone; none without it.
-
-    Raises:
-        ValueError: Its ``viewer.html`` is damaged.
-    """
-    from nsvq_lightning.report.viewer import page_cameras
-
-    page = (path if path.is_dir() else path.parent) / "viewer.html"
-    return page_cameras(page) if page.is_file() else {}

@@ -52,8 +52,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--data.root", dest="root", type=Path, metavar="FOLDER", help=help_)
     help_ = "steps that make codebooks, opacities and positions fit the scene's own pictures: "
     help_ += f"{DEFAULT_TUNING} by default, 0 for none"
-    add("--tune", type=int, default=DEFAULT_TUNING, metavar="N", help=help_)
-    add("--max-steps", type=int, metavar="N", help="training iterations: 3000 by default; 0 only measures")
+    add("--tune", type=positive(int, zero=True), default=DEFAULT_TUNING, metavar="N", help=help_)
+    help_ = "training iterations: 3000 by default; 0 only measures"
+    add("--max-steps", type=positive(int, zero=True), metavar="N", help=help_)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -74,10 +75,6 @@ def run(options: argparse.Namespace) -> int:
         wrong = "--max-steps trains with photos: give their COLMAP folder with --data.root"
     elif options.max_steps and options.codebooks == "none":
         wrong = "--max-steps trains codebooks, and there are none with --codebooks=none"
-    elif options.max_steps is not None and options.max_steps < 0:
-        wrong = f"--max-steps must be at least 0, got {options.max_steps}"
-    elif options.tune < 0:
-        wrong = f"--tune must be at least 0, got {options.tune}"
     if wrong:
         raise argparse.ArgumentError(None, wrong)
     from nsvq_lightning.compression.presets import Compressor

@@ -186,9 +186,9 @@ def check_gpu() -> Iterator[Finding]:
     from nsvq_lightning.compute.devices import fast_backends
 
     if torch.cuda.is_available():
-        name, fast = torch.cuda.get_device_name(), fast_backends(torch.zeros(1, device="cuda"))
+        fast = fast_backends(torch.zeros(1, device="cuda"))
         advice = "this version renders on it in plain torch, slower than on the CPU; use the CPU"
-        yield judged("gpu", f"{name}, back-ends {', '.join(fast)}", not fast and advice)
+        yield judged("gpu", f"{torch.cuda.get_device_name()}, back-ends {', '.join(fast)}", not fast and advice)
     else:
         built = torch.version.cuda or torch.version.hip
         advice = "check nvidia-smi and CUDA_VISIBLE_DEVICES" if built else "for an NVIDIA GPU install a CUDA build"
@@ -281,21 +281,15 @@ def check_points(model: ColmapModel) -> Iterator[Finding]:
 
 
 def check_overlap(model: ColmapModel) -> Iterator[Finding]:
-    """How many views saw a point, whether each view shares points with another, and all are connected."""
+    """Whether each view shares points with another, and all are connected."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
     pairs, names = model.observations, [image.name for image in model.images]
     if pairs is None or not len(pairs):
-        yield judged("tracks", f"{model.source} has no observations", "the overlap of views is unknown")
+        yield judged("overlap", f"{model.source} has no observations", "how far views overlap is unknown")
         return
-    lengths = np.bincount(pairs[:, 0], minlength=len(model.points))
-    # Two views may be a wrong match, three confirm each other.
-    share, mean = float(np.mean(lengths >= 3)), float(lengths.mean())
-    text = f"{100 * share:.0f} % of the points were seen by 3 views or more, {mean:.1f} on average"
-    advice = "many points are uncertain; take photos closer to each other"
-    yield judged("tracks", text, share < 0.5 and advice)
-    seen = csr_array((np.ones(len(pairs), np.int64), pairs.T), shape=(len(lengths), len(names)))
+    seen = csr_array((np.ones(len(pairs), np.int64), pairs.T), shape=(len(model.points), len(names)))
     common = (seen.T @ seen).toarray()  # points that two views both saw [V, V]; on the diagonal, those of one view
     own = np.maximum(common.diagonal(), 1)
     np.fill_diagonal(common, 0)

@@ -14,13 +14,11 @@ from types import NoneType
 from typing import Any, ClassVar, NoReturn
 
 from jsonargparse import _typehints as typehints
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import Callback, LightningModule, Trainer, loggers
 from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
-from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
-import nsvq_lightning.callbacks as callbacks
-import nsvq_lightning.quantize as quantize
+from nsvq_lightning import callbacks, quantize
 from nsvq_lightning.callbacks.standard import OPTIONAL, STANDARD
 from nsvq_lightning.commands import arguments as given
 from nsvq_lightning.commands.option_help import class_help, command_help, first_sentence
@@ -155,9 +153,9 @@ class SplatCLI(LightningCLI):
         self._arguments = QuietParser.arguments = args
         for argument in args:
             check_name(argument, "the command line", allow_outside=True)
-            asked = re.fullmatch(r"--callbacks\.(\w+)\.help", argument)
-            if asked and asked[1] in STANDARD:
-                sys.stdout.write(class_help(f"callbacks.{asked[1]}", STANDARD[asked[1]]))
+        for name, kind in STANDARD.items():
+            if f"--callbacks.{name}.help" in args:
+                sys.stdout.write(class_help(f"callbacks.{name}", kind))
                 raise SystemExit(0)
         with switched():  # they hold for this command only
             super().__init__(
@@ -285,29 +283,21 @@ class SplatCLI(LightningCLI):
         try:
             super()._run_subcommand(subcommand)
         except BaseException:
-            path = self._last_checkpoint()
-            if subcommand == "fit" and path is not None and self.trainer.is_global_zero:
-                sys.stderr.write(f"continue with: {continuation(self._arguments, path)}\n")
+            for callback in self.trainer.callbacks:  # type: ignore[attr-defined]  # Lightning does not type it
+                path = callback.last_path if isinstance(callback, callbacks.RunCheckpoint) else None
+                if subcommand == "fit" and path is not None and self.trainer.is_global_zero:
+                    sys.stderr.write(f"continue with: {continuation(self._arguments, path)}\n")
             raise
-
-    def _last_checkpoint(self) -> Path | None:
-        """The checkpoint to continue from."""
-        found: list[Callback] = self.trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
-        paths = [callback.last_path for callback in found if isinstance(callback, callbacks.RunCheckpoint)]
-        return next((path for path in paths if path is not None), None)
 
     def after_fit(self) -> None:
         """Test the decoded file, and print a summary."""
         if is_fast_dev_run(self.trainer) or self.trainer.interrupted:
             return
         self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
-        self._print_summary()
+        self.after_test()
 
     def after_test(self) -> None:
         """Print a summary."""
-        self._print_summary()
-
-    def _print_summary(self) -> None:
         path = run_folder(self.trainer) / "metrics.json"
         if self.trainer.is_global_zero and path.is_file():
             sys.stdout.write(summary(path.parent, json.loads(path.read_text(encoding="utf-8"))))
@@ -337,13 +327,13 @@ def summary(folder: Path, metrics: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def default_loggers(folder: Path) -> list[Logger]:
+def default_loggers(folder: Path) -> list[loggers.Logger]:
     """A CSV logger that writes into ``folder``, and a TensorBoard logger if that is installed."""
     place: dict[str, Any] = {"save_dir": folder.parent, "name": "", "version": folder.name}
-    loggers: list[Logger] = [CSVLogger(**place)]
+    found: list[loggers.Logger] = [loggers.CSVLogger(**place)]
     if find_spec("tensorboard") is not None:
-        loggers.append(TensorBoardLogger(**place, default_hp_metric=False))
-    return loggers
+        found.append(loggers.TensorBoardLogger(**place, default_hp_metric=False))
+    return found
 
 
 def _number(value: float | None, form: str) -> str:

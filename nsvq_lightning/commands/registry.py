@@ -34,21 +34,17 @@ COMMANDS = {
 def overview() -> str:
     """What ``nsvq --help`` prints."""
     width = max(map(len, COMMANDS))
-    lines = [f"  {name:{width}}  {command.summary}" for name, command in COMMANDS.items()]
-    return "\n".join(
-        [
-            "usage: nsvq COMMAND [options]",
-            "",
-            "Train 3D Gaussian splatting scenes and store them small.",
-            "",
-            "commands:",
-            *lines,
-            "",
-            "nsvq COMMAND --help    options of a command",
-            "nsvq --version         version of this package",
-            "",
-            "nsvq fit --config demo                    train the embedded scene",
-            "nsvq fit --data.root path/to/scene        train yours",
-            "",
-        ]
-    )
+    commands = "\n".join(f"  {name:{width}}  {command.summary}" for name, command in COMMANDS.items())
+    return f"""usage: nsvq COMMAND [options]
+
+Train 3D Gaussian splatting scenes and store them small.
+
+commands:
+{commands}
+
+nsvq COMMAND --help    options of a command
+nsvq --version         version of this package
+
+nsvq fit --config demo                    train the embedded scene
+nsvq fit --data.root path/to/scene        train yours
+"""

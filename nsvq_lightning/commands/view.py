@@ -18,10 +18,10 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from nsvq_lightning.commands.arguments import cameras_of, photos_of, scene_file
+from nsvq_lightning.commands.arguments import photos_of, scene_file
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
@@ -47,25 +47,6 @@ def _port(text: str) -> int:
     return int(text)
 
 
-class Source(NamedTuple):
-    """What is shown.
-
-    Attributes:
-        file: A ``.nsvq`` file.
-        run: Folder of the fit that is followed; None for a finished scene.
-    """
-
-    file: Path
-    run: Path | None = None
-
-    def current(self) -> Path | None:
-        """The file to show now; None if the fit has not written one yet."""
-        from nsvq_lightning.report.viewer import LIVE_SCENE
-
-        files = [self.file] if self.run is None else [self.run / LIVE_SCENE, self.file]
-        return next((file for file in files if file.is_file()), None)
-
-
 def run(options: argparse.Namespace) -> int:
     """Serve a scene until Ctrl-C, or write its page.
 
@@ -74,22 +55,23 @@ def run(options: argparse.Namespace) -> int:
         ValueError: The scene is empty, or it is not known where the photos of a running fit are.
         OSError: A file cannot be read or written, or the port is taken.
     """
-    from nsvq_lightning.report.viewer import viewer_page, write_viewer
+    from nsvq_lightning.report.viewer import LIVE_SCENE, viewer_page, write_viewer
 
     if options.live and (options.output is not None or not options.scene.is_dir()):
         message = "--live follows a fit that is running: give the folder of the run, and no --output"
         raise argparse.ArgumentError(None, message)
     path = options.scene.resolve()
     title = f"{path.parent.name} / {path.name}" if path.is_dir() else path.name
-    with _source(options) as source:
-        cameras = _cameras(options, source)
+    with _nsvq_file(options) as file:
+        cameras = _cameras(options, file)
         if options.output is not None:
             options.output.parent.mkdir(parents=True, exist_ok=True)
-            size = write_viewer(options.output, source.file, cameras, title)
+            size = write_viewer(options.output, file, cameras, title)
             sys.stdout.write(f"{options.output}: {size:,} bytes\n")
             return 0
         page = viewer_page(cameras, title, live=3.0 if options.live else 0.0).encode()  # seconds between two looks
-        handler = type("Handler", (_Handler,), {"page": page, "source": source, "host": options.host})
+        live = options.scene / LIVE_SCENE if options.live else None
+        handler = type("Handler", (_Handler,), {"page": page, "file": file, "live": live, "host": options.host})
         try:
             server = _Server((options.host, options.port), handler)
         except OSError as error:
@@ -104,27 +86,25 @@ def run(options: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _source(options: argparse.Namespace) -> Iterator[Source]:
-    """The scene that is meant, as a ``.nsvq`` file."""
+def _nsvq_file(options: argparse.Namespace) -> Iterator[Path]:
+    """The scene that is meant, as a ``.nsvq`` file; that of a running fit is yet to come."""
     from nsvq_lightning.io.formats import read_scene, save
     from nsvq_lightning.io.nsvq.header import read_header
     from nsvq_lightning.io.nsvq.precision import Storage
 
-    if options.live:
-        yield Source(options.scene / "scene.nsvq", options.scene)
-        return
-    file = scene_file(options.scene)
+    file = options.scene / "scene.nsvq" if options.live else scene_file(options.scene)
     if file.suffix.lower() == ".nsvq":
-        read_header(file)  # verifies the checksum
-        yield Source(file)
+        if not options.live:
+            read_header(file)  # verifies the checksum
+        yield file
         return
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "scene.nsvq"
         save(read_scene(file), made, Storage("paper"))
-        yield Source(made)
+        yield made
 
 
-def _cameras(options: argparse.Namespace, source: Source) -> dict[str, Camera]:
+def _cameras(options: argparse.Namespace, file: Path) -> dict[str, Camera]:
     """Cameras of the photos, or guessed ones."""
     from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.data.scene import load_scene
@@ -134,11 +114,9 @@ def _cameras(options: argparse.Namespace, source: Source) -> dict[str, Camera]:
     root = options.root or photos_of(options.scene)
     if root is not None:
         return some_cameras(load_scene(root))
-    if recorded := cameras_of(options.scene):
-        return recorded
-    if source.run is not None:
-        raise ValueError(f"{source.run} does not say where its photos are: name their folder with --data.root")
-    splats = load(source.file)
+    if options.live:
+        raise ValueError(f"{options.scene} does not say where its photos are: name their folder with --data.root")
+    splats = load(file)
     if len(splats) == 0:
         raise ValueError(f"{options.scene} holds no splat; there is nothing to see")
     sys.stderr.write("no photos: cameras are guessed from the scene; --data.root names the folder of the photos\n")
@@ -157,7 +135,10 @@ class _Handler(BaseHTTPRequestHandler):
     """Answers a browser."""
 
     page: bytes
-    source: Source
+    file: Path
+    """A ``.nsvq`` file; that of a running fit is yet to come."""
+    live: Path | None = None
+    """File with the splats of a fit that is followed."""
     host: str
     timeout = 20.0
     """Seconds after which a connection is closed on which nothing moves."""
@@ -177,10 +158,11 @@ class _Handler(BaseHTTPRequestHandler):
     def _scene(self, is_question: bool) -> None:
         from nsvq_lightning.report import viewer
 
-        if is_question and self.source.run is not None:
+        if is_question and self.live is not None:
             # What was asked of a run that has ended in between is taken back.
-            (viewer.end_live if self.source.file.exists() else viewer.ask_live)(self.source.run)
-        file = self.source.current()
+            (viewer.end_live if self.file.exists() else viewer.ask_live)(self.live.parent)
+        files = [file for file in (self.live, self.file) if file is not None and file.is_file()]
+        file = files[0] if files else None
         try:
             if file is None and self.followed:
                 self._answer(503, b"the run trains no more; its scene is not there yet")
@@ -190,7 +172,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self._answer(200, f"{file.name} {file.stat().st_mtime_ns}".encode())
             else:
                 self._answer(200, file.read_bytes(), "application/octet-stream")
-                type(self).followed = file != self.source.file
+                type(self).followed = file != self.file
         except FileNotFoundError:  # the run has ended in between
             self._answer(503, b"the scene is being written")
 

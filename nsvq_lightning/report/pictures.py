@@ -1,5 +1,6 @@
 """Rendered views as PNG files, and as a video that browsers and players open."""
 
+import logging
 import re
 import shutil
 import subprocess
@@ -10,7 +11,7 @@ from contextlib import contextmanager
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from unicodedata import normalize
 
 import cv2
@@ -22,6 +23,8 @@ from torch import Tensor
 
 from nsvq_lightning.data.images import encode_png
 from nsvq_lightning.io.atomic import atomic_path, atomic_write
+
+log = logging.getLogger(__name__)
 
 # Bytes of a file name without suffix; file systems take 143 to 255 with it.
 LONGEST = 120
@@ -101,21 +104,13 @@ def log_pictures(loggers: Sequence[Logger], pictures: Sequence[Path], step: int)
                 logger.experiment.add_image(f"test/{path.stem}", image, step, dataformats="HWC")
 
 
-class VideoWriter(NamedTuple):
-    """Takes the pictures of a video.
-
-    Attributes:
-        codec: Name of the video's codec.
-        write: Adds a picture ``[H, W, 3]``, RGB.
-    """
-
-    codec: str
-    write: Callable[[NDArray[np.uint8]], Any]
+# Adds a picture ``[H, W, 3]``, RGB, to a video.
+AddPicture = Callable[[NDArray[np.uint8]], Any]
 
 
 @contextmanager
-def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[VideoWriter]:
-    """Write a video atomically: it is there when the block ends without an error.
+def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[AddPicture]:
+    """Write a video atomically: it is there when the block, which gets the pictures, ends without an error.
 
     It is H.264 where the program ``ffmpeg`` is installed, which every player opens; otherwise VP9, which browsers and
     most players open.
@@ -127,36 +122,33 @@ def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Vi
         fps: Frames per second.
 
     Raises:
-        ValueError: Another suffix, or an odd size.
+        ValueError: An odd size.
         OSError: The video cannot be written.
     """
-    if path.suffix.lower() != VIDEO:
-        raise ValueError(f"{path}: a video ends in {VIDEO}")
     if width % 2 or height % 2:
         raise ValueError(f"{path}: width and height of a video must be even, got {width}x{height}")
-    with atomic_path(path) as unfinished:
-        program = shutil.which("ffmpeg")
-        # Both tell the container by the suffix, which the unfinished file does not have.
-        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-            file = Path(folder) / f"video{VIDEO}"
-            with _h264(program, file, width, height, fps) if program else _vp9(file, width, height, fps) as writer:
-                yield writer
-            file.replace(unfinished)
+    # Both programs tell the container by the suffix, which the unfinished file does not have.
+    with atomic_path(path) as unfinished, tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        file, program = Path(folder) / f"video{VIDEO}", shutil.which("ffmpeg")
+        log.info("%s: %s", path, "H.264" if program else "VP9")
+        with _h264(program, file, width, height, fps) if program else _vp9(file, width, height, fps) as add:
+            yield add
+        file.replace(unfinished)
 
 
 @contextmanager
-def _vp9(path: Path, width: int, height: int, fps: float) -> Iterator[VideoWriter]:
+def _vp9(path: Path, width: int, height: int, fps: float) -> Iterator[AddPicture]:
     video = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"vp09"), fps, (width, height))
     if not video.isOpened():
         raise OSError("OpenCV cannot write VP9 here: install ffmpeg, or write PNGs into a folder")
     try:
-        yield VideoWriter("VP9", lambda rgb: video.write(np.ascontiguousarray(rgb[:, :, ::-1])))
+        yield lambda rgb: video.write(np.ascontiguousarray(rgb[:, :, ::-1]))
     finally:
         video.release()
 
 
 @contextmanager
-def _h264(program: str, path: Path, width: int, height: int, fps: float) -> Iterator[VideoWriter]:
+def _h264(program: str, path: Path, width: int, height: int, fps: float) -> Iterator[AddPicture]:
     command = [program, "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
     command += ["-r", str(fps), "-i", "-", "-c:v", "libx264", "-crf", "17", "-pix_fmt", "yuv420p"]  # 17: nearly no loss
     command += ["-movflags", "+faststart", str(path)]
@@ -165,7 +157,7 @@ def _h264(program: str, path: Path, width: int, height: int, fps: float) -> Iter
         pipe = process.stdin
         assert pipe is not None
         try:
-            yield VideoWriter("H.264", lambda rgb: pipe.write(np.ascontiguousarray(rgb).data))
+            yield lambda rgb: pipe.write(np.ascontiguousarray(rgb).data)
         except BrokenPipeError:  # what ffmpeg says is the cause
             broken = True
         except BaseException:

@@ -16,11 +16,11 @@ from nsvq_lightning.commands import main as cli
 from nsvq_lightning.commands.arguments import check_config, expand, find_config
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.commands.main import main
-from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.training.trainer import SplatTrainer
 
 CODES = ["--model.quantizer=NSVQ", "--model.codebooks.scales=16", "--model.codebooks.sh0=8"]
 
@@ -188,26 +188,6 @@ def test_a_checkpoint_that_cannot_be_used_is_named_with_the_reason(
     assert not (tmp_path / demo_scene.name).exists()  # nothing was begun
 
 
-@pytest.mark.parametrize(
-    ("option", "message"),
-    [
-        ("--model.codebooks=null", "the checkpoint has quantized with NSVQ (scales: 16, sh0: 8), and this run would"),
-        ("--model.sh_degree=2", "a run with SH degree 1, this one has 2; pass --model.sh_degree=1"),
-    ],
-)
-def test_a_fit_goes_on_with_the_model_of_the_checkpoint_only(
-    option: str,
-    message: str,
-    finished: Path,
-    demo_scene: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    checkpoint = finished / "checkpoints" / "last.ckpt"
-    assert main(fit(demo_scene, tmp_path, *CODES, option, f"--ckpt_path={checkpoint}")) == 1
-    assert message in capsys.readouterr().err
-
-
 def test_test_takes_the_model_from_the_checkpoint(demo_scene: Path, finished: Path, tmp_path: Path) -> None:
     checkpoint = finished / "checkpoints" / "last.ckpt"
     arguments = [f"--ckpt_path={checkpoint}", f"--data.root={demo_scene}", "--data.factor=2"]
@@ -217,15 +197,6 @@ def test_test_takes_the_model_from_the_checkpoint(demo_scene: Path, finished: Pa
     ours, theirs = (json.loads((f / "metrics.json").read_text()) for f in (folder, finished))
     assert ours.pop("train_seconds") == pytest.approx(theirs.pop("train_seconds"), abs=0.1)
     assert ours == theirs
-
-
-def test_export_reads_no_scene(finished: Path, tmp_path: Path) -> None:
-    checkpoint = finished / "checkpoints" / "last.ckpt"
-    for suffix in ("nsvq", "ply"):
-        output = tmp_path / f"out.{suffix}"
-        assert main(["export", f"--ckpt_path={checkpoint}", f"--output={output}"]) == 0
-        assert output.read_bytes() == (finished / f"scene.{suffix}").read_bytes()
-    assert len(load(tmp_path / "out.ply")) > 0
 
 
 def test_only_the_command_line_names_what_is_imported(
@@ -248,15 +219,16 @@ def test_only_the_command_line_names_what_is_imported(
     assert read_nsvq(tmp_path / "scene.nsvq").config["quantizers"]["sh0"] == "Mine"
 
 
-def test_options_win_over_the_checkpoint_in_export(finished: Path, tmp_path: Path) -> None:
+def test_export_reads_no_scene_and_its_options_win_over_the_checkpoint(finished: Path, tmp_path: Path) -> None:
     arguments = ["export", f"--ckpt_path={finished / 'checkpoints' / 'last.ckpt'}"]
-    for level in ("compact", "paper"):
-        more = [f"--output={tmp_path / level}.nsvq", "--model.storage.level", level]
-        assert main([*arguments, *more]) == 0
-    compact, paper = (read_nsvq(tmp_path / f"{level}.nsvq") for level in ("compact", "paper"))
+    for name, more in (("out.nsvq", []), ("out.ply", []), ("paper.nsvq", ["--model.storage.level", "paper"])):
+        assert main([*arguments, f"--output={tmp_path / name}", *more]) == 0
+    for suffix in (".nsvq", ".ply"):
+        assert (tmp_path / f"out{suffix}").read_bytes() == (finished / f"scene{suffix}").read_bytes()
+    compact, paper = (read_nsvq(tmp_path / name) for name in ("out.nsvq", "paper.nsvq"))
     assert len(paper.codebooks["scales"]) == 16  # of the checkpoint
     assert len(paper) == len(compact)
-    assert (tmp_path / "compact.nsvq").stat().st_size < (tmp_path / "paper.nsvq").stat().st_size
+    assert (tmp_path / "out.nsvq").stat().st_size < (tmp_path / "paper.nsvq").stat().st_size
 
 
 def test_predict_writes_a_picture_of_every_view(demo_scene: Path, finished: Path, tmp_path: Path) -> None:
@@ -277,24 +249,15 @@ def test_validate_scores_the_test_views_with_the_settings_of_the_run(
     assert "val/psnr" in capsys.readouterr().out
 
 
-def test_a_checkpoint_of_another_scene_is_refused(
+def test_a_checkpoint_of_another_scene_is_refused_unless_allowed(
     finished: Path, demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = write_synthetic_scene(tmp_path / "garden", views=8, width=48, height=36, points=300)
-    checkpoint = f"--ckpt_path={finished / 'checkpoints' / 'last.ckpt'}"
-    arguments = [
-        checkpoint,
-        f"--data.root={other}",
-        f"--trainer.default_root_dir={tmp_path}",
-        "--callbacks.progress=null",
-    ]
-    for command in (["validate", *arguments], fit(other, tmp_path, *CODES, checkpoint, steps=22)):
-        assert main(command) == 1
-        assert re.search(
-            rf"^error: .* trained on {demo_scene.name} with 9 views, and 1 of the 8 views of {other} are .*--data",
-            capsys.readouterr().err,
-            re.MULTILINE,
-        )
+    arguments = [f"--ckpt_path={finished / 'checkpoints' / 'last.ckpt'}", f"--data.root={other}"]
+    arguments += [f"--trainer.default_root_dir={tmp_path}", "--callbacks.progress=null"]
+    assert main(["validate", *arguments]) == 1
+    message = rf"^error: .* trained on {demo_scene.name} with 9 views, and 1 of the 8 views of {other} are .*--data"
+    assert re.search(message, capsys.readouterr().err, re.MULTILINE)
     assert main(["validate", *arguments, "--trainer.allow_other_scene=true"]) == 0
 
 
@@ -322,20 +285,22 @@ def test_callbacks_can_be_configured_exchanged_removed_and_added(capsys: pytest.
     assert config["trainer"]["callbacks"][0]["class_path"].endswith("LearningRateMonitor")
 
 
-def test_a_fit_without_a_config_is_fast(capsys: pytest.CaptureFixture[str]) -> None:
-    plain = settings(capsys, "--data.root=x")
-    assert plain == settings(capsys, "--data.root=x", "--config=fast")
-    assert (plain["trainer"]["max_steps"], plain["callbacks"]["budget"]["init_args"]["quality"]) == (4000, 0.9)
-    assert plain["trainer"]["devices"] == 1  # whatever the machine has
-    assert plain["model"]["quantizer"]["class_path"].endswith("TrainedStraightThrough")
+def test_shipped_configs_are_what_their_names_say(capsys: pytest.CaptureFixture[str]) -> None:
+    default = settings(capsys, "--data.root=x")
+    assert default == settings(capsys, "--data.root=x", "--config=fast")
+    assert (default["trainer"]["max_steps"], default["callbacks"]["budget"]["init_args"]["quality"]) == (4000, 0.9)
+    assert default["trainer"]["devices"] == 1  # whatever the machine has
+    assert default["model"]["quantizer"]["class_path"].endswith("TrainedStraightThrough")
+    plain = settings(capsys, "--config=plain", "--data.root=x")
+    assert plain["model"]["codebooks"] is None
+    assert plain["callbacks"]["phases"]["init_args"]["warmup_end"] == 15_000
+    assert plain["callbacks"]["density"]["init_args"]["prune_every"] == 0
+    assert settings(capsys, "--config=demo.yaml")["data"]["class_path"].endswith("DemoDataModule")
 
 
-def test_the_papers_config_is_the_paper_and_its_settings_survive_another_class(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_papers_settings_survive_another_class(capsys: pytest.CaptureFixture[str]) -> None:
     config = settings(capsys, "--config=paper", "--data.root=x", "--model.codebooks=4k", "--model.quantizer=PostHoc")
-    assert config["trainer"]["max_steps"] == 45_000
-    assert config["model"]["codebooks"] == "4k"
+    assert (config["trainer"]["max_steps"], config["model"]["codebooks"]) == (45_000, "4k")
     assert config["model"]["quantizer"]["class_path"].endswith("PostHoc")
     assert config["model"]["rates"]["shN"] == 0.000125
     callbacks = config["callbacks"]
@@ -343,14 +308,6 @@ def test_the_papers_config_is_the_paper_and_its_settings_survive_another_class(
     assert callbacks["phases"]["init_args"]["quantize_end"] == 43_000
     assert callbacks["density"]["class_path"].endswith("DensityControl")
     assert callbacks["density"]["init_args"]["start"] == 600
-
-
-def test_plain_and_demo_configs_parse(capsys: pytest.CaptureFixture[str]) -> None:
-    plain = settings(capsys, "--config=plain", "--data.root=x")
-    assert plain["model"]["codebooks"] is None
-    assert plain["callbacks"]["phases"]["init_args"]["warmup_end"] == 15_000
-    assert plain["callbacks"]["density"]["init_args"]["prune_every"] == 0
-    assert settings(capsys, "--config=demo.yaml")["data"]["class_path"].endswith("DemoDataModule")
 
 
 def test_a_missing_opencv_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -517,3 +474,10 @@ def test_a_quantizer_of_the_current_folder_trains(
     assert main(fit(demo_scene, tmp_path, *CODES[1:], "--model.quantizer=my_quantizers.Halfway", steps=4)) == 0
     stored = read_nsvq(tmp_path / demo_scene.name / "version_0" / "scene.nsvq")
     assert stored.config["quantizers"] == {"scales": "Halfway", "sh0": "Halfway"}
+
+
+def test_several_devices_are_view_parallel_unless_told_otherwise(tmp_path: Path) -> None:
+    settings = {"accelerator": "cpu", "logger": False, "enable_checkpointing": False, "default_root_dir": tmp_path}
+    assert type(SplatTrainer(devices=2, **settings).strategy).__name__ == "ViewParallelStrategy"
+    assert type(SplatTrainer(devices=2, strategy="ddp", **settings).strategy).__name__ == "DDPStrategy"
+    assert type(SplatTrainer(devices=1, **settings).strategy).__name__ == "SingleDeviceStrategy"

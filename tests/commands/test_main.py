@@ -1,12 +1,153 @@
+"""The ``nsvq`` command before anything runs: version, help, settings that cannot be; and the script ``lightning``."""
+
 from __future__ import annotations
 
+import inspect
+import os
+import re
+import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import torch
 
-from nsvq_lightning.commands import main as front_end
+import nsvq_lightning
+from nsvq_lightning.callbacks import STANDARD
+from nsvq_lightning.commands import main as main_module
+from nsvq_lightning.commands.fit import SplatCLI
+from nsvq_lightning.commands.main import main
+from nsvq_lightning.commands.option_help import class_help
+from nsvq_lightning.commands.registry import COMMANDS
+
+
+@pytest.mark.parametrize(("argument", "said"), [("--version", nsvq_lightning.__version__), ("--help", "benchmark")])
+def test_version_and_overview_come_without_torch(argument: str, said: str) -> None:
+    code = (
+        "import sys; from nsvq_lightning.commands.main import main; status = main(sys.argv[1:]); "
+        "exit(status or 'torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, argument], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert said in done.stdout
+    if argument == "--help":
+        assert all(
+            re.search(rf"^  {name} +{re.escape(command.summary)}$", done.stdout, re.M)
+            for name, command in COMMANDS.items()
+        )
+
+
+def test_help_of_commands_without_training_comes_without_torch() -> None:
+    code = (
+        "import sys\nfrom nsvq_lightning.commands.main import main\n"
+        "for name in sys.argv[1:]:\n"
+        "    try: main([name, '--help'])\n"
+        "    except SystemExit as end: assert not end.code\n"
+        "assert not {'torch', 'numba', 'lightning'} & set(sys.modules)"
+    )
+    names = [name for name, command in COMMANDS.items() if command.module is not None]
+    done = subprocess.run([sys.executable, "-c", code, *names], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.count("\nExamples:\n") == len(names) - 1  # info has none
+
+
+def test_no_command_is_an_error_that_shows_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 2
+    assert "nsvq COMMAND --help" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def fit_help() -> str:
+    environment = os.environ | {"COLUMNS": "80"}
+    command = [sys.executable, "-m", "nsvq_lightning", "fit", "--help"]
+    return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
+
+
+def test_help_says_what_there_is_and_names_none_of_torchs_classes(fit_help: str) -> None:
+    for key, kind in STANDARD.items():
+        assert f"--callbacks.{key}" in fit_help or not inspect.signature(kind).parameters
+    assert "--data.root\n        Scene folder" in fit_help
+    assert "--trainer.max_steps=4000" in fit_help
+    assert "torch.nn" not in fit_help
+    assert len(fit_help.splitlines()) < 510
+    assert max(len(line) for line in fit_help.splitlines() if line.startswith("        ")) <= 80
+
+
+def test_options_that_the_readme_names_are_in_the_help(fit_help: str) -> None:
+    root = Path(__file__).resolve().parents[2]
+    if not (root / "README.md").exists():
+        pytest.skip("a source distribution has no README beside the tests")
+    pages = "".join(path.read_text(encoding="utf-8") for path in (root / "README.md", root / "docs" / "your_photos.md"))
+    named = {
+        name
+        for name in re.findall(r"--((?:callbacks|data|model|trainer)\.[\w.]*\w)", pages)
+        if "quantizer." not in name
+    }
+    assert {"data.root", "trainer.max_steps"} <= named
+    known = fit_help + "".join(class_help(f"callbacks.{key}", kind) for key, kind in STANDARD.items())
+    assert {name for name in named if f"--{name}" not in known} == set()
+
+
+def test_one_callback_says_what_it_takes(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["fit", "--callbacks.density.help"])
+    assert end.value.code == 0
+    out = capsys.readouterr().out
+    assert out.startswith("callbacks.density:\n  Splits splats where the photos have edges")
+    assert "--callbacks.density.grad_threshold=0.0003\n" in out
+
+
+SCENE = ["--data.root=no_scene", "--callbacks.progress=null"]
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("--trainer.accelerator=tpu", "torch_xla"),
+        ("--trainer.devices=0", "devices='0'"),
+        ("--trainer.strategy=nothing", "strategy='nothing'"),
+        ("--callbacks.density.budget=1", "budget must be at least min_splats=10, got 1"),
+        ("--callbacks.report.every=-1", "every must be at least 0, got -1"),
+        ("--trainer.logger=MLFlowLogger", "mlflow"),
+        ("--trainer.accelerator=gpu", "No supported gpu backend found"),
+        ("--model.quantizer=nn_modules.NoQuantizer", "NoQuantizer is not a quantizer; it lacks: codebook, codes"),
+    ],
+)
+def test_settings_that_cannot_be_are_one_line(
+    option: str, message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    if option.endswith("gpu") and (torch.cuda.is_available() or torch.backends.mps.is_available()):
+        pytest.skip("this machine has a GPU")
+    if "mlflow" in message and (find_spec("mlflow") or find_spec("mlflow_skinny")):
+        pytest.skip("MLflow is installed")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "nn_modules", raising=False)
+    Path("nn_modules.py").write_text("import torch\nclass NoQuantizer(torch.nn.Linear): ...\n")
+    assert main(["fit", *SCENE, option]) == 1
+    lines = [line for line in capsys.readouterr().err.splitlines() if "available" not in line and "Tip" not in line]
+    assert [line.partition(":")[0] for line in lines] == ["error", "(NSVQ_TRACEBACK=1 shows where)"]
+    assert message in lines[0]
+    assert sorted(path.name for path in tmp_path.iterdir() if path.name != "__pycache__") == ["nn_modules.py"]
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes")]
+)
+def test_a_lack_of_memory_is_one_line(
+    error: Exception, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(path: Path) -> None:
+        raise error
+
+    monkeypatch.setattr("nsvq_lightning.commands.info.describe", fail)
+    assert main(["info", "a.ply"]) == 1
+    assert re.fullmatch(r"error: there is not enough memory: close .* \(--splats\).*\n", capsys.readouterr().err)
+    monkeypatch.setenv("NSVQ_TRACEBACK", "1")
+    with pytest.raises(type(error)):
+        main(["info", "a.ply"])
+
 
 Install = Callable[[str, str], None]
 
@@ -20,7 +161,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         seen.append(list(argv or []))
         return 3
 
-    monkeypatch.setattr(front_end, "main", main)
+    monkeypatch.setattr(main_module, "main", main)
     return seen
 
 
@@ -44,17 +185,14 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
     return add
 
 
-def test_the_words_are_those_of_the_front_end() -> None:
-    from nsvq_lightning.commands.fit import SplatCLI
-    from nsvq_lightning.commands.registry import COMMANDS
-
+def test_the_words_are_those_of_the_main_module() -> None:
     assert {name for name, command in COMMANDS.items() if command.module is None} == set(SplatCLI.subcommands())
 
 
 @pytest.mark.parametrize("arguments", [["fit", "--config", "a.yaml"], ["info", "x.ply"], ["validate"], ["--help"], []])
 def test_our_words_run_our_command(calls: list[list[str]], install: Install, arguments: list[str]) -> None:
     install("lightning-sdk", "foreign:wrong")
-    assert front_end.lightning(arguments) == 3
+    assert main_module.lightning(arguments) == 3
     assert calls == [arguments]
 
 
@@ -65,7 +203,7 @@ def test_foreign_words_go_to_the_other_distribution(
     install("litserve", "foreign:wrong")
     install("lightning-sdk", "foreign:run")
     with pytest.raises(SystemExit, match="5"):
-        front_end.lightning(["login", "--token", "x"])
+        main_module.lightning(["login", "--token", "x"])
     assert capsys.readouterr().out == "foreign lightning login --token x\n"
     assert calls == []
 
@@ -74,7 +212,7 @@ def test_without_another_distribution_the_known_words_are_listed(
     install: Install, capsys: pytest.CaptureFixture[str]
 ) -> None:
     install("nsvq-lightning", "foreign:wrong")
-    assert front_end.lightning(["login"]) == 2
+    assert main_module.lightning(["login"]) == 2
     message = capsys.readouterr().err
     assert "unknown command 'login'" in message
     assert "fit, test, validate, predict" in message

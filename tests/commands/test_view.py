@@ -14,7 +14,7 @@ from splat_scenes import random_splats
 
 from nsvq_lightning.commands.arguments import photos_of
 from nsvq_lightning.commands.main import main
-from nsvq_lightning.commands.view import Source, _Handler, _is_own, _Server
+from nsvq_lightning.commands.view import _Handler, _is_own, _Server
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import read_nsvq, save
 from nsvq_lightning.io.compressed import CompressedScene
@@ -41,7 +41,8 @@ def run(tmp_path: Path) -> Path:
 def address(run: Path, demo_scene: Path) -> Iterator[str]:
     """A server that follows the run."""
     page = viewer.viewer_page(viewer.some_cameras(load_scene(demo_scene)), "run", live=0.2).encode()
-    attributes = {"page": page, "source": Source(run / "scene.nsvq", run), "host": "127.0.0.1", "timeout": 0.5}
+    files = {"file": run / "scene.nsvq", "live": run / viewer.LIVE_SCENE}
+    attributes = {"page": page, **files, "host": "127.0.0.1", "timeout": 0.5}
     with _Server(("127.0.0.1", 0), type("Handler", (_Handler,), attributes)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import logging
 import shutil
 from pathlib import Path
 from typing import Any
@@ -36,12 +37,12 @@ def codec(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> st
     return str(request.param)
 
 
-def test_pictures_come_back_from_the_video(tmp_path: Path, codec: str) -> None:
+def test_pictures_come_back_from_the_video(tmp_path: Path, codec: str, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "a.mp4"
-    with video_writer(path, 64, 48, 12.0) as writer:
-        assert writer.codec == codec
+    with caplog.at_level(logging.INFO), video_writer(path, 64, 48, 12.0) as add:
         for picture in _pictures():
-            writer.write(picture)
+            add(picture)
+    assert caplog.messages == [f"{path}: {codec}"]
     frames = _frames(path)
     assert len(frames) == 10
     for frame, picture in zip(frames, _pictures(), strict=True):
@@ -54,8 +55,8 @@ def test_an_error_leaves_the_old_video(tmp_path: Path, codec: str) -> None:
     path.write_bytes(b"old")
 
     def broken_off() -> None:
-        with video_writer(path, 64, 48, 12.0) as writer:
-            writer.write(_pictures()[0])
+        with video_writer(path, 64, 48, 12.0) as add:
+            add(_pictures()[0])
             raise RuntimeError("stop")
 
     with pytest.raises(RuntimeError, match="stop"):
@@ -64,11 +65,8 @@ def test_an_error_leaves_the_old_video(tmp_path: Path, codec: str) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
 
 
-@pytest.mark.parametrize(
-    ("name", "width", "message"), [("a.avi", 64, r"a\.avi: a video ends in \.mp4"), ("a.mp4", 63, "even, got 63x48")]
-)
-def test_impossible_videos_are_refused(tmp_path: Path, name: str, width: int, message: str) -> None:
-    with pytest.raises(ValueError, match=message), video_writer(tmp_path / name, width, 48, 12):
+def test_odd_sizes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="even, got 63x48"), video_writer(tmp_path / "a.mp4", 63, 48, 12):
         pass
     assert not list(tmp_path.iterdir())
 
@@ -80,7 +78,7 @@ def test_what_ffmpeg_says_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(pictures.shutil, "which", lambda name: str(program))
     with (
         pytest.raises(OSError, match="could not write the video: no such codec"),
-        video_writer(tmp_path / "a.mp4", 64, 48, 12) as writer,
+        video_writer(tmp_path / "a.mp4", 64, 48, 12) as add,
     ):
-        writer.write(_pictures()[0])
+        add(_pictures()[0])
     assert not (tmp_path / "a.mp4").exists()

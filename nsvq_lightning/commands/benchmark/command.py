@@ -2,7 +2,7 @@
 
 Suites:
   render     back-ends of the rasterizer and of the loss, forward and backward, against float64
-  quantize   a step of NSVQ, the search for the nearest code, and k-means
+  quantize   a step of NSVQ, and the search for the nearest code
   codec      writing and reading scene files
   train      whole runs, with switches on and off
 

@@ -1,4 +1,4 @@
-"""Suite ``quantize``: a step of NSVQ, the search for the nearest code in it, and the k-means it starts from."""
+"""Suite ``quantize``: a step of NSVQ, and the search for the nearest code in it."""
 
 from collections.abc import Iterator, Mapping
 from functools import partial
@@ -11,13 +11,13 @@ from torch import Tensor
 from nsvq_lightning.commands.benchmark import Scope
 from nsvq_lightning.commands.benchmark.timing import Measurement, compare, use_threads
 from nsvq_lightning.commands.benchmark.workloads import relative_l2, synthetic_workload, workloads
-from nsvq_lightning.quantize import NSVQ, CodebookQuantizer, kmeans, nearest, nearest_reference
+from nsvq_lightning.quantize import NSVQ, CodebookQuantizer, nearest, nearest_reference
 from nsvq_lightning.quantize.attributes import attribute_rows, build_quantizers
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.optim import LearningRates
 
-STEP, SEARCH, KMEANS = "step, forward + backward", "search", "k-means"
+STEP, SEARCH = "step, forward + backward", "search"
 # Rows an attribute whose codes are checked: the float64 oracle is slow.
 CHECKED_ROWS = 4_000
 
@@ -53,15 +53,11 @@ def run(scope: Scope) -> Iterator[Measurement]:
         x, codebook = attribute.x.detach(), attribute.quantizer.codebook.detach()
         seen, size = x[attribute.rows], f"D {x.shape[1]}, K {len(codebook)}"
         searches = {"nsvq_lightning": nearest, "cdist + argmin": _by_distances}
-        means = {f"Lloyd: {n} step{'s' * (n > 1)}": n for n in (1, 10)}  # the last one is training's
         cases = {method: partial(search, seen, codebook) for method, search in searches.items()}
-        starts = {method: partial(_kmeans, x, len(codebook), name, steps) for method, steps in means.items()}
         with use_threads(max(scope.threads)):
             errors = {method: code_errors(seen, codebook, call()) for method, call in cases.items()}
-            kept = {method: {"distortion": distortion(x, call())} for method, call in starts.items()}
         yield from compare(SEARCH, f"{name}: {len(seen)} rows, {size}", cases, errors, scope)
-        yield from compare(KMEANS, f"{name}: {len(x)} rows, {size}", starts, kept, scope)
-    # The step comes last: it moves rows and codes, and the others measure them as they are fitted.
+    # The step comes last: it moves rows and codes, and the search measures them as they are fitted.
     methods, clock = {"NSVQ": step, "plain torch": plain_step}, count(1)
     with use_threads(max(scope.threads)):
         errors = {method: step_errors(attributes, call(attributes, 0)) for method, call in methods.items()}
@@ -69,10 +65,6 @@ def run(scope: Scope) -> Iterator[Measurement]:
     note = f"codes checked on at most {CHECKED_ROWS} rows an attribute"
     workload, move = f"{source.name}, {scope.codebooks} codebooks", lambda: _advance(attributes, next(clock))
     yield from compare(STEP, workload, steps, errors, scope, note, prepare=move)
-
-
-def _kmeans(x: Tensor, codes: int, name: str, steps: int) -> Tensor:
-    return kmeans(x, codes, generator(0, 0, "start", name), steps=steps)
 
 
 def prepare(splats: RawSplats, codebooks: str) -> dict[str, Attribute]:
@@ -166,10 +158,3 @@ def code_errors(x: Tensor, codebook: Tensor, codes: Tensor) -> dict[str, float]:
 def _by_distances(x: Tensor, codebook: Tensor) -> Tensor:
     parts = torch.split(x, max(1, (1 << 22) // len(codebook)))  # all distances at once would fill the memory
     return torch.cat([torch.cdist(part, codebook).argmin(1) for part in parts])
-
-
-def distortion(x: Tensor, codebook: Tensor) -> float:
-    """Mean squared distance of the rows ``[N, D]`` to their nearest codes, as a share of their variance."""
-    away = (x - codebook[nearest(x, codebook)]).double().square().sum(1).mean()
-    spread = x.double().var(0, correction=0).sum()
-    return float(away / spread) if spread > 0 else float(away)

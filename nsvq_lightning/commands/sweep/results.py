@@ -145,28 +145,22 @@ def draw_sweep(path: Path, rows: Sequence[Row]) -> None:
 def _draw_sizes(axis: Any, rows: Sequence[Row], colours: dict[str, str]) -> None:
     """Test PSNR over the size of the file, a line for each series."""
     are_points = not any(row["codebooks"] for row in rows)
-    style = {"linewidth": 1, "elinewidth": 0.8, "capsize": 2, "markersize": 5}
-    labelled = set()
+    style = {"fmt": "o-", "linewidth": 1, "elinewidth": 0.8, "capsize": 2, "markersize": 5}
     for name, colour in colours.items():
         note = {"textcoords": "offset points", "fontsize": 7, "color": colour}
-        points = []
-        for group in grouped([row for row in rows if row["series"] == name]):
-            if group[0]["codebooks"] or are_points:
-                points.append(group)
-                continue
-            # As a point, it would be far outside the picture.
-            psnr, size = moments(group, "psnr")[0], moments(group, "bytes", 1e-6)[0]
-            axis.axhline(psnr, color=colour, linestyle="--", linewidth=1)
-            axis.annotate(f"{size:.3g} MB", (0, psnr), (3, 3), xycoords=("axes fraction", "data"), **note)
+        groups = grouped([row for row in rows if row["series"] == name])
+        points = [group for group in groups if group[0]["codebooks"] or are_points]
         points.sort(key=lambda group: moments(group, "bytes"))
         x, x_spread = np.reshape([moments(group, "bytes", 1e-6) for group in points], (-1, 2)).T
         y, y_spread = np.reshape([moments(group, "psnr") for group in points], (-1, 2)).T
-        axis.errorbar(x, y, xerr=x_spread, yerr=y_spread, fmt="o-", color=colour, **style)
-        sizes = tuple(group[0]["codebooks"] for group in points)
-        if sizes not in labelled:  # the first curve of these sizes speaks for the others
-            labelled.add(sizes)
-            for size, *place in zip(sizes, x, y, strict=True):
-                axis.annotate(size, place, (4, 5), **note)
+        axis.errorbar(x, y, xerr=x_spread, yerr=y_spread, color=colour, **style)
+        for group, *place in zip(points, x, y, strict=True):
+            axis.annotate(group[0]["codebooks"], place, (4, 5), **note)
+        for group in groups:
+            if group not in points:  # as a point, it would be far outside the picture
+                psnr, size = moments(group, "psnr")[0], moments(group, "bytes", 1e-6)[0]
+                axis.axhline(psnr, color=colour, linestyle="--", linewidth=1)
+                axis.annotate(f"{size:.3g} MB", (0, psnr), (3, 3), xycoords=("axes fraction", "data"), **note)
 
 
 def _draw_times(axis: Any, rows: Sequence[Row], colours: dict[str, str]) -> None:

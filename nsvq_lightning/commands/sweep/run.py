@@ -49,9 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seeds", type=integers, default=(), metavar="0,1,2", help="of the draws and of the order of the views")
     add("--max-steps", type=int, metavar="N", help="iterations of every run (default: those of its configuration)")
     parser.add_argument("--keep-checkpoints", action="store_true", help="keep those of finished runs")
-    add = parser.add_mutually_exclusive_group().add_argument
-    add("--dry-run", action="store_true", help="only say which runs there are")
-    add("--commands", action="store_true", help="only print a command for each unfinished run, to be run anywhere")
+    help_ = "only print a command for each unfinished run, to be run anywhere"
+    parser.add_argument("--commands", action="store_true", help=help_)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -76,9 +75,6 @@ def run(options: argparse.Namespace) -> int:
     steps = [] if options.max_steps is None else [f"--trainer.max_steps={options.max_steps}"]
     lists = (options.scenes, options.configs, options.quantizers, options.codebooks, options.seeds)
     runs = plan(*lists, options=[*steps, *further])
-    if options.dry_run:
-        sys.stdout.writelines(preview(output, runs))
-        return 0
     output.mkdir(parents=True, exist_ok=True)
     hold(output)
     # What a job scheduler sends ends the training that is on, too; it would go on alone otherwise.
@@ -174,15 +170,6 @@ def train(folder: Path, settings: Settings) -> str:
 def folder_of(output: Path, run: Run) -> Path:
     """Folder of a run, named after its digest: no other run writes there. The title is that of the first."""
     return next((output / "runs").glob(f"*-{run.digest}"), output / "runs" / f"{run.title}-{run.digest}")
-
-
-def preview(output: Path, runs: Sequence[Run]) -> Iterator[str]:
-    """A line for each run."""
-    for run in runs:
-        folder = folder_of(output, run)
-        begun = "begun" if (folder / CHECKPOINT).is_file() else "new"
-        state = "finished" if (folder / "metrics.json").is_file() else begun
-        yield f"{folder.name}: {run.names['steps']} iterations, {state}\n"
 
 
 def commands(output: Path, runs: Sequence[Run]) -> Iterator[str]:

@@ -75,7 +75,7 @@ def test_image_errors_leave_out_a_flipped_pixel_and_count_it() -> None:
     assert set(render.image_errors(truth, truth)[0].values()) == {0}
 
 
-def test_quantizer_search_and_kmeans_are_right(scene: Path) -> None:
+def test_quantizer_and_search_are_right(scene: Path) -> None:
     rows = list(quantize.run(_tiny(scene=scene)))
     values = _checked(rows)
     assert values[quantize.STEP, "NSVQ"]["gradient error"] < 1e-4
@@ -84,9 +84,6 @@ def test_quantizer_search_and_kmeans_are_right(scene: Path) -> None:
     ours = [row.values["added distance"] for row in rows if row.method == "nsvq_lightning"]
     assert len(ours) == 4
     assert max(ours) < 1e-6
-    once, often = ([r for r in rows if r.method == f"Lloyd: {n}"] for n in ("1 step", "10 steps"))
-    for few, many in zip(once, often, strict=True):
-        assert 0 < many.values["distortion"] < few.values["distortion"] < 1
 
 
 def test_codes_are_judged_by_their_distances() -> None:
@@ -94,9 +91,6 @@ def test_codes_are_judged_by_their_distances() -> None:
     # Distances 0.5 + 0.5 + 0.1; the second code is 1 away from row 1; code 2 equals code 1.
     values = quantize.code_errors(x, codebook, torch.tensor([0, 1, 2]))
     assert values == {"wrong codes": 1, "added distance": pytest.approx(0.5 / 1.1)}
-    rows = torch.tensor([[0.0, 1.0], [2.0, 1.0], [10.0, 1.0], [12.0, 1.0]])
-    # Squared distances of 1 to the centres of the pairs; variance (36 + 16 + 16 + 36) / 4.
-    assert quantize.distortion(rows, torch.tensor([[1.0, 1.0], [11.0, 1.0]])) == pytest.approx(1 / 26)
 
 
 def test_wrong_quantize_step_is_found() -> None:

@@ -214,14 +214,7 @@ def test_an_interrupted_sweep_leaves_no_process_behind(tmp_path: Path, monkeypat
     assert process.returncode == -signal.SIGTERM
 
 
-def test_the_command_says_what_it_would_do(
-    demo_scene: Path, configs: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    given = [f"--scenes={demo_scene}", f"--configs={configs[0]},plain", "--seeds=0,1", "--max-steps=60"]
-    assert main(["sweep", "--dry-run", f"--output={tmp_path}", *given, *OPTIONS[:2]]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 4
-    assert all(line.endswith(": 60 iterations, new") for line in lines)
+def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sweep", f"--output={tmp_path}", "--scenes=missing"]) == 1
     problem = "missing is no folder; --scenes takes COLMAP folders with commas between them"
     assert capsys.readouterr().err == f"nsvq sweep: {problem}\n"
