@@ -29,7 +29,7 @@ SMALL = ((r"max_steps=\d+", "max_steps=8"), (r'codebooks="4k"', 'codebooks="0.5k
 """What is smaller in a test."""
 EXECUTED = ("info", "convert")
 """Commands that are quick enough to be run, not only parsed."""
-SLOW_OPTIONS = ("--measure", "--up")
+SLOW_OPTIONS = ("--floaters", "--measure", "--up")
 ELSEWHERE = ("nsvq_format",)
 """Pages whose code has tests of its own: ``tests/io/nsvq/test_readers.py``."""
 

@@ -17,6 +17,8 @@ from nsvq_lightning.top_level import folder_of
 if TYPE_CHECKING:
     from yaml.nodes import Node
 
+    from nsvq_lightning.rendering.camera import Camera
+
 
 def names(text: str) -> tuple[str, ...]:
     """The entries of ``A,B``, each once."""
@@ -281,3 +283,15 @@ def photos_of(path: Path) -> Path | None:
     data = data.get("init_args", data) if isinstance(data, dict) else None
     root = data.get("root") if isinstance(data, dict) else None
     return Path(root) if isinstance(root, str) and Path(root).is_dir() else None
+
+
+def cameras_of(path: Path) -> dict[str, Camera]:
+    """Cameras by name that the run has recorded that a scene lies in, for when its photos are gone; none without it.
+
+    Raises:
+        ValueError: Its ``viewer.html`` is damaged.
+    """
+    from nsvq_lightning.report.viewer import page_cameras
+
+    page = (path if path.is_dir() else path.parent) / "viewer.html"
+    return page_cameras(page) if page.is_file() else {}

@@ -7,7 +7,7 @@ Examples:
   nsvq convert scene.nsvq scene.sog
   nsvq convert scene.ply scene.sog --palette 4096
   nsvq convert scene.ply scene.spz --measure
-  nsvq convert scene.nsvq turned.ply --up z --data.root my/scene
+  nsvq convert scene.nsvq clean.nsvq --floaters --up z --data.root my/scene
 """
 
 from __future__ import annotations
@@ -15,17 +15,25 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from nsvq_lightning.io import formats, spz
 from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, cropped, rotated, turn_up
 from nsvq_lightning.io.describe import attribute_errors
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.sog import PALETTE_LIMIT
+
+if TYPE_CHECKING:
+    import torch
+
+    from nsvq_lightning.data.scene import View
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,10 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--measure", action="store_true", help="render both files and say how they differ")
     corners, help_ = ("X0", "Y0", "Z0", "X1", "Y1", "Z1"), "keep the splats with centres in this box, in scene units"
     add("--crop", nargs=6, type=float, metavar=corners, help=f"{help_} of the input")
+    help_ = "remove splats that no photo of --data.root supports; takes minutes"
+    add("--floaters", action="store_true", help=help_)
     help_ = "turn the scene so that up, as the cameras of --data.root hold it, is this axis"
     add("--up", choices=UP_AXES, help=help_)
     add("--up-from", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where up is in the input, for --up")
-    help_ = "scene folder: for --up, and for --measure instead of views from around the scene"
+    help_ = "scene folder: for --floaters and --up, and for --measure instead of views from around the scene"
     add("--data.root", dest="root", type=Path, metavar="FOLDER", help=help_)
 
 
@@ -61,11 +71,13 @@ def run(options: argparse.Namespace) -> int:
     """
     wrong = {
         "--up-from says where up is: add --up to say what it is to become": options.up_from and not options.up,
+        "--floaters asks the photos: add --data.root": options.floaters and not options.root,
         "--up needs to know where up is now: add --data.root or --up-from": options.up
         and not (options.up_from or options.root),
-        "--data.root says where to measure: add --measure": options.root and not (options.measure or options.up),
+        "--data.root says where to measure: add --measure": options.root
+        and not (options.measure or options.floaters or options.up),
         "--measure compares with the input as it is: convert without it first": options.measure
-        and (options.crop or options.up),
+        and (options.crop or options.floaters or options.up),
     }
     writer: dict[str, Any] = {}
     for flag, name, suffix in (
@@ -82,7 +94,7 @@ def run(options: argparse.Namespace) -> int:
         if is_so:
             raise argparse.ArgumentError(None, message)
     output: Path = options.output
-    if not output.parent.is_dir():  # before anything is read
+    if not output.parent.is_dir():  # now, not after the minutes that floaters take
         raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
     scene = _cleaned(formats.read_scene(options.input).finite(), options)
     size = formats.save(scene, output, **writer)
@@ -101,13 +113,15 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _cleaned(scene: CompressedScene, options: argparse.Namespace) -> CompressedScene:
-    """The scene within the box, turned."""
+    """The scene within the box, without floaters, turned, in this order."""
     before = len(scene)
     if options.crop is not None:
         scene = cropped(scene, np.array(options.crop[:3]), np.array(options.crop[3:]))
         if len(scene) == 0:
             raise ValueError(f"no splat of {options.input} is in the box {' '.join(map(str, options.crop))}")
         sys.stdout.write(f"crop: {before - len(scene):,} of {before:,} splats are outside\n")
+    if options.floaters:
+        scene = _without_floaters(scene, options.root)
     if options.up is not None:
         scene = rotated(scene, turn_up(_up(options), options.up))
     return scene.in_use() if len(scene) < before else scene
@@ -125,6 +139,34 @@ def _up(options: argparse.Namespace) -> NDArray[np.float64]:
     if not 0 < length < np.inf:
         raise ValueError(f"--up-from {' '.join(map(str, options.up_from))} is no direction")
     return np.asarray(up / length)
+
+
+def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
+    import torch
+
+    from nsvq_lightning.compression.floaters import floaters
+    from nsvq_lightning.data.scene import load_scene
+    from nsvq_lightning.rendering.rasterize import render
+    from nsvq_lightning.report.files import evaluate
+
+    photos = load_scene(root)
+    splats = scene.decode().raw()
+    look = partial(render, antialiased=scene.antialiased)
+
+    def views() -> Iterator[View]:
+        return (photos.view(index) for index in tqdm(photos.train, unit=" photos", mininterval=1))
+
+    def psnr(keep: torch.Tensor) -> float:
+        kept = type(splats)(*(tensor[keep] for tensor in splats))
+        tests = (photos.view(index) for index in photos.test)
+        return evaluate(lambda camera: look(kept, camera).image, tests, torch.device("cpu"))[0]
+
+    removed = floaters(splats, views, look)
+    sys.stdout.write(
+        f"floaters: {int(removed.sum()):,} of {len(scene):,} splats; test photos at "
+        f"{psnr(torch.ones_like(removed)):.2f} dB before, {psnr(~removed):.2f} dB after\n"
+    )
+    return scene.take((~removed).numpy())
 
 
 def _measure(source: Path, output: Path, root: Path | None) -> None:

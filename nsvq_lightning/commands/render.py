@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from nsvq_lightning.commands.arguments import photos_of, positive, scene_file, some_of
+from nsvq_lightning.commands.arguments import cameras_of, photos_of, positive, scene_file, some_of
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
@@ -134,12 +134,15 @@ def _path(options: argparse.Namespace, splats: Splats, is_video: bool) -> tuple[
 
     fps = options.fps or FPS
     root = options.root or photos_of(options.scene)
-    kind = options.path or ("through" if root is not None else "orbit")
+    recorded = list(cameras_of(options.scene).values()) if root is None else []
+    kind = options.path or ("through" if root is not None or recorded else "orbit")
     if kind not in ("through", "cameras", "orbit"):
         given, own = read_camera_path(Path(kind))
         fps = options.fps or own
     elif root is not None:
         given = list(load_scene(root).cameras)
+    elif recorded:
+        given = recorded
     elif kind == "orbit":
         log.info("no photos: their cameras are guessed from the scene; --data.root names the folder of the photos")
         given = likely_cameras(splats, 24)

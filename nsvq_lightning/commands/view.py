@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from nsvq_lightning.commands.arguments import photos_of, scene_file
+from nsvq_lightning.commands.arguments import cameras_of, photos_of, scene_file
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
@@ -114,6 +114,8 @@ def _cameras(options: argparse.Namespace, file: Path) -> dict[str, Camera]:
     root = options.root or photos_of(options.scene)
     if root is not None:
         return some_cameras(load_scene(root))
+    if recorded := cameras_of(options.scene):
+        return recorded
     if options.live:
         raise ValueError(f"{options.scene} does not say where its photos are: name their folder with --data.root")
     splats = load(file)

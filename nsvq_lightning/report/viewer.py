@@ -4,6 +4,7 @@ import base64
 import json
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
@@ -121,6 +122,29 @@ def camera_entry(camera: Camera) -> dict[str, Any]:
     pose = [float(f"{value:.9g}") + 0.0 for row in [*rows, [0.0, 0.0, 0.0, 1.0]] for value in row]
     intrinsics = dict(zip(("fx", "fy", "cx", "cy"), camera.intrinsics, strict=True))
     return {"camera_to_world": pose, "width": camera.width, "height": camera.height, **intrinsics}
+
+
+def page_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
+    """The cameras that a page of :func:`write_viewer` lists, by name; none if it is another page.
+
+    Raises:
+        ValueError: They are damaged.
+        OSError: It cannot be read.
+    """
+    text = Path(path).read_text(encoding="utf-8")
+    found = re.search(r'<script id="scene" type="application/json">(.*)</script>', text)
+    cameras = {}
+    opengl = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    try:
+        for entry in json.loads(found[1])["cameras"] if found else ():
+            name, width, height = str(entry["name"]), int(entry["width"]), int(entry["height"])
+            pose = torch.tensor(entry["camera_to_world"], dtype=torch.float64).view(4, 4)
+            fx, fy, cx, cy = (float(entry[key]) for key in ("fx", "fy", "cx", "cy"))
+            K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+            cameras[name] = Camera(K, (pose @ opengl).inverse().float(), width, height)
+    except (ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(f"the cameras in {path} are damaged ({error}): name the photos with --data.root") from error
+    return cameras
 
 
 def _source(name: str) -> str:

@@ -15,6 +15,7 @@ from nsvq_lightning.io import FORMATS, CompressedScene, read_scene, save
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.spz import read_spz_header
 from nsvq_lightning.rendering.camera import up_of
+from nsvq_lightning.splats.splats import Splats
 
 
 def main(arguments: list[str]) -> int:
@@ -137,6 +138,7 @@ def test_measuring_says_how_the_pictures_differ(tmp_path: Path, capsys: pytest.C
         ("a.nsvq b.sog --data.root x", "add --measure", 2),
         ("a.nsvq b.ply --up z", "--up needs to know where up is now: add --data.root or --up-from", 2),
         ("a.nsvq b.ply --up-from 0 0 1", "--up-from says where up is: add --up", 2),
+        ("a.nsvq b.ply --floaters", "--floaters asks the photos: add --data.root", 2),
         ("a.nsvq b.ply --crop 1 1 1 2 2 2 --measure", "--measure compares with the input as it is", 2),
     ],
 )
@@ -184,3 +186,16 @@ def test_up_is_where_the_cameras_hold_it(demo_scene: Path, tmp_path: Path) -> No
     before, after = (arrays_of(read_scene(tmp_path / f"{name}.ply")).means for name in "ab")
     up = up_of(load_scene(demo_scene).cameras)
     np.testing.assert_allclose(np.sort(after[:, 1]), np.sort(before @ up), atol=1e-5)
+
+
+def test_floaters_ask_the_photos(demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = load_scene(demo_scene)
+    splats = Splats.from_points(scene.points, scene.colors, 0)
+    save(splats, tmp_path / "a.ply")
+    arguments = ["--data.root", str(demo_scene), "--floaters"]
+    assert main([str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), *arguments]) == 0
+    out = capsys.readouterr().out
+    found = re.search(r"floaters: ([\d,]+) of 500 splats; test photos at ([\d.]+) dB before, ([\d.]+) dB after", out)
+    assert found is not None
+    assert len(read_scene(tmp_path / "b.ply")) == 500 - int(found[1])
+    assert float(found[3]) >= float(found[2])

@@ -12,9 +12,10 @@ from splat_scenes import random_splats
 
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.data.scene import load_scene
-from nsvq_lightning.io import save
+from nsvq_lightning.io import load, save
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.report.viewer import page_cameras, write_viewer
 
 
 @pytest.fixture
@@ -72,6 +73,26 @@ def test_a_run_knows_its_photos(scene: Path, demo_scene: Path, tmp_path: Path) -
     reader = cv2.VideoCapture(str(run / "render.mp4"))
     assert reader.get(cv2.CAP_PROP_FRAME_COUNT) == 5
     assert (reader.get(cv2.CAP_PROP_FRAME_WIDTH), reader.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (32, 20)
+
+
+def test_a_run_knows_its_cameras_without_its_photos(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save(random_splats(50), tmp_path / "scene.nsvq")
+    cameras = load_scene(demo_scene).cameras
+    write_viewer(tmp_path / "viewer.html", tmp_path / "scene.nsvq", dict(zip("<bcdefgh&", cameras, strict=True)), "t")
+    (tmp_path / "config.yaml").write_text("data: {class_path: x, init_args: {root: gone}}")
+    assert _run(tmp_path, "--path", "cameras", "-o", tmp_path / "frames") == 0
+    expected = (render(load(tmp_path / "scene.nsvq"), cameras[4]).image.detach().clamp(0, 1) * 255).numpy()
+    assert np.abs(_picture(tmp_path / "frames" / "00004.png") - expected).max() <= 0.51
+    assert main(["view", str(tmp_path), "-o", str(tmp_path / "page.html")]) == 0
+    found = page_cameras(tmp_path / "page.html")
+    assert list(found) == list("<bcdefgh&")
+    assert torch.allclose(found["b"].viewmat, cameras[1].viewmat, atol=1e-6)
+    assert "guessed" not in capsys.readouterr().err
+    (tmp_path / "viewer.html").write_text('<script id="scene" type="application/json">{"cameras": [{}]}</script>')
+    assert _run(tmp_path) == 1
+    assert "viewer.html are damaged ('name'): name the photos with --data.root" in capsys.readouterr().err
 
 
 def test_without_photos_cameras_are_guessed(scene: Path, tmp_path: Path) -> None:
