@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from guards import GuardError, guarded
+from kernel_calls import Call, judged
 from numba import njit, typeof
 
 from nsvq_lightning.compute.memory import Workspace, recycled
-from nsvq_lightning.compute.simd import put
+from nsvq_lightning.compute.simd import get, put
 
 
 @njit
 def write_at(array: Any, place: int) -> None:
     put(array, place, 7)
+
+
+@njit
+def read_at(array: Any, place: int) -> Any:
+    return get(array, place)
 
 
 @njit
@@ -51,6 +58,17 @@ def test_a_planted_overrun_is_found(buffer: str) -> None:
             with pytest.raises(GuardError, match=r"write_at has written beside array 0"):
                 write_at(array, place)
     assert array[9] == 7
+
+
+def test_a_planted_read_beside_an_array_is_found() -> None:
+    def last_of(array: Any) -> Any:
+        return read_at(array, array.size - 1)
+
+    def behind(array: Any) -> Any:
+        return read_at(array, array.size)
+
+    verdicts = [judged(Call(f, inspect.signature(f).bind(np.arange(9.0))), None) for f in (last_of, behind)]
+    assert verdicts == ["right", "it depends on what lies beside its arrays"]
 
 
 def test_an_overrun_of_an_empty_array_is_found() -> None:

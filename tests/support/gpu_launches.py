@@ -7,7 +7,6 @@ kernel, constants, warps, registers of a thread, and bytes of its stack, which h
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 import subprocess
@@ -20,6 +19,7 @@ from typing import Any
 
 import torch
 import triton
+from kernel_entries import stand_in_for_a_gpu
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource, make_backend
 from triton.runtime.jit import JITFunction, create_function_from_signature
@@ -123,8 +123,6 @@ CASES: dict[str, Callable[[], object]] = {
     "sums_3": lambda: sums(3, torch.float32),
     "sums_45": lambda: sums(45, torch.float64),
 }
-USERS = ("quality.loss", "compute.rows", "quantize.nearest", "quantize.tracking", "quantize.nsvq", "quantize.kmeans")
-"""The modules that choose kernels by device."""
 
 compiled: dict[str, dict[str, Any]] = {}
 
@@ -164,9 +162,7 @@ def usage(cubin: bytes) -> dict[str, int]:
 
 if __name__ == "__main__":
     JITFunction.run = compile_launch  # type: ignore[method-assign]
-    for name in USERS:
-        module = importlib.import_module(f"nsvq_lightning.{name}")
-        module.kernels_for = lambda like: "cuda" if like.dtype == torch.float32 else None  # type: ignore[attr-defined]
+    stand_in_for_a_gpu()
     for case in sys.argv[1:]:
         CASES[case]()
     print(json.dumps(list(compiled.values())))

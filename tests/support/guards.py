@@ -4,20 +4,23 @@ Compiled code looks at no bounds, so a write past the end of an array changes wh
 later or never. With :func:`guarded` a kernel works on copies of its arrays, each in the middle of a block of its own,
 and the words around them are looked at after every call: whoever allocated the arrays (a workspace, ``recycled``, an
 entry point), and however much longer they are than what is passed on. What a kernel reads past an end are guard words,
-too, not the neighbour that happens to lie there.
+too, not the neighbour that happens to lie there: with other words it computes something else.
 """
 
 from __future__ import annotations
 
+import inspect
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numba.core.registry import CPUDispatcher
 from numpy.lib.array_utils import byte_bounds
-
-__all__ = ["GuardError", "guarded"]
+from torch import Tensor
 
 GUARD = 4096
 """Bytes before and after each array."""
@@ -35,34 +38,51 @@ class _Block(NamedTuple):
     high: int
     data: np.ndarray[Any, np.dtype[np.uint8]]
 
-    @property
-    def is_intact(self) -> bool:
-        return bool((self.data[:GUARD] == WORD).all() and (self.data[GUARD + self.high - self.low :] == WORD).all())
+    def is_intact(self, word: int) -> bool:
+        return bool((self.data[:GUARD] == word).all() and (self.data[GUARD + self.high - self.low :] == word).all())
 
 
 @contextmanager
-def guarded() -> Iterator[None]:
+def guarded(word: int = WORD) -> Iterator[None]:
     """Check guard words after every call of a kernel from Python, in the body of a ``with`` statement.
+
+    Kernels are those of Numba, and those that Triton interprets.
 
     Raises:
         GuardError: A kernel has written beside its arrays; it names kernel and argument.
     """
-    before = CPUDispatcher.__call__
-    CPUDispatcher.__call__ = lambda kernel, *arguments: _call(before, kernel, arguments)
+    interpreter = sys.modules.get("triton.runtime.interpreter")
+    kinds: list[Any] = [CPUDispatcher, *([] if interpreter is None else [interpreter.GridExecutor])]
+    before = [kind.__call__ for kind in kinds]
+    for kind, call in zip(kinds, before, strict=True):
+        kind.__call__ = _checked(inspect.unwrap(call), word)
     try:
         yield
     finally:
-        CPUDispatcher.__call__ = before
+        for kind, call in zip(kinds, before, strict=True):
+            kind.__call__ = call
 
 
-def _call(call: Callable[..., Any], kernel: Any, arguments: tuple[Any, ...]) -> Any:
-    arrays = list(_arrays(arguments))
-    blocks = _blocks(arrays)
+def _checked(call: Callable[..., Any], word: int) -> Callable[..., Any]:
+    @wraps(call)
+    def checked(kernel: Any, *arguments: Any, **options: Any) -> Any:
+        return _call(lambda *copies: call(kernel, *copies, **options), kernel, arguments, word)
+
+    return checked
+
+
+def _call(call: Callable[..., Any], kernel: Any, arguments: tuple[Any, ...], word: int) -> Any:
+    tensors = {id(value): value.detach().numpy() for value in arguments if isinstance(value, Tensor)}
+    given = _replaced(arguments, tensors)
+    arrays = list(_arrays(given))
+    blocks = _blocks(arrays, word)
     copies = {id(array): _copy(array, blocks) for array in arrays}
-    result = call(kernel, *_replaced(arguments, copies))
+    copies |= {number: torch.from_numpy(copies[id(array)]) for number, array in tensors.items()}
+    result = call(*_replaced(arguments, copies))
     for number, array in enumerate(arrays):
-        if not _block_of(array, blocks).is_intact:
-            raise GuardError(f"{kernel.py_func.__module__}.{kernel.__name__} has written beside array {number}")
+        if not _block_of(array, blocks).is_intact(word):
+            name = getattr(kernel, "py_func", kernel.fn if hasattr(kernel, "fn") else kernel)
+            raise GuardError(f"{name.__module__}.{name.__name__} has written beside array {number}")
         if array.flags.writeable:
             np.copyto(array, copies[id(array)])
     return result
@@ -78,15 +98,15 @@ def _arrays(value: Any) -> Iterator[Any]:
 
 
 def _replaced(value: Any, copies: dict[int, Any]) -> Any:
-    if isinstance(value, np.ndarray):
-        return copies[id(value)]
+    if isinstance(value, np.ndarray | Tensor):
+        return copies.get(id(value), value)
     if isinstance(value, tuple):
         parts = (_replaced(part, copies) for part in value)
         return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
     return value
 
 
-def _blocks(arrays: list[Any]) -> list[_Block]:
+def _blocks(arrays: list[Any], word: int) -> list[_Block]:
     """A block for each array; one for those that share memory, such as records as floats and as integers."""
     spans: list[list[int]] = []
     for low, high in sorted(byte_bounds(array) for array in arrays if array.size):
@@ -94,8 +114,7 @@ def _blocks(arrays: list[Any]) -> list[_Block]:
             spans[-1][1] = max(spans[-1][1], high)
         else:
             spans.append([low, high])
-    blocks = [_Block(low, high, np.full(high - low + 2 * GUARD, WORD, np.uint8)) for low, high in spans]
-    return [*blocks, _Block(0, 0, np.full(2 * GUARD, WORD, np.uint8))]
+    return [_Block(low, high, np.full(high - low + 2 * GUARD, word, np.uint8)) for low, high in [*spans, (0, 0)]]
 
 
 def _block_of(array: Any, blocks: list[_Block]) -> _Block:

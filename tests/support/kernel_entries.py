@@ -15,15 +15,31 @@ from collections.abc import Iterator
 from types import ModuleType
 from typing import Any
 
+import torch
 from numba.core.registry import CPUDispatcher
 
 import nsvq_lightning
 
-__all__ = ["entry_points"]
-
 OPTIONAL = {"triton"}
 MAKER = "kernel"
 """Name of the function that compiles: who names it makes a kernel."""
+
+BY_DEVICE = (
+    "quality.loss",
+    "compute.rows",
+    "quantize.nearest",
+    "quantize.tracking",
+    "quantize.nsvq",
+    "quantize.kmeans",
+)
+"""The modules that choose kernels by device."""
+
+
+def stand_in_for_a_gpu() -> None:
+    """Let tensors that are on no GPU have its kernels, if they are float32."""
+    for name in BY_DEVICE:
+        module: Any = importlib.import_module(f"nsvq_lightning.{name}")
+        module.kernels_for = lambda like: "cuda" if like.dtype == torch.float32 else None
 
 
 def entry_points() -> dict[str, str]:
