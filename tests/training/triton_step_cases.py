@@ -1,6 +1,6 @@
 """What a whole training step asks of a GPU: operators, launches, and numbers that the host waits for.
 
-Run by ``tests/rendering/test_triton.py``; see ``tests/rendering/triton_cases.py`` on how. Tensors on the CPU stand for
+Run by ``tests/properties/test_triton.py``; see ``tests/rendering/triton_cases.py`` on how. Tensors on the CPU stand for
 those on a GPU, so a copy between the two is not seen; what is read is found by the operators that read, and told by
 the function of the package that asks.
 """

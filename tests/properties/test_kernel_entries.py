@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from kernel_entries import entry_points
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def test_a_new_entry_point_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

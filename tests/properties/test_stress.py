@@ -40,7 +40,7 @@ MEANS_SOMETHING = {"scales -inf", "opacities inf", "sh0 -inf"}
 
 @pytest.fixture(scope="module", autouse=True)
 def table_that_is_asked_for(request: pytest.FixtureRequest) -> Iterator[None]:
-    """``pytest tests/test_stress.py --stress-table PATH`` leaves a table of all scenes, larger ones than are tested."""
+    """``--stress-table PATH`` leaves a table of all scenes, larger ones than are tested."""
     yield
     path = request.config.getoption("--stress-table")
     if path is not None:
