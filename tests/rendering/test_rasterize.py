@@ -16,29 +16,22 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu import rasterizer
 from nsvq_lightning.rendering.cpu.records import MAX_SIDE
 from nsvq_lightning.rendering.rasterize import render, visible
+from nsvq_lightning.rendering.reference import light_kept
 from nsvq_lightning.skips import switched
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
 assert_same = partial(oracle.assert_same, "cpu")
 
 
-@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("stored", [0, 1, 2, 3])
+@pytest.mark.parametrize(("sh_degree", "stored"), [(0, 0), (0, 3), (1, 1), (1, 2), (2, 3), (3, 3)])
 def test_sh_degrees(sh_degree: int, stored: int) -> None:
-    if sh_degree <= stored:
-        assert_same(random_splats(150, sh_degree=stored), front_camera(), sh_degree=sh_degree)
+    assert_same(random_splats(150, sh_degree=stored), front_camera(), sh_degree=sh_degree)
 
 
-@pytest.mark.parametrize(
-    ("width", "height"), [(64, 64), (70, 45), (16, 16), (17, 31), (6, 3), (1, 1), (1, 50), (129, 5)]
-)
+@pytest.mark.parametrize(("width", "height"), [(64, 64), (17, 31), (6, 3), (1, 1), (1, 50), (129, 5)])
 def test_image_sizes(width: int, height: int) -> None:
-    assert_same(random_splats(120, seed=2), front_camera(width, height, cx=0.3 * width))
-
-
-@pytest.mark.parametrize("background", [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.2, 0.5, 0.9]])
-def test_backgrounds(background: list[float]) -> None:
-    assert_same(random_splats(100, seed=3), front_camera(), background=torch.tensor(background))
+    background = torch.tensor([0.2, 0.5, 0.9])
+    assert_same(random_splats(120, seed=2), front_camera(width, height, cx=0.3 * width), background=background)
 
 
 def test_saturated_pixels_stop_early() -> None:
@@ -49,14 +42,7 @@ def test_saturated_pixels_stop_early() -> None:
     assert_same(splats, camera)
 
 
-def test_tiny_and_huge_splats() -> None:
-    splats = random_splats(200, seed=6)
-    scales = splats.scales.clone()
-    scales[:40], scales[40:50], scales[50:80, 0] = -12.0, 1.0, 0.5
-    assert_same(splats._replace(scales=scales), front_camera())
-
-
-@pytest.mark.parametrize("count", [1, 2, 15, 16, 17, 33])
+@pytest.mark.parametrize("count", [1, 15, 16, 17])
 def test_counts_around_the_vector_width(count: int) -> None:
     assert_same(random_splats(count, seed=7), front_camera())
 
@@ -70,7 +56,7 @@ def test_splats_behind_and_beside_the_camera() -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("count", [1, 40, 300])
+@pytest.mark.parametrize("count", [1, 300])
 @pytest.mark.parametrize("observed", [False, True])
 def test_bits_do_not_depend_on_the_number_of_threads(threads: int, count: int, observed: bool) -> None:
     if threads > numba.config.NUMBA_NUM_THREADS:
@@ -87,11 +73,14 @@ def test_bits_do_not_depend_on_the_number_of_threads(threads: int, count: int, o
     torch.testing.assert_close((result, again), (expected, gradients), atol=0, rtol=0)
 
 
-def test_no_splat_in_view_is_background() -> None:
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_no_splat_in_view_is_background(antialiased: bool) -> None:
     splats = random_splats(20)
     behind = splats._replace(means=splats.means - torch.tensor([0.0, 0.0, 50.0]))
     background = torch.tensor([0.1, 0.2, 0.3])
-    result, gradients = run(behind, front_camera(), "cpu", torch.float32, background=background)
+    result, gradients = run(
+        behind, front_camera(), "cpu", torch.float32, background=background, antialiased=antialiased
+    )
     assert len(visible(behind, front_camera())) == 0
     torch.testing.assert_close(result.image, background.expand_as(result.image))
     assert all((gradient == 0).all() for gradient in gradients.values())
@@ -122,7 +111,7 @@ def test_zero_quaternion_is_the_identity() -> None:
     assert torch.isfinite(gradients["quats"]).all()
 
 
-@pytest.mark.parametrize("threads", [1, 3, 20])
+@pytest.mark.parametrize("threads", [1, 20])
 def test_visible_is_radii(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rasterizer, "thread_count", lambda: threads)
     splats, camera = random_splats(200, seed=11), front_camera(40, 30, cx=3.0)
@@ -297,12 +286,6 @@ def test_attributes_that_do_not_belong_together_are_refused(name: str) -> None:
             function(splats._replace(**{name: getattr(splats, name)[:5]}), camera)
 
 
-def test_a_background_of_another_type_is_the_same_colour() -> None:
-    splats, camera, background = random_splats(20), front_camera(), torch.tensor([0.25, 0.5, 1.0])
-    images = [render(splats, camera, background=colour).image for colour in (background, background.half())]
-    assert torch.equal(*images)
-
-
 def test_cameras_that_no_back_end_renders_are_refused() -> None:
     camera = front_camera()
     for entry, value, message in (
@@ -357,3 +340,59 @@ def test_data_exchanged_before_the_backward_pass_are_refused(name: str) -> None:
     tensor.data = tensor.data[:20]
     with pytest.raises(ValueError, match=rf"{name} had shape \[50.*add or remove splats only after it"):
         image.sum().backward()
+
+
+@pytest.mark.parametrize("log_scale", [-5.0, -3.5, -2.0])
+def test_anti_aliasing_is_that_of_the_oracle(log_scale: float) -> None:
+    splats, camera = random_splats(300, log_scale=log_scale), front_camera()
+    ours, _ = assert_same(splats, camera, antialiased=True, tolerance=2e-4)
+    assert (render(splats, camera).image - ours.image).abs().max() > 0.01
+
+
+def test_the_factor_is_that_of_the_determinants() -> None:
+    """A splat of known size, straight ahead: √(s² / (s² + 0.3)) along each axis of the picture."""
+    camera = front_camera()
+    depth, pixels = 4.0, 0.5
+    forward, position = camera.viewmat[2, :3], -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
+    scale = pixels * depth / camera.intrinsics[0]
+    splats = RawSplats(
+        means=(position + depth * forward)[None].float(),
+        quats=torch.tensor([[1.0, 0, 0, 0]]),
+        scales=torch.full((1, 3), scale).log(),
+        opacities=torch.tensor([0.3]),
+        sh0=torch.zeros(1, 1, 3),
+        shN=torch.zeros(1, 0, 3),
+    )
+    along = camera.intrinsics[1] / camera.intrinsics[0]
+    expected = math.prod((size / (size + 0.3)) ** 0.5 for size in (pixels**2, (pixels * along) ** 2))
+    assert float(light_kept(splats, camera, torch.tensor([0]))) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_pictures_are_alike_at_half_and_double_resolution(factor: float) -> None:
+    """Against the mean of many small pixels, in which the blur is nothing."""
+    splats, camera = random_splats(400, log_scale=-4.2), front_camera(64, 48)
+
+    def scaled(factor: float) -> Camera:
+        stretch = torch.diag(torch.tensor([factor, factor, 1.0]))
+        return Camera(stretch @ camera.K, camera.viewmat, int(64 * factor), int(48 * factor))
+
+    fine = render(splats, scaled(16 * factor)).image
+    fine = fine.reshape(int(48 * factor), 16, int(64 * factor), 16, 3).mean((1, 3))
+    errors = {
+        antialiased: float((render(splats, scaled(factor), antialiased=antialiased).image - fine).abs().mean())
+        for antialiased in (False, True)
+    }
+    assert errors[True] < 0.5 * errors[False]
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_broken_and_huge_splats_do_no_harm_to_anti_aliasing(backend: str) -> None:
+    camera, splats = front_camera(), random_splats(40)
+    splats.means[0], splats.scales[1], splats.quats[2] = torch.nan, 40.0, 0.0
+    splats.opacities[3], splats.opacities[4], splats.scales[5] = 60.0, -60.0, -60.0
+    splats.means[6] = -splats.means[6] * 10
+    dtype = torch.float32 if backend == "cpu" else torch.float64
+    result, gradients = run(splats, camera, backend, dtype, antialiased=True)
+    assert result.image.isfinite().all()
+    assert all(gradient[1:].isfinite().all() for gradient in gradients.values())
