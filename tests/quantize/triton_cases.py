@@ -90,7 +90,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.mark.parametrize(
     ("dim", "size", "programs"),
-    [(3, 0.0, 4096), (3, 1e-4, 1), (45, 1e-4, 4096), (45, 1e-2, 4096), (9, 0.3, 1)],
+    [(3, 1e-4, 1), (4, 1e-2, 4096), (45, 1e-4, 4096)],
 )
 def test_codes_that_a_bound_proves_are_those_of_a_search(
     dim: int, size: float, programs: int, searched: list[int], monkeypatch: pytest.MonkeyPatch
@@ -176,7 +176,7 @@ def test_codes_beyond_sixteen_bits(num_codes: int) -> None:
     assert starts[-1] == 4
 
 
-@pytest.mark.parametrize(("seed", "n", "dim"), [(5, 300, 3), (2**31 - 1, 21, 45), (2**63 - 1, 21, 45), (5, 0, 3)])
+@pytest.mark.parametrize(("seed", "n", "dim"), [(5, 300, 3), (2**63 - 1, 21, 45), (5, 0, 3)])
 @pytest.mark.parametrize(("aim", "spread"), [(0.0, 1.0), (1.0, 1e-3)])
 def test_substitution_is_that_of_the_cpu(seed: int, n: int, dim: int, aim: float, spread: float) -> None:
     x, codebook = rows_and_codes(2 * n, 7, dim)

@@ -38,14 +38,14 @@ def on_device(splats: RawSplats) -> RawSplats:
     return RawSplats(*(tensor.to(DEVICE, copy=True).requires_grad_() for tensor in splats))
 
 
-@pytest.mark.parametrize(("sh_degree", "stored"), [(0, 0), (0, 3), (1, 1), (2, 3), (3, 3)])
+@pytest.mark.parametrize(("sh_degree", "stored"), [(0, 3), (1, 1), (2, 3)])
 def test_sh_degrees(sh_degree: int, stored: int) -> None:
     assert_same(random_splats(12, sh_degree=stored), front_camera(16, 12), sh_degree=sh_degree)
 
 
-@pytest.mark.parametrize(("width", "height"), [(40, 28), (16, 16), (17, 3), (1, 1)])
+@pytest.mark.parametrize(("width", "height"), [(16, 16), (1, 1)])
 def test_image_sizes(width: int, height: int) -> None:
-    assert_same(random_splats(24, seed=2), front_camera(width, height, cx=0.4 * width))
+    assert_same(random_splats(12, seed=2), front_camera(width, height, cx=0.4 * width))
 
 
 def test_background_and_its_gradient() -> None:
@@ -75,12 +75,11 @@ def test_tiny_and_huge_splats() -> None:
     assert_same(splats._replace(scales=scales), front_camera(20, 16))
 
 
-@pytest.mark.parametrize("axes", [(10.0, 0.01, 0.01), (100.0, 1e-4, 1e-4)])
-def test_needles_keep_the_digits_of_their_gradients(axes: tuple[float, float, float]) -> None:
+def test_needles_keep_the_digits_of_their_gradients() -> None:
     splats = random_splats(16, sh_degree=0, seed=3)
     noise = 0.1 * torch.randn(16, 3, generator=torch.Generator().manual_seed(0))
-    scales = torch.tensor([math.log(axis) for axis in axes]) + noise
-    assert_same(splats._replace(scales=scales, opacities=splats.opacities - 1), front_camera(32, 20))
+    scales = torch.tensor([100.0, 1e-4, 1e-4]).log() + noise
+    assert_same(splats._replace(scales=scales, opacities=splats.opacities - 1), front_camera(16, 20))
 
 
 def test_nothing_overflows_that_the_cpu_can_draw() -> None:
@@ -106,9 +105,8 @@ def test_a_colour_that_is_no_number_shows() -> None:
     assert ours.image[expected.image.isnan()].isnan().all()
 
 
-@pytest.mark.parametrize("count", [1, 129])
-def test_counts_around_the_size_of_a_program(count: int) -> None:
-    assert_same(random_splats(count, seed=7, log_scale=-4.0), front_camera(12, 9))
+def test_more_splats_than_a_program_takes() -> None:
+    assert_same(random_splats(129, seed=7, log_scale=-4.0), front_camera(8, 6))
 
 
 def test_splats_behind_and_beside_the_camera() -> None:
@@ -129,7 +127,8 @@ def test_no_splat_in_view_is_background() -> None:
     splats, camera = random_splats(20), front_camera(20, 9)
     behind = splats._replace(means=splats.means - torch.tensor([0.0, 0.0, 50.0]))
     background = torch.tensor([0.1, 0.2, 0.3])
-    result, gradients = run(behind, camera, "cuda", torch.float32, background=background)
+    result, gradients = run(behind, camera, "cuda", torch.float32, background=background, observe=pixel_map(camera))
+    assert set(oracle.OBSERVED) <= set(gradients)
     assert torch.equal(result.image, background.expand_as(result.image))
     assert all((gradient == 0).all() for gradient in gradients.values())
     nothing, gradients = run(RawSplats(*(tensor[:0] for tensor in splats)), camera, "cuda", torch.float32)
@@ -137,27 +136,26 @@ def test_no_splat_in_view_is_background() -> None:
     assert gradients["shN"].shape == (0, 15, 3)
 
 
-@pytest.mark.parametrize("attribute", ["means", "quats", "scales", "opacities"])
-def test_broken_splats_leave_the_rest_alone(attribute: str) -> None:
+def test_broken_splats_leave_the_rest_alone() -> None:
     splats, camera = random_splats(16, seed=10), front_camera(16, 12)
-    broken = splats._replace(**{attribute: splats._asdict()[attribute].clone()})
-    values = getattr(broken, attribute)
-    values[0], values[1] = float("nan"), -float("inf") if attribute == "opacities" else float("inf")
+    broken = RawSplats(*(tensor.clone() for tensor in splats))
+    for row, values in enumerate((broken.means, broken.quats, broken.scales, broken.opacities)):
+        values[2 * row], values[2 * row + 1] = math.nan, -math.inf if values.ndim == 1 else math.inf
     result, gradients = run(broken, camera, "cuda", torch.float32)
     assert all(torch.isfinite(gradient).all() for gradient in gradients.values())
-    rest, _ = run(RawSplats(*(tensor[2:] for tensor in splats)), camera, "cuda", torch.float32)
+    rest, _ = run(RawSplats(*(tensor[8:] for tensor in splats)), camera, "cuda", torch.float32)
     assert torch.equal(result.image, rest.image)
-    assert not result.radii[:2].any()
+    assert not result.radii[:8].any()
 
 
 def test_visible_is_radii() -> None:
-    splats, camera = random_splats(200, seed=11, log_scale=-4.0), front_camera(8, 6, cx=3.0)
+    splats, camera = random_splats(130, seed=11, log_scale=-4.0), front_camera(8, 6, cx=3.0)
     with torch.no_grad():
         rows = visible(on_device(splats), camera, backend="cuda").cpu()
         radii = render(on_device(splats), camera, backend="cuda").radii.cpu()
     assert torch.equal(rows, radii.nonzero()[:, 0])
     assert torch.equal(rows, visible(splats, camera, backend="reference"))
-    assert 0 < len(rows) < 200
+    assert 0 < len(rows) < 130
 
 
 def test_backward_twice_gives_the_same_bits() -> None:
@@ -172,12 +170,11 @@ def test_backward_twice_gives_the_same_bits() -> None:
 @pytest.mark.parametrize(
     ("splats", "camera"),
     [
-        (random_splats(24, seed=2), front_camera(40, 28)),
         (random_splats(24, seed=2), front_camera(17, 3)),
-        (random_splats(80, seed=5, log_scale=0.5), front_camera(16, 12)),
+        (random_splats(40, seed=5, log_scale=0.5), front_camera(16, 12)),
         (uneven_splats(24), front_camera(20, 16)),
     ],
-    ids=["plain", "small", "saturated", "uneven"],
+    ids=["small", "saturated", "uneven"],
 )
 def test_what_is_observed_is_that_of_the_oracle(splats: RawSplats, camera: Camera) -> None:
     _, gradients = assert_same(splats, camera, observe=pixel_map(camera))
@@ -204,13 +201,6 @@ def test_observing_changes_nothing_else() -> None:
     rtol = 1e-5 if DEVICE == "cuda" else 0
     for name, gradient in gradients.items():
         assert (observed[name] - gradient).norm() <= rtol * gradient.norm(), name
-
-
-def test_nothing_is_observed_where_nothing_is_in_view() -> None:
-    splats, camera = random_splats(20), front_camera(20, 9)
-    behind = splats._replace(means=splats.means - torch.tensor([0.0, 0.0, 50.0]))
-    _, gradients = run(behind, camera, "cuda", torch.float32, observe=pixel_map(camera))
-    assert not any(gradients[name].any() for name in oracle.OBSERVED)
 
 
 @pytest.mark.parametrize("output", ["means2d", "image", "alpha", "depth"])

@@ -28,7 +28,7 @@ def pair(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 @pytest.mark.parametrize(
     ("height", "width", "weight", "bytes_"),
-    [(9, 43, 0.2, False), (9, 20, 0.2, True), (1, 1, 1.0, False), (3, 2, 1.0, True), (17, 5, 0.0, False)],
+    [(9, 43, 0.2, True), (1, 1, 1.0, False), (17, 5, 0.0, False)],
 )
 def test_loss_and_gradient(height: int, width: int, weight: float, bytes_: bool) -> None:
     image, target = pair(height, width)
@@ -48,7 +48,7 @@ def test_loss_and_gradient(height: int, width: int, weight: float, bytes_: bool)
 
 
 def test_ssim_without_gradient() -> None:
-    image, target = (x.clamp(0, 1) for x in pair(13, 17))
+    image, target = (x.clamp(0, 1) for x in pair(6, 7))
     expected = ssim(image.double(), target.double()).item()
     assert ssim(image.to(DEVICE), target.to(DEVICE)).item() == pytest.approx(expected, abs=1e-6)
     with torch.no_grad():
