@@ -19,7 +19,7 @@ from guards import guarded
 
 from nsvq_lightning.data.colmap import import_pycolmap
 
-FIRST = ("test_view_parallel.py", "test_triton.py", "test_kernel_entries.py", "test_interruption.py", "test_fuzz.py")
+FIRST = ("test_triton.py", "test_fit.py", "test_interruption.py", "test_view_parallel.py", "test_kernel_entries.py")
 """Files that take longest: one that starts last would be waited for."""
 
 

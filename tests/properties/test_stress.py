@@ -10,19 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from extremes import (
-    BROKEN_ROWS,
-    beside,
-    extremes,
-    quantizer_errors,
-    quantizers,
-    step,
-    stress_errors,
-    stress_table,
-)
+from extremes import BACKENDS, BROKEN_ROWS, extremes, quantizer_errors, quantizers, step, stress_errors, stress_table
 
 from nsvq_lightning.commands.benchmark import quantize
-from nsvq_lightning.commands.benchmark.render import painter, trace
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.rasterize import render
@@ -31,11 +21,8 @@ from nsvq_lightning.training.optim import LearningRates, build_adam, param_group
 from nsvq_lightning.training.row_ops import LARGEST_LOG_SCALE, drop_non_finite
 
 SCENES = extremes()
-BACKENDS = ("cpu", "reference")
 COARSE = {"scene at 1e+03": 1e-3, "scene at 1e+06": 1.0}
 """Largest relative errors where float32 does not know the positions themselves."""
-MEANS_SOMETHING = {"scales -inf", "opacities inf", "sh0 -inf"}
-"""A point, an opaque splat and a black one."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -62,23 +49,15 @@ def test_an_extreme_scene_is_rendered_and_trained_as_in_float64(name: str) -> No
 @pytest.mark.parametrize("name", [name for name, scene in SCENES.items() if scene.culprit])
 def test_a_number_that_is_none_hurts_no_other_splat_and_is_named(name: str, backend: str) -> None:
     scene = SCENES[name]
-    values, outcome = stress_errors(scene, backend), step(scene, backend)
-    assert outcome.lost == 0
-    assert outcome.named == {scene.culprit: BROKEN_ROWS}
+    values, (refused, named, lost) = stress_errors(scene, backend), step(scene, backend)
+    assert lost == 0
+    assert named == {scene.culprit: BROKEN_ROWS}
     if values["not finite"]:
-        assert outcome.refused
+        assert refused
         assert scene.culprit in ("sh0", "shN")
     else:
         assert values["max error"] < 1e-5
         assert values["gradient error"] < 1e-4
-
-
-@pytest.mark.parametrize("name", [n for n, s in SCENES.items() if s.culprit not in ("", "sh0", "shN")])
-def test_splats_without_a_place_or_shape_change_nothing(name: str) -> None:
-    scene = SCENES[name]
-    both = trace(scene.workload, beside("reference", scene.planted), torch.float64).image
-    alone = trace(scene.workload, painter("reference"), torch.float64).image
-    assert torch.equal(both, alone) == (name not in MEANS_SOMETHING)
 
 
 @pytest.mark.parametrize("name", quantizers())
@@ -122,7 +101,7 @@ def test_determinant_that_would_under_or_overflow(backend: str) -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("log_scale", [LARGEST_LOG_SCALE + 1, 44.4, 88.8, 1e4, math.inf])
+@pytest.mark.parametrize("log_scale", [LARGEST_LOG_SCALE + 1, 88.8, math.inf])
 def test_inf_scale_is_named_and_dropped(log_scale: float, backend: str, caplog: pytest.LogCaptureFixture) -> None:
     """Sizes whose squares, or which themselves, are infinite in float32."""
     both = RawSplats(*map(torch.cat, zip(_one_splat(-2.0), _one_splat(log_scale), strict=True)))
@@ -137,7 +116,7 @@ def test_inf_scale_is_named_and_dropped(log_scale: float, backend: str, caplog: 
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("log_scale", [18.0, 21.5, 24.5, 28.0, LARGEST_LOG_SCALE])
+@pytest.mark.parametrize("log_scale", [18.0, 24.5, LARGEST_LOG_SCALE])
 def test_the_largest_sizes_that_are_kept_train(log_scale: float, antialiased: bool) -> None:
     """On the near plane, where a splat covers most pixels; plain torch overflows there, and then drops the splat."""
     camera = SCENES["one splat"].workload.camera
@@ -173,7 +152,7 @@ def test_two_points_a_hair_apart_get_the_smallest_scale() -> None:
 
 def test_table_has_a_row_for_each_scene_and_backend() -> None:
     head, _, *rows = stress_table({name: SCENES[name] for name in ("one splat", "sh0 nan")}).splitlines()
-    assert [cell.strip() for cell in head.split("|")[1:4]] == ["scene", "back-end", "max error"]
+    assert head.split()[1:4:2] == ["scene", "back-end"]
     cells = [[cell.strip() for cell in row.split("|")[1:-1]] for row in rows]
     assert [row[:2] for row in cells] == [[n, b] for n in ("one splat", "sh0 nan") for b in BACKENDS]
     assert [row[-3:] for row in cells] == [["0", "0", "0"], ["0", "0", "0"], *[["1", str(BROKEN_ROWS), "0"]] * 2]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,19 +28,6 @@ from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.training.row_ops import trainable_rows
-
-__all__ = [
-    "BROKEN_ROWS",
-    "Extreme",
-    "Outcome",
-    "beside",
-    "extremes",
-    "quantizer_errors",
-    "quantizers",
-    "step",
-    "stress_errors",
-    "stress_table",
-]
 
 BACKENDS = ("cpu", "reference")
 BROKEN_ROWS = 7
@@ -69,27 +55,8 @@ class Extreme:
     culprit: str = ""
 
 
-class Outcome(NamedTuple):
-    """How a training step ended.
-
-    Attributes:
-        refused: The loss was not finite, so there was no update.
-        named: Rows with a number that is not finite, by attribute, as density control names them.
-        lost: How many of them were finite before.
-    """
-
-    refused: bool
-    named: Mapping[str, int]
-    lost: int
-
-
 def extremes(count: int = 60, crowd: int = 1000) -> dict[str, Extreme]:
-    """All scenes by name, the same numbers at every call.
-
-    Args:
-        count: Splats of a scene.
-        crowd: Splats of the scene that has all of them on one pixel.
-    """
+    """All scenes by name, of ``count`` splats, or ``crowd`` where all are on one pixel; the same at every call."""
     splats = _splats(count)
     nothing = RawSplats(*(tensor[:0] for tensor in splats))
     scenes = (*_shapes(splats), *_places(splats), *_numbers(splats, nothing, crowd), *_cameras(splats))
@@ -108,10 +75,7 @@ def beside(backend: str, planted: RawSplats) -> Painter:
 
 
 def stress_errors(scene: Extreme, backend: str) -> dict[str, float]:
-    """Errors of image and gradient in float32, and how the step of a training ends.
-
-    Where a number of image or gradient is not finite, there are no errors, but the count of such numbers.
-    """
+    """Errors of image and gradient in float32, or how many numbers of them are not finite, and how a step ends."""
     paint = beside(backend, scene.planted)
     traced = trace(scene.workload, paint, torch.float32)
     gradients = gradients_of(traced, scene.workload.image_gradient)
@@ -122,18 +86,17 @@ def stress_errors(scene: Extreme, backend: str) -> dict[str, float]:
         for errors in errors_of(scene.workload, paint, truth).values():
             values.update(errors)
         values["largest value"] = float(traced.image.detach().abs().max())
-    outcome = step(scene, backend)
-    ends = {
-        "not finite": broken,
-        "step refused": outcome.refused,
-        "rows named": max(outcome.named.values(), default=0),
-        "other rows lost": outcome.lost,
-    }
-    return values | {name: float(value) for name, value in ends.items()}
+    refused, named, lost = step(scene, backend)
+    rows = max(named.values(), default=0)
+    return values | {"not finite": broken, "step refused": refused, "rows named": rows, "other rows lost": lost}
 
 
-def step(scene: Extreme, backend: str) -> Outcome:
-    """One training step on a random photo: forward, backward and Adam, or a refusal where the loss is not finite."""
+def step(scene: Extreme, backend: str) -> tuple[bool, Mapping[str, int], int]:
+    """One training step on a random photo: forward, backward and Adam, or a refusal where the loss is not finite.
+
+    Returns whether it was refused, rows with a number that is not finite by attribute, as density control names them,
+    and how many of them were finite before.
+    """
     splats = Splats.from_tensors(*map(torch.cat, zip(scene.planted, scene.workload.splats, strict=True)))
     optimizer = build_adam(param_groups(splats, {}, LearningRates(), extent=1.0))
     before, _ = trainable_rows(splats)
@@ -144,7 +107,7 @@ def step(scene: Extreme, backend: str) -> Outcome:
         loss.backward()
         optimizer.step()
     after, named = trainable_rows(splats)
-    return Outcome(refused, named, int((before & ~after).sum()))
+    return refused, named, int((before & ~after).sum())
 
 
 def quantizers() -> dict[str, Attribute]:
