@@ -76,7 +76,7 @@ def run(options: argparse.Namespace) -> int:
 def check_all(folder: Path | None) -> Iterator[Finding]:
     """All findings about this machine and, if given, a scene folder."""
     checks = {"machine": check_machine(), "packages": check_packages(), "threads": check_threads()}
-    checks |= {"memory": check_room(Path()), "gpu": check_gpu(), "self-test": check_backends()}
+    checks |= {"memory": check_room(Path()), "self-test": check_backends()}
     for subject, check in checks.items():
         yield from attempt(subject, check)
     if folder is not None:
@@ -124,10 +124,16 @@ def attempt(subject: str, check: Iterator[Finding]) -> Iterator[Finding]:
 
 def check_machine() -> Iterator[Finding]:
     """The machine, and the versions of Python and of the packages that results depend on."""
+    import torch
+
     from nsvq_lightning.commands.benchmark import timing
 
-    for subject, facts in timing.describe_machine().items():
-        yield judged(subject, timing.listed(facts))
+    facts = timing.describe_machine()
+    built = torch.version.cuda or torch.version.hip
+    advice = "check nvidia-smi and CUDA_VISIBLE_DEVICES" if built else "for an NVIDIA GPU install a CUDA build"
+    alone = facts["machine"]["gpu"] is None and f"torch finds no GPU: {advice}"
+    yield judged("machine", timing.listed(facts["machine"]), alone)
+    yield judged("versions", timing.listed(facts["versions"]))
 
 
 def check_packages() -> Iterator[Finding]:
@@ -152,14 +158,12 @@ def check_threads() -> Iterator[Finding]:
     from nsvq_lightning.compute.jit import thread_count
 
     cores, used = usable_cores(), thread_count()
-    torchs, numbas = torch.get_num_threads(), int(numba.config.NUMBA_NUM_THREADS)
     told = {"OMP_NUM_THREADS", "NUMBA_NUM_THREADS"} & os.environ.keys()
     # On a Mac, torch spares the slow cores, which would hold up the others.
     spared = used < cores and not told and (platform.system(), platform.machine()) == ("Darwin", "arm64")
-    text = f"{used} used of {cores} cores (torch {torchs}, numba {numbas})"
+    text = f"{used} used of {cores} cores (torch {torch.get_num_threads()}, numba {numba.config.NUMBA_NUM_THREADS})"
     advice = f"as many as cores are fastest; unset OMP_NUM_THREADS and NUMBA_NUM_THREADS, or set them to {cores}"
-    bad = used != cores and not spared
-    yield judged("threads", text, bad and advice)
+    yield judged("threads", text, used != cores and not spared and advice)
     policy = os.environ.get("OMP_WAIT_POLICY", "not set")
     advice = "on a shared machine threads that wait by spinning slow a step down several times; set it to passive"
     yield judged("waiting", f"OMP_WAIT_POLICY is {policy}", policy.lower() != "passive" and advice)
@@ -177,22 +181,6 @@ def check_room(folder: Path) -> Iterator[Finding]:
     text = f"{readable_bytes(disk)} free in {folder.resolve()}{'' if writable else ', which is read-only'}"
     advice = "checkpoints of a run take about 1 GB; see --trainer.default_root_dir"
     yield judged("disk", text, (disk < SMALL_DISK or not writable) and advice)
-
-
-def check_gpu() -> Iterator[Finding]:
-    """Whether there is a GPU, and what renders on it."""
-    import torch
-
-    from nsvq_lightning.compute.devices import fast_backends
-
-    if torch.cuda.is_available():
-        fast = fast_backends(torch.zeros(1, device="cuda"))
-        advice = "this version renders on it in plain torch, slower than on the CPU; use the CPU"
-        yield judged("gpu", f"{torch.cuda.get_device_name()}, back-ends {', '.join(fast)}", not fast and advice)
-    else:
-        built = torch.version.cuda or torch.version.hip
-        advice = "check nvidia-smi and CUDA_VISIBLE_DEVICES" if built else "for an NVIDIA GPU install a CUDA build"
-        yield judged("gpu", f"torch {torch.__version__} finds none", advice)
 
 
 def check_backends() -> Iterator[Finding]:
@@ -213,7 +201,10 @@ def check_backends() -> Iterator[Finding]:
     truth = results(small, "reference", torch.float64)
     for device in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
         here = small.to(device)
-        for backend in fast_backends(here.splats.means):
+        if not (backends := fast_backends(here.splats.means)):
+            advice = "this version renders on it in plain torch, slower than on the CPU; use the CPU"
+            yield judged("self-test", f"{device} has no back-end", advice)
+        for backend in backends:
             found = results(here, backend, torch.float32)
             errors = {name: workloads.relative_l2(value.cpu(), truth[name]) for name, value in found.items()}
             text = f"{backend}: relative errors against the float64 oracle: "

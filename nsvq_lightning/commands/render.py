@@ -7,7 +7,7 @@ path in nerfstudio's JSON, as the viewer saves it.
 Examples:
   nsvq render runs/fox/version_0
   nsvq render scene.ply --path orbit --seconds 6 --size 1280x720 -o orbit.mp4
-  nsvq render scene.nsvq --data.root scenes/fox --path cameras -o frames/ --what color,depth
+  nsvq render scene.nsvq --data.root scenes/fox --path cameras -o frames/
 """
 
 from __future__ import annotations
@@ -16,28 +16,24 @@ import argparse
 import logging
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
-from nsvq_lightning.commands.arguments import cameras_of, photos_of, positive, scene_file, some_of
+from nsvq_lightning.commands.arguments import cameras_of, photos_of, positive, scene_file
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from nsvq_lightning.rendering.camera import Camera
-    from nsvq_lightning.rendering.rasterize import Render
     from nsvq_lightning.splats.splats import Splats
 
 log = logging.getLogger(__name__)
 
-WHAT = ("color", "depth", "alpha")
 FPS, SECONDS = 24.0, 10.0
-# Steps of a scene unit in a 16-bit picture of the depth.
-UNIT = 1000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -49,9 +45,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     help_ = "folder of the photos, whose cameras the path follows; that of the run by default"
     add("--data.root", dest="root", type=Path, metavar="FOLDER", help=help_)
     add("--path", help="through, cameras, orbit or a .json; through by default, orbit without photos")
-    help_ = f"of {', '.join(WHAT)}, with commas, or all; color by default. PNGs of the depth are also written with 16 "
-    help_ += f"bits, {UNIT} steps a scene unit"
-    add("--what", type=some_of(WHAT), default=("color",), metavar="NAMES", help=help_)
     add("--size", type=_size, metavar="WxH", help="pixels; those of the cameras by default")
     length = parser.add_mutually_exclusive_group().add_argument
     length("--frames", type=positive(int), metavar="N", help="number of frames, of through and orbit")
@@ -98,8 +91,6 @@ def run(options: argparse.Namespace) -> int:
     is_video = output.suffix.lower() == VIDEO
     if output.suffix and not is_video:
         raise ValueError(f"{output}: name a video ({VIDEO}), or a folder for PNGs")
-    outputs = {kind: output.with_stem(f"{output.stem}_{kind}") for kind in options.what}
-    outputs[options.what[0]] = output
     scene = read_scene(file)
     splats = scene.decode()
     if len(splats) == 0:
@@ -107,22 +98,13 @@ def run(options: argparse.Namespace) -> int:
     cameras, fps = _path(options, splats, is_video)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     raw, background = splats.to(device).raw(), torch.tensor(options.background, device=device)
-
-    @torch.no_grad()
-    def look(camera: Camera) -> Render:
-        return render(raw, camera, background=background, antialiased=scene.antialiased, backend=options.backend)
-
-    depths = _depth_range(look, cameras) if "depth" in outputs else (1.0, 2.0)
-    size = cameras[0].width, cameras[0].height
-    with ExitStack() as stack:
-        writers = {kind: stack.enter_context(_writer(path, kind, size, fps)) for kind, path in outputs.items()}
+    how = {"background": background, "antialiased": scene.antialiased, "backend": options.backend}
+    width, height = cameras[0].width, cameras[0].height
+    with torch.no_grad(), _writer(output, width, height, fps) as write:
         for index, camera in enumerate(tqdm(cameras, unit=" frames", mininterval=1)):
-            view = look(camera)
-            for kind, write in writers.items():
-                write(index, *_picture(view, kind, *depths))
+            write(index, render(raw, camera, **how).image)
     length = f", {len(cameras) / fps:.1f} s at {fps:g} frames per second" if is_video else ""
-    for kind, path in outputs.items():
-        sys.stdout.write(f"{path}: {len(cameras)} frames of {size[0]}x{size[1]}, {kind}{length}\n")
+    sys.stdout.write(f"{output}: {len(cameras)} frames of {width}x{height}{length}\n")
     return 0
 
 
@@ -164,65 +146,15 @@ def _path(options: argparse.Namespace, splats: Splats, is_video: bool) -> tuple[
     return given, fps
 
 
-def _depths(view: Render) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Mean depth of the pixels ``[H, W]``, scene units, and where there is one."""
-    opacity = view.alpha.cpu().numpy()
-    return view.depth.cpu().numpy() / np.maximum(opacity, 1e-6), opacity >= 0.5
-
-
-def _depth_range(look: Callable[[Camera], Render], cameras: Sequence[Camera]) -> tuple[float, float]:
-    """Depths of the first and the last colour, scene units, from eight frames."""
-    chosen = cameras[:: -(-len(cameras) // 8)]
-    seen = np.concatenate([found[where] for found, where in map(_depths, map(look, chosen))])
-    if not len(seen):
-        return 1.0, 2.0
-    near, far = map(float, np.quantile(seen, [0.01, 0.99]))
-    log.info("colours of the depth: red %.3g, blue %.3g scene units", near, far)
-    return near, far
-
-
-def _picture(view: Render, kind: str, near: float, far: float) -> tuple[NDArray[np.uint8], NDArray[np.uint16] | None]:
-    """A picture of a render ``[H, W, 3]`` RGB, and of the depth also one of 16 bits ``[H, W]``."""
-    import cv2
-
-    if kind == "color":
-        return _bytes(view.image.cpu().numpy()), None
-    if kind == "alpha":
-        return np.repeat(_bytes(view.alpha.cpu().numpy())[:, :, None], 3, axis=2), None
-    found, where = _depths(view)
-    closeness = (1 / np.clip(found, near, far) - 1 / far) / max(1 / near - 1 / far, 1e-9)
-    shades = cv2.applyColorMap(_bytes(closeness), cv2.COLORMAP_TURBO)[:, :, ::-1]
-    steps = np.clip(np.rint(found * UNIT), 1, 65535).astype(np.uint16)
-    return np.where(where[:, :, None], shades, 0).astype(np.uint8), np.where(where, steps, 0).astype(np.uint16)
-
-
-def _bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
-    """Values in [0, 1] as 8 bits."""
-    bytes_: NDArray[np.uint8] = np.rint(np.clip(values, 0.0, 1.0) * 255).astype(np.uint8)
-    return bytes_
-
-
 @contextmanager
-def _writer(path: Path, kind: str, size: tuple[int, int], fps: float) -> Iterator[Callable[..., None]]:
-    """A function that writes the picture of a frame, and its 16-bit form into folders."""
-    import cv2
-
-    from nsvq_lightning.data.images import encode_png
-    from nsvq_lightning.io.atomic import atomic_write
-    from nsvq_lightning.report.pictures import video_writer
+def _writer(path: Path, width: int, height: int, fps: float) -> Iterator[Callable[[int, Tensor], object]]:
+    """A function that writes the picture ``[H, W, 3]`` of a frame."""
+    from nsvq_lightning.report.pictures import as_bytes, video_writer, write_png
 
     if path.suffix:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with video_writer(path, *size, fps) as video:
-            yield lambda index, picture, _: video(picture)
-        return
-    path.mkdir(parents=True, exist_ok=True)
-
-    def write(index: int, picture: NDArray[np.uint8], steps: NDArray[np.uint16] | None) -> None:
-        with atomic_write(path / f"{index:05d}.png") as file:
-            file.write(encode_png(picture))
-        if steps is not None:
-            with atomic_write(path / f"{index:05d}_16bit.png") as file:
-                file.write(cv2.imencode(".png", steps)[1].tobytes())
-
-    yield write
+        with video_writer(path, width, height, fps) as add:
+            yield lambda _, picture: add(as_bytes(picture))
+    else:
+        path.mkdir(parents=True, exist_ok=True)
+        yield lambda index, picture: write_png(path / f"{index:05d}.png", picture)

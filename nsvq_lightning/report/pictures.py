@@ -75,13 +75,19 @@ def comparison(image: Tensor, photo: Tensor, gain: float = 4.0) -> Tensor:
     return torch.cat([photo, image, ((image - photo).abs() * gain).clamp(max=1.0)], dim=1)
 
 
+def as_bytes(image: Tensor) -> NDArray[np.uint8]:
+    """An image ``[H, W, 3]`` in [0, 1] with 8 bits."""
+    pixels: NDArray[np.uint8] = (image.clamp(0.0, 1.0) * 255).round().to(torch.uint8).cpu().numpy()
+    return pixels
+
+
 def write_png(path: Path, image: Tensor) -> None:
     """Write an RGB image ``[H, W, 3]`` in [0, 1] as 8-bit PNG, atomically.
 
     Raises:
         OSError: The image could not be encoded.
     """
-    data = encode_png((image.clamp(0.0, 1.0) * 255).round().to(torch.uint8).cpu().numpy())
+    data = encode_png(as_bytes(image))
     with atomic_write(path) as file:
         file.write(data)
 

@@ -12,7 +12,6 @@ import torch
 import yaml
 from demo_room import write_synthetic_scene
 
-from nsvq_lightning.commands import main as cli
 from nsvq_lightning.commands.arguments import check_config, expand, find_config
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.commands.main import main
@@ -138,6 +137,8 @@ def test_a_checkpoint_of_another_phase_is_refused_with_the_way_out(
         (["fit", "--data.root=scene\udcff"], "which is not UTF-8: rename"),
         (["fit", "--model.codebooks=3k"], "choose one of 0.5k"),
         (["fit", "--trainer.max_steps=0"], "set trainer.max_steps"),
+        (["fit", "--trainer.precision=bf16-mixed"], "trainer.precision is bf16-mixed: "),
+        (["fit", "--trainer.run_folder=file/run"], "the folder of the run, file/run, cannot be made ("),
         (["fit", "--ckpt_path=last"], "last: no such checkpoint"),
         (["test"], "--ckpt_path"),
     ],
@@ -151,6 +152,7 @@ def test_errors_of_the_user_are_one_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    Path("file").touch()
     assert main([*arguments, f"--data.root={demo_scene}"]) == 1
     error = capsys.readouterr().err
     assert message in error
@@ -231,21 +233,16 @@ def test_export_reads_no_scene_and_its_options_win_over_the_checkpoint(finished:
     assert (tmp_path / "out.nsvq").stat().st_size < (tmp_path / "paper.nsvq").stat().st_size
 
 
-def test_predict_writes_a_picture_of_every_view(demo_scene: Path, finished: Path, tmp_path: Path) -> None:
-    checkpoint = finished / "checkpoints" / "last.ckpt"
-    arguments = [f"--ckpt_path={checkpoint}", f"--data.root={demo_scene}", "--data.factor=2"]
-    folder = f"--callbacks.predictions.folder={tmp_path / 'pictures'}"
-    assert main(["predict", *arguments, folder, f"--trainer.default_root_dir={tmp_path}"]) == 0
-    photos = {path.stem for path in (demo_scene / "images").iterdir()}
-    assert {path.stem for path in (tmp_path / "pictures").iterdir()} == photos
-
-
-def test_validate_scores_the_test_views_with_the_settings_of_the_run(
+def test_predict_and_validate_take_a_checkpoint(
     demo_scene: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = [f"--config={finished / 'config.yaml'}", f"--ckpt_path={finished / 'checkpoints' / 'last.ckpt'}"]
-    arguments = [*run, f"--data.root={demo_scene}", f"--trainer.default_root_dir={tmp_path}"]
-    assert main(["validate", *arguments, "--callbacks.progress=null"]) == 0
+    arguments = [f"--ckpt_path={finished / 'checkpoints' / 'last.ckpt'}", f"--data.root={demo_scene}"]
+    arguments += [f"--trainer.default_root_dir={tmp_path}", "--callbacks.progress=null"]
+    folder = f"--callbacks.predictions.folder={tmp_path / 'pictures'}"
+    assert main(["predict", *arguments, "--data.factor=2", folder]) == 0
+    photos = {path.stem for path in (demo_scene / "images").iterdir()}
+    assert {path.stem for path in (tmp_path / "pictures").iterdir()} == photos
+    assert main(["validate", f"--config={finished / 'config.yaml'}", *arguments]) == 0
     assert "val/psnr" in capsys.readouterr().out
 
 
@@ -308,15 +305,6 @@ def test_the_papers_settings_survive_another_class(capsys: pytest.CaptureFixture
     assert callbacks["phases"]["init_args"]["quantize_end"] == 43_000
     assert callbacks["density"]["class_path"].endswith("DensityControl")
     assert callbacks["density"]["init_args"]["start"] == 600
-
-
-def test_a_missing_opencv_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def without_opencv(name: str) -> None:
-        raise ModuleNotFoundError("No module named 'cv2'", name="cv2")
-
-    monkeypatch.setattr(cli, "import_module", without_opencv)
-    assert main(["compress"]) == 1
-    assert capsys.readouterr().err.startswith("error: OpenCV (cv2) is missing: pip install opencv-")
 
 
 def test_configs_are_found_as_files_first_then_by_name(tmp_path: Path) -> None:
@@ -383,72 +371,11 @@ def test_wrong_settings_name_the_file_they_came_from(tmp_path: Path, capsys: pyt
     assert f"Settings came from {path} and the command line" in message
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["fit", "--data", "{folder}"], "the folder of a scene is --data.root=path/to/scene"),
-        (["fit", "--data", "no.Such"], "no.Such"),
-        (["fit", "--bytes=abc"], "error: bytes: expected a whole number or null, got 'abc'\n"),
-        (["fit", "--data.root=x", "--data.factor", "3"], "error: data.factor: expected 1, 2, 4, 8 or null, got '3'\n"),
-        (["fit", "--data.root=x", "--trainer.max_steps=x"], "trainer.max_steps: expected a whole number, got 'x'\n"),
-        (["fit", "--data.root=x", "--model.background=gray"], "expected auto, black, white or random, got 'gray'\n"),
-        (
-            ["fit", "--data.root=x", "--callbacks.density=NoSuch"],
-            "expected BudgetedGrowth, Callback or null, got 'NoSuch'\n",
-        ),
-        (["fit", "--data.root=x", "--callbacks.density=BudgetGrowth"], "'BudgetGrowth'; did you mean BudgetedGrowth?"),
-        (["fit", "--data.root=x", "--model.quantizer=NSVX"], "got 'NSVX'; did you mean NSVQ?"),
-        (["fit", "--data.root=x", "--callbacks.densty=null"], "did you mean --callbacks.density?"),
-        (["fit", "--data.root=x", "--callbacks.density.min_splat=5"], "did you mean --min_splats?"),
-        (
-            ["fit", "--data.root=x", "--callbacks.report.every=2", "--callbacks.sh_degree.every=abc"],
-            "error: callbacks.sh_degree.every: expected a whole number, got 'abc'\n",
-        ),
-        (["fit", "--data.root=x", "--qualty=2"], "did you mean --quality?"),
-        (
-            ["fit", "--data.root=x", "--config", "fats.yaml"],
-            "fats.yaml; did you mean fast?\nShipped ones: best, ",
-        ),
-        (["view", "{folder}", "--prot=3"], "did you mean --port?"),
-        (["benchmark", "render", "--repeat=2", "--treads=x"], "did you mean --threads?"),
-    ],
-)
-def test_likely_slips_are_told_what_was_meant(
-    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main([argument.format(folder=tmp_path) for argument in arguments])
-    assert stop.value.code == 2
-    assert message in capsys.readouterr().err
-
-
-def test_commands_that_do_not_exist_or_contradict_themselves_are_told_so(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["compres", "a.ply", "b.nsvq"]) == 2
-    assert "there is no command 'compres'; did you mean compress?" in capsys.readouterr().err
-    assert main(["fit", "--splats", "1000", "--quality=2"]) == 1
-    assert "--splats and --quality both say how large the scene is" in capsys.readouterr().err
-    assert main(["fit", "--splats"]) == 1
-    assert "--splats needs a number" in capsys.readouterr().err
-
-
 def test_a_folder_that_cannot_be_used_leaves_no_run_behind(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     runs = tmp_path / "runs"
     assert main(["fit", f"--data.root={tmp_path / 'photos'}", f"--trainer.default_root_dir={runs}"]) == 1
     assert not runs.exists()
-
-
-def test_a_run_folder_that_cannot_be_made_is_a_sentence(
-    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").touch()
-    assert main(fit(demo_scene, tmp_path, f"--trainer.run_folder={tmp_path / 'file' / 'run'}")) == 1
-    assert f"the folder of the run, {tmp_path / 'file' / 'run'}, cannot be made (" in capsys.readouterr().err
-
-
-def test_only_float32_trains(demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(fit(demo_scene, tmp_path, "--trainer.precision=bf16-mixed")) == 1
-    assert "trainer.precision is bf16-mixed: " in capsys.readouterr().err
 
 
 def test_a_run_without_checkpoints_or_bar_leaves_none(

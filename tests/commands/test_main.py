@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import inspect
-import os
+import io
 import re
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -60,9 +61,11 @@ def test_no_command_is_an_error_that_shows_them(capsys: pytest.CaptureFixture[st
 
 @pytest.fixture(scope="module")
 def fit_help() -> str:
-    environment = os.environ | {"COLUMNS": "80"}
-    command = [sys.executable, "-m", "nsvq_lightning", "fit", "--help"]
-    return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as printed:
+        patch.setenv("COLUMNS", "80")
+        with pytest.raises(SystemExit):
+            main(["fit", "--help"])
+    return printed.getvalue()
 
 
 def test_help_says_what_there_is_and_names_none_of_torchs_classes(fit_help: str) -> None:
@@ -97,6 +100,77 @@ def test_one_callback_says_what_it_takes(capsys: pytest.CaptureFixture[str]) -> 
     out = capsys.readouterr().out
     assert out.startswith("callbacks.density:\n  Splits splats where the photos have edges")
     assert "--callbacks.density.grad_threshold=0.0003\n" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fit", "--data", "{folder}"], "the folder of a scene is --data.root=path/to/scene"),
+        (["fit", "--data", "no.Such"], "no.Such"),
+        (["fit", "--bytes=abc"], "error: bytes: expected a whole number or null, got 'abc'\n"),
+        (["fit", "--data.root=x", "--data.factor", "3"], "error: data.factor: expected 1, 2, 4, 8 or null, got '3'\n"),
+        (["fit", "--data.root=x", "--trainer.max_steps=x"], "trainer.max_steps: expected a whole number, got 'x'\n"),
+        (["fit", "--data.root=x", "--model.background=gray"], "expected auto, black, white or random, got 'gray'\n"),
+        (
+            ["fit", "--data.root=x", "--callbacks.density=NoSuch"],
+            "expected BudgetedGrowth, Callback or null, got 'NoSuch'\n",
+        ),
+        (["fit", "--data.root=x", "--callbacks.density=BudgetGrowth"], "'BudgetGrowth'; did you mean BudgetedGrowth?"),
+        (["fit", "--data.root=x", "--model.quantizer=NSVX"], "got 'NSVX'; did you mean NSVQ?"),
+        (["fit", "--data.root=x", "--callbacks.densty=null"], "did you mean --callbacks.density?"),
+        (["fit", "--data.root=x", "--callbacks.density.min_splat=5"], "did you mean --min_splats?"),
+        (
+            ["fit", "--data.root=x", "--callbacks.report.every=2", "--callbacks.sh_degree.every=abc"],
+            "error: callbacks.sh_degree.every: expected a whole number, got 'abc'\n",
+        ),
+        (["fit", "--data.root=x", "--qualty=2"], "did you mean --quality?"),
+        (
+            ["fit", "--data.root=x", "--config", "fats.yaml"],
+            "fats.yaml; did you mean fast?\nShipped ones: best, ",
+        ),
+        (["view", "{folder}", "--prot=3"], "did you mean --port?"),
+        (["benchmark", "render", "--repeat=2", "--treads=x"], "did you mean --threads?"),
+        (["view", "{folder}", "--port", "99999"], "argument --port: must be from 0 to 65535, got 99999"),
+        (["render", "{folder}", "--frames", "0"], "must be above 0"),
+        (["render", "{folder}", "--frames", "5", "--seconds", "2"], "not allowed with"),
+        (["render", "{folder}", "--size", "12"], "must be like 1280x720"),
+        (["render", "{folder}", "--background", "2,0,0"], "three numbers from 0 to 1"),
+        (["sweep", "--output={folder}", "--scenes", "a", "b"], "a list has commas between its entries, and no spaces"),
+        (["benchmark", "train,rendre"], "choose some of render, quantize, codec, train, or all, got 'train,rendre'"),
+        (["benchmark", "train", "--switches", "blocks,blokcs"], "got 'blocks,blokcs'"),
+        (["benchmark", "render", "--init-from", "scene.ply"], "needs a COLMAP folder"),
+        (["benchmark", "render", "--threads", "1,two"], "got '1,two'"),
+        (["benchmark", "render", "--threads", "4096"], "at most"),
+        (["benchmark", "render", "--repeats", "0"], "argument --repeats: must be above 0, got 0"),
+        (["benchmark", "render", "--steps", "3"], "steps must be at least 4, one for each phase, got 3"),
+        (["benchmark", "render", "--workloads", "A,Z"], "some of A20k, B100k, C500k, D1M, E3M, or all, got 'A,Z'"),
+    ],
+)
+def test_wrong_arguments_are_explained(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([argument.format(folder=tmp_path) for argument in arguments])
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_commands_that_do_not_exist_or_contradict_themselves_are_told_so(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compres", "a.ply", "b.nsvq"]) == 2
+    assert "there is no command 'compres'; did you mean compress?" in capsys.readouterr().err
+    assert main(["fit", "--splats", "1000", "--quality=2"]) == 1
+    assert "--splats and --quality both say how large the scene is" in capsys.readouterr().err
+    assert main(["fit", "--splats"]) == 1
+    assert "--splats needs a number" in capsys.readouterr().err
+
+
+def test_a_missing_opencv_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def without_opencv(name: str) -> None:
+        raise ModuleNotFoundError("No module named 'cv2'", name="cv2")
+
+    monkeypatch.setattr(main_module, "import_module", without_opencv)
+    assert main(["compress"]) == 1
+    assert capsys.readouterr().err.startswith("error: OpenCV (cv2) is missing: pip install opencv-")
 
 
 SCENE = ["--data.root=no_scene", "--callbacks.progress=null"]

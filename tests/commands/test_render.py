@@ -28,39 +28,22 @@ def _run(*arguments: str | Path) -> int:
     return main(["render", *map(str, arguments)])
 
 
-def _picture(path: Path, flags: int = cv2.IMREAD_COLOR) -> np.ndarray[Any, Any]:
-    found = cv2.imread(str(path), flags)
-    return found[:, :, ::-1] if found.ndim == 3 else found
+def _picture(path: Path) -> np.ndarray[Any, Any]:
+    return np.asarray(cv2.imread(str(path)))[:, :, ::-1]
 
 
 def test_cameras_of_the_photos_see_what_they_render(
     scene: Path, demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "frames"
-    assert _run(scene, "--data.root", demo_scene, "--path", "cameras", "-o", out, "--what", "color,depth,alpha") == 0
+    assert _run(scene, "--data.root", demo_scene, "--path", "cameras", "-o", out) == 0
     cameras = load_scene(demo_scene).cameras
     assert len(list(out.iterdir())) == len(cameras)
     for index in (0, len(cameras) - 1):
-        seen = render(random_splats(300), cameras[index])
-        expected = (seen.image.clamp(0, 1) * 255).numpy()
+        expected = (render(random_splats(300), cameras[index]).image.clamp(0, 1) * 255).numpy()
         assert np.abs(_picture(out / f"{index:05d}.png") - expected).max() <= 0.51
-        opacity = seen.alpha.numpy()
-        found = _picture(tmp_path / f"frames_alpha/{index:05d}.png")
-        assert np.abs(found - 255 * opacity[:, :, None]).max() <= 0.51
-        steps = _picture(tmp_path / f"frames_depth/{index:05d}_16bit.png", cv2.IMREAD_UNCHANGED)
-        assert steps.dtype == np.uint16
-        filled = opacity >= 0.5
-        assert np.array_equal(steps > 0, filled)
-        depth = seen.depth.numpy()[filled] / opacity[filled]
-        assert np.abs(steps[filled] - 1000 * depth).max() <= 0.51
-        shades = _picture(tmp_path / f"frames_depth/{index:05d}.png").astype(int)
-        assert shades[~filled].sum() == 0
-        if filled.any():
-            near, far = np.argmin(np.where(filled, steps, 65535)), np.argmax(steps)
-            redness = (shades[:, :, 0] - shades[:, :, 2]).ravel()
-            assert redness[near] > redness[far]
     said = capsys.readouterr()
-    assert f"{out}: 9 frames of 96x72, color" in said.out
+    assert f"{out}: 9 frames of 96x72\n" in said.out
     assert "9/9" in said.err
 
 
@@ -140,22 +123,3 @@ def test_a_checkpoint_is_told_how_it_becomes_a_scene(tmp_path: Path, capsys: pyt
     (tmp_path / "last.ckpt").touch()
     assert _run(tmp_path / "last.ckpt") == 1
     assert "nsvq export --ckpt_path" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--frames", "0"], "must be above 0"),
-        (["--frames", "5", "--seconds", "2"], "not allowed with"),
-        (["--size", "12"], "must be like 1280x720"),
-        (["--what", "color,sound"], "choose some of color, depth, alpha, or all, got 'color,sound'"),
-        (["--background", "2,0,0"], "three numbers from 0 to 1"),
-    ],
-)
-def test_wrong_arguments_end_with_usage(
-    scene: Path, arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as ended:
-        _run(scene, *arguments)
-    assert ended.value.code == 2
-    assert words in capsys.readouterr().err

@@ -195,13 +195,6 @@ def test_a_config_of_something_else_names_no_photos(settings: str, tmp_path: Pat
     assert photos_of(tmp_path / "scene.nsvq") is None
 
 
-def test_a_port_that_cannot_be_is_told(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(["view", "scene.nsvq", "--port", "99999"])
-    assert stop.value.code == 2
-    assert "argument --port: must be from 0 to 65535, got 99999" in capsys.readouterr().err
-
-
 def test_a_port_in_use_is_told(
     tmp_path: Path, demo_scene: Path, address: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

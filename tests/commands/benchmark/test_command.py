@@ -25,26 +25,6 @@ def test_results_are_printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     assert found["settings"]["threads"] == [1]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["train,rendre"], "choose some of render, quantize, codec, train, or all, got 'train,rendre'"),
-        (["train", "--switches", "blocks,blokcs"], "got 'blocks,blokcs'"),
-        (["render", "--init-from", "scene.ply"], "needs a COLMAP folder"),
-        (["render", "--threads", "1,two"], "got '1,two'"),
-        (["render", "--threads", "4096"], "at most"),
-        (["render", "--repeats", "0"], "argument --repeats: must be above 0, got 0"),
-        (["render", "--steps", "3"], "steps must be at least 4, one for each phase, got 3"),
-        (["render", "--workloads", "A20k,Z"], "some of A20k, B100k, C500k, D1M, E3M, or all, got 'A20k,Z'"),
-    ],
-)
-def test_wrong_arguments_are_explained(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stopped:
-        main(["benchmark", *arguments])
-    assert stopped.value.code == 2
-    assert message in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(("name", "message"), [("none.ply", "No such file"), ("bad.ply", "bad.ply"), ("x.md", ".md")])
 def test_unreadable_scene_is_one_line(
     name: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
