@@ -154,6 +154,7 @@ def test_settings_are_accepted(block: Block, workplace: Path, capsys: pytest.Cap
     assert stop.value.code == 0, capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_api_reference_is_built_without_warnings(tmp_path: Path) -> None:
     pytest.importorskip("sphinx")
     build = [sys.executable, "-m", "sphinx", "-W", "-q", "-b", "html", str(ROOT / "docs/api"), str(tmp_path)]

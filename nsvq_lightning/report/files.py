@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -134,7 +133,8 @@ def paper_level(scene: CompressedScene) -> dict[str, Any]:
 
 def write_metrics(path: Path, metrics: Mapping[str, Any]) -> None:
     """Write the numbers as JSON, atomically; an infinite PSNR (no error at all) becomes null."""
-    write_text(path, json.dumps(_json_value(metrics), indent=2, allow_nan=False) + "\n")
+    finite = json.loads(json.dumps(metrics), parse_constant=lambda name: None)
+    write_text(path, json.dumps(finite, indent=2) + "\n")
 
 
 def new_figure(width: float, height: float) -> Any:
@@ -205,11 +205,3 @@ def _codes_in_use(codes: NDArray[np.integer], size: int) -> dict[str, Any]:
     counts = np.bincount(codes, minlength=size)
     shares = counts[counts > 0] / max(1, len(codes))
     return {"codebook": size, "used": len(shares), "entropy": float(-(shares * np.log2(shares)).sum()) + 0.0}
-
-
-def _json_value(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _json_value(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_json_value(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

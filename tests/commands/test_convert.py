@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compressed_scenes import arrays_of
-from viewer_scenes import coded_scene, nearest_in, needs_zstd, plain_scene
+from viewer_scenes import coded_scene, nearest_in, needs_zstd
 
 from nsvq_lightning.commands.main import main as nsvq
 from nsvq_lightning.data.scene import load_scene
@@ -53,15 +53,6 @@ def test_codebooks_survive_where_the_format_has_them(tmp_path: Path) -> None:
     np.testing.assert_array_equal(codebook, read_scene(tmp_path / "c.sog").codebooks["shN"])
 
 
-def test_a_run_exports_its_codes_as_labels(tmp_path: Path) -> None:
-    scene = coded_scene(50, 1)
-    paths = exported(scene, tmp_path, Storage("paper"), "nsvq", "sog", "spz")
-    sog, plain = read_scene(paths["sog"]), read_scene(paths["nsvq"])
-    order = nearest_in(arrays_of(sog), arrays_of(plain))
-    pairs = set(zip(sog.codes["shN"].tolist(), plain.codes["shN"][order].tolist(), strict=True))
-    assert len(pairs) == len(np.unique(scene.codes["shN"]))
-
-
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("suffix", [".sog", ".spz", ".splat"])
 def test_exports_and_conversions_of_a_scene_are_the_same_file(tmp_path: Path, suffix: str, level: str) -> None:
@@ -74,15 +65,6 @@ def test_exports_and_conversions_of_a_scene_are_the_same_file(tmp_path: Path, su
     if suffix != ".spz":  # which is ordered by the codes, and a .ply has none
         assert main([str(paths["ply"]), str(tmp_path / f"plain{suffix}")]) == 0
         assert (tmp_path / f"plain{suffix}").read_bytes() == expected
-
-
-def test_a_plain_scene_is_exported_as_it_is(tmp_path: Path) -> None:
-    scene = plain_scene(40, 1)
-    paths = exported(scene, tmp_path, Storage(), "nsvq", "ply", "sog")
-    for name, values in vars(arrays_of(scene)).items():
-        np.testing.assert_array_equal(getattr(arrays_of(read_scene(paths["ply"])), name), values, err_msg=name)
-    assert main([str(paths["ply"]), str(tmp_path / "converted.sog")]) == 0
-    assert (tmp_path / "converted.sog").read_bytes() == paths["sog"].read_bytes()
 
 
 @pytest.mark.parametrize(("suffix", "shown"), [(".sog", True), (".spz", True), (".splat", True), (".ply", False)])

@@ -2,9 +2,7 @@ from __future__ import annotations
 
 import base64
 import math
-import os
 import re
-import unicodedata
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,7 @@ import torch
 
 from nsvq_lightning.report.files import curve_figure
 from nsvq_lightning.report.page import write_page
-from nsvq_lightning.report.pictures import comparison, file_stem, write_png
+from nsvq_lightning.report.pictures import comparison, write_png
 from nsvq_lightning.training.schedule import Schedule
 
 SCHEDULE = Schedule(total=450)
@@ -137,19 +135,3 @@ def test_curve_shades_the_phases_where_they_are() -> None:
     assert [patch.get_label() for patch in quality.patches] == ["warmup", "prune", "quantize", "finetune"]
     assert quality.lines[0].get_ydata()[-2] == HISTORY[-1]["psnr"]
     assert count.lines[0].get_ydata()[0] == HISTORY[0]["splats"]
-
-
-def test_files_of_different_views_differ_and_fit_any_file_system(tmp_path: Path) -> None:
-    ordinary = ("view_000.png", "IMG 1.2.JPG", "left/é.jpg", "right/é.jpg")
-    assert [file_stem(name, ordinary) for name in ordinary] == ["view_000", "IMG 1.2", "left_é", "right_é"]
-    assert file_stem("a/b.png") == "a_b"  # of views that nobody has listed
-    same = ("a/b.png", "a_b.png", "x.png", "x.jpg", "X.jpeg", "é.png", "e\u0301.png", "a/b.jpg~0123456789ab.png")
-    deep = tuple("/".join(["ö" * 100] * 2 + [last]) for last in ("1.png", "2.png"))
-    names = (*same, *deep, "y~0123456789ab.png", "z\udcff.png")
-    stems = [file_stem(name, names) for name in names]
-    assert len({unicodedata.normalize("NFC", stem).casefold() for stem in stems}) == len(names)
-    for stem in stems:
-        assert len(os.fsencode(stem)) <= 120
-        (tmp_path / f"{stem}.png").touch()
-    assert re.fullmatch("a_b~[0-9a-f]{12}", stems[0])
-    assert len(list(tmp_path.iterdir())) == len(names)

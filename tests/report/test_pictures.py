@@ -1,7 +1,10 @@
 from __future__ import annotations
 
 import logging
+import os
+import re
 import shutil
+import unicodedata
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +13,7 @@ import numpy as np
 import pytest
 
 from nsvq_lightning.report import pictures
-from nsvq_lightning.report.pictures import video_writer
+from nsvq_lightning.report.pictures import file_stem, video_writer
 
 
 def _pictures() -> list[np.ndarray[Any, Any]]:
@@ -82,3 +85,19 @@ def test_what_ffmpeg_says_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     ):
         add(_pictures()[0])
     assert not (tmp_path / "a.mp4").exists()
+
+
+def test_files_of_different_views_differ_and_fit_any_file_system(tmp_path: Path) -> None:
+    ordinary = ("view_000.png", "IMG 1.2.JPG", "left/é.jpg", "right/é.jpg")
+    assert [file_stem(name, ordinary) for name in ordinary] == ["view_000", "IMG 1.2", "left_é", "right_é"]
+    assert file_stem("a/b.png") == "a_b"  # of views that nobody has listed
+    same = ("a/b.png", "a_b.png", "x.png", "x.jpg", "X.jpeg", "é.png", "e\u0301.png", "a/b.jpg~0123456789ab.png")
+    deep = tuple("/".join(["ö" * 100] * 2 + [last]) for last in ("1.png", "2.png"))
+    names = (*same, *deep, "y~0123456789ab.png", "z\udcff.png")
+    stems = [file_stem(name, names) for name in names]
+    assert len({unicodedata.normalize("NFC", stem).casefold() for stem in stems}) == len(names)
+    for stem in stems:
+        assert len(os.fsencode(stem)) <= 120
+        (tmp_path / f"{stem}.png").touch()
+    assert re.fullmatch("a_b~[0-9a-f]{12}", stems[0])
+    assert len(list(tmp_path.iterdir())) == len(names)
