@@ -42,7 +42,7 @@ def codec(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> st
 
 def test_pictures_come_back_from_the_video(tmp_path: Path, codec: str, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "a.mp4"
-    with caplog.at_level(logging.INFO), video_writer(path, 64, 48, 12.0) as add:
+    with caplog.at_level(logging.INFO, "nsvq_lightning"), video_writer(path, 64, 48, 12.0) as add:
         for picture in _pictures():
             add(picture)
     assert caplog.messages == [f"{path}: {codec}"]
