@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from difflib import get_close_matches
 from functools import cache
 from itertools import chain
@@ -140,28 +140,33 @@ def unknown_option(message: str, options: Iterable[str]) -> str:
     return nearest("--" + (found[1] or found[2]), known)
 
 
-def in_plain_words(message: str, classes: Iterable[str]) -> str:
+def in_plain_words(message: str, classes: Iterable[str], arguments: Iterable[str]) -> str:
     """A message of jsonargparse about a value, in one line that says what is allowed; any other message as it is.
 
     Args:
-        message: The message, which shows Python's types and each attempt to read the value as one of them.
+        message: The message, which shows Python's types and each attempt to read the value as one of them. The parser
+            of a nested class knows only the last part of the option.
         classes: Names of classes that may have been meant.
+        arguments: Options with their values, to find the whole option among.
     """
     key = re.match(r'Parser key "([^"]+)":', message)
     value = re.search(r"(?:Given|Got) value: (.*)\Z", message, re.S) or re.search(r"path string: (.*)", message)
     if key is None or value is None:
         return message
+    options = (argument.partition("=") for argument in arguments if not argument.startswith(BUDGET))
+    whole = (option[2:] for option, _, given in options if option.endswith(f".{key[1]}") and given == value[1])
+    name = next(whole, key[1])
     meant = nearest(value[1].rpartition(".")[2], classes)
     causes = r"(?:Problem with given class_path|Invalid content in sub-config file).*?(?=\n +- |\Z)"
     problem = re.search(causes, message, re.S)
     if problem is not None:
-        return f"{key[1]}: {' '.join(problem[0].split())}{meant}"
+        return f"{name}: {' '.join(problem[0].split())}{meant}"
     types = re.search(r"Subtypes: .*", message) or re.search(r"Expected a .*", message)
     allowed: list[str] = []
     for literal, kind in re.findall(r"Literal\[(.*?)\]|<class '(?:[\w.]*\.)?(\w+)'>", types[0] if types else ""):
         allowed += [each.strip("'") for each in literal.split(", ")] if literal else [WORDS.get(kind, kind)]
     *others, last = dict.fromkeys(allowed or ["the name of a class"])
-    return f"{key[1]}: expected {', '.join(others)}{' or ' * bool(others)}{last}, got {value[1]!r}{meant}"
+    return f"{name}: expected {', '.join(others)}{' or ' * bool(others)}{last}, got {value[1]!r}{meant}"
 
 
 class Parser(argparse.ArgumentParser):
@@ -175,6 +180,29 @@ class Parser(argparse.ArgumentParser):
 CONFIG = "--config="
 # Of a config, and of its values with every alias written out; that of a run has 6 kB and 500 values.
 _MOST_BYTES, _MOST_VALUES = 1 << 17, 100_000
+
+
+def configs_among(arguments: Iterable[str]) -> list[str]:
+    """The values of ``--config`` among joined arguments."""
+    return [argument.removeprefix(CONFIG) for argument in arguments if argument.startswith(CONFIG)]
+
+
+def settings_of(configs: Iterable[str]) -> Iterator[str]:
+    """What configs set, each value as the option ``--a.b=value``.
+
+    Raises:
+        ValueError: One cannot be read, see :func:`check_config`.
+    """
+
+    def options(settings: dict[str, Any], prefix: str) -> Iterator[str]:
+        for name, value in settings.items():
+            if isinstance(value, dict):
+                yield from options(value, f"{prefix}{name}.")
+            else:
+                yield f"{prefix}{name}={value}"
+
+    for config in configs:
+        yield from options(check_config(config), "--")
 
 
 def check_config(path: str) -> dict[str, Any]:

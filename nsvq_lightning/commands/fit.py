@@ -56,7 +56,7 @@ class QuietParser(LightningArgumentParser):
     """Reports errors without the usage, which has about a hundred lines, and lists options without their classes."""
 
     arguments: ClassVar[Sequence[str]] = ()
-    """The command line."""
+    """The command line, and what its configs set, as options."""
 
     def format_help(self, *args: Any) -> str:
         """Help of a command, see :mod:`nsvq_lightning.commands.option_help`."""
@@ -80,7 +80,7 @@ class QuietParser(LightningArgumentParser):
             path = Path(missing[1])
             message = f"there is no config {path}{given.nearest(path.stem, names)}\nShipped ones: {', '.join(names)}"
         else:
-            message = given.in_plain_words(self._with_whole_option(message), CLASSES)
+            message = given.in_plain_words(message, CLASSES, self.arguments)
             parsers = getattr(self._subcommands_action, "_name_parser_map", {"": self}).values()
             options = [option for parser in parsers for option in parser._option_string_actions]
             if program == "nsvq fit":
@@ -88,17 +88,6 @@ class QuietParser(LightningArgumentParser):
             message += given.unknown_option(message, options)
         sys.stderr.write(f"error: {message}\nAll options: {program} --help\n")
         self.exit(2)
-
-    def _with_whole_option(self, message: str) -> str:
-        """The message with the option as it was given: the parser of a nested class knows only its last part."""
-        key = re.match(r'Parser key "(\w+)":', message)
-        if key is None or key[1] in given.SHORTHANDS:
-            return message
-        for argument in self.arguments:
-            option, _, value = argument.partition("=")
-            if option.endswith(f".{key[1]}") and message.endswith(f"value: {value}"):
-                return message.replace(key[1], option.removeprefix("--"), 1)
-        return message
 
 
 def _drop_settings_of_another_class(_: Any, before: Any, value: Any) -> None:
@@ -150,7 +139,7 @@ class SplatCLI(LightningCLI):
     """
 
     def __init__(self, args: list[str]) -> None:
-        self._arguments = QuietParser.arguments = args
+        self._arguments, QuietParser.arguments = args, [*args, *given.settings_of(given.configs_among(args))]
         for argument in args:
             check_name(argument, "the command line", allow_outside=True)
         for name, kind in STANDARD.items():

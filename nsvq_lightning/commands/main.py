@@ -163,9 +163,7 @@ def _run_lightning(arguments: list[str]) -> int:
     configs: list[str] = []
     try:
         arguments = given.expand(arguments)
-        configs += [argument.removeprefix(given.CONFIG) for argument in arguments if argument.startswith(given.CONFIG)]
-        for config in configs:
-            given.check_config(config)
+        configs += given.configs_among(arguments)
         SplatCLI(arguments)
     except SIGTERMException:  # a kind of SystemExit
         return 128 + signal.SIGTERM  # Lightning itself would exit with the status of success

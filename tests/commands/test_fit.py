@@ -362,13 +362,17 @@ def test_a_config_that_a_config_names_may_not_explode_either(
 
 def test_wrong_settings_name_the_file_they_came_from(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "mine.yaml"
-    path.write_text("model: {nonsense: 3}")
-    with pytest.raises(SystemExit) as stop:
-        main(["fit", "--config", str(path), "--data.root=x"])
-    assert stop.value.code == 2
-    message = capsys.readouterr().err
-    assert "nonsense" in message
-    assert f"Settings came from {path} and the command line" in message
+    for settings, said in (
+        ("model: {nonsense: 3}", "nonsense"),
+        ("callbacks: {density: {init_args: {budget: abc}}}", "callbacks.density.init_args.budget: expected"),
+    ):
+        path.write_text(settings)
+        with pytest.raises(SystemExit) as stop:
+            main(["fit", "--config", str(path), "--data.root=x"])
+        assert stop.value.code == 2
+        message = capsys.readouterr().err
+        assert said in message
+        assert f"Settings came from {path} and the command line" in message
 
 
 def test_a_folder_that_cannot_be_used_leaves_no_run_behind(tmp_path: Path) -> None:
