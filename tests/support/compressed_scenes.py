@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -50,3 +55,24 @@ def scene_of(**arrays: NDArray[np.float32]) -> CompressedScene:
 def arrays_of(scene: CompressedScene) -> SimpleNamespace:
     """The decoded attributes by name, in the shapes of ``Splats``."""
     return SimpleNamespace(**{name: scene.values(name) for name in ATTRIBUTES})
+
+
+def framed(path: Path, text: bytes, body: bytes, version: int = 2) -> None:
+    """Write a ``.nsvq`` file of any header and streams, whose checksum fits."""
+    rest = struct.pack("<II", version, len(text)) + text + body
+    path.write_bytes(b"\x89NSVQ\r\n\x1a" + hashlib.blake2b(rest, digest_size=16).digest() + rest)
+
+
+def text_and_body(path: Path) -> tuple[bytes, bytes]:
+    """The JSON of a ``.nsvq`` file, and its streams."""
+    data = path.read_bytes()
+    (length,) = struct.unpack_from("<I", data, 28)
+    return data[32 : 32 + length], data[32 + length :]
+
+
+def forge(path: Path, change: Callable[[Any], object], version: int = 2, body: bytes | None = None) -> None:
+    """Change the header of a ``.nsvq`` file, and perhaps its streams; the checksum fits."""
+    text, old = text_and_body(path)
+    header = json.loads(text)
+    change(header)
+    framed(path, json.dumps(header).encode(), old if body is None else body, version)

@@ -1,9 +1,7 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import json
-import struct
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -11,30 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from compressed_scenes import forge, framed, scene, text_and_body
 
 from nsvq_lightning import io
 from nsvq_lightning.io import CompressedScene, FormatError, read_header, read_nsvq
-from nsvq_lightning.io.nsvq.header import VERSION
 from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims
 
 write_nsvq = partial(io.write_nsvq, storage=Storage("paper"))
 
-DIMS = {"quats": 4, "scales": 3, "sh0": 3, "shN": 45}
 SIZES_16K = {"quats": 16384, "scales": 16384, "sh0": 4096, "shN": 4096}
-
-
-def scene(n: int, sizes: dict[str, int], degree: int = 3, **header: Any) -> CompressedScene:
-    rng = np.random.default_rng([n, degree, *sizes.values()])
-    dims = {**DIMS, "shN": 3 * ((degree + 1) ** 2 - 1)}
-    return CompressedScene(
-        means=rng.standard_normal((n, 3), np.float32),
-        opacities=rng.standard_normal(n, np.float32),
-        codes={name: rng.integers(0, k, n) for name, k in sizes.items()},
-        codebooks={name: rng.standard_normal((k, dims[name]), np.float32) for name, k in sizes.items()},
-        raw={name: rng.standard_normal((n, dim), np.float32) for name, dim in dims.items() if name not in sizes},
-        sh_degree=degree,
-        **header,
-    )
 
 
 def assert_same(a: CompressedScene, b: CompressedScene) -> None:
@@ -47,21 +31,17 @@ def assert_same(a: CompressedScene, b: CompressedScene) -> None:
     assert (a.sh_degree, a.origin, a.config, a.metrics) == (b.sh_degree, b.origin, b.config, b.metrics)
 
 
-@pytest.mark.parametrize("sizes", [SIZES_16K, {"quats": 512, "scales": 512, "sh0": 128, "shN": 128}])
+@pytest.mark.parametrize("sizes", [SIZES_16K, {"quats": 512, "scales": 512, "sh0": 128, "shN": 128}, {"shN": 1000}])
 def test_file_bytes_are_the_formula_of_the_paper(tmp_path: Path, sizes: dict[str, int]) -> None:
-    n, path = 12_345, tmp_path / "x.nsvq"
+    """Attributes without a codebook add their floats."""
+    n, path, dims = 1234, tmp_path / "x.nsvq", attribute_dims(3)
     written = write_nsvq(path, scene(n, sizes))
     bits = sum(int(np.ceil(np.log2(k))) for k in sizes.values())
-    codebooks = sum(4 * k * DIMS[name] for name, k in sizes.items())
-    json_bytes = struct.unpack_from("<I", path.read_bytes(), 28)[0]
-    assert written == path.stat().st_size == 16 * n + -(-n * bits // 8) + codebooks + 32 + json_bytes
-    assert read_header(path).size == 32 + json_bytes < 2000
-
-
-def test_unquantized_attributes_add_their_floats(tmp_path: Path) -> None:
-    n, path = 100, tmp_path / "x.nsvq"
-    written = write_nsvq(path, scene(n, {"shN": 1000}))
-    assert written - read_header(path).size == 16 * n + -(-n * 10 // 8) + 4 * 1000 * 45 + 4 * n * (4 + 3 + 3)
+    codebooks = sum(4 * k * dims[name] for name, k in sizes.items())
+    floats = sum(4 * n * dims[name] for name in QUANTIZABLE if name not in sizes)
+    header = 32 + len(text_and_body(path)[0])
+    assert written == path.stat().st_size == 16 * n + -(-n * bits // 8) + codebooks + floats + header
+    assert read_header(path).size == header < 2000
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -114,22 +94,11 @@ def test_every_truncation_and_every_changed_byte_is_one_clear_error(tmp_path: Pa
         read_nsvq(path)
 
 
-def _forge(path: Path, change: Callable[[dict[str, Any]], object], tail: bytes = b"") -> None:
-    """Rewrite the header with a valid checksum."""
-    data = path.read_bytes()
-    size = struct.unpack_from("<I", data, 28)[0]
-    header = json.loads(data[32 : 32 + size])
-    change(header)
-    text = json.dumps(header).encode()
-    body = struct.pack("<II", VERSION, len(text)) + text + data[32 + size :] + tail
-    path.write_bytes(data[:8] + hashlib.blake2b(body, digest_size=16).digest() + body)
-
-
 def test_forged_headers_are_refused_before_anything_is_allocated(tmp_path: Path) -> None:
     path = tmp_path / "x.nsvq"
     write_nsvq(path, scene(3, {"quats": 3, "sh0": 2}, config={"a": 1}, metrics={"psnr": 1.0}))
     good = path.read_bytes()
-    header = json.loads(good[32 : 32 + struct.unpack_from("<I", good, 28)[0]])
+    header = json.loads(text_and_body(path)[0])
     wrong: list[Any] = [None, -1, 10**15, 10**400, 1.5, "x", True, [], {}, [[]], 0]
     places = [*([key] for key in header if key not in ("config", "metrics"))]
     places += [["attributes", i, key] for i in range(6) for key in range(5)]
@@ -145,7 +114,7 @@ def test_forged_headers_are_refused_before_anything_is_allocated(tmp_path: Path)
                 table[place[-1]] = value
 
             path.write_bytes(good)
-            _forge(path, change)
+            forge(path, change)
             with pytest.raises(FormatError, match=r"x\.nsvq: "):
                 read_nsvq(path)
 
@@ -170,7 +139,7 @@ def test_forged_headers_are_refused_before_anything_is_allocated(tmp_path: Path)
 def test_forged_tables(tmp_path: Path, change: Callable[[dict[str, Any]], object], message: str) -> None:
     path = tmp_path / "x.nsvq"
     write_nsvq(path, scene(3, {"quats": 3, "sh0": 2}))
-    _forge(path, change)
+    forge(path, change)
     with pytest.raises(FormatError, match=message):
         read_nsvq(path)
 
@@ -178,7 +147,7 @@ def test_forged_tables(tmp_path: Path, change: Callable[[dict[str, Any]], object
 def test_bytes_outside_the_stream_table_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.nsvq"
     write_nsvq(path, scene(3, {"quats": 3}))
-    _forge(path, lambda header: None, tail=b"hidden")
+    forge(path, lambda header: None, body=text_and_body(path)[1] + b"hidden")
     with pytest.raises(FormatError, match="the file holds"):
         read_nsvq(path)
 
@@ -190,7 +159,7 @@ def test_a_code_beyond_its_codebook_is_refused(tmp_path: Path) -> None:
     names = [stream.name for stream in header.streams]
     data = bytearray(path.read_bytes())
     data[header.size + sum(stream.length for stream in header.streams[: names.index("codes")])] = 0xFF
-    path.write_bytes(data[:8] + hashlib.blake2b(data[24:], digest_size=16).digest() + data[24:])
+    framed(path, data[32 : header.size], data[header.size :])
     with pytest.raises(FormatError, match=r"codes\['quats'\] must be in 0\.\.2, got \d\.\.3"):
         read_nsvq(path)
 
@@ -198,8 +167,7 @@ def test_a_code_beyond_its_codebook_is_refused(tmp_path: Path) -> None:
 def test_a_newer_version_says_so(tmp_path: Path) -> None:
     path = tmp_path / "x.nsvq"
     write_nsvq(path, scene(4, {}))
-    body = struct.pack("<I", VERSION + 1) + path.read_bytes()[28:]
-    path.write_bytes(path.read_bytes()[:8] + hashlib.blake2b(body, digest_size=16).digest() + body)
+    forge(path, lambda header: None, version=3)
     with pytest.raises(FormatError, match="version 3 of the format; this release reads 2; update"):
         read_nsvq(path)
 
