@@ -3,11 +3,13 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from viewer_scenes import coded_scene
 
 from nsvq_lightning import Splats, load, save
-from nsvq_lightning.io import CompressedScene, FormatError
+from nsvq_lightning.io import FORMATS, CompressedScene, FormatError
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.random import generator
 
@@ -54,7 +56,7 @@ def test_wrong_content_is_named(tmp_path: Path) -> None:
         load(tmp_path / "no.ply")
 
 
-@pytest.mark.parametrize("suffix", [".nsvq", ".ply"])
+@pytest.mark.parametrize("suffix", FORMATS)
 def test_non_finite_rows_are_dropped_and_the_scene_itself_is_left_alone(
     tmp_path: Path, suffix: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -63,17 +65,31 @@ def test_non_finite_rows_are_dropped_and_the_scene_itself_is_left_alone(
         splats.scales[3, 1] = torch.nan
         splats.shN[3, 2, 2] = torch.inf
         splats.means[8, 0] = -torch.inf
+    path, keep = tmp_path / f"x{suffix}", [0, 1, 2, 4, 5, 6, 7, 9]
     with caplog.at_level(logging.WARNING):
-        save(splats, tmp_path / f"x{suffix}", Storage("paper"))
+        save(splats, path, Storage("paper"))
     assert "dropped 2 of 10 splats with non-finite values: means in 1 rows" in caplog.text
-    back = load(tmp_path / f"x{suffix}")
-    keep = [0, 1, 2, 4, 5, 6, 7, 9]
-    assert all(torch.equal(getattr(back, name), values[keep]) for name, values in splats.attributes().items())
+    back = load(path)
+    assert len(back) == 8
+    if suffix in (".nsvq", ".ply"):
+        assert all(torch.equal(getattr(back, name), values[keep]) for name, values in splats.attributes().items())
     assert len(splats) == 10
 
 
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_splats_whose_code_is_not_finite_are_dropped(tmp_path: Path, suffix: str) -> None:
+    coded = coded_scene(30, 1)
+    coded.codebooks["scales"][int(coded.codes["scales"][4]), 1] = np.nan
+    lost = int((coded.codes["scales"] == coded.codes["scales"][4]).sum())
+    save(coded, tmp_path / f"x{suffix}")
+    assert len(load(tmp_path / f"x{suffix}")) == 30 - lost
+
+
 def test_an_origin_is_not_lost_silently(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    save(CompressedScene.from_splats(scene(5, 1), origin=(4e6, 0.0, 0.0)), tmp_path / "x.nsvq")
-    with caplog.at_level(logging.WARNING):
-        load(tmp_path / "x.nsvq")
-    assert "4000000.0" in caplog.text
+    far = CompressedScene.from_splats(scene(5, 1), origin=(4e6, 0.0, 0.0))
+    for step in (lambda: load(tmp_path / "x.nsvq"), lambda: save(far, tmp_path / "x.spz")):
+        caplog.clear()
+        save(far, tmp_path / "x.nsvq")
+        assert caplog.text == ""
+        step()
+        assert "4000000.0" in caplog.text

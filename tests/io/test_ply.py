@@ -97,12 +97,6 @@ def test_ascii(tmp_path: Path) -> None:
         read_ply(path)
 
 
-def test_empty_scene(tmp_path: Path) -> None:
-    write_ply(tmp_path / "x.ply", scene(0, 2))
-    back = read_ply(tmp_path / "x.ply")
-    assert (len(back), back.sh_degree) == (0, 2)
-
-
 def test_infinite_logits_of_byte_opacities_become_finite(tmp_path: Path) -> None:
     splats, path = scene(3), tmp_path / "x.ply"
     write_ply(path, splats)
@@ -151,24 +145,6 @@ def test_garbled_headers(tmp_path: Path, old: bytes, new: bytes, message: str) -
     path.write_bytes(data.replace(old, new, 1))
     with pytest.raises(FormatError, match=message):
         read_ply(path)
-
-
-def test_random_damage_never_ends_in_another_error(tmp_path: Path) -> None:
-    path = tmp_path / "x.ply"
-    write_ply(path, scene(3, 0))
-    data = path.read_bytes()
-    rng = np.random.default_rng(7)
-    refused = 0
-    for _ in range(500):
-        damaged = bytearray(data)
-        for position in rng.integers(0, data.index(b"end_header"), 2):
-            damaged[position] = rng.integers(256)
-        path.write_bytes(damaged)
-        try:
-            read_ply(path)
-        except FormatError:
-            refused += 1
-    assert refused > 250
 
 
 def _packed(**counts: int) -> bytes:

@@ -50,28 +50,6 @@ def test_extensions_that_say_nothing_of_the_axes_are_passed_over(tmp_path: Path)
         read_scene(extended(0xADBE0003, struct.pack("<I", 17)))
 
 
-@needs_zstd
-def test_truncated_and_altered_streams_are_refused_or_read_as_they_were(tmp_path: Path) -> None:
-    path = tmp_path / "bad.spz"
-    save(coded_scene(12, 1), path, version=4)
-    data, expected = path.read_bytes(), vars(arrays_of(read_scene(path)))
-    for length in range(1, len(data)):
-        path.write_bytes(data[:length])
-        with pytest.raises(FormatError, match=r"bad\.spz: "):
-            read_scene(path)
-    rng, start, refused = np.random.default_rng(5), HEAD.size + 6 * ENTRY.size, 0
-    for position in rng.integers(start, len(data), 200):
-        path.write_bytes(data[:position] + bytes([data[position] ^ (1 << rng.integers(8))]) + data[position + 1 :])
-        try:
-            read = vars(arrays_of(read_scene(path)))  # a Zstandard frame has a bit without a meaning
-        except FormatError:
-            refused += 1
-        else:
-            for name, values in expected.items():
-                np.testing.assert_array_equal(read[name], values)
-    assert refused > 190
-
-
 @pytest.mark.parametrize(
     ("offset", "number", "message"),
     [
@@ -108,13 +86,13 @@ def test_there_is_a_stream_for_each_array_that_is_not_empty(
 
 @needs_zstd
 def test_both_versions_hold_the_same_splats_and_the_same_scene_gives_the_same_bytes(tmp_path: Path) -> None:
-    paths = [tmp_path / name for name in ("a.spz", "b.spz", "c.spz")]
-    for path, version in zip(paths, (3, 4, 4), strict=True):
-        save(coded_scene(80), path, version=version)
-    old, new = (vars(arrays_of(read_scene(path))) for path in paths[:2])
-    for name, values in old.items():
-        np.testing.assert_array_equal(new[name], values, err_msg=name)
-    assert paths[1].read_bytes() == paths[2].read_bytes()
+    files = []
+    for version in (3, 4, 4):
+        save(coded_scene(80), tmp_path / "x.spz", version=version)
+        files.append((vars(arrays_of(read_scene(tmp_path / "x.spz"))), (tmp_path / "x.spz").read_bytes()))
+    for name, values in files[0][0].items():
+        np.testing.assert_array_equal(files[1][0][name], values, err_msg=name)
+    assert files[1][1] == files[2][1]
 
 
 def test_only_known_versions_are_written(tmp_path: Path) -> None:

@@ -8,19 +8,24 @@ shown.
 from __future__ import annotations
 
 import faulthandler
+import gzip
 import io
 import re
 import resource
 import sys
+import zipfile
 from collections.abc import Callable
 from contextlib import redirect_stderr, suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from hashlib import blake2b
 from pathlib import Path
 
 import numpy as np
+from compressed_scenes import scene
 from guards import guarded
+
+from nsvq_lightning.io.compressed import CompressedScene
 
 SECONDS = 20
 """A case that takes longer hangs."""
@@ -149,21 +154,8 @@ def _limit_memory() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY,) * 2)
 
 
-def _scene(n: int) -> object:
-    from nsvq_lightning.io.compressed import CompressedScene
-    from nsvq_lightning.splats.attributes import attribute_dims
-
-    rng = np.random.default_rng(0)
-    sizes, dims = {"quats": 8, "scales": 5, "shN": 3}, attribute_dims(1)
-    return CompressedScene(
-        means=rng.standard_normal((n, 3)).astype(np.float32),
-        opacities=rng.standard_normal(n).astype(np.float32),
-        codes={name: rng.integers(0, k, n) for name, k in sizes.items()},
-        codebooks={name: rng.standard_normal((k, dims[name])).astype(np.float32) for name, k in sizes.items()},
-        raw={"sh0": rng.standard_normal((n, 3)).astype(np.float32)},
-        sh_degree=1,
-        config={"seed": 1},
-    )
+def _scene(n: int) -> CompressedScene:
+    return scene(n, {"quats": 8, "scales": 5, "shN": 3}, 1, config={"seed": 1})
 
 
 def _build_ply(folder: Path) -> list[Path]:
@@ -171,7 +163,7 @@ def _build_ply(folder: Path) -> list[Path]:
 
     binary, ascii_ = folder / "binary.ply", folder / "ascii.ply"
     scene = _scene(5)
-    write_ply(binary, scene)  # type: ignore[arg-type]
+    write_ply(binary, scene)
     data = binary.read_bytes()
     head, body = data.split(b"end_header\n", 1)
     rows = np.frombuffer(body, "<f4").reshape(len(scene), -1)
@@ -180,26 +172,14 @@ def _build_ply(folder: Path) -> list[Path]:
     return [binary, ascii_]
 
 
-def _read_ply(path: Path) -> object:
-    from nsvq_lightning.io.ply import read_ply
-
-    return read_ply(path)
-
-
 def _build_nsvq(folder: Path) -> list[Path]:
-    from nsvq_lightning.io.nsvq.file import write_nsvq
-    from nsvq_lightning.io.nsvq.precision import Storage
+    from nsvq_lightning.io.formats import save
+    from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 
-    files = [folder / "compact.nsvq", folder / "paper.nsvq"]
+    files = [folder / f"{level}.nsvq" for level in LEVELS]
     for path in files:
-        write_nsvq(path, _scene(40), Storage(path.stem))  # type: ignore[arg-type]
+        save(_scene(40), path, Storage(path.stem))
     return files
-
-
-def _read_nsvq(path: Path) -> object:
-    from nsvq_lightning.io.nsvq.file import read_nsvq
-
-    return {name: read_nsvq(path).values(name) for name in ("means", "quats", "scales", "sh0", "shN")}
 
 
 def _mend_nsvq(data: bytes) -> bytes:
@@ -211,26 +191,17 @@ def _mend_nsvq(data: bytes) -> bytes:
     return b"\x89NSVQ\r\n\x1a" + blake2b(rest, digest_size=16).digest() + rest
 
 
-def _build_viewer(folder: Path, suffix: str) -> list[Path]:
-    import gzip
-
+def _build_viewer(folder: Path, suffix: str, **options: int) -> list[Path]:
     from nsvq_lightning.io.formats import save
 
     path = folder / f"scene{suffix}"
-    save(_scene(40), path)  # type: ignore[arg-type]
-    if suffix == ".spz":
+    save(_scene(40), path, **options)
+    if suffix == ".spz" and not options:
         path.write_bytes(gzip.compress(gzip.decompress(path.read_bytes()), 0, mtime=0))
     return [path]
 
 
-def _build_spz4(folder: Path) -> list[Path]:
-    from nsvq_lightning.io.formats import save
-
-    save(_scene(40), folder / "scene.spz", version=4)  # type: ignore[arg-type]
-    return [folder / "scene.spz"]
-
-
-def _read_viewer(path: Path) -> object:
+def _read_scene(path: Path) -> object:
     from nsvq_lightning.io.describe import describe
     from nsvq_lightning.io.errors import FormatError
     from nsvq_lightning.io.formats import read_scene
@@ -238,22 +209,20 @@ def _read_viewer(path: Path) -> object:
     with suppress(FormatError):
         describe(path)
     scene = read_scene(path)
-    for name in ("quats", "scales", "opacities", "sh0", "shN") if path.suffix != ".splat" else ("opacities", "sh0"):
-        assert np.isfinite(scene.values(name)).all(), name
+    finite = {".ply": (), ".nsvq": (), ".splat": ("opacities", "sh0")}
+    values = {name: scene.values(name) for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
+    for name in finite.get(path.suffix, ("quats", "scales", "opacities", "sh0", "shN")):
+        assert np.isfinite(values[name]).all(), name
     return scene
 
 
 def _mend_spz(data: bytes) -> bytes:
     """Mostly a new gzip stream around what may be the content: without the 15 bytes before and the 8 behind."""
-    import gzip
-
     return data if data[-1:] > b"\xc0" or len(data) % 5 == 0 else gzip.compress(data[15:-8], 1, mtime=0)
 
 
 def _mend_sog(data: bytes) -> bytes:
     """Mostly a new archive of what stands between the signatures of its entries."""
-    import zipfile
-
     if len(data) % 5 == 0:
         return data
     archive = io.BytesIO()
@@ -389,14 +358,14 @@ def targets() -> dict[str, Target]:
     from nsvq_lightning.io.errors import FormatError
 
     return {
-        "ply": Target(_build_ply, _read_ply, (FormatError,)),
-        "nsvq": Target(_build_nsvq, _read_nsvq, (FormatError,), _mend_nsvq),
-        "spz": Target(lambda folder: _build_viewer(folder, ".spz"), _read_viewer, (FormatError,), _mend_spz),
-        "spz4": Target(_build_spz4, _read_viewer, (FormatError,)),
-        "sog": Target(lambda folder: _build_viewer(folder, ".sog"), _read_viewer, (FormatError,), _mend_sog),
-        "splat": Target(lambda folder: _build_viewer(folder, ".splat"), _read_viewer, (FormatError,)),
-        "colmap-bin": Target(lambda folder: _build_colmap(folder, ".bin"), _read_colmap, (SceneError,)),
-        "colmap-txt": Target(lambda folder: _build_colmap(folder, ".txt"), _read_colmap, (SceneError,)),
+        "ply": Target(_build_ply, _read_scene, (FormatError,)),
+        "nsvq": Target(_build_nsvq, _read_scene, (FormatError,), _mend_nsvq),
+        "spz": Target(partial(_build_viewer, suffix=".spz"), _read_scene, (FormatError,), _mend_spz),
+        "spz4": Target(partial(_build_viewer, suffix=".spz", version=4), _read_scene, (FormatError,)),
+        "sog": Target(partial(_build_viewer, suffix=".sog"), _read_scene, (FormatError,), _mend_sog),
+        "splat": Target(partial(_build_viewer, suffix=".splat"), _read_scene, (FormatError,)),
+        "colmap-bin": Target(partial(_build_colmap, suffix=".bin"), _read_colmap, (SceneError,)),
+        "colmap-txt": Target(partial(_build_colmap, suffix=".txt"), _read_colmap, (SceneError,)),
         "photo": Target(_build_photos, _read_photo, (SceneError,)),
         "config": Target(_build_config, _read_config, (ValueError,)),
         "checkpoint": Target(_build_checkpoint, _read_checkpoint, (FormatError,)),
