@@ -16,8 +16,6 @@ from torch import Tensor
 
 log = logging.getLogger(__name__)
 
-# Names that ``render(backend=...)`` takes; ``auto`` is this package's fastest one for the device of the splats.
-BACKENDS = ("auto", "reference", "cpu", "cuda")
 # Options of every launch. Triton's default is about to change; values on which the forward and backward pass must
 # agree to the bit are computed with an explicit ``fma``.
 COMPILE = {"enable_fp_fusion": True}
@@ -60,6 +58,10 @@ def _obstacle(kernels: str, like: Tensor) -> str | None:
 def _has_triton() -> bool:
     """Whether Triton is installed; a render with ``backend="cuda"`` asks each time."""
     return importlib.util.find_spec("triton") is not None
+
+
+# Names that ``render(backend=...)`` takes; ``auto`` is this package's fastest one for the device of the splats.
+BACKENDS = ("auto", "reference", "cpu", "cuda")
 
 
 def resolve_backend(backend: str, like: Tensor) -> str:

@@ -23,20 +23,6 @@ log = logging.getLogger(__name__)
 
 # Called when a compilation begins, with a line that says how many kernels there are and how many are ready.
 Watcher = Callable[[str], None]
-# Type of the numeric literals in kernels; Python floats would promote their operands to float64.
-F = np.float32
-
-_OPTIONS: dict[str, Any] = {
-    # Products and sums may fuse; NaN and infinity keep their meaning because this package's guards rely on them.
-    "fastmath": {"contract", "nsz"},
-    "error_model": "numpy",
-    "boundscheck": False,
-    "nogil": True,
-    "no_cfunc_wrapper": True,
-}
-
-# Every kernel of the modules that are loaded.
-_kernels: list[Any] = []
 
 
 class _Compilations(event.Listener):
@@ -76,6 +62,8 @@ class _Compilations(event.Listener):
             watcher(f"compiling kernels {ready + 1}/{len(_kernels)}, once on this machine")
 
 
+# Every kernel of the modules that are loaded.
+_kernels: list[Any] = []
 _compilations = _Compilations()
 event.register("numba:compile", _compilations)
 
@@ -110,6 +98,19 @@ def _start_threads() -> None:
     count = torch.get_num_threads()
     numba.set_num_threads(numba.get_num_threads())
     torch.set_num_threads(count)
+
+
+# Type of the numeric literals in kernels; Python floats would promote their operands to float64.
+F = np.float32
+
+_OPTIONS: dict[str, Any] = {
+    # Products and sums may fuse; NaN and infinity keep their meaning because this package's guards rely on them.
+    "fastmath": {"contract", "nsz"},
+    "error_model": "numpy",
+    "boundscheck": False,
+    "nogil": True,
+    "no_cfunc_wrapper": True,
+}
 
 
 def inline(function: Callable[..., Any]) -> Any:

@@ -19,9 +19,6 @@ import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.misc.appdirs import AppDirs
 
-# So many folders are kept; those of a few checkouts, between which one may change.
-MAX_FOLDERS = 64
-
 
 @functools.cache
 def source_digest(module: str) -> str:
@@ -116,6 +113,10 @@ class _Locator(_CacheLocator):
 
 class _Layout(CompileResultCacheImpl):
     _locator_classes = (_Locator,)
+
+
+# So many folders are kept; those of a few checkouts, between which one may change.
+MAX_FOLDERS = 64
 
 
 class KernelCache(FunctionCache):

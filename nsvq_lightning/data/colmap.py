@@ -18,14 +18,15 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
+
+class SceneError(ValueError):
+    """A scene folder that cannot be used; the message names the file, what is wrong with it and what to do."""
+
+
 # Pixels; a camera with a larger side is damaged.
 LARGEST_SIDE = (1 << 20) - 1
 # Upper bound on poses and intrinsics: their squares, which rendering computes in float32, stay finite.
 LARGEST = 1e18
-
-
-class SceneError(ValueError):
-    """A scene folder that cannot be used; the message names the file, what is wrong with it and what to do."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,6 @@ from nsvq_lightning.io.atomic import atomic_path, atomic_write
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 # Suffixes of videos.
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-JPEG_QUALITY = 95
 
 
 def photos_in(folder: Path) -> list[Path]:
@@ -40,6 +39,9 @@ def photos_in(folder: Path) -> list[Path]:
     if not photos:
         raise SceneError(f"{folder}: no photos; it must hold files that end in {', '.join(PHOTOS)}")
     return photos
+
+
+JPEG_QUALITY = 95
 
 
 def copy_photos(photos: Sequence[Path], folder: Path, done: Callable[[int], None]) -> list[tuple[Path, str]]:

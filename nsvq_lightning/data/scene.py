@@ -25,14 +25,6 @@ from nsvq_lightning.rendering.camera import Camera
 
 log = logging.getLogger(__name__)
 
-Factor = Literal[1, 2, 4, 8]
-
-OTHER_SHAPE = (
-    "have another aspect ratio than their camera: they were cropped, rotated or mixed up after COLMAP ran; copy the "
-    "photos it ran on"
-)
-ONE_PLACE = "are taken from one place: without parallax there is no depth; move while taking photos"
-
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -109,8 +101,10 @@ class Scene:
         return View(self.names[index], index, self.cameras[index], *self.images[index])
 
 
+Factor = Literal[1, 2, 4, 8]
 # Distance of the cameras from the origin, in extents, from which float32 positions are too coarse: as on a map.
 _FARTHEST = 1e4
+ONE_PLACE = "are taken from one place: without parallax there is no depth; move while taking photos"
 
 
 def load_scene(
@@ -276,6 +270,12 @@ def find_masks(images: Sequence[ColmapImage], root: Path, folders: Sequence[str]
 def _by_stem(folder: Path) -> dict[Path, Path]:
     """The files in a folder and the folders in it, by their path without suffix."""
     return {path.with_suffix(""): path for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+OTHER_SHAPE = (
+    "have another aspect ratio than their camera: they were cropped, rotated or mixed up after COLMAP ran; copy the "
+    "photos it ran on"
+)
 
 
 def same_shape(camera: Any, width: int, height: int) -> bool:

@@ -19,17 +19,8 @@ from numba import prange
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
-from nsvq_lightning.compute.memory import Array, aligned_empty, check_array, check_table, outside
+from nsvq_lightning.compute.memory import FLOAT32, INT32, INT64, Array, aligned_empty, check_array, check_table, outside
 from nsvq_lightning.compute.rows import count_outside
-
-# Beyond this dimension, boxes prune too little, and the scores of :mod:`scores` are faster.
-MAX_DIM = 8
-# Factor on the bounds, far above the relative rounding error of a float32 distance.
-ROUNDING = 1.0 + 1e-5
-
-_NO_CODE = np.int32(np.iinfo(np.int32).max)  # label of a lane without a code
-_ROWS = 512  # queries per unit of parallel work; a pass over them hides the latency of one behind the others
-_TASKS = 2048  # capacity for visits to leaves, which are deferred and processed together
 
 
 class Memory(NamedTuple):
@@ -50,6 +41,16 @@ class Memory(NamedTuple):
     def empty(cls, count: int, dim: int) -> "Memory":
         """Memory of ``count`` rows that have not been searched."""
         return cls(np.full(count, -1, np.int32), np.zeros((count, dim), np.float32), np.full(count, -np.inf))
+
+
+# Beyond this dimension, boxes prune too little, and the scores of :mod:`scores` are faster.
+MAX_DIM = 8
+# Factor on the bounds, far above the relative rounding error of a float32 distance.
+ROUNDING = 1.0 + 1e-5
+
+_NO_CODE = np.int32(np.iinfo(np.int32).max)  # label of a lane without a code
+_ROWS = 512  # queries per unit of parallel work; a pass over them hides the latency of one behind the others
+_TASKS = 2048  # capacity for visits to leaves, which are deferred and processed together
 
 
 @inline
@@ -381,14 +382,11 @@ def box_search(
     rows = np.arange(count) if rows is None else rows
     known = Memory.empty(0, dim) if memory is None else memory
     remembered = max(count, len(known.last)) if memory is not None else 0
-    for name, array, shape, kind in (
-        ("order", order, (num_codes,), np.int32),
-        ("rows", rows, (rows.size,), np.int64),
-        ("memory.last", known.last, (remembered,), np.int32),
-        ("memory.anchors", known.anchors, (remembered, dim), np.float32),
-        ("memory.clearance", known.clearance, (remembered,), np.float64),
-    ):
-        check_array(name, array, shape, np.dtype(kind))
+    check_array("order", order, (num_codes,), INT32)
+    check_array("rows", rows, (rows.size,), INT64)
+    check_array("memory.last", known.last, (remembered,), INT32)
+    check_array("memory.anchors", known.anchors, (remembered, dim), FLOAT32)
+    check_array("memory.clearance", known.clearance, (remembered,), np.dtype(np.float64))
     if order.min() < 0 or order.max() >= num_codes:
         raise outside("order", order, num_codes)
     result = np.empty(len(rows), np.int64)

@@ -18,15 +18,6 @@ from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, Array, aligned_empty, check_array, check_table
 
-# Codes in the list of a row.
-LIST = 8
-
-_BEST = LIST + 1  # scores that a row keeps: those of a list, and the smallest of a code outside it
-_FEW = 4  # scores that a row keeps where no list is requested
-_GROUP = 6  # rows scored together
-_TILE = 8 * _GROUP  # rows that pass over a chunk of codes while it stays in the L1 cache
-_CHUNK = 4  # blocks of 32 codes in a chunk
-
 
 @kernel
 def _lay_out(codebook, centre, blocks, halves):
@@ -90,6 +81,16 @@ def squares(dim, a, at_a, b, at_b, keep):
         difference = (simd.load(a, at_a + dim - 16) - simd.load(b, at_b + dim - 16)) * simd.load(keep, 0)
         total = simd.fma(difference, difference, total)
     return total
+
+
+# Codes in the list of a row.
+LIST = 8
+
+_BEST = LIST + 1  # scores that a row keeps: those of a list, and the smallest of a code outside it
+_FEW = 4  # scores that a row keeps where no list is requested
+_GROUP = 6  # rows scored together
+_TILE = 8 * _GROUP  # rows that pass over a chunk of codes while it stays in the L1 cache
+_CHUNK = 4  # blocks of 32 codes in a chunk
 
 
 @inline

@@ -26,6 +26,14 @@ from nsvq_lightning.compute.memory import INT64, Array, flat_checked, outside, r
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside
 from nsvq_lightning.quantize.scores import squares
 
+
+@inline
+def _polynomial(c, t):
+    value = simd.fma(c[0], t, c[1])
+    value = simd.fma(simd.fma(value, t, c[2]), t, c[3])
+    return simd.fma(simd.fma(value, t, c[4]), t, c[5])
+
+
 MULTIPLIERS = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 # cos 2πt and (sin 2πt)/t as polynomials of t² on |t| ≤ 1/2 (Chebyshev fits), highest power first; errors 1e-6.
 COS = (-21.071106, 58.790493, -85.271622, 64.928658, -19.738981, 0.99999923)
@@ -50,13 +58,6 @@ def _uniforms(seed, pair, radius, angle):
         bits = bits ^ (bits >> _S31)
         radius[lane] = F(np.int32(bits >> _S40) + np.int32(1)) * _UNIT
         angle[lane] = F(np.int32(bits & _LOW24)) * _UNIT - F(0.5)
-
-
-@inline
-def _polynomial(c, t):
-    value = simd.fma(c[0], t, c[1])
-    value = simd.fma(simd.fma(value, t, c[2]), t, c[3])
-    return simd.fma(simd.fma(value, t, c[4]), t, c[5])
 
 
 @inline

@@ -22,16 +22,6 @@ from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quantize.box_search import ROUNDING
 
-ROWS = 8  # rows per program of a search
-CODES = 128  # codes that it compares its rows with at a time
-LIST = 8  # codes in the list of a row
-BLOCK = 64  # rows, or codes, per program of a check
-COPIED = 1024  # numbers per program of a copy
-PROGRAMS = 4096  # most programs of a search; they share the queue, whatever its length
-SNAPSHOT_STEPS = 16  # searches between two snapshots, as on the CPU
-SLACK = tl.constexpr(ROUNDING)
-LARGEST = tl.constexpr(float(torch.finfo(torch.float32).max))
-
 
 @triton.jit
 def compare(
@@ -83,6 +73,15 @@ def nearest_kernel(
     tl.store(result + row, nearest.to(tl.int64), mask=row < count)
 
 
+ROWS = 8  # rows per program of a search
+CODES = 128  # codes that it compares its rows with at a time
+LIST = 8  # codes in the list of a row
+BLOCK = 64  # rows, or codes, per program of a check
+COPIED = 1024  # numbers per program of a copy
+PROGRAMS = 4096  # most programs of a search; they share the queue, whatever its length
+SNAPSHOT_STEPS = 16  # searches between two snapshots, as on the CPU
+
+
 def nearest_codes(x: Tensor, codebook: Tensor) -> Tensor:
     """Nearest codes ``[N]`` int64; of equally near ones the lowest, and 0 for a row with a NaN.
 
@@ -129,6 +128,10 @@ def empty_memory(count: int, dim: int, device: torch.device) -> tuple[Tensor, ..
         torch.full((count,), -torch.inf, dtype=torch.float64, device=device),
         torch.full((count,), -torch.inf, dtype=torch.float64, device=device),
     )
+
+
+SLACK = tl.constexpr(ROUNDING)
+LARGEST = tl.constexpr(float(torch.finfo(torch.float32).max))
 
 
 @triton.jit

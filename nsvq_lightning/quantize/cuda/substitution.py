@@ -26,9 +26,6 @@ SPLIT = tl.constexpr(0x3F3504F3)  # bits of 1/√2: a mantissa lies in [1/√2, 
 TWO_LOG2_E = tl.constexpr(2 / math.log(2))
 L0, L1, L2, L3, L4 = (tl.constexpr(1 / odd) for odd in (11, 9, 7, 5, 3))
 TINY = tl.constexpr(torch.finfo(torch.float32).tiny)
-ROWS = 16  # rows of a code that are added up side by side
-PARTS = 8  # most programs that share the rows of one code, so that one of very many is no long tail; a power of two
-PART = 256  # fewest rows of a part, but for the last one
 
 
 @triton.jit
@@ -200,6 +197,11 @@ def substitute_backward(
                 **COMPILE,
             )  # fmt: skip
     return grad_x, sum_rows(radials, codes, len(codebook), x.dtype)
+
+
+ROWS = 16  # rows of a code that are added up side by side
+PARTS = 8  # most programs that share the rows of one code, so that one of very many is no long tail; a power of two
+PART = 256  # fewest rows of a part, but for the last one
 
 
 @triton.jit
