@@ -19,21 +19,19 @@ from torch import Tensor
 from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.undistort import Pinhole, Undistortion
 
-# Relative difference of aspect ratios that rounding explains.
-ROUNDED = 0.01
-# EXIF and TIFF tag: how to turn the stored pixels.
-ORIENTATION = 274
-# Its values from here on: stored lying on its side, so that programs that apply it swap width and height.
-ON_ITS_SIDE = 5
+
+def _undecodable(path: Path, reason: str) -> SceneError:
+    return SceneError(f"image {path} cannot be decoded ({reason}): copy it again, or remove it and run COLMAP again")
+
 
 # Pillow refuses twice as many, and by default fewer than phones have.
 PIL.Image.MAX_IMAGE_PIXELS = 1 << 28
 # What Pillow raises for a file that is damaged, not a picture, or beyond that limit.
 DAMAGED = (OSError, ValueError, SyntaxError, KeyError, PIL.Image.DecompressionBombError)
-
-
-def _undecodable(path: Path, reason: str) -> SceneError:
-    return SceneError(f"image {path} cannot be decoded ({reason}): copy it again, or remove it and run COLMAP again")
+# EXIF and TIFF tag: how to turn the stored pixels.
+ORIENTATION = 274
+# Its values from here on: stored lying on its side, so that programs that apply it swap width and height.
+ON_ITS_SIDE = 5
 
 
 class ImageHead(NamedTuple):
@@ -128,6 +126,10 @@ def _turned_back(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint
     stored = pixels.swapaxes(0, 1) if orientation >= ON_ITS_SIDE else pixels
     mirrored = {2: (1,), 3: (0, 1), 4: (0,), 6: (0,), 7: (0, 1), 8: (1,)}  # axes
     return np.ascontiguousarray(np.flip(stored, mirrored.get(orientation, ())))
+
+
+# Relative difference of aspect ratios that rounding explains.
+ROUNDED = 0.01
 
 
 def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
@@ -232,7 +234,7 @@ class ImageSource:
             mask = read_mask(self.mask, width, height)
             kept = mask if kept is None else kept & mask
         if self.undistortion is not None:
-            image, kept = self.undistortion(image), self.undistortion.kept(kept)
+            image, kept = self.undistortion(image, kept)
         size = self.pinhole.width, self.pinhole.height
         if image.shape[1::-1] != size:
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -81,33 +81,29 @@ class Undistortion:
         self._maps: Maps | None = None
         self._warned = False
 
-    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Undistort an image ``[H, W, 3]`` of the file's size; pixels the camera never saw are black."""
+    def __call__(
+        self, image: NDArray[np.uint8], kept: NDArray[np.bool_] | None = None
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+        """Undistort an image ``[H, W, 3]`` of the file's size, and say which pixels of the result count.
+
+        Args:
+            image: The image; pixels that the camera never saw become black.
+            kept: Which of its pixels count ``[H, W]``; None if all do.
+
+        Returns:
+            The pinhole image, and its pixels that the camera saw and whose sources count ``[H, W]``; None if all count.
+        """
         maps = self.maps()
         # replicate the border, so that the cubic kernel does not mix black into the edge of the crop
         result: NDArray[np.uint8] = cv2.remap(image, maps.x, maps.y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        count = None
+        if kept is not None:
+            whole = kept.astype(np.uint8) * np.uint8(255)
+            count = cv2.remap(whole, maps.x, maps.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) == 255
         if maps.blank is not None:
             result[maps.blank] = 0
-        return result
-
-    def kept(self, kept: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
-        """Which pixels of the pinhole image count: those that the camera saw, and whose sources ``[H, W]`` count.
-
-        Args:
-            kept: Which pixels of the file count; None if all do.
-
-        Returns:
-            ``[H, W]``; None if all count.
-        """
-        maps = self.maps()
-        seen = None if maps.blank is None else ~maps.blank
-        if kept is None:
-            return seen
-        whole = kept.astype(np.uint8) * np.uint8(255)
-        sources: NDArray[np.bool_] = (
-            cv2.remap(whole, maps.x, maps.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) == 255
-        )
-        return sources if seen is None else sources & seen
+            count = ~maps.blank if count is None else count & ~maps.blank
+        return result, count
 
     def maps(self) -> Maps:
         """Where each pixel of the pinhole image comes from."""
