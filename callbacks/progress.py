@@ -15,6 +15,8 @@ from nsvq_lightning.training.module import SplatModule
 
 # Lines of a run if the output is not a terminal.
 LINES = 50
+# Weight of the past in the exponential mean of the training PSNR.
+SMOOTHING = 0.8
 
 
 class SplatProgressBar(TQDMProgressBar):
@@ -26,10 +28,6 @@ class SplatProgressBar(TQDMProgressBar):
 
     Args:
         refresh_rate: Iterations between two refreshes on a terminal; 0 turns the bar off.
-        smoothing: Weight of the past in the exponential mean, in [0, 1).
-
-    Raises:
-        ValueError: ``smoothing`` is out of range.
 
     Example:
         >>> from nsvq_lightning.callbacks import SplatProgressBar
@@ -41,11 +39,8 @@ class SplatProgressBar(TQDMProgressBar):
 
     BAR_FORMAT = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} {elapsed}<{remaining}{postfix}"
 
-    def __init__(self, refresh_rate: int = 25, smoothing: float = 0.8) -> None:
-        if not 0.0 <= smoothing < 1.0:
-            raise ValueError(f"smoothing must be in [0, 1), got {smoothing}")
+    def __init__(self, refresh_rate: int = 25) -> None:
         super().__init__(refresh_rate=refresh_rate)
-        self.smoothing = smoothing
         self._psnr: float | None = None
         self._is_plain = False
         self._start = 0.0  # of the clock that stops while kernels are compiled
@@ -130,7 +125,7 @@ class SplatProgressBar(TQDMProgressBar):
         psnr = trainer.callback_metrics.get("train/psnr")
         if psnr is not None:
             past = float(psnr) if self._psnr is None else self._psnr
-            self._psnr = self.smoothing * past + (1.0 - self.smoothing) * float(psnr)
+            self._psnr = SMOOTHING * past + (1.0 - SMOOTHING) * float(psnr)
             parts.append(f"{self._psnr:.1f} dB")
         if module.history:
             parts.append(f"test {module.history[-1]['psnr']:.2f}")

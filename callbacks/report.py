@@ -22,8 +22,7 @@ from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_bit, psnr
-from nsvq_lightning.report import files, pictures
-from nsvq_lightning.report.page import write_page
+from nsvq_lightning.report import files, page, pictures
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
@@ -167,7 +166,7 @@ class MetricReport(WritingCallback):
         module.history.append(entry)
         if trainer.is_global_zero:
             files.write_csv(folder / "curve.csv", module.history)
-            write_page(folder, module.history, module.schedule, self._other_seconds())
+            page.write_page(folder, module.history, module.schedule, self._other_seconds())
         values = {f"report/{name}": float(entry[name]) for name in ("psnr", "ssim", "splats")}
         trainer.callback_metrics.update({name: torch.tensor(value) for name, value in values.items()})
         for logger in trainer.loggers:
@@ -253,8 +252,8 @@ class MetricReport(WritingCallback):
             files.write_csv(folder / "views.csv", [asdict(score) for score in scores])
             paths = [self._picture(trainer, score.name) for score in scores]
             views = [asdict(score) | {"picture": path.name} for score, path in zip(scores, paths, strict=True)]
-            page = write_page(folder, module.history, module.schedule, self._other_seconds(), metrics, views)
-            log.info(f"report: {page}")
+            written = page.write_page(folder, module.history, module.schedule, self._other_seconds(), metrics, views)
+            log.info(f"report: {written}")
             if self.pictures:
                 pictures.log_pictures(trainer.loggers, paths, trainer.global_step)
         self._scene, self._lpips = None, None

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from runs import paper_phases, paper_replacement
+from runs import paper_replacement
 from torch import Tensor
 
 from nsvq_lightning.callbacks import (
@@ -82,12 +82,6 @@ def test_the_sh_degree_grows_up_to_that_of_the_splats() -> None:
         callback.on_train_batch_start(SimpleNamespace(global_step=step), module, None, 0)  # type: ignore[arg-type]
         degrees[step + 1] = module.active_sh_degree
     assert degrees == {1: 0, 999: 0, 1000: 1, 2000: 2, 3000: 2, 40_001: 2}
-
-
-def test_ends_in_iterations_of_the_run_do_not_scale() -> None:
-    callback = paper_phases(reference_total=None, warmup_end=100, prune_end=150, quantize_end=300)
-    schedule = callback.schedule(400)
-    assert (schedule.ends, schedule.scale) == ((100, 150, 300, 400), 1.0)
 
 
 @pytest.mark.parametrize("rank", [0, 1])

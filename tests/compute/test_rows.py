@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from nsvq_lightning.compute import rows as rows_module
-from nsvq_lightning.compute.rows import gather_rows, spread_rows
+from nsvq_lightning.compute.rows import gather_rows, spread_rows, take_rows
 from nsvq_lightning.random import generator
 
 
@@ -18,3 +18,15 @@ def test_rows_out_of_a_table_and_back_over_old_memory(
     values = gather_rows(table, rows)
     assert torch.equal(values, table[rows])
     assert torch.equal(spread_rows(values, rows, 9), torch.zeros(shape).index_copy_(0, rows, values))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("chosen", [[0, 3, 4], []])
+def test_taking_rows_has_the_gradient_of_index_select(dtype: torch.dtype, chosen: list[int]) -> None:
+    x = torch.randn(6, 15, 3, generator=generator(0), dtype=dtype, requires_grad=True)
+    rows = torch.tensor(chosen, dtype=torch.int64)
+    weight = torch.randn(len(chosen), 15, 3, generator=generator(1), dtype=dtype)
+    (ours,) = torch.autograd.grad((take_rows(x, rows) * weight).sum(), x)
+    (theirs,) = torch.autograd.grad((x.index_select(0, rows) * weight).sum(), x)
+    assert torch.equal(take_rows(x, rows), x.index_select(0, rows))
+    assert torch.equal(ours, theirs)

@@ -72,34 +72,6 @@ def test_a_branch_ends_in_the_bytes_of_the_run_trained_from_its_start(
     assert branched[1].stopwatch.seconds > trunk_seconds > 0
 
 
-@pytest.mark.parametrize(
-    ("rules", "named"),
-    [
-        ({"quantize_end": 44_000, "min_finetune": 7, "min_replacement_interval": 9}, None),
-        ({"quantize_end": 44_000, "min_reset_interval": 12}, ("min_reset_interval = 11", "min_reset_interval = 12")),
-    ],
-    ids=["of the quantize phase", "of another"],
-)
-def test_a_branch_tells_which_rules_of_its_trunk_have_changed(
-    run: RunFactory,
-    recipe: Recipe,
-    trunk: Path,
-    caplog: pytest.LogCaptureFixture,
-    rules: dict[str, int],
-    named: tuple[str, str] | None,
-) -> None:
-    phases = paper_phases(**{"total": 60, **INTERVALS, **rules})
-    run(recipe(phases=phases).values(), ckpt_path=trunk, max_steps=PRUNE_END + 1)
-    messages = [message for message in caplog.messages if message.startswith("the checkpoint is of")]
-    if named is None:
-        assert messages == []
-        return
-    assert messages == [
-        f"the checkpoint is of a run with {named[0]}, this one continues with {named[1]}; pass "
-        "--callbacks.phases.min_reset_interval=11 to continue that run as it was"
-    ]
-
-
 def test_once_quantized_the_rules_of_that_phase_count() -> None:
     module = SplatModule(sh_degree=1)
     module.schedule = Schedule(min_finetune=200)
@@ -112,6 +84,13 @@ def test_once_quantized_the_rules_of_that_phase_count() -> None:
         assert changed_schedule(stored, module.schedule) is None
     assert told is not None
     assert "--callbacks.phases.min_finetune=200" in told
+    module.phase, module.schedule = Phase.PRUNE, Schedule(min_finetune=200, min_reset_interval=11)
+    stored = {"state_dict": module.state_dict()}
+    module.on_save_checkpoint(stored)
+    assert changed_schedule(stored, Schedule(min_reset_interval=12)) == (
+        "the checkpoint is of a run with min_reset_interval = 11, this one continues with min_reset_interval = 12; "
+        "pass --callbacks.phases.min_reset_interval=11 to continue that run as it was"
+    )
 
 
 def test_codebooks_may_change_until_they_are_placed() -> None:

@@ -17,7 +17,6 @@ from typing import Any
 import pytest
 from checkpoints import assert_same, assert_same_end, iteration_of, read
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from runs import RECIPE_MODULE, Recipe, RunFactory, Whole, paper_phases, recipe_options
 
@@ -205,13 +204,12 @@ def test_a_signal_in_the_last_evaluation_waits_for_the_last_checkpoint(
     assert_same(read(path), read(last))
 
 
-@pytest.mark.parametrize("hook", ["on_train_epoch_end", "on_train_end"])
 def test_a_run_that_broke_in_its_last_evaluation_makes_up_for_it(
-    run: RunFactory, recipe: Recipe, whole: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch, hook: str
+    run: RunFactory, recipe: Recipe, whole: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runner, start = Runner(run, recipe, "paper"), shortly_before(whole("paper"), 60)
     with monkeypatch.context() as patch:
-        patch.setattr(MetricReport, hook, lambda *_: fail())
+        patch.setattr(MetricReport, "on_train_epoch_end", lambda *_: fail())
         path = runner.stopped(Broken, Callback(), start=start)
     assert iteration_of(path) == 60
     folder = runner.continued(path)
@@ -236,17 +234,6 @@ def test_a_checkpoint_that_cannot_be_written_hides_no_error_and_harms_no_other(
     path = Runner(run, recipe, "paper").stopped(Broken, Trouble(8, fail), every=5)
     assert (iteration_of(path), good) == (5, [5])
     assert "the checkpoint of iteration 7 could not be written: No space left on device" in caplog.messages
-
-
-def test_lightnings_own_checkpoints_continue_to_the_same_bits(
-    run: RunFactory, recipe: Recipe, whole: Callable[[str], Path], tmp_path: Path
-) -> None:
-    own = ModelCheckpoint(tmp_path, "{step}", every_n_train_steps=12, save_top_k=-1)
-    runner, start = Runner(run, recipe, "paper"), shortly_before(whole("paper"), 32)
-    with pytest.raises(Broken):
-        runner(own, Trouble(37, fail), checkpoint=RunCheckpoint(every=0), ckpt_path=start)
-    assert os.listdir(tmp_path) == ["step=36.ckpt"]
-    assert_same_end(runner.continued(tmp_path / "step=36.ckpt"), whole("paper"))
 
 
 def test_a_run_continued_with_another_length_says_what_follows_from_it(

@@ -17,6 +17,7 @@ from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.formats import save
+from nsvq_lightning.quantize import PostHoc
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render, visible
@@ -236,3 +237,22 @@ def test_photos_from_one_place_are_named(make_scene: Callable[..., Path]) -> Non
     trainer = Trainer(max_steps=1, logger=False, enable_checkpointing=False, enable_progress_bar=False)
     with pytest.raises(ValueError, match=r"the 7 train photos of .* are taken from one place.* move while"):
         trainer.fit(module, data)
+
+
+def test_before_the_codebooks_everything_is_stored_as_it_is(caplog: pytest.LogCaptureFixture) -> None:
+    module = SplatModule(codebooks="0.5k", splats=make_splats())
+    stored = module.compressed()
+    assert "unquantized" in caplog.text
+    assert not stored.codes
+    decoded = stored.decode()
+    for name in ATTRIBUTES:
+        assert torch.equal(getattr(decoded, name), getattr(module.splats, name)), name
+
+
+def test_the_sizes_of_codebooks_that_storing_places_are_those_that_it_placed() -> None:
+    module = SplatModule(codebooks={"scales": 4096, "sh0": 8}, quantizer=PostHoc, splats=make_splats())
+    module.phase = Phase.QUANTIZE
+    for _ in range(2):
+        stored = module.compressed()
+        assert stored.config["codebooks"] == {"scales": 30, "sh0": 8}
+        assert {name: len(rows) for name, rows in stored.codebooks.items()} == stored.config["codebooks"]

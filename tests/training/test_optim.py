@@ -10,7 +10,6 @@ import torch
 from runs import PAPER_MODULE
 from torch import nn
 
-from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training.optim import (
     LearningRates,
@@ -123,18 +122,3 @@ def test_a_codebook_without_gradient_is_left_alone() -> None:
 def test_impossible_rates_are_refused(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"rate {next(iter(bad))} must be finite"):
         LearningRates(**bad)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("shape", [(6,), (6, 3), (6, 15, 3)])
-@pytest.mark.parametrize("chosen", [[0, 3, 4], [5], [0, 1, 2, 3, 4, 5], []])
-def test_taking_rows_has_the_gradient_of_index_select(
-    shape: tuple[int, ...], dtype: torch.dtype, chosen: list[int]
-) -> None:
-    x = torch.randn(shape, generator=torch.Generator().manual_seed(0), dtype=dtype, requires_grad=True)
-    rows = torch.tensor(chosen, dtype=torch.int64)
-    weight = torch.randn((len(chosen), *shape[1:]), generator=torch.Generator().manual_seed(1), dtype=dtype)
-    (ours,) = torch.autograd.grad((take_rows(x, rows) * weight).sum(), x)
-    (theirs,) = torch.autograd.grad((x.index_select(0, rows) * weight).sum(), x)
-    assert torch.equal(take_rows(x, rows), x.index_select(0, rows))
-    assert torch.equal(ours, theirs)

@@ -110,24 +110,17 @@ def refuse(*_: Any, **__: Any) -> None:
     raise OSError("no more processes")
 
 
-@pytest.mark.parametrize(
-    ("cores", "module", "compiles"),
-    [(1, {}, True), (2, {"codebooks": None}, True), (2, {}, False)],
-    ids=["one core", "no codebooks", "all cached"],
-)
+@pytest.mark.parametrize(("cores", "module"), [(1, {}), (2, {"codebooks": None})], ids=["one core", "no codebooks"])
 def test_nothing_is_started_where_it_is_of_no_use(
+    cores: int,
+    module: dict[str, Any],
     recipe: Recipe,
     run: RunFactory,
     processes: list[Process],
     monkeypatch: pytest.MonkeyPatch,
-    cores: int,
-    module: dict[str, Any],
-    compiles: bool,
 ) -> None:
-    run(recipe().values(), max_steps=3, module=module)  # from here on all kernels of these steps are compiled
     monkeypatch.setattr(callback_module, "usable_cores", lambda: cores)
-    more: list[Callback] = [Compiles()] if compiles else []
-    run([*recipe(kernels=CompileAhead()).values(), *more], max_steps=3, module=module)
+    run([*recipe(kernels=CompileAhead()).values(), Compiles()], max_steps=3, module=module)
     assert not processes
 
 
