@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 # Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh0.
 SH_C0 = 0.5 / math.sqrt(math.pi)
@@ -46,6 +45,8 @@ def unit(quats: NDArray[np.float32]) -> NDArray[np.float64]:
 
 def turned(quats: NDArray[np.float32], rotation: NDArray[np.float64]) -> NDArray[np.float32]:
     """Quaternions wxyz ``[N, 4]`` after all axes have turned by a rotation ``[3, 3]``; lengths stay."""
+    from scipy.spatial.transform import Rotation  # slow to import, and few files are turned
+
     x, y, z, w = Rotation.from_matrix(rotation).as_quat()
     product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return np.asarray(quats.astype(np.float64) @ product.T, np.float32)
