@@ -92,11 +92,11 @@ def test_the_mean_estimate_is_the_sum_of_squared_derivatives() -> None:
         tuple[Tensor, ...],
         torch.autograd.functional.jacobian(lambda *raw: render(RawSplats(*raw), CAMERA).image.flatten(), tuple(splats)),
     )
-    estimates = [sensitivity(splats, CAMERA, render, generator(1, draw))[0] for draw in range(400)]
+    estimates = [sensitivity(splats, CAMERA, render, generator(1, draw))[0] for draw in range(150)]
     for name, derivative in zip(RawSplats._fields, jacobian, strict=True):
         exact = derivative.square().sum(0)
         mean = torch.stack([getattr(estimate, name) for estimate in estimates]).mean(0)
-        torch.testing.assert_close(mean, exact, rtol=0.35, atol=1e-5)
+        torch.testing.assert_close(mean, exact, rtol=0.5, atol=1e-5)
     assert not any(getattr(estimates[0], name)[3].any() for name in RawSplats._fields)
 
 

@@ -19,14 +19,12 @@ def scene(n: int, degree: int) -> Splats:
     return Splats.from_tensors(*(torch.randn(s, generator=generator(1, i)) for i, s in enumerate(shapes)))
 
 
-@pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("suffix", [".ply", ".nsvq", ".PLY"])
-def test_save_then_load_is_exact(tmp_path: Path, suffix: str, degree: int) -> None:
-    splats, path = scene(20, degree), tmp_path / f"x{suffix}"
+@pytest.mark.parametrize("suffix", [".ply", ".NSVQ", ".Ply"])
+def test_save_then_load_is_exact_whatever_the_case_of_the_suffix(tmp_path: Path, suffix: str) -> None:
+    splats, path = scene(20, 2), tmp_path / f"x{suffix}"
     assert save(splats, path, Storage("paper")) == path.stat().st_size
     back = load(str(path))
-    for name, values in splats.attributes().items():
-        assert torch.equal(getattr(back, name), values)
+    assert all(torch.equal(getattr(back, name), values) for name, values in splats.attributes().items())
 
 
 def test_options_reach_the_format(tmp_path: Path) -> None:

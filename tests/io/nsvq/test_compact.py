@@ -61,16 +61,6 @@ def test_errors_stay_within_the_precision(tmp_path: Path, sizes: dict[str, int])
         assert np.abs(now - was).max() <= error + 1e-6
 
 
-@pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("n", [0, 1, 2])
-def test_small_scenes_of_every_degree_come_back(tmp_path: Path, n: int, degree: int) -> None:
-    for sizes in ({}, {"quats": 1, "sh0": 3}):
-        write_nsvq(tmp_path / "x.nsvq", scene(n, sizes, degree))
-        read = read_nsvq(tmp_path / "x.nsvq")
-        assert (len(read), read.sh_degree) == (n, degree)
-        assert set(read.codebooks) == set(sizes)
-
-
 @pytest.mark.parametrize("sizes", [SIZES, {}, {"quats": 1, "scales": 300}])
 def test_a_file_that_is_read_and_written_again_loses_nothing_more(tmp_path: Path, sizes: dict[str, int]) -> None:
     once, twice = tmp_path / "once.nsvq", tmp_path / "twice.nsvq"
