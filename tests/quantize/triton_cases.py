@@ -96,8 +96,9 @@ def test_codes_that_a_bound_proves_are_those_of_a_search(
     dim: int, size: float, programs: int, searched: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(search_module, "PROGRAMS", programs)  # one works off the whole queue
+    monkeypatch.setattr(search_module, "SNAPSHOT_STEPS", 4)
     tracker = DeviceTracker(150, dim, torch.device(DEVICE))
-    for x, codebook, rows in walk(dim, 20 if size < 1e-2 else 8, size):
+    for x, codebook, rows in walk(dim, 9 if size < 1e-2 else 5, size):
         found = tracker.search(x.to(DEVICE), codebook.to(DEVICE), rows.to(DEVICE))
         assert torch.equal(found.cpu(), nearest(x[rows], codebook))
     assert searched[0] == 30
