@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from pathlib import Path
 
@@ -92,12 +91,22 @@ def test_files_of_half_the_models_size() -> None:
     assert np.abs(ours.astype(float) - expected).mean() < 1.5
 
 
-def test_wide_fisheye_warns_of_pixels_it_never_saw(caplog: pytest.LogCaptureFixture) -> None:
-    _, undistortion = rectify(_camera("SIMPLE_RADIAL_FISHEYE", (90.0, 200.0, 150.0, 0.0)), 400, 300)
+def test_pixels_that_the_camera_never_saw_are_black_and_told_once(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, undistortion = rectify(_camera("OPENCV", DISTORTED["OPENCV"]), 400, 300, keep_maps=False)
     assert undistortion is not None
-    with caplog.at_level(logging.WARNING, "nsvq_lightning"):
-        blank = (undistortion(np.full((300, 400, 3), 255, np.uint8))[0] == 0).all(-1).mean()
-    assert bool(caplog.records) == (blank > 0)
+    pixels = undistortion._source_pixels()
+    pixels[:4] = -5  # outside the file
+    monkeypatch.setattr(undistortion, "_source_pixels", lambda: pixels)
+    for _ in range(2):
+        image, count = undistortion(np.full((300, 400, 3), 255, np.uint8))
+        assert count is not None
+        assert not count[:4].any()
+        assert count[4:].all()
+        assert np.array_equal(image, np.repeat(255 * count[..., None].astype(np.uint8), 3, 2))
+    (message,) = caplog.messages
+    assert "of the pinhole image is left out" in message
 
 
 def test_spherical_camera_is_refused() -> None:
