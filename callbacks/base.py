@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, ClassVar
 
 from lightning.pytorch import Callback, Trainer
@@ -10,7 +9,7 @@ from lightning.pytorch import Callback, Trainer
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.training import row_ops
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.run_folder import hold, is_fast_dev_run, let_go, run_folder, take
+from nsvq_lightning.training.run_folder import hold, is_fast_dev_run, let_go, run_folder
 
 # What a setting may be, by how an error says it.
 BOUNDS: dict[str, Callable[[float], bool]] = {
@@ -111,8 +110,6 @@ class WritingCallback(SplatCallback):
 
     stages: ClassVar[tuple[str, ...]] = ("fit",)
     """Stages in which it writes: ``fit``, ``test`` or both."""
-    folder: str | Path | None = None
-    """Where it writes instead of the folder of the run, if set."""
 
     def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Check the module, and for a test take the folder.
@@ -135,17 +132,14 @@ class WritingCallback(SplatCallback):
     def _take_folder(self, trainer: Trainer, stage: str) -> None:
         if stage not in self.stages:
             return
-        if self.folder is None:
-            folder = run_folder(trainer)
-            if trainer.is_global_zero and not is_fast_dev_run(trainer):
-                hold(folder)  # again, if an earlier stage of the run has ended
-        elif trainer.is_global_zero and not is_fast_dev_run(trainer):
-            take(Path(self.folder), trainer.ckpt_path)
+        folder = run_folder(trainer)
+        if trainer.is_global_zero and not is_fast_dev_run(trainer):
+            hold(folder)  # again, if an earlier stage of the run has ended
 
     def teardown(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Let go of the folder: nothing is written after this."""
         if stage in self.stages:
-            let_go(run_folder(trainer) if self.folder is None else Path(self.folder))
+            let_go(run_folder(trainer))
 
 
 def finite_search_is_due(trainer: Trainer, every: int) -> bool:

@@ -194,7 +194,6 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     Args:
         every: Iterations between two checkpoints; None is a tenth of the schedule, 0 saves only at the end of the run.
         keep: Also keep each checkpoint as ``step-<iteration>.ckpt``.
-        folder: Where; None is ``checkpoints`` in the folder of the run.
 
     Raises:
         ValueError: ``every`` is negative.
@@ -210,7 +209,6 @@ class RunCheckpoint(WritingCallback, Checkpoint):
 
     every: int | None = None
     keep: bool = False
-    folder: str | None = None
     best_model_path: str = field(default="", init=False)
     """Path of ``last_path`` under the name by which Lightning looks for ``ckpt_path="best"``."""
     _saved: int = field(default=-1, init=False)
@@ -304,7 +302,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     def _save(self, trainer: Trainer, module: SplatModule) -> None:
         if is_fast_dev_run(trainer):
             return
-        folder = run_folder(trainer) / "checkpoints" if self.folder is None else Path(self.folder)
+        folder = run_folder(trainer) / "checkpoints"
         with module.stopwatch.paused(module.device):
             if self.keep:
                 _write(trainer, folder / f"step-{trainer.global_step}.ckpt")

@@ -34,7 +34,6 @@ class ExportScene(WritingCallback):
 
     Args:
         formats: Suffixes without the dot; ``sog``, ``spz`` and ``splat`` are smaller files for viewers.
-        folder: Where; None is the folder of the run.
 
     Raises:
         ValueError: An unknown format.
@@ -49,7 +48,6 @@ class ExportScene(WritingCallback):
     """
 
     formats: Sequence[str] = ("nsvq", "ply")
-    folder: str | None = None
 
     def __post_init__(self) -> None:
         known = [suffix.removeprefix(".") for suffix in FORMATS]
@@ -59,13 +57,12 @@ class ExportScene(WritingCallback):
 
     def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Write the files, on the first process."""
-        folder = run_folder(trainer) if self.folder is None else Path(self.folder)
+        folder = run_folder(trainer)
         if is_fast_dev_run(trainer) or not trainer.is_global_zero:
             return
         scene = module.compressed().finite()
         # The files of viewers hold what the compressed one decodes to: found once, however many there are.
         decoded = as_stored(scene, module.storage) if set(self.formats) - {"nsvq"} else scene
-        folder.mkdir(parents=True, exist_ok=True)
         for suffix in self.formats:
             path = folder / f"scene.{suffix}"
             size = save(scene, path, module.storage) if suffix == "nsvq" else save(decoded, path)

@@ -74,17 +74,6 @@ def test_a_folder_that_holds_a_run_is_refused(run: RunFactory, tmp_path: Path) -
     assert run_folder(again) == folder
 
 
-def test_what_callbacks_were_told_to_write_elsewhere_is_not_overwritten_either(run: RunFactory, tmp_path: Path) -> None:
-    def fit() -> None:
-        run([PhaseSchedule(), RunCheckpoint(folder=str(tmp_path / "kept"))], max_steps=2)
-
-    fit()
-    before = contents(tmp_path / "kept")
-    with pytest.raises(FileExistsError, match="kept already holds a run"):
-        fit()
-    assert contents(tmp_path / "kept") == before
-
-
 def test_a_trial_leaves_no_folder(run: RunFactory, tmp_path: Path, demo_scene: Path) -> None:
     everything = [*callbacks(), RenderWriter()]
     trainer, module = run(everything, default_root_dir=tmp_path / "runs", fast_dev_run=True)
