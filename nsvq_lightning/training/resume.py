@@ -1,4 +1,4 @@
-"""Checkpoints that continue a run, or branch from it: read, checked, and never trusted to import anything."""
+"""Checkpoints that continue a run: read, checked, and never trusted to import anything."""
 
 import logging
 import os
@@ -16,12 +16,10 @@ from zipfile import BadZipFile, ZipFile
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.model_helpers import _restricted_classmethod
-from torch import Tensor, nn
-from torch.optim import Optimizer
+from torch import Tensor
 
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import sh_degree_of
 from nsvq_lightning.training.scene_access import scene_of
 from nsvq_lightning.training.scene_module import SceneModule
@@ -29,12 +27,6 @@ from nsvq_lightning.training.schedule import Phase, Schedule
 from nsvq_lightning.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
-
-# Settings of a schedule that have no effect before the quantize phase.
-QUANTIZE_RULES = ("quantize_end", "min_finetune", "min_replacement_interval")
-
-# Prefix of the codebooks in a module's state.
-CODEBOOKS = "codebooks."
 
 # Prefix of the splats in a module's state.
 SPLATS = "splats."
@@ -44,49 +36,6 @@ QUANTIZER_SETTINGS = "quantizer_settings"
 
 # Key of :meth:`ResumedModule.get_extra_state` in a module's state.
 RUN = "_extra_state"
-
-
-def can_branch(checkpoint: Mapping[str, Any], codebooks: nn.ModuleDict) -> bool:
-    """Whether a checkpoint is from before the quantize phase and has other codebooks, in number or size, than these."""
-    if not _is_unquantized(checkpoint):
-        return False
-    state = checkpoint["state_dict"]
-    stored = {name: value.shape for name, value in state.items() if name.startswith(CODEBOOKS)}
-    return stored != {name: value.shape for name, value in _prefixed(codebooks).items()}
-
-
-def branch_checkpoint(checkpoint: dict[str, Any], codebooks: nn.ModuleDict, optimizer: Optimizer) -> None:
-    """Replace the codebooks of a checkpoint with fresh ones, in place.
-
-    Splats, side tables, their moments in the optimiser, the loops and the callbacks' states stay; so the continued run
-    is, bit for bit, the run that would have had these codebooks from the start.
-
-    Args:
-        checkpoint: Checkpoint of a run that has not quantized yet (:func:`can_branch`).
-        codebooks: Untrained quantizers of the continuing module, by attribute.
-        optimizer: A new optimiser of that module, whose groups are named.
-    """
-    state = checkpoint["state_dict"]
-    kept = {name: value for name, value in state.items() if not name.startswith(CODEBOOKS)}
-    checkpoint["state_dict"] = kept | _prefixed(codebooks)
-    if checkpoint.get("optimizer_states"):
-        (stored,) = checkpoint["optimizer_states"]
-        checkpoint["optimizer_states"] = [branch_optimizer_state(stored, optimizer.state_dict())]
-
-
-def branch_optimizer_state(stored: Mapping[str, Any], fresh: Mapping[str, Any]) -> dict[str, Any]:
-    """State of an optimiser with the groups of ``fresh``: splat attributes as stored, codebooks untrained.
-
-    Args:
-        stored: ``state_dict()`` of the trained optimiser; its groups are named.
-        fresh: ``state_dict()`` of a new optimiser, with the desired groups.
-    """
-    groups = {group["name"]: group for group in stored["param_groups"] if group["name"] in ATTRIBUTES}
-    merged = [groups.get(group["name"], group) | {"params": group["params"]} for group in fresh["param_groups"]]
-    # A state dict refers to parameters by index in the list of all; codebooks before them would shift it.
-    places = {group["params"][0]: groups[group["name"]]["params"][0] for group in merged if group["name"] in groups}
-    state = {place: stored["state"][old] for place, old in places.items() if old in stored["state"]}
-    return {"state": state, "param_groups": merged}
 
 
 def continued_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> Schedule:
@@ -105,8 +54,8 @@ def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str |
             "control and learning rates follow the new length; pass "
             f"--trainer.max_steps={stored.total} to continue that run as it was"
         )
-    own, without_effect = asdict(schedule), ("saved", *(QUANTIZE_RULES if _is_unquantized(checkpoint) else ()))
-    changed = {name: v for name, v in asdict(stored).items() if v != own[name] and name not in without_effect}
+    own = asdict(schedule) | {"saved": stored.saved}
+    changed = {name: value for name, value in asdict(stored).items() if value != own[name]}
     if not changed:
         return None
     return (
@@ -123,7 +72,7 @@ def check_continuation(
     """Check that training of a module can continue from a checkpoint.
 
     Args:
-        checkpoint: The checkpoint, with codebooks replaced where allowed (:func:`branch_checkpoint`).
+        checkpoint: The checkpoint, as it was read.
         own: Its ``state_dict()``; numbers of splats may differ, and those of codes if k-means found fewer rows.
         quantizers: Class and number of codes of the module's quantizers by attribute, as requested.
 
@@ -143,19 +92,10 @@ def check_continuation(
             f"--model.sh_degree={degrees[0]}"
         )
     trained = checkpoint[QUANTIZER_SETTINGS]
-    if trained != quantizers and not _is_unquantized(checkpoint):
+    if trained != quantizers:
         raise ValueError(
-            f"the checkpoint has quantized with {_described(trained)}, and this run would with "
-            f"{_described(quantizers)}; that can change only before the quantize phase: pass the --model.quantizer and "
-            "--model.codebooks that it was trained with, or a checkpoint from before it"
-        )
-    # The splats' side tables may differ.
-    stored, wanted = ({name for name in values if not name.startswith(SPLATS)} for values in (state, own))
-    if stored != wanted:
-        raise ValueError(
-            f"the checkpoint is of a run with other codebooks or another quantizer: it has {_some(stored - wanted)} "
-            f"that this run lacks, and lacks {_some(wanted - stored)}; pass the --model.codebooks and "
-            "--model.quantizer that it was trained with"
+            f"the checkpoint is of a run that quantizes with {_described(trained)}, and this one would with "
+            f"{_described(quantizers)}; pass the --model.quantizer and --model.codebooks that it was trained with"
         )
 
 
@@ -164,19 +104,6 @@ def _described(settings: Mapping[str, Mapping[str, Any]]) -> str:
     kinds = ", ".join(sorted({str(one["quantizer"]) for one in settings.values()}))
     sizes = ", ".join(f"{name}: {one['codes']}" for name, one in settings.items())
     return f"{kinds} ({sizes})" if settings else "no codebooks"
-
-
-def _is_unquantized(checkpoint: Mapping[str, Any]) -> bool:
-    """Whether a checkpoint is from before the quantize phase."""
-    return Phase(int(checkpoint["state_dict"][RUN][0])) < Phase.QUANTIZE
-
-
-def _some(names: set[str]) -> str:
-    return ", ".join(sorted(names)[:3]) + ", …" * (len(names) > 3) or "nothing"
-
-
-def _prefixed(codebooks: nn.ModuleDict) -> dict[str, Tensor]:
-    return {f"{CODEBOOKS}{name}": value for name, value in codebooks.state_dict().items()}
 
 
 # Key under which a checkpoint holds which scene it is of.
@@ -355,11 +282,10 @@ def _is_plain(value: Any) -> bool:
 
 
 class ResumedModule(SceneModule):
-    """A module whose checkpoints continue its run, or branch from it."""
+    """A module whose checkpoints continue its run."""
 
     quantizer_settings: dict[str, dict[str, Any]]
     """Class and number of codes of each quantizer by attribute, as requested; k-means may give fewer codes."""
-    configure_optimizers: Callable[[], Optimizer]
     stopwatch: Stopwatch
     history: list[dict[str, Any]]
     """Evaluations so far, one plain dictionary each; checkpoints carry it."""
@@ -412,7 +338,7 @@ class ResumedModule(SceneModule):
             checkpoint[self.CHECKPOINT_HYPER_PARAMS_KEY] = plain(stored) | {"background": self.background}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Restore history and schedule; a fit keeps its own schedule, and may continue with other codebooks.
+        """Restore history and schedule; a fit keeps its own schedule.
 
         Raises:
             ValueError: A fit cannot continue from the checkpoint, or it is of another scene than the trainer's, which
@@ -428,6 +354,4 @@ class ResumedModule(SceneModule):
         self.schedule = continued_schedule(checkpoint, self.schedule)
         if (change := changed_schedule(checkpoint, self.schedule)) is not None:
             log.warning(change)
-        if can_branch(checkpoint, self.codebooks):
-            branch_checkpoint(checkpoint, self.codebooks, self.configure_optimizers())
         check_continuation(checkpoint, self.state_dict(), self.quantizer_settings)

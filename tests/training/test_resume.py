@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +16,18 @@ from torch import Tensor, nn
 
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.quantize import NSVQ, StraightThrough
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.resume import (
     PlainCheckpointIO,
+    changed_schedule,
+    check_continuation,
     check_scene,
     check_settings,
     read_checkpoint,
     scene_record,
 )
+from nsvq_lightning.training.schedule import Schedule
 
 SCENE = {"splats.means": torch.arange(300.0).view(100, 3), "_extra_state": torch.zeros(4)}
 
@@ -81,7 +87,7 @@ def test_code_is_not_run(tmp_path: Path) -> None:
     assert mark.is_dir()
 
 
-NSVQ = "nsvq_lightning.quantize.NSVQ"
+NAMED = "nsvq_lightning.quantize.NSVQ"
 
 
 @pytest.mark.parametrize(
@@ -91,7 +97,7 @@ NSVQ = "nsvq_lightning.quantize.NSVQ"
         {"quantizer": {"class_path": "evilmod.f"}},
         {"quantizer.class_path": "evilmod.f"},
         {"quantizer": '{"class_path": "evilmod.f"}'},
-        {"quantizer": {"class_path": NSVQ, "init_args": {"start": ["evilmod.f"]}}},
+        {"quantizer": {"class_path": NAMED, "init_args": {"start": ["evilmod.f"]}}},
         {"quantizer": "evil.yaml"},
         {"quantizer": "evil"},
         {"quantizer": "os.system"},
@@ -122,8 +128,8 @@ def test_what_the_user_has_named_is_loaded() -> None:
     for settings in ({"quantizer": f"{__name__}.Harmful"}, {"init_from": "old.ply", "codebooks": "0.5k"}):
         check_settings("a.ckpt", settings)
     with pytest.raises(FormatError, match=r"its model.quantizer.table is a/b.txt, .*: --model.quantizer.table=a/b.txt"):
-        check_settings("a.ckpt", {"quantizer": {"class_path": NSVQ, "init_args": {"table": "a/b.txt"}}})
-    check_settings("a.ckpt", {"quantizer": {"class_path": NSVQ, "init_args": {"table": "a/b.txt"}}}, ["a/b.txt"])
+        check_settings("a.ckpt", {"quantizer": {"class_path": NAMED, "init_args": {"table": "a/b.txt"}}})
+    check_settings("a.ckpt", {"quantizer": {"class_path": NAMED, "init_args": {"table": "a/b.txt"}}}, ["a/b.txt"])
 
 
 def test_a_scene_is_the_same_with_other_photos_in_another_place(demo_scene: Path, tmp_path: Path) -> None:
@@ -162,3 +168,61 @@ def test_what_is_no_checkpoint_of_this_package_is_refused(tmp_path: Path) -> Non
         read_checkpoint(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"none\.ckpt: no such checkpoint; pass a checkpoint"):
         read_checkpoint(tmp_path / "none.ckpt")
+
+
+def test_another_schedule_is_told_of() -> None:
+    module = SplatModule(sh_degree=1)
+    module.schedule = Schedule(min_reset_interval=11, saved=3)
+    stored: dict[str, Any] = {"state_dict": module.state_dict()}
+    module.on_save_checkpoint(stored)
+    assert changed_schedule(stored, replace(module.schedule, saved=0)) is None
+    assert changed_schedule(stored, Schedule(min_reset_interval=12)) == (
+        "the checkpoint is of a run with min_reset_interval = 11, this one continues with min_reset_interval = 12; "
+        "pass --callbacks.phases.min_reset_interval=11 to continue that run as it was"
+    )
+
+
+def check(checkpoint: dict[str, Any], module: SplatModule) -> None:
+    check_continuation(checkpoint, module.state_dict(), module.quantizer_settings)
+
+
+def quantizing(**settings: Any) -> SplatModule:
+    module = SplatModule(**{"sh_degree": 0, "quantizer": NSVQ, "codebooks": {"scales": 12, "sh0": 8}, **settings})
+    return module
+
+
+def saved(module: SplatModule) -> dict[str, Any]:
+    """What a checkpoint holds of a module."""
+    checkpoint: dict[str, Any] = {"state_dict": module.state_dict(), "optimizer_states": [{}]}
+    module.on_save_checkpoint(checkpoint)
+    return checkpoint
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"codebooks": {"scales": 24, "sh0": 8}}, "this one would with NSVQ (scales: 24, sh0: 8)"),
+        ({"codebooks": {"scales": 12}}, "this one would with NSVQ (scales: 12)"),
+        ({"codebooks": None}, "this one would with no codebooks"),
+        ({"quantizer": StraightThrough}, "this one would with StraightThrough (scales: 12, sh0: 8)"),
+    ],
+)
+def test_a_run_cannot_go_on_with_other_quantizers(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(words)) as refusal:
+        check(saved(quantizing()), quantizing(**settings))
+    assert "is of a run that quantizes with NSVQ (scales: 12, sh0: 8)" in str(refusal.value)
+    assert "pass the --model.quantizer and --model.codebooks that it was trained with" in str(refusal.value)
+    with pytest.raises(ValueError, match=r"quantizes with no codebooks, and this one would with NSVQ"):
+        check(saved(quantizing(codebooks=None)), quantizing())
+
+
+def test_the_same_quantizers_go_on_whatever_they_are_called() -> None:
+    module = quantizing()
+    scales = module.codebooks["scales"]
+    assert isinstance(scales, NSVQ)
+    scales.fit(torch.arange(9.0).reshape(3, 3))  # fewer rows than codes
+    assert scales.num_codes == 3
+    for same in (quantizing(), quantizing(quantizer=partial(NSVQ, kmeans_steps=3))):
+        check(saved(module), same)
+    paper = quantizing(codebooks="0.5k")  # without SH coefficients there are three codebooks
+    check(saved(paper), quantizing(codebooks={"scales": 512, "quats": 512, "sh0": 128, "shN": 7}))
