@@ -28,14 +28,8 @@ from nsvq_lightning.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
-# Prefix of the splats in a module's state.
-SPLATS = "splats."
-
 # Key under which a checkpoint holds the class and number of codes that each quantizer was made with.
 QUANTIZER_SETTINGS = "quantizer_settings"
-
-# Key of :meth:`ResumedModule.get_extra_state` in a module's state.
-RUN = "_extra_state"
 
 
 def continued_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> Schedule:
@@ -84,8 +78,7 @@ def check_continuation(
             "the checkpoint holds weights without the state of the optimiser, so training cannot continue from it; "
             "export its scene and start from that (--model.init_from=scene.ply)"
         )
-    state = checkpoint["state_dict"]
-    degrees = [sh_degree_of(values[f"{SPLATS}shN"]) for values in (state, own)]
+    degrees = [sh_degree_of(values["splats.shN"]) for values in (checkpoint["state_dict"], own)]
     if degrees[0] != degrees[1]:
         raise ValueError(
             f"the checkpoint is of a run with SH degree {degrees[0]}, this one has {degrees[1]}; pass "
@@ -159,7 +152,7 @@ def _check_contents(path: Path, checkpoint: Any) -> None:
     state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
     if not isinstance(state, dict) or "pytorch-lightning_version" not in checkpoint:
         raise FormatError(f"{path}: not a checkpoint of Lightning", WAY_OUT)
-    if not {"splats.means", RUN} <= state.keys():
+    if not {"splats.means", "_extra_state"} <= state.keys():
         first = ", ".join(list(state)[:3]) or "nothing"
         raise FormatError(f"{path}: a checkpoint of another model, which has {first} but no splats", WAY_OUT)
     if missing := {"history", "schedule", QUANTIZER_SETTINGS} - checkpoint.keys():
