@@ -33,10 +33,6 @@ def test_against_the_oracle() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-BINNING, BLEND, PROJECTION = (f"rendering.cuda.{name}" for name in ("binning", "blend", "projection"))
-SEARCH, SUBSTITUTION = (f"quantize.cuda.{name}" for name in ("search", "substitution"))
-
-
 REGISTERS = {
     "project_kernel": 80,
     "project_backward_kernel": 72,
@@ -66,17 +62,15 @@ REGISTERS = {
 @pytest.mark.parametrize(
     "cases",
     [
-        ["radii", "blend_backward", "search_45", "substitute_3"],
-        pytest.param(["project_0", "project_3", "project_backward_0", "project_backward_3"], marks=pytest.mark.slow),
-        pytest.param(["tiles", "blend", "blend_backward_all", "loss", "loss_of_one_row"], marks=pytest.mark.slow),
-        pytest.param(["nearest_3", "nearest_45", "search_3"], marks=pytest.mark.slow),
-        pytest.param(["substitute_45", "sums_3", "sums_45"], marks=pytest.mark.slow),
+        "radii blend search_45",
+        pytest.param("project_0 project_3 tiles blend_and_observe loss loss_of_one_row", marks=pytest.mark.slow),
+        pytest.param("nearest_3 nearest_45 search_3 substitute_3 substitute_45 sums_3 sums_45", marks=pytest.mark.slow),
     ],
 )
-def test_kernels_compile_as_they_are_launched(cases: list[str]) -> None:
+def test_kernels_compile_as_they_are_launched(cases: str) -> None:
     pytest.importorskip("triton", reason="the CUDA back-end needs Triton")
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
-    command = [sys.executable, str(TESTS / "support" / "gpu_launches.py"), *cases]
+    command = [sys.executable, str(TESTS / "support" / "gpu_launches.py"), *cases.split()]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     built = json.loads(done.stdout)
@@ -95,22 +89,23 @@ def test_no_kernel_is_left_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kernel", "changing"),
+    ("kernels", "changing"),
     [
-        (f"{PROJECTION}:project_kernel", {"n"}),
-        (f"{PROJECTION}:project_backward_kernel", {"n"}),
-        (f"{BLEND}:total_kernel", {"count"}),
-        (f"{BINNING}:expand_kernel", {"total", "count", "halvings"}),
-        *((f"{SEARCH}:{name}_kernel", {"count"}) for name in ("nearest", "check", "queue", "search", "snapshot")),
-        (f"{SUBSTITUTION}:substitute_kernel", {"seed", "count", "height"}),
-        (f"{SUBSTITUTION}:radial_kernel", {"count", "height"}),
+        ("rendering.cuda.projection: project project_backward", "n"),
+        ("rendering.cuda.blend: total", "count"),
+        ("rendering.cuda.binning: expand", "total count halvings"),
+        ("quantize.cuda.search: nearest check queue search snapshot", "count"),
+        ("quantize.cuda.substitution: substitute", "seed count height"),
+        ("quantize.cuda.substitution: radial", "count height"),
     ],
 )
-def test_numbers_that_change_from_step_to_step_compile_once(kernel: str, changing: set[str]) -> None:
+def test_numbers_that_change_from_step_to_step_compile_once(kernels: str, changing: str) -> None:
     pytest.importorskip("triton", reason="the CUDA back-end needs Triton")
-    module, _, name = kernel.partition(":")
-    function = getattr(importlib.import_module(f"nsvq_lightning.{module}"), name)
-    assert {parameter.name for parameter in function.params if parameter.do_not_specialize} == changing
+    path, _, names = kernels.partition(": ")
+    module = importlib.import_module(f"nsvq_lightning.{path}")
+    for name in names.split():
+        parameters = getattr(module, f"{name}_kernel").params
+        assert [parameter.name for parameter in parameters if parameter.do_not_specialize] == changing.split()
 
 
 def test_error_without_gpu_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,14 +38,9 @@ def pose(seen: Camera) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
 
 def test_a_path_passes_every_camera_at_even_speed() -> None:
     generator = np.random.default_rng(3)
-    given = [
-        camera(
-            generator.normal(size=3) + np.array([3 * k, 0, 0]),
-            Rotation.from_rotvec(0.3 * generator.normal(size=3)),
-            100 + 10 * k,
-        )
-        for k in range(5)
-    ]
+    places = generator.normal(size=(5, 3)) + 3 * np.arange(5)[:, None] * [1, 0, 0]
+    turns = Rotation.from_rotvec(0.3 * generator.normal(size=(5, 3)))
+    given = [camera(place, turn, 100 + 10 * k) for k, (place, turn) in enumerate(zip(places, turns, strict=True))]
     path = smooth_path(given, 400)
     assert len(path) == 400
     positions = np.array([pose(seen)[0] for seen in path])
@@ -57,13 +52,10 @@ def test_a_path_passes_every_camera_at_even_speed() -> None:
         assert path[nearest].intrinsics[0] == pytest.approx(key.intrinsics[0], abs=0.5)
     for end, key in ((path[0], given[0]), (path[-1], given[-1])):
         assert end.viewmat.numpy() == pytest.approx(key.viewmat.numpy(), abs=1e-4)
-    unit = np.median(
-        np.linalg.norm([pose(key)[0] for key in given] - np.mean([pose(key)[0] for key in given], axis=0), axis=1)
-    )
+    unit = np.median(np.linalg.norm(places - places.mean(axis=0), axis=1))
     rotations = Rotation.from_matrix([pose(seen)[1].T for seen in path])
-    speed = (
-        np.linalg.norm(np.diff(positions, axis=0), axis=1) / unit + (rotations[:-1].inv() * rotations[1:]).magnitude()
-    )
+    turned = (rotations[:-1].inv() * rotations[1:]).magnitude()
+    speed = np.linalg.norm(np.diff(positions, axis=0), axis=1) / unit + turned
     assert speed.max() < 1.1 * speed.min()
     for seen in path:
         matrix = seen.viewmat[:3, :3].double().numpy()
@@ -124,17 +116,14 @@ def test_a_frame_of_another_shape_shows_all_of_the_photo() -> None:
         assert (fx, fy) == pytest.approx((factor * gx, factor * gy))
         left, right = (0 - dx) / gx * fx + cx, (80 - dx) / gx * fx + cx
         top, bottom = (0 - dy) / gy * fy + cy, (60 - dy) / gy * fy + cy
-        assert left >= -1e-4
-        assert right <= width + 1e-4
-        assert top >= -1e-4
-        assert bottom <= height + 1e-4
+        assert -1e-4 <= left < right <= width + 1e-4
+        assert -1e-4 <= top < bottom <= height + 1e-4
         assert (left + right) / 2 == pytest.approx(width / 2, abs=1e-3)
 
 
 def _written(path: Path, entries: list[dict[str, Any]], key: str = "camera_path", **more: Any) -> Path:
-    path.write_text(
-        json.dumps({"camera_type": "perspective", "render_width": 80, "render_height": 60, key: entries, **more})
-    )
+    head = {"camera_type": "perspective", "render_width": 80, "render_height": 60}
+    path.write_text(json.dumps({**head, key: entries, **more}))
     return path
 
 

@@ -102,15 +102,6 @@ def test_broken_splats_leave_the_rest_alone(attribute: str, value: float) -> Non
         torch.testing.assert_close(result.image, render(rest, front_camera()).image, atol=1e-6, rtol=0)
 
 
-def test_zero_quaternion_is_the_identity() -> None:
-    splats = random_splats(10)
-    zero = splats._replace(quats=torch.zeros_like(splats.quats))
-    identity = splats._replace(quats=torch.tensor([1.0, 0, 0, 0]).repeat(10, 1))
-    torch.testing.assert_close(render(zero, front_camera()).image, render(identity, front_camera()).image)
-    _, gradients = run(zero, front_camera(), "cpu", torch.float32)
-    assert torch.isfinite(gradients["quats"]).all()
-
-
 @pytest.mark.parametrize("threads", [1, 20])
 def test_visible_is_radii(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rasterizer, "thread_count", lambda: threads)

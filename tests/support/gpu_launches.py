@@ -55,9 +55,6 @@ def attributes() -> tuple[torch.Tensor, ...]:
 def project(degree: int) -> None:
     records, boxes = tensor(SPLATS, RECORD.value), tensor(SPLATS, 4, dtype=torch.int32)
     projection._launch_projection(lens(), attributes(), degree, records, boxes, tensor(SPLATS, 2))
-
-
-def project_backward(degree: int) -> None:
     ids, rows = tensor(SEEN, dtype=torch.int64), tensor(SEEN, RECORD.value)
     projection.project_backward(lens(), attributes(), degree, ids, rows, rows, tensor(SPLATS, 2))
 
@@ -68,15 +65,12 @@ def tiles() -> Tiles:
     return Tiles(*(tensor(length, dtype=torch.int32) for length in lengths))
 
 
-def render() -> None:
-    blend(lens(), tensor(SEEN, RECORD.value), tiles(), tensor(3))
-
-
-def render_backward(*, everything: bool) -> None:
+def render(*, everything: bool) -> None:
     columns, rows = tile_grid(WIDTH, HEIGHT)
-    image, plane = tensor(HEIGHT, WIDTH, 3), tensor(HEIGHT, WIDTH)
+    image, plane, records = tensor(HEIGHT, WIDTH, 3), tensor(HEIGHT, WIDTH), tensor(SEEN, RECORD.value)
+    blend(lens(), records, tiles(), tensor(3))
     blend_backward(
-        lens(), tensor(SEEN, RECORD.value), tensor(SEEN, dtype=torch.int64), SPLATS, tiles(),
+        lens(), records, tensor(SEEN, dtype=torch.int64), SPLATS, tiles(),
         tensor(columns * rows, dtype=torch.int32), (image, plane, plane),
         (image, plane, plane) if everything else (image, None, None), plane if everything else None,
     )  # fmt: skip
@@ -106,12 +100,9 @@ CASES: dict[str, Callable[[], object]] = {
     "radii": lambda: projection.project_radii(lens(), attributes()),
     "project_0": lambda: project(0),
     "project_3": lambda: project(3),
-    "project_backward_0": lambda: project_backward(0),
-    "project_backward_3": lambda: project_backward(3),
     "tiles": lambda: tiles_of(tensor(SEEN, 4, dtype=torch.int32), tensor(SEEN, dtype=torch.int32), PAIRS, 7, 4),
-    "blend": render,
-    "blend_backward": lambda: render_backward(everything=False),
-    "blend_backward_all": lambda: render_backward(everything=True),
+    "blend": lambda: render(everything=False),
+    "blend_and_observe": lambda: render(everything=True),
     "loss": lambda: loss(HEIGHT, torch.uint8),
     "loss_of_one_row": lambda: loss(1, torch.float32),
     "nearest_3": lambda: nearest_codes(tensor(SPLATS, 3), tensor(4096, 3)),
