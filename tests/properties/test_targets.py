@@ -38,7 +38,7 @@ def _compiled(processor: str, *kernels: str) -> dict[str, Any]:
     ("processor", "kernels"),
     [
         ("generic", MAIN),
-        ("nehalem", MAIN[:1]),
+        pytest.param("nehalem", MAIN[:1], marks=pytest.mark.slow),
         *(pytest.param(processor, tuple(SIGNATURES), marks=pytest.mark.long) for processor in PROCESSORS),
     ],
 )

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
+from splat_scenes import front_camera, random_splats
 from torch import Tensor
 
 from nsvq_lightning.commands.benchmark.quantize import Attribute, step_errors
@@ -57,7 +58,7 @@ class Extreme:
 
 def extremes(count: int = 60, crowd: int = 1000) -> dict[str, Extreme]:
     """All scenes by name, of ``count`` splats, or ``crowd`` where all are on one pixel; the same at every call."""
-    splats = _splats(count)
+    splats = random_splats(count)
     nothing = RawSplats(*(tensor[:0] for tensor in splats))
     scenes = (*_shapes(splats), *_places(splats), *_numbers(splats, nothing, crowd), *_cameras(splats))
     every = [*(Extreme(_workload(*scene), nothing) for scene in scenes), *_broken(splats)]
@@ -150,27 +151,13 @@ def stress_table(scenes: Mapping[str, Extreme]) -> str:
     return markdown_table(["scene", "back-end", *columns], cells, words=("scene", "back-end")) + "\n"
 
 
-def _splats(count: int) -> RawSplats:
-    """Splats in a ball around the origin, which the camera has in its middle."""
-    draw = generator(0, 0, "extremes")
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(count, *shape, generator=draw)
-
-    return RawSplats(
-        0.8 * normal(3), normal(4), 0.6 * normal(3) - 2.5, 1.5 * normal(), normal(1, 3), 0.2 * normal(15, 3)
-    )
-
-
 def _camera(width: int = WIDTH, height: int = HEIGHT, origin: float = 0.0) -> Camera:
-    """A camera in front of the ball, slightly rotated; ``origin`` is how far the ball is from that of the world."""
-    focal, angle = 0.9 * max(width, height), torch.tensor(0.3, dtype=torch.float64)
-    K = torch.tensor([[focal, 0.0, width / 2], [0.0, 1.1 * focal, height / 2], [0.0, 0.0, 1.0]])
-    view = torch.eye(4, dtype=torch.float64)
-    view[0, 0] = view[2, 2] = angle.cos()
-    view[0, 2], view[2, 0] = angle.sin(), -angle.sin()
-    view[:3, 3] = torch.tensor([0.1, -0.05, DISTANCE]) - view[:3, :3] @ torch.full((3,), origin, dtype=torch.float64)
-    return Camera(K, view.float(), width, height)
+    """A camera in front of the ball of splats; ``origin`` is how far this is from that of the world."""
+    side = max(width, height)
+    camera = front_camera(side, side, width / 2, height / 2)
+    view = camera.viewmat.double()
+    view[:3, 3] -= view[:3, :3] @ torch.full((3,), origin, dtype=torch.float64)
+    return Camera(camera.K, view.float(), width, height)
 
 
 def _workload(name: str, splats: RawSplats, camera: Camera | None = None) -> Workload:
@@ -220,7 +207,7 @@ def _numbers(splats: RawSplats, nothing: RawSplats, crowd: int) -> Iterator[tupl
     yield "SH coefficients 1e4", splats._replace(sh0=1e4 * splats.sh0, shN=1e4 * splats.shN)
     yield "no splat", nothing
     yield "one splat", RawSplats(*(tensor[:1] for tensor in splats))
-    many, camera = _splats(crowd), _camera()
+    many, camera = random_splats(crowd), _camera()
     # On one ray, at depths that float32 can tell apart; faint, so that the last ones still count.
     target = torch.tensor([0.3, 0.2, DISTANCE]) * torch.linspace(0.25, 2.0, crowd)[:, None]
     means = (target - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
