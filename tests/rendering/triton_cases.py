@@ -13,6 +13,9 @@ import numpy as np
 import oracle
 import pytest
 import torch
+import triton
+import triton.language as tl
+from guards import GuardError, guarded
 from oracle import run
 from splat_scenes import front_camera, pixel_map, random_splats, uneven_splats
 from triton.runtime.interpreter import InterpreterBuilder
@@ -227,3 +230,18 @@ def test_backend_is_chosen_by_device_and_type() -> None:
     assert resolve_backend("auto", like) == ("cuda" if DEVICE == "cuda" else "cpu")
     with pytest.raises(ValueError, match="float32 tensors on a CUDA device"):
         resolve_backend("cuda", like.double())
+
+
+@triton.jit
+def fill_kernel(out, SIZE: tl.constexpr):
+    tl.store(out + tl.arange(0, SIZE), 1.0)
+
+
+@pytest.mark.skipif(DEVICE == "cuda", reason="guard words lie around what is interpreted")
+def test_guard_words_find_a_planted_overrun() -> None:
+    out = torch.zeros(16)
+    with guarded():
+        fill_kernel[(1,)](out, SIZE=16)
+        assert out.sum() == 16
+        with pytest.raises(GuardError, match="fill_kernel has written beside array 0"):
+            fill_kernel[(1,)](out[:8], SIZE=16)
