@@ -32,16 +32,6 @@ from nsvq_lightning.training.resume import check_settings, read_checkpoint
 from nsvq_lightning.training.run_folder import is_fast_dev_run, reserve, run_folder
 from nsvq_lightning.training.trainer import SplatTrainer
 
-TRAINER_DEFAULTS: dict[str, Any] = {
-    "max_epochs": -1,  # the sampler is endless: steps end the run
-    "limit_val_batches": 0,  # MetricReport evaluates, outside the training time
-    "num_sanity_val_steps": 0,
-    "devices": 1,  # more must be requested, because they change what a step is
-    "use_distributed_sampler": False,  # the sampler knows its rank
-    "enable_model_summary": False,
-    "default_root_dir": "runs",
-}
-
 # Names that options take as they are: short class names resolve to what is imported.
 CLASSES = (*callbacks.__all__, *quantize.__all__, "ColmapDataModule", "DemoDataModule")
 
@@ -128,6 +118,17 @@ class RunStart(SaveConfigCallback):
             if isinstance(root, str):  # so that it is found from any folder
                 self.config["data.init_args.root"] = os.path.abspath(root)
             write_text(folder / self.config_filename, self.parser.dump(self.config, skip_none=False))
+
+
+TRAINER_DEFAULTS: dict[str, Any] = {
+    "max_epochs": -1,  # the sampler is endless: steps end the run
+    "limit_val_batches": 0,  # MetricReport evaluates, outside the training time
+    "num_sanity_val_steps": 0,
+    "devices": 1,  # more must be requested, because they change what a step is
+    "use_distributed_sampler": False,  # the sampler knows its rank
+    "enable_model_summary": False,
+    "default_root_dir": "runs",
+}
 
 
 class SplatCLI(LightningCLI):

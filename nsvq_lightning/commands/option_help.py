@@ -18,9 +18,6 @@ from jsonargparse import Namespace
 
 from nsvq_lightning.commands.arguments import SHORTHANDS
 
-# Largest width in columns to which text is wrapped, even on a wider terminal.
-WIDEST = 100
-
 
 class Option(NamedTuple):
     """An option of the command line."""
@@ -110,6 +107,10 @@ def _texts(kind: type) -> Mapping[str, str]:
     """First sentence for each argument or attribute by name, from the docstring."""
     found = docstring_parser.parse(inspect.getdoc(kind) or "", docstring_parser.DocstringStyle.GOOGLE).params
     return {each.arg_name.lstrip("*"): first_sentence(each.description) for each in found}
+
+
+# Largest width in columns to which text is wrapped, even on a wider terminal.
+WIDEST = 100
 
 
 def _wrapped(text: str, indent: str) -> list[str]:

@@ -28,11 +28,6 @@ from nsvq_lightning.io.atomic import write_text
 if TYPE_CHECKING:
     from nsvq_lightning.data.reconstruct import Verdict
 
-# File that shows that a folder was made by this command, and from what.
-RECORD = "prepare.json"
-# Photos below which a scene is likely to look good only from where they were taken.
-FEW = 20
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq prepare`` takes."""
@@ -105,6 +100,12 @@ def run(options: argparse.Namespace) -> int:
         return 1
     sys.stdout.write(f"\nnext: nsvq fit --config fast.yaml --data.root {scene}\n")
     return 0
+
+
+# File that shows that a folder was made by this command, and from what.
+RECORD = "prepare.json"
+# Photos below which a scene is likely to look good only from where they were taken.
+FEW = 20
 
 
 def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:

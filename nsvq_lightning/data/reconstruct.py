@@ -14,9 +14,6 @@ from typing import Any
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
 from nsvq_lightning.data.images import image_head
 
-# Called with a step, how much of it is done, and how much there is.
-Report = Callable[[str, int, int], None]
-
 
 @dataclass(frozen=True)
 class Verdict:
@@ -37,6 +34,10 @@ class Verdict:
     error: float
     track: float
     models: int
+
+
+# Called with a step, how much of it is done, and how much there is.
+Report = Callable[[str, int, int], None]
 
 
 def reconstruct(

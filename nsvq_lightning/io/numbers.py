@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Magnitude of the logit that replaces ±inf: its sigmoid is 1 in float32, and training can still move it.
-_OPAQUE = 20.0
-
 
 def opacity_of(logits: NDArray[np.float32]) -> NDArray[np.float64]:
     """Opacities in [0, 1] of logits of any shape."""
     opacities: NDArray[np.float64] = 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80)))
     return opacities
+
+
+# Magnitude of the logit that replaces ±inf: its sigmoid is 1 in float32, and training can still move it.
+_OPAQUE = 20.0
 
 
 def finite_logits(logits: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -22,19 +22,6 @@ from nsvq_lightning.splats.conventions import SH_C0, from_smallest_three, shN_de
 
 PLY_MAGIC = b"ply"
 
-# Comments of Brush and of Postshot, and the word after each that says: trained with anti-aliasing.
-_MIP_COMMENTS = {"SplatRenderMode:": "mip", "antialiased": "1"}
-_BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
-_TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
-    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
-    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
-}
-# Properties of a compressed ``.ply``, and the attributes in them; the opacity is in the colour.
-_PACKED = {"packed_position": "means", "packed_rotation": "quats", "packed_scale": "scales", "packed_color": "sh0"}
-# Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene.
-_ROWS = 1 << 12
-
 
 @dataclass(frozen=True)
 class PlyHeader:
@@ -90,6 +77,20 @@ def read_ply_header(path: str | os.PathLike[str]) -> PlyHeader:
         if needed > file_bytes:
             raise FormatError(f"truncated: {header.count} vertices need {needed} bytes, the file has {file_bytes}")
     return header
+
+
+# Comments of Brush and of Postshot, and the word after each that says: trained with anti-aliasing.
+_MIP_COMMENTS = {"SplatRenderMode:": "mip", "antialiased": "1"}
+_BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+# Properties of a compressed ``.ply``, and the attributes in them; the opacity is in the colour.
+_PACKED = {"packed_position": "means", "packed_rotation": "quats", "packed_scale": "scales", "packed_color": "sh0"}
+# Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene.
+_ROWS = 1 << 12
 
 
 def _parsed(start: bytes) -> PlyHeader:

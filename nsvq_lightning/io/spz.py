@@ -64,28 +64,6 @@ _POSITION, MOST_FRACTION = 24, 30
 _USUAL_FRACTION = 12
 _COLOR = 0.15
 
-# Magic, version, N, SH degree, fractional bits, flags, and number of streams (0 up to version 3).
-_HEADER = struct.Struct("<4sIIBBBB")
-_TABLE_OFFSET = struct.Struct("<I12x")
-_HEAD = _HEADER.size + _TABLE_OFFSET.size
-# Compressed and uncompressed bytes of a stream.
-_ENTRY = struct.Struct("<QQ")
-# Bytes of extensions that are read; those in use have less than a hundred.
-_MOST_EXTENDED = 1 << 20
-# The flags of a scene that was trained with anti-aliasing, and of extensions.
-ANTIALIASED, _EXTENDED = 1, 2
-# Type and length, then the number of the axes.
-_EXTENSION = struct.Struct("<III")
-# The extension that states the axes.
-_AXES = 0xADBE0003
-# Axes by the number that the extension holds; 0 says nothing.
-_SYSTEMS = (
-    *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
-    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
-)
-# Coordinates that the real spherical harmonics of degree 1 to 3 are odd functions of.
-_ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
-
 
 @dataclass(frozen=True)
 class SpzHeader:
@@ -119,6 +97,29 @@ class SpzHeader:
     def streams(self) -> dict[str, int]:
         """Bytes of each array that is not empty, in file order: the streams of version 4."""
         return {name: self.count * size for name, size in self.sizes.items() if self.count * size}
+
+
+# Magic, version, N, SH degree, fractional bits, flags, and number of streams (0 up to version 3).
+_HEADER = struct.Struct("<4sIIBBBB")
+_TABLE_OFFSET = struct.Struct("<I12x")
+_HEAD = _HEADER.size + _TABLE_OFFSET.size
+# Compressed and uncompressed bytes of a stream.
+_ENTRY = struct.Struct("<QQ")
+# Bytes of extensions that are read; those in use have less than a hundred.
+_MOST_EXTENDED = 1 << 20
+# The flags of a scene that was trained with anti-aliasing, and of extensions.
+ANTIALIASED, _EXTENDED = 1, 2
+# Type and length, then the number of the axes.
+_EXTENSION = struct.Struct("<III")
+# The extension that states the axes.
+_AXES = 0xADBE0003
+# Axes by the number that the extension holds; 0 says nothing.
+_SYSTEMS = (
+    *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
+    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
+)
+# Coordinates that the real spherical harmonics of degree 1 to 3 are odd functions of.
+_ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 
 
 def _write_frame(path: str | os.PathLike[str], header: SpzHeader, arrays: Mapping[str, NDArray[Any]]) -> int:

@@ -17,10 +17,6 @@ from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
 
-G0, G1, G2, G3, G4, G5 = (tl.constexpr(tap) for tap in ssim_window()[SSIM_RADIUS:].tolist())
-C1, C2 = tl.constexpr(SSIM_C1), tl.constexpr(SSIM_C2)
-WHITE = tl.constexpr(255.0)
-
 MOMENTS = 4
 DERIVATIVES = 3
 # Image rows per program: four floats per thread, so that registers suffice for all taps.
@@ -51,6 +47,11 @@ def clamped(image, row, column, height, length):
     """The image clamped to [0, 1]; not by minimum and maximum, since NaN must stay NaN."""
     raw = load_at(image, row, column, height, length)
     return tl.where(raw < 0, 0.0, tl.where(raw > 1, 1.0, raw))
+
+
+G0, G1, G2, G3, G4, G5 = (tl.constexpr(tap) for tap in ssim_window()[SSIM_RADIUS:].tolist())
+C1, C2 = tl.constexpr(SSIM_C1), tl.constexpr(SSIM_C2)
+WHITE = tl.constexpr(255.0)
 
 
 @triton.jit

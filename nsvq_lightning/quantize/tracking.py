@@ -25,8 +25,6 @@ from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, Memory, box_se
 from nsvq_lightning.quantize.nearest import check_rows, nearest
 from nsvq_lightning.quantize.scores import LIST, score_search, squares, true_distance
 
-_BLOCK = 256  # rows per unit of parallel work
-
 
 @inline
 def _member(dim, x, at, codebook, lists, place, keep):
@@ -64,6 +62,9 @@ def _settle(dim, x, row, codebook, lists, start, near):
         if candidate_distance < distance or (candidate_distance == distance and candidate < code):
             code, distance = candidate, candidate_distance
     return code
+
+
+_BLOCK = 256  # rows per unit of parallel work
 
 
 @cache

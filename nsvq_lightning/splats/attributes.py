@@ -9,9 +9,6 @@ import numpy as np
 
 from nsvq_lightning.splats.conventions import sh_coefficients
 
-# NumPy arrays, or torch tensors on any device; torch is not imported for the former.
-_Array = TypeVar("_Array")
-
 
 @dataclass(frozen=True)
 class Attribute:
@@ -63,6 +60,10 @@ def attribute_shapes(sh_degree: int) -> dict[str, tuple[int, ...]]:
 def attribute_dims(sh_degree: int) -> dict[str, int]:
     """Values per splat, D, by attribute; ``shN`` is the flattened ``[coefficients, 3]``."""
     return {name: math.prod(shape) for name, shape in attribute_shapes(sh_degree).items()}
+
+
+# NumPy arrays, or torch tensors on any device; torch is not imported for the former.
+_Array = TypeVar("_Array")
 
 
 def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int]]:

@@ -25,9 +25,6 @@ from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
-# Splats, so that some search trees have more than one level.
-MIN_SPLATS = 600
-
 
 def settings_of(module: SplatModule) -> bytes | None:
     """The settings of a module for another process; None if they hold something that cannot be sent to one."""
@@ -35,6 +32,10 @@ def settings_of(module: SplatModule) -> bytes | None:
         return pickle.dumps(dict(module.hparams) | {"init_from": None, "backend": "cpu"})
     except (pickle.PicklingError, AttributeError, TypeError):
         return None
+
+
+# Splats, so that some search trees have more than one level.
+MIN_SPLATS = 600
 
 
 def compile_kernels(settings: dict[str, Any]) -> None:

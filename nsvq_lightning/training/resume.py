@@ -28,9 +28,6 @@ from nsvq_lightning.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
-# Key under which a checkpoint holds the class and number of codes that each quantizer was made with.
-QUANTIZER_SETTINGS = "quantizer_settings"
-
 
 def continued_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> Schedule:
     """The schedule with the iterations that the checkpoint's run has saved in the same warm-up phase."""
@@ -58,6 +55,10 @@ def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str |
         f"{' '.join(f'--callbacks.phases.{name}={value}' for name, value in changed.items())} to continue that run as "
         "it was"
     )
+
+
+# Key under which a checkpoint holds the class and number of codes that each quantizer was made with.
+QUANTIZER_SETTINGS = "quantizer_settings"
 
 
 def check_continuation(

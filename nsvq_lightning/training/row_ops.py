@@ -22,10 +22,6 @@ log = logging.getLogger(__name__)
 # shows larger splats, so nothing would ever train or prune them.
 LARGEST_LOG_SCALE = 32.0
 
-FIRST_MOMENT = "exp_avg"
-# Per-row state of Adam; everything else in its state belongs to the whole parameter.
-MOMENTS = (FIRST_MOMENT, "exp_avg_sq", "max_exp_avg_sq")
-
 
 def append_rows(splats: Splats, optimizer: Optimizer, new: Mapping[str, Tensor]) -> None:
     """Add splats at the end; their Adam moments and side tables start at zero.
@@ -86,6 +82,11 @@ def replace_attribute(splats: Splats, optimizer: Optimizer, name: str, values: T
     if values.shape != parameter.shape:
         raise ValueError(f"{name} must keep its shape {list(parameter.shape)}, got {list(values.shape)}")
     _rebind(splats, optimizer, name, values.detach().to(parameter), lambda moment: moment)
+
+
+FIRST_MOMENT = "exp_avg"
+# Per-row state of Adam; everything else in its state belongs to the whole parameter.
+MOMENTS = (FIRST_MOMENT, "exp_avg_sq", "max_exp_avg_sq")
 
 
 def change_coordinates(splats: Splats, optimizer: Optimizer, name: str, values: Tensor, maps: Tensor) -> None:

@@ -25,9 +25,6 @@ from nsvq_lightning.version import __version__
 
 SGEMM_SIDE = 2048
 
-# What is timed.
-Call = Callable[[], object]
-
 
 @dataclass(frozen=True)
 class Timing:
@@ -79,6 +76,10 @@ class Measurement:
     timing: Timing
     values: Mapping[str, float] = field(default_factory=dict)
     note: str = ""
+
+
+# What is timed.
+Call = Callable[[], object]
 
 
 def compare(

@@ -17,10 +17,6 @@ from nsvq_lightning.io.formats import read_scene
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
-Floats = NDArray[np.float64]
-
-SEED = 7
-
 
 @dataclass(frozen=True, eq=False)
 class Workload:
@@ -105,6 +101,9 @@ def workloads(scope: Scope) -> list[Workload]:
     return [_seen_by(_camera(800, 533, centre, 2 * reach), splats, name)]
 
 
+SEED = 7
+
+
 def synthetic_workload(name: str) -> Workload:
     """A scene of surfaces, a loose volume and a far shell; sizes, rotations, opacities and colours are random.
 
@@ -123,6 +122,9 @@ def synthetic_workload(name: str) -> Workload:
     harmonics[:, 0] = rng.normal(size=(n, 3)) * 0.9
     attributes = (means, quats, scales, opacities, harmonics[:, :1], harmonics[:, 1:])
     return _seen_by(_camera(width, height, np.zeros(3), 4.0), RawSplats(*map(_tensor, attributes)), name)
+
+
+Floats = NDArray[np.float64]
 
 
 def _tensor(values: Floats) -> Tensor:

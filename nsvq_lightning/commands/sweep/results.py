@@ -13,9 +13,6 @@ from nsvq_lightning.version import __version__
 
 Row = dict[str, Any]
 
-# Columns that say which runs a line of the table is about: they differ in the seed alone.
-NAMES = ("scene", "config", "quantizer", "codebooks")
-
 
 def row_of(names: Row, folder: Path, error: str = "") -> Row:
     """What a run with these names came to that has finished, or failed with an error.
@@ -50,6 +47,10 @@ def write_results(output: Path, rows: Sequence[Row]) -> None:
         files.write_csv(output / "results.csv", rows)
         write_text(output / "results.md", as_markdown(rows))
         draw_sweep(output / "results.png", rows)
+
+
+# Columns that say which runs a line of the table is about: they differ in the seed alone.
+NAMES = ("scene", "config", "quantizer", "codebooks")
 
 
 def grouped(rows: Sequence[Row]) -> list[list[Row]]:

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-CHECKPOINT = Path("checkpoints", "last.ckpt")
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq sweep`` takes; what it does not know are options of ``nsvq fit``."""
@@ -113,6 +111,9 @@ def run_subprocess(arguments: Sequence[str], log: Path) -> int:
     finally:  # nothing if it has ended
         process.kill()
         process.wait()
+
+
+CHECKPOINT = Path("checkpoints", "last.ckpt")
 
 
 def prepare(folder: Path, settings: Settings) -> list[str]:

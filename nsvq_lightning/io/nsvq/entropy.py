@@ -24,13 +24,6 @@ _MODELLED_BITS = 16
 # What two neighbours say about a decision: each one has left the path before, takes 0 here, or takes 1 here.
 _RELATIONS = 9
 
-_START = uint64(0xFFFFFFFFFFFFFFFF)
-# Integers are below it in size: they and their sums are exact in float64.
-_TOO_LARGE = 1 << 52
-_KEY_MASK = uint64((1 << KEY_BITS) - 1)
-# What a reader returns instead of the number of words when it meets a value out of range.
-_OUTSIDE = -1
-
 
 def encode_paths(paths: NDArray[np.int64], bits: int, neighbours: NDArray[np.int32]) -> bytes:
     """Bytes of paths ``[N]`` of ``bits`` decisions each, the first one in the highest bit.
@@ -74,6 +67,14 @@ def decode_paths(data: bytes | memoryview, bits: int, neighbours: NDArray[np.int
     used = _read_paths(words, bits, neighbours, paths, rc.new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
     _check_used(words, used)
     return paths
+
+
+_START = uint64(0xFFFFFFFFFFFFFFFF)
+# Integers are below it in size: they and their sums are exact in float64.
+_TOO_LARGE = 1 << 52
+_KEY_MASK = uint64((1 << KEY_BITS) - 1)
+# What a reader returns instead of the number of words when it meets a value out of range.
+_OUTSIDE = -1
 
 
 def encode_keys(keys: NDArray[np.uint64], depths: NDArray[np.int64]) -> bytes:

@@ -16,16 +16,6 @@ from nsvq_lightning.compute.jit import inline
 # Number of bits after which the probability of a context moves at its slowest.
 COUNT_LIMIT = 126
 
-_RATES = np.rint(65536 / (np.arange(COUNT_LIMIT + 1) + 1.6)).astype(np.int64)
-# No probability is below 48/65536: an unlikely bit costs at most 11 bits.
-_LEAST = 48
-
-# Largest number of bits written at once without a model.
-PLAIN_BITS = 16
-
-_FULL = uint64(0xFFFFFFFFFFFFFFFF)
-_LOW_WORD = uint64(0xFFFFFFFF)
-
 
 def new_contexts(count: int) -> NDArray[np.uint32]:
     """States ``[count]``: the probability of a 1 in 65536ths times 256, plus how many bits were met."""
@@ -37,6 +27,11 @@ def _chance(context, contexts):
     return uint64(contexts[context] >> uint32(8))
 
 
+_RATES = np.rint(65536 / (np.arange(COUNT_LIMIT + 1) + 1.6)).astype(np.int64)
+# No probability is below 48/65536: an unlikely bit costs at most 11 bits.
+_LEAST = 48
+
+
 @inline
 def _learn(bit, context, contexts):
     """Move the probability towards the bit; without branches, which would be unpredictable."""
@@ -45,6 +40,10 @@ def _learn(bit, context, contexts):
     target = _LEAST + np.int64(bit) * (65536 - 2 * _LEAST)
     chance += ((target - chance) * _RATES[n]) >> 16
     contexts[context] = uint32((chance << 8) + n + (n < COUNT_LIMIT))
+
+
+_FULL = uint64(0xFFFFFFFFFFFFFFFF)
+_LOW_WORD = uint64(0xFFFFFFFF)
 
 
 @inline
@@ -80,6 +79,10 @@ def encode_bit(bit, context, contexts, low, width, words, used):
         _carry(words, used)
     _learn(bit, context, contexts)
     return _shift_out(low, width, words, used)
+
+
+# Largest number of bits written at once without a model.
+PLAIN_BITS = 16
 
 
 @inline

@@ -10,9 +10,6 @@ from nsvq_lightning.rendering.cpu import projection
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import AHEAD, coefficients_of, color_backward, prefetch_sh
 
-# Converts moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)².
-COVARIANCE_SCALE = F(2 * np.log(2.0) ** 2)
-
 
 @inline
 def quaternion_gradient(q, inverse, r):
@@ -71,6 +68,10 @@ def axes_backward(camera, view, axes, gu, gv, g2x, g2y, g_depth):
     vz = vz - fx_z * (x * g2x + j00) - fy_z * (y * g2y + j11)
     v = vx, vy, vz + g_depth
     return (rec.rotate_back(camera, 0, v), rec.rotate_back(camera, 1, v), rec.rotate_back(camera, 2, v)), g_quat
+
+
+# Converts moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)².
+COVARIANCE_SCALE = F(2 * np.log(2.0) ** 2)
 
 
 @inline

@@ -17,14 +17,15 @@ from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import SplatTensors
 
-PROJECTION_SCRATCH = 2048 + 64
-
 
 def _flat(attributes: tuple[Tensor, ...]) -> tuple[Array, ...]:
     """Means, rotations, scales and, if it is there, opacities, flat."""
     n = len(attributes[0])
     named = zip(ATTRIBUTES, attributes, ((n, 3), (n, 4), (n, 3), (n,)), strict=False)
     return tuple(flat_checked(name, tensor.contiguous(), shape) for name, tensor, shape in named)
+
+
+PROJECTION_SCRATCH = 2048 + 64
 
 
 class _Frame:

@@ -8,9 +8,6 @@ from nsvq_lightning.compute.jit import F, kernel, thread_count
 from nsvq_lightning.compute.memory import INT32, flat_checked
 from nsvq_lightning.compute.simd import get, put
 
-# Parts of the splats whose weights are summed one by one: as many for any number of threads, so with the same bits.
-CHUNKS = 64
-
 
 @kernel
 def _add(threads, gradients, radii, x_factor, y_factor, sums, views):
@@ -41,6 +38,10 @@ def add_view(sums: Tensor, views: Tensor, gradients: Tensor, radii: Tensor, fact
     inputs = (flat_checked("gradients", gradients.contiguous(), (*rows, 2)), flat_checked("radii", radii, rows, INT32))
     outputs = flat_checked("sums", sums, rows), flat_checked("views", views, rows)
     _add(thread_count(), *inputs, F(factors[0]), F(factors[1]), *outputs)
+
+
+# Parts of the splats whose weights are summed one by one: as many for any number of threads, so with the same bits.
+CHUNKS = 64
 
 
 @kernel

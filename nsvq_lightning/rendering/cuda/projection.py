@@ -18,11 +18,6 @@ from nsvq_lightning.rendering.cuda import records as rec
 from nsvq_lightning.rendering.cuda.harmonics import color, color_backward, load3, store3
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 
-# Splats per program.
-BLOCK = 128
-# Passed as the SH degree where no record is wanted.
-RADIUS_ONLY = -1
-
 
 @triton.jit
 def dot3(a, b):
@@ -116,6 +111,12 @@ def load_geometry(means, quats, scales, row, mask):
     w = tl.load(q, mask=mask, other=0.0)
     x, y, z = load3(q + 1, mask)
     return load3(means + 3 * row, mask), (w, x, y, z), load3(scales + 3 * row, mask)
+
+
+# Splats per program.
+BLOCK = 128
+# Passed as the SH degree where no record is wanted.
+RADIUS_ONLY = -1
 
 
 @triton.jit(do_not_specialize=["n"])
