@@ -100,30 +100,30 @@ CHILD_WIDTH = 0.893
 CHILD_OPACITY = 0.6
 
 
-def add_observed(
-    gradients: Tensor, views: Tensor, weights: Tensor, observed: Tensor, radii: Tensor, width: int, height: int
+def add_absgrad(
+    gradients: Tensor, views: Tensor, weights: Tensor, absgrad: Tensor, radii: Tensor, width: int, height: int
 ) -> None:
-    """Add what one view has observed to the statistics ``[N]`` of the splats that it saw, in place.
+    """Add what one view says to the statistics ``[N]`` of the splats that it saw, in place.
 
     Args:
         gradients: Sum over the views of the norm of the two absolute sums, in normalised device coordinates, in which
             an image is 2 wide and 2 high.
         views: Number of views.
         weights: Sum over the views of the edge weight, divided by the mean of those in the view that are positive.
-        observed: Gradient of ``Render.observed``: Σ |∂L/∂x|, Σ |∂L/∂y| per pixel, Σ weight · edge strength ``[N, 3]``.
+        absgrad: Gradient of ``Render.absgrad``: Σ |∂L/∂x|, Σ |∂L/∂y| per pixel, Σ weight · edge strength ``[N, 3]``.
         radii: Radius on the screen ``[N]``, 0 for splats that were not seen.
         width: Image width in pixels.
         height: Image height in pixels.
     """
-    if kernels_for(observed) == "cpu":
-        from nsvq_lightning.rendering.cpu.statistics import add_observed as add_observed_cpu
+    if kernels_for(absgrad) == "cpu":
+        from nsvq_lightning.rendering.cpu.statistics import add_absgrad as add_absgrad_cpu
 
-        add_observed_cpu(gradients, views, weights, observed, radii, (0.5 * width, 0.5 * height))
+        add_absgrad_cpu(gradients, views, weights, absgrad, radii, (0.5 * width, 0.5 * height))
         return
-    seen = (radii > 0).to(observed)
-    edges = observed[:, 2].clamp_min(0)
+    seen = (radii > 0).to(absgrad)
+    edges = absgrad[:, 2].clamp_min(0)
     mean = edges.sum() / (edges > 0).sum().clamp_min(1)
-    gradients.add_(torch.hypot(observed[:, 0] * (0.5 * width), observed[:, 1] * (0.5 * height)) * seen)
+    gradients.add_(torch.hypot(absgrad[:, 0] * (0.5 * width), absgrad[:, 1] * (0.5 * height)) * seen)
     views.add_(seen)
     weights.add_(edges / mean.clamp_min(torch.finfo(edges.dtype).tiny) * seen)
 
@@ -285,18 +285,18 @@ class BudgetedGrowth(Densification):
     def ask(self, module: SplatModule, iteration: int, batch: View) -> bool:
         """Ask for absolute gradients and edge weights during warm-up."""
         growing = module.schedule.phase_at(iteration) is Phase.WARMUP
-        module.pixel_map = edge_strength(batch.image, batch.mask) if growing else None
+        module.pixel_weights = edge_strength(batch.image, batch.mask) if growing else None
         return growing
 
     def add(self, tables: Sequence[Tensor], render: Render, micro_batches: int) -> None:
         """Add a view's absolute gradients and edge weights, and count it."""
-        if render.observed is None or render.observed.grad is None:
+        if render.absgrad is None or render.absgrad.grad is None:
             return
         height, width = render.alpha.shape
         # Gradient accumulation divides the loss by the number of micro-batches; each is a separate view here.
         size = width * micro_batches, height * micro_batches
         gradients, views, edges = tables
-        add_observed(gradients, views, edges, render.observed.grad, render.radii, *size)
+        add_absgrad(gradients, views, edges, render.absgrad.grad, render.radii, *size)
 
     def act(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Split, prune and reset when due."""

@@ -25,7 +25,7 @@ def _undecodable(path: Path, reason: str) -> SceneError:
 
 
 # Pillow refuses twice as many, and by default fewer than phones have.
-PIL.Image.MAX_IMAGE_PIXELS = 1 << 28
+PIL.Image.MAX_IMAGE_PIXELS = 1 << 27
 # What Pillow raises for a file that is damaged, not a picture, or beyond that limit.
 DAMAGED = (OSError, ValueError, SyntaxError, KeyError, PIL.Image.DecompressionBombError)
 # EXIF and TIFF tag: how to turn the stored pixels.

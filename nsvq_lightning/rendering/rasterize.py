@@ -24,9 +24,9 @@ class Render(NamedTuple):
         means2d: Projected centres ``[N, 2]`` in pixels, x right, y down. Call ``retain_grad()`` on it before the
             backward pass to get screen-space gradients.
         depth: Σ weight · view-space z ``[H, W]``; divide by ``alpha`` for the mean depth.
-        observed: With ``observe``, zeros ``[N, 3]`` whose ``grad`` the backward pass of a loss L sets to sums over the
-            pixels p: Σ abs(∂L/∂x at p), Σ abs(∂L/∂y at p) of the projected centre (x, y) in pixels (AbsGS, Ye et al.
-            2024), and Σ weight · ``observe``. Otherwise None.
+        absgrad: With ``pixel_weights``, zeros ``[N, 3]`` whose ``grad`` the backward pass of a loss L sets to sums over
+            the pixels p: Σ abs(∂L/∂x at p), Σ abs(∂L/∂y at p) of the projected centre (x, y) in pixels (AbsGS, Ye et
+            al. 2024), and Σ weight · ``pixel_weights``. Otherwise None.
     """
 
     image: Tensor
@@ -34,7 +34,7 @@ class Render(NamedTuple):
     radii: Tensor
     means2d: Tensor
     depth: Tensor
-    observed: Tensor | None = None
+    absgrad: Tensor | None = None
 
 
 def render(
@@ -43,7 +43,7 @@ def render(
     *,
     sh_degree: int | None = None,
     background: Tensor | None = None,
-    observe: Tensor | None = None,
+    pixel_weights: Tensor | None = None,
     antialiased: bool = False,
     backend: str = "auto",
 ) -> Render:
@@ -54,7 +54,8 @@ def render(
         camera: Where to look from; COLMAP axes.
         sh_degree: Highest degree of the spherical harmonics that is evaluated; all stored ones by default.
         background: RGB ``[3]`` behind the splats; black by default.
-        observe: Strength of each pixel ``[H, W]``; the backward pass then also sums up what ``Render.observed`` holds.
+        pixel_weights: Weight of each pixel ``[H, W]``; the backward pass then also sums up what ``Render.absgrad``
+            holds.
         antialiased: Make splats fainter as the rasterizer's blur makes them larger, so that those smaller than a pixel
             look alike from near and far (Mip-Splatting, Yu et al. 2024). For scenes that were trained so.
         backend: One of :data:`nsvq_lightning.compute.devices.BACKENDS`.
@@ -65,7 +66,7 @@ def render(
     Raises:
         ValueError: Unknown back-end, or a back-end that cannot take the device or type of the splats; attributes that
             differ in device or type, or whose shapes do not fit; ``sh_degree`` above the stored degree; a background
-            that is not ``[3]``; a map to observe that is not ``[H, W]``.
+            that is not ``[3]``; pixel weights that is not ``[H, W]``.
     """
     _check_alike(splats)
     stored = sh_degree_of(splats.shN)
@@ -81,14 +82,15 @@ def render(
     module = _module_of(backend, means)
     if antialiased:
         splats = _compensated(splats, camera, module)
-    pixel_map = observed = None
-    if observe is not None:
-        if tuple(observe.shape) != (camera.height, camera.width):
-            raise ValueError(f"observe must be [{camera.height}, {camera.width}], got {list(observe.shape)}")
-        observed = means.new_zeros(means.shape[0], 3).requires_grad_()
-        pixel_map = observe.detach().to(means).contiguous()
-    image, alpha, radii, means2d, depth = module.render(splats, camera, degree, background, pixel_map, observed)
-    return Render(image, alpha, radii, means2d, depth, observed)
+    absgrad = None
+    if pixel_weights is not None:
+        if tuple(pixel_weights.shape) != (camera.height, camera.width):
+            expected = [camera.height, camera.width]
+            raise ValueError(f"pixel_weights must be {expected}, got {list(pixel_weights.shape)}")
+        absgrad = means.new_zeros(means.shape[0], 3).requires_grad_()
+        pixel_weights = pixel_weights.detach().to(means).contiguous()
+    image, alpha, radii, means2d, depth = module.render(splats, camera, degree, background, pixel_weights, absgrad)
+    return Render(image, alpha, radii, means2d, depth, absgrad)
 
 
 def _compensated(splats: SplatTensors, camera: Camera, module: Any) -> RawSplats:

@@ -132,8 +132,8 @@ def render(
     camera: Camera,
     sh_degree: int,
     background: Tensor,
-    pixel_map: Tensor | None = None,
-    observed: Tensor | None = None,
+    pixel_weights: Tensor | None = None,
+    absgrad: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``, differentiable.
 
@@ -157,9 +157,9 @@ def render(
     order = torch.sort(projection.depths.detach(), stable=True).indices
     low = (centres - projection.half_sizes).detach()[order]
     high = (centres + projection.half_sizes).detach()[order]
-    if pixel_map is None or observed is None:
-        pixel_map, observed = centres.new_zeros(camera.height, camera.width), centres.new_zeros(n, 3)
-    watched = observed[rows]
+    if pixel_weights is None or absgrad is None:
+        pixel_weights, absgrad = centres.new_zeros(camera.height, camera.width), centres.new_zeros(n, 3)
+    watched = absgrad[rows]
     side = 32  # of the squares that are blended at a time, pixels
     strips = []
     for top in range(0, camera.height, side):
@@ -173,9 +173,10 @@ def render(
                 torch.arange(top, bottom).to(centres), torch.arange(left, right).to(centres), indexing="ij"
             )
             pixels = torch.stack([xs, ys], -1).reshape(-1, 2) + 0.5
-            here_map = pixel_map[top:bottom, left:right].reshape(-1)
+            weights_here = pixel_weights[top:bottom, left:right].reshape(-1)
             inputs = (
-                pixels, centres[near], projection.conics[near], opacities[near], features[near], here_map, watched[near]
+                pixels, centres[near], projection.conics[near], opacities[near], features[near], weights_here,
+                watched[near],
             )  # fmt: skip
             blended = checkpoint(_blend, *inputs, use_reentrant=False) if torch.is_grad_enabled() else _blend(*inputs)
             tiles.append(blended.view(bottom - top, right - left, 5))
@@ -199,17 +200,17 @@ class _WatchOffsets(torch.autograd.Function):
 
 
 class _WatchWeights(torch.autograd.Function):
-    """Weights ``[P, n]`` unchanged; Σ weight · map over the pixels goes to ``[n]`` zeros as their gradient."""
+    """Weights ``[P, n]`` unchanged; Σ weight · pixel weight over the pixels goes to ``[n]`` zeros as their gradient."""
 
     @staticmethod
-    def forward(ctx: Any, weights: Tensor, pixel_map: Tensor, zeros: Tensor) -> Tensor:
-        ctx.save_for_backward(weights, pixel_map)
+    def forward(ctx: Any, weights: Tensor, pixel_weights: Tensor, zeros: Tensor) -> Tensor:
+        ctx.save_for_backward(weights, pixel_weights)
         return weights.view_as(weights)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, Tensor | None]:
-        weights, pixel_map = ctx.saved_tensors
-        return gradient, None, pixel_map @ weights if ctx.needs_input_grad[2] else None
+        weights, pixel_weights = ctx.saved_tensors
+        return gradient, None, pixel_weights @ weights if ctx.needs_input_grad[2] else None
 
 
 def _blend(
@@ -218,11 +219,11 @@ def _blend(
     conics: Tensor,
     opacities: Tensor,
     features: Tensor,
-    pixel_map: Tensor,
-    observed: Tensor,
+    pixel_weights: Tensor,
+    absgrad: Tensor,
 ) -> Tensor:
     """Front-to-back blend of sorted splats at ``pixels [P, 2]``: Σ w·feature and the transmittance left ``[P, 5]``."""
-    offsets: Tensor = _WatchOffsets.apply(pixels[:, None] - centres[None], observed[:, :2])  # type: ignore[no-untyped-call]
+    offsets: Tensor = _WatchOffsets.apply(pixels[:, None] - centres[None], absgrad[:, :2])  # type: ignore[no-untyped-call]
     dx, dy = offsets.unbind(-1)
     power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy
     alpha = (opacities * power.clamp_max(0).exp()).clamp_max(constants.ALPHA_MAX)
@@ -232,5 +233,5 @@ def _blend(
     alpha = torch.where(running, alpha, torch.zeros_like(alpha))
     transmittance = torch.cat([pixels.new_ones(pixels.shape[0], 1), (1 - alpha).cumprod(1)], 1)
     weights = alpha * transmittance[:, :-1]
-    weights = _WatchWeights.apply(weights, pixel_map, observed[:, 2])  # type: ignore[no-untyped-call]
+    weights = _WatchWeights.apply(weights, pixel_weights, absgrad[:, 2])  # type: ignore[no-untyped-call]
     return torch.cat([weights @ features, transmittance[:, -1:]], 1)

@@ -103,8 +103,8 @@ class SplatModule(resume.ResumedModule):
         self.schedule = Schedule()
         self.loss_terms: dict[str, LossTerm] = {"photometric": self._photometric_term}
         """Terms of the loss by name; callbacks add some, or wrap the first."""
-        self.pixel_map: Tensor | None = None
-        """Strength ``[H, W]`` of the pixels of the next view, whose rendering then has ``observed``, or None."""
+        self.pixel_weights: Tensor | None = None
+        """Strength ``[H, W]`` of the pixels of the next view, whose rendering then has ``absgrad``, or None."""
         self.splat_budget: int | None = None
         """How many splats the scene is to have in the end; None for as many as density control makes."""
         self.evaluation_splats = None
@@ -123,14 +123,14 @@ class SplatModule(resume.ResumedModule):
         """
         self._rate_factors[group] = factor * self._rate_factors.get(group, 1.0)
 
-    def forward(self, camera: Camera, observe: Tensor | None = None) -> Render:
+    def forward(self, camera: Camera, pixel_weights: Tensor | None = None) -> Render:
         """Render what the current phase trains or, outside training, what a file would hold.
 
         Args:
             camera: Where to look from.
-            observe: Strength of each pixel ``[H, W]``, see :func:`nsvq_lightning.render`.
+            pixel_weights: Strength of each pixel ``[H, W]``, see :func:`nsvq_lightning.render`.
         """
-        options: dict[str, Any] = {"observe": observe}
+        options: dict[str, Any] = {"pixel_weights": pixel_weights}
         if self.training and self.background == "random":
             options["background"] = to_device(torch.rand(3, generator=self._generator("background")), self.device)
         return self.render_splats(self._phase_splats(camera), camera, **options)
@@ -215,7 +215,7 @@ class SplatModule(resume.ResumedModule):
             been launched, so that it never waits.
         """
         edits = self.splats.edits
-        rendered = self(batch.camera, self.pixel_map)
+        rendered = self(batch.camera, self.pixel_weights)
         if rendered.means2d.requires_grad:
             rendered.means2d.retain_grad()
         first, *others = (term(rendered, batch) for term in self.loss_terms.values())

@@ -10,7 +10,7 @@ import torch
 from density_stage import Stage, make_splats
 
 from nsvq_lightning.callbacks import BudgetedGrowth
-from nsvq_lightning.callbacks.growth import add_observed, draw_rows, lowest_share, split_longest
+from nsvq_lightning.callbacks.growth import add_absgrad, draw_rows, lowest_share, split_longest
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
@@ -26,10 +26,10 @@ def tables(count: int, like: torch.Tensor) -> list[torch.Tensor]:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_view_adds_gradients_in_device_coordinates_and_edge_weights_of_mean_one(dtype: torch.dtype) -> None:
-    observed = torch.tensor([[3e-6, 4e-6, 2.0], [1e-6, 0.0, 0.0], [5e-6, 0.0, 6.0], [1.0, 1.0, 0.0]], dtype=dtype)
-    gradients, views, edges = tables(4, observed)
+    absgrad = torch.tensor([[3e-6, 4e-6, 2.0], [1e-6, 0.0, 0.0], [5e-6, 0.0, 6.0], [1.0, 1.0, 0.0]], dtype=dtype)
+    gradients, views, edges = tables(4, absgrad)
     radii = torch.tensor([3, 1, 9, 0], dtype=torch.int32)
-    add_observed(gradients, views, edges, observed, radii, width=800, height=600)
+    add_absgrad(gradients, views, edges, absgrad, radii, width=800, height=600)
     assert gradients.tolist() == pytest.approx([1 + math.hypot(3e-6 * 400, 4e-6 * 300), 1 + 4e-4, 1 + 2e-3, 1.0])
     assert views.tolist() == [2.0, 2.0, 2.0, 1.0]
     assert edges.tolist() == pytest.approx([1.5, 1.0, 2.5, 1.0])  # the mean of the two that are positive is 4
@@ -38,11 +38,11 @@ def test_a_view_adds_gradients_in_device_coordinates_and_edge_weights_of_mean_on
 @pytest.mark.parametrize("count", [0, 1, 63, 1000])
 def test_the_kernel_adds_what_plain_torch_adds(count: int) -> None:
     draw = torch.Generator().manual_seed(count)
-    observed = torch.rand(count, 3, generator=draw) - torch.tensor([0.0, 0.0, 0.3])
+    absgrad = torch.rand(count, 3, generator=draw) - torch.tensor([0.0, 0.0, 0.3])
     radii = torch.randint(0, 3, (count,), generator=draw, dtype=torch.int32)
-    fast, exact = tables(count, observed), tables(count, observed.double())
-    add_observed(*fast, observed, radii, width=80, height=60)
-    add_observed(*exact, observed.double(), radii, width=80, height=60)
+    fast, exact = tables(count, absgrad), tables(count, absgrad.double())
+    add_absgrad(*fast, absgrad, radii, width=80, height=60)
+    add_absgrad(*exact, absgrad.double(), radii, width=80, height=60)
     for ours, theirs in zip(fast, exact, strict=True):
         torch.testing.assert_close(ours.double(), theirs, rtol=1e-6, atol=1e-6)
 
@@ -128,12 +128,12 @@ SCHEDULE = Schedule(
 
 def view(gradients: list[float], edges: list[float], seen: list[bool]) -> Render:
     """A render whose absolute screen gradients (in device coordinates, along x) and edge weights are given."""
-    observed = torch.zeros(len(gradients), 3, requires_grad=True)
+    absgrad = torch.zeros(len(gradients), 3, requires_grad=True)
     columns = zip(gradients, edges, strict=True)
-    observed.grad = torch.tensor([[gradient / (0.5 * WIDTH), 0.0, edge] for gradient, edge in columns])
+    absgrad.grad = torch.tensor([[gradient / (0.5 * WIDTH), 0.0, edge] for gradient, edge in columns])
     image = torch.zeros(HEIGHT, WIDTH, 3)
     means2d = torch.zeros(len(gradients), 2)
-    return Render(image, image[..., 0], torch.tensor(seen).int(), means2d, image[..., 0], observed)
+    return Render(image, image[..., 0], torch.tensor(seen).int(), means2d, image[..., 0], absgrad)
 
 
 def stage_of(opacities: list[float], growth: BudgetedGrowth, micro: int = 1) -> Stage:
@@ -209,12 +209,12 @@ def test_nothing_happens_after_warm_up() -> None:
 def test_it_asks_for_edges_during_warm_up_only() -> None:
     stage = stage_of([0.5] * 3, BudgetedGrowth(**RULES, budget=1000))
     stage.start_batch(120, BATCH)
-    strength = stage.module.pixel_map
+    strength = stage.module.pixel_weights
     assert strength.shape == (HEIGHT, WIDTH)
     assert strength[:, WIDTH // 2].min() == 1.0
     assert strength.sum() == HEIGHT  # the bright side of the edge alone
     stage.start_batch(121, BATCH)
-    assert stage.module.pixel_map is None
+    assert stage.module.pixel_weights is None
 
 
 def test_a_budget_is_needed_and_the_modules_is_taken() -> None:

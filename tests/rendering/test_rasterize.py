@@ -8,7 +8,7 @@ import oracle
 import pytest
 import torch
 from oracle import run
-from splat_scenes import front_camera, pixel_map, random_splats, uneven_splats
+from splat_scenes import front_camera, random_splats, some_pixel_weights, uneven_splats
 
 from nsvq_lightning.compression.importance import contributions
 from nsvq_lightning.compute.devices import _warn_of_plain_torch, resolve_backend
@@ -50,17 +50,17 @@ def test_splats_behind_and_beside_the_camera() -> None:
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("count", [1, 300])
-@pytest.mark.parametrize("observed", [False, True])
-def test_bits_do_not_depend_on_the_number_of_threads(threads: int, count: int, observed: bool) -> None:
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_bits_do_not_depend_on_the_number_of_threads(threads: int, count: int, absgrad: bool) -> None:
     if threads > numba.config.NUMBA_NUM_THREADS:
         pytest.skip("this machine has one core")
     before = torch.get_num_threads()
     splats, camera = random_splats(count, seed=9), front_camera(150, 100)
-    observe = pixel_map(camera) if observed else None
-    expected, gradients = run(splats, camera, "cpu", torch.float32, observe=observe)
+    pixel_weights = some_pixel_weights(camera) if absgrad else None
+    expected, gradients = run(splats, camera, "cpu", torch.float32, pixel_weights=pixel_weights)
     try:
         torch.set_num_threads(threads)
-        result, again = run(splats, camera, "cpu", torch.float32, observe=observe)
+        result, again = run(splats, camera, "cpu", torch.float32, pixel_weights=pixel_weights)
     finally:
         torch.set_num_threads(before)
     torch.testing.assert_close((result, again), (expected, gradients), atol=0, rtol=0)
@@ -170,25 +170,25 @@ def test_oracle_against_finite_differences() -> None:
     ids=["plain", "whole tiles", "small", "column", "saturated", "one", "uneven"],
 )
 def test_what_is_observed_is_that_of_the_oracle(splats: RawSplats, camera: Camera) -> None:
-    _, gradients = assert_same(splats, camera, observe=pixel_map(camera))
-    assert all(gradients[name].any() for name in oracle.OBSERVED)
+    _, gradients = assert_same(splats, camera, pixel_weights=some_pixel_weights(camera))
+    assert all(gradients[name].any() for name in oracle.ABSGRAD)
 
 
 @pytest.mark.parametrize(("backend", "dtype"), [("cpu", torch.float32), ("reference", torch.float64)])
 def test_absolute_gradients_are_those_of_one_pixel_at_a_time(backend: str, dtype: torch.dtype) -> None:
     splats, camera = random_splats(6, seed=13, sh_degree=0, log_scale=-1.2), front_camera(19, 9)
     leaves = RawSplats(*(tensor.to(dtype).requires_grad_() for tensor in splats))
-    result = render(leaves, camera, observe=pixel_map(camera), backend=backend)
+    result = render(leaves, camera, pixel_weights=some_pixel_weights(camera), backend=backend)
     outputs = torch.cat([result.image, result.alpha[..., None], result.depth[..., None]], -1)
     weights = torch.randn(outputs.shape, generator=torch.Generator().manual_seed(2)).to(dtype)
     losses = (weights * outputs).sum(-1).flatten()
     expected = torch.zeros(6, 2, dtype=dtype)
     for loss in losses:
         expected += torch.autograd.grad(loss, result.means2d, retain_graph=True)[0].abs()
-    assert result.observed is not None
-    summed, observed = torch.autograd.grad(losses.sum(), [result.means2d, result.observed])
+    assert result.absgrad is not None
+    summed, absgrad = torch.autograd.grad(losses.sum(), [result.means2d, result.absgrad])
     assert (expected > 1.5 * summed.abs()).any()
-    torch.testing.assert_close(observed[:, :2], expected, atol=1e-4 if backend == "cpu" else 1e-12, rtol=1e-4)
+    torch.testing.assert_close(absgrad[:, :2], expected, atol=1e-4 if backend == "cpu" else 1e-12, rtol=1e-4)
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
@@ -196,38 +196,38 @@ def test_weights_by_a_map_of_ones_are_the_contributions(backend: str) -> None:
     splats, camera = random_splats(150, seed=3), front_camera()
     expected = contributions(splats, [camera], partial(render, backend=backend))
     leaves = RawSplats(*(tensor.requires_grad_() for tensor in splats))
-    result = render(leaves, camera, observe=torch.ones(45, 70), backend=backend)
+    result = render(leaves, camera, pixel_weights=torch.ones(45, 70), backend=backend)
     result.image.sum().backward()
-    assert result.observed is not None
-    assert result.observed.grad is not None
-    torch.testing.assert_close(result.observed.grad[:, 2], expected, atol=1e-4, rtol=1e-4)
+    assert result.absgrad is not None
+    assert result.absgrad.grad is not None
+    torch.testing.assert_close(result.absgrad.grad[:, 2], expected, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_observing_changes_no_bit_of_the_rest(backend: str) -> None:
     splats, camera = random_splats(300, seed=5), front_camera()
     alone, gradients = run(splats, camera, backend, torch.float32)
-    result, observed = run(splats, camera, backend, torch.float32, observe=pixel_map(camera))
+    result, absgrad = run(splats, camera, backend, torch.float32, pixel_weights=some_pixel_weights(camera))
     torch.testing.assert_close(result, alone, atol=0, rtol=0)
-    for name in oracle.OBSERVED:
-        assert observed.pop(name).any()
-    torch.testing.assert_close(observed, gradients, atol=0, rtol=0)
+    for name in oracle.ABSGRAD:
+        assert absgrad.pop(name).any()
+    torch.testing.assert_close(absgrad, gradients, atol=0, rtol=0)
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_nothing_is_observed_unless_asked_and_nothing_where_nothing_is_in_view(backend: str) -> None:
     splats, camera = random_splats(20), front_camera()
-    assert render(splats, camera, backend=backend).observed is None
+    assert render(splats, camera, backend=backend).absgrad is None
     behind = splats._replace(means=splats.means - torch.tensor([0.0, 0.0, 50.0]))
-    _, gradients = run(behind, camera, backend, torch.float32, observe=pixel_map(camera))
-    assert not any(gradients[name].any() for name in oracle.OBSERVED)
+    _, gradients = run(behind, camera, backend, torch.float32, pixel_weights=some_pixel_weights(camera))
+    assert not any(gradients[name].any() for name in oracle.ABSGRAD)
 
 
 def test_a_map_is_taken_in_any_type_and_layout_and_gets_no_gradient() -> None:
     splats, camera = random_splats(40, seed=2), front_camera()
-    strength = pixel_map(camera).double().T.contiguous().T.requires_grad_()
-    _, expected = run(splats, camera, "cpu", torch.float32, observe=strength.detach().float().contiguous())
-    _, gradients = run(splats, camera, "cpu", torch.float32, observe=strength)
+    strength = some_pixel_weights(camera).double().T.contiguous().T.requires_grad_()
+    _, expected = run(splats, camera, "cpu", torch.float32, pixel_weights=strength.detach().float().contiguous())
+    _, gradients = run(splats, camera, "cpu", torch.float32, pixel_weights=strength)
     torch.testing.assert_close(gradients, expected, atol=0, rtol=0)
     assert strength.grad is None
 
@@ -253,8 +253,8 @@ def test_bad_arguments_say_what_to_do() -> None:
     with pytest.raises(ValueError, match="background"):
         render(splats, camera, background=torch.zeros(4))
     for shape in ((70, 45), (45, 70, 1), (45 * 70,)):
-        with pytest.raises(ValueError, match=rf"observe must be \[45, 70\], got \[{', '.join(map(str, shape))}\]"):
-            render(splats, camera, observe=torch.zeros(shape))
+        with pytest.raises(ValueError, match=rf"must be \[45, 70\], got \[{', '.join(map(str, shape))}\]"):
+            render(splats, camera, pixel_weights=torch.zeros(shape))
     with pytest.raises(ValueError, match="float64"):
         render(RawSplats(*(tensor.double() for tensor in splats.raw())), camera, backend="cpu")
 

@@ -17,7 +17,7 @@ import triton
 import triton.language as tl
 from guards import GuardError, guarded
 from oracle import run
-from splat_scenes import front_camera, pixel_map, random_splats, uneven_splats
+from splat_scenes import front_camera, random_splats, some_pixel_weights, uneven_splats
 from triton.runtime.interpreter import InterpreterBuilder
 
 from nsvq_lightning.compute.devices import resolve_backend
@@ -123,8 +123,10 @@ def test_no_splat_in_view_is_background() -> None:
     splats, camera = random_splats(20), front_camera(20, 9)
     behind = splats._replace(means=splats.means - torch.tensor([0.0, 0.0, 50.0]))
     background = torch.tensor([0.1, 0.2, 0.3])
-    result, gradients = run(behind, camera, "cuda", torch.float32, background=background, observe=pixel_map(camera))
-    assert set(oracle.OBSERVED) <= set(gradients)
+    result, gradients = run(
+        behind, camera, "cuda", torch.float32, background=background, pixel_weights=some_pixel_weights(camera)
+    )
+    assert set(oracle.ABSGRAD) <= set(gradients)
     assert torch.equal(result.image, background.expand_as(result.image))
     assert all((gradient == 0).all() for gradient in gradients.values())
     nothing, gradients = run(RawSplats(*(tensor[:0] for tensor in splats)), camera, "cuda", torch.float32)
@@ -156,8 +158,8 @@ def test_visible_is_radii() -> None:
 
 def test_backward_twice_gives_the_same_bits() -> None:
     leaves = on_device(random_splats(12))
-    result = render(leaves, front_camera(20, 12), observe=torch.ones(12, 20), backend="cuda")
-    loss, inputs = result.image.square().sum(), [*leaves, result.observed]
+    result = render(leaves, front_camera(20, 12), pixel_weights=torch.ones(12, 20), backend="cuda")
+    loss, inputs = result.image.square().sum(), [*leaves, result.absgrad]
     first = torch.autograd.grad(loss, inputs, retain_graph=True)
     second = torch.autograd.grad(loss, inputs)
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
@@ -173,13 +175,13 @@ def test_backward_twice_gives_the_same_bits() -> None:
     ids=["small", "saturated", "uneven"],
 )
 def test_what_is_observed_is_that_of_the_oracle(splats: RawSplats, camera: Camera) -> None:
-    _, gradients = assert_same(splats, camera, observe=pixel_map(camera))
-    assert all(gradients[name].any() for name in oracle.OBSERVED)
+    _, gradients = assert_same(splats, camera, pixel_weights=some_pixel_weights(camera))
+    assert all(gradients[name].any() for name in oracle.ABSGRAD)
 
 
 def test_a_splat_of_many_tiles_is_observed_in_all_of_them() -> None:
     splats = random_splats(2, seed=2, log_scale=0.5)
-    assert_same(splats, camera := front_camera(70, 36), observe=pixel_map(camera))
+    assert_same(splats, camera := front_camera(70, 36), pixel_weights=some_pixel_weights(camera))
     lens = Lens.of(camera, torch.device(DEVICE))
     boxes = project(lens, tuple(tensor.to(DEVICE) for tensor in splats), 3).boxes
     assert int((boxes[:, 2] * boxes[:, 3]).max()) > SLOTS
@@ -188,15 +190,15 @@ def test_a_splat_of_many_tiles_is_observed_in_all_of_them() -> None:
 def test_observing_changes_nothing_else() -> None:
     splats, camera = random_splats(24, seed=5), front_camera(20, 12)
     alone, gradients = run(splats, camera, "cuda", torch.float32)
-    assert alone.observed is None
-    result, observed = run(splats, camera, "cuda", torch.float32, observe=pixel_map(camera))
+    assert alone.absgrad is None
+    result, absgrad = run(splats, camera, "cuda", torch.float32, pixel_weights=some_pixel_weights(camera))
     torch.testing.assert_close(result, alone, atol=0, rtol=0)
-    for name in oracle.OBSERVED:
-        assert observed.pop(name).any()
+    for name in oracle.ABSGRAD:
+        assert absgrad.pop(name).any()
     # The compiler of a GPU may fuse other products and sums where there are more of them.
     rtol = 1e-5 if DEVICE == "cuda" else 0
     for name, gradient in gradients.items():
-        assert (observed[name] - gradient).norm() <= rtol * gradient.norm(), name
+        assert (absgrad[name] - gradient).norm() <= rtol * gradient.norm(), name
 
 
 @pytest.mark.parametrize("output", ["means2d", "image", "alpha", "depth"])

@@ -38,7 +38,7 @@ class Stage:
         self.control = control
         self.module: Any = SimpleNamespace(
             **{"splats": splats, "quantizers": {}, "schedule": schedule, "phase": Phase.WARMUP, "extent": EXTENT},
-            **{"seed": 0, "background": background, "pixel_map": None, "splat_budget": None},
+            **{"seed": 0, "background": background, "pixel_weights": None, "splat_budget": None},
         )
         self.trainer: Any = SimpleNamespace(
             optimizers=[build_adam(param_groups(splats, {}, LearningRates(), EXTENT))],

@@ -26,7 +26,7 @@ import pytest
 import torch
 from guards import guarded
 from kernel_entries import entry_points, stand_in_for_a_gpu
-from splat_scenes import front_camera, pixel_map, random_splats
+from splat_scenes import front_camera, random_splats, some_pixel_weights
 from torch import Tensor
 
 from nsvq_lightning.io import formats
@@ -59,7 +59,7 @@ def use_cpu() -> None:
     statistics = importlib.import_module("nsvq_lightning.rendering.cpu.statistics")
     radii = torch.arange(70, dtype=torch.int32) % 3
     statistics.add_view(*torch.zeros(2, 70), x[:, :2].contiguous(), radii, (2.0, 3.0))
-    statistics.add_observed(*torch.zeros(3, 70), x, radii, (2.0, 3.0))
+    statistics.add_absgrad(*torch.zeros(3, 70), x, radii, (2.0, 3.0))
     with tempfile.TemporaryDirectory() as folder:
         formats.save(Splats.from_tensors(*random_splats(300)), Path(folder, "a.sog"))
 
@@ -76,11 +76,11 @@ def use_triton() -> None:
 
 
 def draw(width: int, height: int, backend: str, **options: Any) -> None:
-    """Render with all that can be observed, compare with photos of floats and of bytes, and back."""
+    """Render with all that can be absgrad, compare with photos of floats and of bytes, and back."""
     camera, splats = front_camera(width, height), random_splats(6, sh_degree=1)
     leaves = RawSplats(*(tensor.requires_grad_() for tensor in splats))
     visible(leaves, camera, backend=backend)
-    result = render(leaves, camera, observe=pixel_map(camera), backend=backend, **options)
+    result = render(leaves, camera, pixel_weights=some_pixel_weights(camera), backend=backend, **options)
     photo = torch.rand(height, width, 3, generator=generator(0))
     losses = [photometric_loss(result.image, target) for target in (photo, (255 * photo).byte())]
     (sum(losses) + result.alpha.sum() + result.depth.sum()).backward()

@@ -11,8 +11,8 @@ from nsvq_lightning.splats.splats import RawSplats
 
 Gradients = dict[str, torch.Tensor]
 
-OBSERVED = "Σ |∂L/∂x|", "Σ |∂L/∂y|", "Σ weight · map"
-"""Columns of what is observed, as the names of gradients."""
+ABSGRAD = "Σ |∂L/∂x|", "Σ |∂L/∂y|", "Σ weight · pixel weight"
+"""Columns of what is absgrad, as the names of gradients."""
 DEVICES = {"cuda": "cuda"} if torch.cuda.is_available() else {}
 """Where a back-end is run, if not on the CPU."""
 
@@ -23,14 +23,14 @@ def run(
     backend: str,
     dtype: torch.dtype,
     background: torch.Tensor | None = None,
-    observe: torch.Tensor | None = None,
+    pixel_weights: torch.Tensor | None = None,
     **options: int,
 ) -> tuple[Render, Gradients]:
     """Render, and differentiate a random combination of image, alpha and depth; results are on the CPU."""
     device = torch.device(DEVICES.get(backend, "cpu"))
     leaves = RawSplats(*(tensor.to(device, dtype, copy=True).requires_grad_() for tensor in splats))
     background = None if background is None else background.to(device, dtype)
-    result = render(leaves, camera, backend=backend, background=background, observe=observe, **options)  # type: ignore[arg-type]
+    result = render(leaves, camera, backend=backend, background=background, pixel_weights=pixel_weights, **options)  # type: ignore[arg-type]
     result.means2d.retain_grad()
     generator = torch.Generator().manual_seed(99)
     weights = [torch.randn(camera.height, camera.width, k, generator=generator).to(device, dtype) for k in (3, 1, 1)]
@@ -39,9 +39,9 @@ def run(
     gradients = {name: leaf.grad.cpu() for name, leaf in zip(ATTRIBUTES, leaves, strict=True) if leaf.grad is not None}
     assert result.means2d.grad is not None
     gradients["means2d"] = result.means2d.grad.cpu()
-    if result.observed is not None:
-        assert result.observed.grad is not None
-        gradients |= dict(zip(OBSERVED, result.observed.grad.cpu().unbind(1), strict=True))
+    if result.absgrad is not None:
+        assert result.absgrad.grad is not None
+        gradients |= dict(zip(ABSGRAD, result.absgrad.grad.cpu().unbind(1), strict=True))
     return Render(*(tensor.cpu() for tensor in result[:5])), gradients
 
 

@@ -55,7 +55,7 @@ def front_camera(width: int = 70, height: int = 45, cx: float | None = None, cy:
     return Camera(K, viewmat, width, height)
 
 
-def pixel_map(camera: Camera) -> torch.Tensor:
+def some_pixel_weights(camera: Camera) -> torch.Tensor:
     """A strength for each pixel, of both signs."""
     return torch.randn(camera.height, camera.width, generator=torch.Generator().manual_seed(1))
 

@@ -36,7 +36,7 @@ BLOCK_SIDE = 4
 T, T_LEFT, R_SUM, G_SUM, B_SUM, Z_SUM = (256 * plane for plane in range(6))
 FORWARD_SCRATCH = 6 * 256 + (BATCH + 1) * rec.RECORD
 # Vectors of one block in the scratch of the backward pass.
-BACK_T, BACK_REST, BACK_RED, BACK_GREEN, BACK_BLUE, BACK_DEPTH, BACK_MAP, BACK_X, BACK_Y = (
+BACK_T, BACK_REST, BACK_RED, BACK_GREEN, BACK_BLUE, BACK_DEPTH, BACK_WEIGHT, BACK_X, BACK_Y = (
     16 * part for part in range(9)
 )
 BLOCK_STATE = 16 * 9
@@ -299,7 +299,7 @@ def blend(
 
 
 @inline
-def start_block(block, corner, size, planes, gradients, pixel_map, wanted, grid, state):
+def start_block(block, corner, size, planes, gradients, pixel_weights, wanted, grid, state):
     """Backward state of a block: transmittance 1, and ``rest`` = g · everything that this pixel received.
 
     Alpha is 1 - T, so its gradient enters as -g_alpha·T at the far end. Gradients that are not needed are not read, nor
@@ -307,7 +307,7 @@ def start_block(block, corner, size, planes, gradients, pixel_map, wanted, grid,
     """
     (left, top), (width, height), (image, transmittance, depth) = corner, size, planes
     g_image, g_alpha, g_depth = gradients
-    with_alpha, with_depth, with_map = wanted
+    with_alpha, with_depth, with_absgrad = wanted
     s = BLOCK_STATE * block
     x0, y0 = left + (block & 3) * BLOCK_SIDE, top + (block >> 2) * BLOCK_SIDE
     simd.store(state, s + BACK_X, simd.load(grid, 16 * block))
@@ -323,8 +323,8 @@ def start_block(block, corner, size, planes, gradients, pixel_map, wanted, grid,
             far = simd.load_block(g_depth, pixel, width)
             simd.store(state, s + BACK_DEPTH, far)
             rest = simd.fma(far, simd.load_block(depth, pixel, width), rest)
-        if with_map:
-            simd.store(state, s + BACK_MAP, simd.load_block(pixel_map, pixel, width))
+        if with_absgrad:
+            simd.store(state, s + BACK_WEIGHT, simd.load_block(pixel_weights, pixel, width))
         simd.store(state, s + BACK_T, 1)
         simd.store(state, s + BACK_REST, rest)
         simd.store(state, s + BACK_RED, red)
@@ -347,8 +347,8 @@ def start_block(block, corner, size, planes, gradients, pixel_map, wanted, grid,
             if with_depth:
                 simd.put(state, o + BACK_DEPTH, simd.get(g_depth, pixel))
                 rest += simd.get(g_depth, pixel) * simd.get(depth, pixel)
-            if with_map:
-                simd.put(state, o + BACK_MAP, simd.get(pixel_map, pixel))
+            if with_absgrad:
+                simd.put(state, o + BACK_WEIGHT, simd.get(pixel_weights, pixel))
             simd.put(state, o + BACK_REST, rest)
             simd.put(state, o + BACK_T, F(1))
 
@@ -367,7 +367,7 @@ def slot_of(integers, row, group):
 @inline
 def splat_backward(records, row, blocks, corner, wanted, state):
     """Sums of one splat over the blocks it changed in a tile (the fields of a slot); advances the blocks' state."""
-    _, with_depth, with_map = wanted
+    _, with_depth, with_absgrad = wanted
     zero = simd.broadcast(0)
     r = rec.RECORD * row
     a, b, c = simd.get(records, r + rec.A), simd.get(records, r + rec.B), simd.get(records, r + rec.C)
@@ -402,10 +402,10 @@ def splat_backward(records, row, blocks, corner, wanted, state):
         s_uu, s_uv, s_vv = simd.fma(hu, u, s_uu), simd.fma(hu, v, s_uv), simd.fma(hv, v, s_vv)
         if with_depth:
             s_z = simd.fma(weight, simd.load(state, s + BACK_DEPTH), s_z)
-        if with_map:
+        if with_absgrad:
             along_y = simd.fma(b, hu, c * hv)
             s_ax, s_ay = s_ax + simd.vmax(hu, 0 - hu), s_ay + simd.vmax(along_y, 0 - along_y)
-            s_map = simd.fma(weight, simd.load(state, s + BACK_MAP), s_map)
+            s_map = simd.fma(weight, simd.load(state, s + BACK_WEIGHT), s_map)
     return simd.lane_sums((s_r, s_g, s_b, s_h, s_u, s_v, s_uu, s_uv, s_vv, s_z, s_ax, s_ay, s_map))
 
 
@@ -430,7 +430,7 @@ def tile_backward(records, integers, entries, begin, end, corner, group, wanted,
 @kernel
 def blend_backward(
     threads, records, integers, entries, offsets, ends, group_columns, size, grid, touched, planes, gradients,
-    pixel_map, wanted, sums, slots, scratch, counter,
+    pixel_weights, wanted, sums, slots, scratch, counter,
 ):  # fmt: skip
     """Write the sums of every (splat, group) pair to its slot; groups are scheduled dynamically, each in one order.
 
@@ -455,16 +455,16 @@ def blend_backward(
                     continue
                 corner = tile_corner(tile, group_columns)
                 for block in range(BLOCKS):
-                    start_block(block, corner, size, planes, gradients, pixel_map, wanted, grid, state)
+                    start_block(block, corner, size, planes, gradients, pixel_weights, wanted, grid, state)
                 place = group % group_columns, group // group_columns
                 tile_backward(records, integers, entries, begin, end, corner, place, wanted, touched, sums, state)
 
 
 @kernel
-def total_slots(threads, ids, count, slots, records, integers, sums, g_means2d, with_map, observed):
+def total_slots(threads, ids, count, slots, records, integers, sums, g_means2d, with_absgrad, absgrad):
     """Add up the slots of each splat into its first one, and derive the gradient of the projected centre ``[N·2]``.
 
-    ``with_map`` also writes what the pass observed ``[N·3]``: Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · map over pixels.
+    ``with_absgrad`` also writes sums over the pixels ``[N·3]``: Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · pixel weight.
     """
     for thread in prange(threads):
         last = count * (thread + 1) // threads
@@ -488,9 +488,7 @@ def total_slots(threads, ids, count, slots, records, integers, sums, g_means2d, 
             simd.put(
                 g_means2d, 2 * row + 1, TWO_LN2 * (simd.get(records, r + rec.B) * u + simd.get(records, r + rec.C) * v)
             )
-            if with_map:
-                simd.put(
-                    observed, 3 * row, abs(TWO_LN2 * simd.get(records, r + rec.A)) * simd.get(sums, o + rec.SUM_ABS_X)
-                )
-                simd.put(observed, 3 * row + 1, TWO_LN2 * simd.get(sums, o + rec.SUM_ABS_Y))
-                simd.put(observed, 3 * row + 2, simd.get(sums, o + rec.SUM_MAP))
+            if with_absgrad:
+                simd.put(absgrad, 3 * row, abs(TWO_LN2 * simd.get(records, r + rec.A)) * simd.get(sums, o + rec.ABS_X))
+                simd.put(absgrad, 3 * row + 1, TWO_LN2 * simd.get(sums, o + rec.ABS_Y))
+                simd.put(absgrad, 3 * row + 2, simd.get(sums, o + rec.SUM_WEIGHT))

@@ -158,8 +158,8 @@ class _Blend(torch.autograd.Function):
         means2d: Tensor,
         token: Tensor,
         background: Tensor,
-        pixel_map: Tensor | None,
-        observed: Tensor | None,
+        pixel_weights: Tensor | None,
+        absgrad: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         shape = frame.size[::-1]
         image, transmittance, depth, alpha = (recycled((*shape, *last)) for last in ((3,), (), (), ()))
@@ -176,38 +176,38 @@ class _Blend(torch.autograd.Function):
         )  # fmt: skip
         ctx.frame = frame
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(image, transmittance, depth, pixel_map)
+        ctx.save_for_backward(image, transmittance, depth, pixel_weights)
         return image, torch.sub(1, transmittance, out=alpha), depth
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, g_depth: Tensor | None) -> tuple[Any, ...]:
         frame: _Frame = ctx.frame
-        image, transmittance, depth, pixel_map = ctx.saved_tensors
+        image, transmittance, depth, pixel_weights = ctx.saved_tensors
         # Placeholders that are never read stand in for missing gradients and a missing map.
-        with_map = pixel_map is not None
-        wanted = g_alpha is not None, g_depth is not None, with_map
-        pixel_map = flat_checked("pixel_map", pixel_map if with_map else depth, frame.size[::-1])
+        with_absgrad = pixel_weights is not None
+        wanted = g_alpha is not None, g_depth is not None, with_absgrad
+        pixel_weights = flat_checked("pixel_weights", pixel_weights if with_absgrad else depth, frame.size[::-1])
         g_image = torch.zeros_like(image) if g_image is None else g_image
         g_alpha = transmittance if g_alpha is None else g_alpha
         g_depth = depth if g_depth is None else g_depth
         work = frame.work
         frame.sums = work.array("sums", rec.RECORD * frame.slots)
-        g_means2d, g_observed = torch.zeros(frame.n, 2), torch.zeros(frame.n if with_map else 0, 3)
+        g_means2d, g_absgrad = torch.zeros(frame.n, 2), torch.zeros(frame.n if with_absgrad else 0, 3)
         blending.blend_backward(
             frame.threads, frame.records, frame.integers, frame.entries, frame.offsets, frame.ends,
             frame.group_columns, frame.size, _GRID, frame.touched, (flat(image), flat(transmittance), flat(depth)),
-            (flat(g_image), flat(g_alpha), flat(g_depth)), pixel_map, wanted, frame.sums, frame.slots,
+            (flat(g_image), flat(g_alpha), flat(g_depth)), pixel_weights, wanted, frame.sums, frame.slots,
             work.rows("blend_backward", frame.threads, blending.BACKWARD_SCRATCH), np.zeros(1, np.int64),
         )  # fmt: skip
         blending.total_slots(
             frame.threads, frame.ids, frame.count, frame.slots, frame.records, frame.integers, frame.sums,
-            flat(g_means2d), with_map, flat(g_observed),
+            flat(g_means2d), with_absgrad, flat(g_absgrad),
         )  # fmt: skip
         g_background = None
         if ctx.needs_input_grad[3]:
             g_background = (g_image * transmittance[..., None]).sum((0, 1))
-        return None, g_means2d, torch.zeros(()), g_background, None, g_observed if with_map else None
+        return None, g_means2d, torch.zeros(()), g_background, None, g_absgrad if with_absgrad else None
 
 
 def render(
@@ -215,8 +215,8 @@ def render(
     camera: Camera,
     sh_degree: int,
     background: Tensor,
-    pixel_map: Tensor | None = None,
-    observed: Tensor | None = None,
+    pixel_weights: Tensor | None = None,
+    absgrad: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
 
@@ -229,7 +229,7 @@ def render(
     attributes = splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN
     frame = _Frame(splats, camera)
     means2d, token, radii = _Project.apply(frame, sh_degree, *attributes)
-    image, alpha, depth = _Blend.apply(frame, means2d, token, background, pixel_map, observed)
+    image, alpha, depth = _Blend.apply(frame, means2d, token, background, pixel_weights, absgrad)
     return image, alpha, radii, means2d, depth
 
 

@@ -29,9 +29,9 @@ RECORD = 16
 X, Y, A, B, C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, SLOPE_X, SLOPE_Y, SLOT, ORIGIN, EXTENT, RADIUS = range(RECORD)
 
 # Fields of a slot: with h = α·dL/dα, sums over pixels of w·g (colour), h, h·u, h·v, h·u², h·u·v, h·v², w·g (depth) and,
-# if somebody observes the pass, |h·u|, |B·h·u + C·h·v|, w·map.
-SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_DEPTH, SUM_ABS_X, SUM_ABS_Y, SUM_MAP = (
-    range(13)
+# with absolute gradients, |h·u|, |B·h·u + C·h·v|, w·pixel weight.
+SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_DEPTH, ABS_X, ABS_Y, SUM_WEIGHT = range(
+    13
 )
 
 TILE_SHIFT = 4

@@ -45,12 +45,12 @@ CHUNKS = 64
 
 
 @kernel
-def _add_observed(threads, observed, radii, x_factor, y_factor, partial, gradients, views, weights):
+def _add_absgrad(threads, absgrad, radii, x_factor, y_factor, partial, gradients, views, weights):
     count = radii.shape[0]
     for chunk in prange(CHUNKS):
         total, positive = 0.0, 0.0
         for i in range(count * chunk // CHUNKS, count * (chunk + 1) // CHUNKS):
-            weight = get(observed, 3 * i + 2)
+            weight = get(absgrad, 3 * i + 2)
             if weight > 0:
                 total += weight
                 positive += 1.0
@@ -64,24 +64,24 @@ def _add_observed(threads, observed, radii, x_factor, y_factor, partial, gradien
     for thread in prange(threads):
         for i in range(count * thread // threads, count * (thread + 1) // threads):
             if get(radii, i) > 0:
-                x, y = x_factor * get(observed, 3 * i), y_factor * get(observed, 3 * i + 1)
+                x, y = x_factor * get(absgrad, 3 * i), y_factor * get(absgrad, 3 * i + 1)
                 put(gradients, i, get(gradients, i) + np.sqrt(x * x + y * y))
                 put(views, i, get(views, i) + F(1))
-                weight = get(observed, 3 * i + 2)
+                weight = get(absgrad, 3 * i + 2)
                 if weight > 0:
                     put(weights, i, get(weights, i) + scale * weight)
 
 
-def add_observed(
-    gradients: Tensor, views: Tensor, weights: Tensor, observed: Tensor, radii: Tensor, factors: tuple[float, float]
+def add_absgrad(
+    gradients: Tensor, views: Tensor, weights: Tensor, absgrad: Tensor, radii: Tensor, factors: tuple[float, float]
 ) -> None:
-    """Add what one view has observed, where a splat was seen; in place.
+    """Add what one view says, where a splat was seen; in place.
 
     Args:
         gradients: Sum of the norms of absolute gradients ``[N]`` float32.
         views: Number of views ``[N]`` float32.
         weights: Sum of the weights ``[N]`` float32, those of a view divided by the mean of its positive ones.
-        observed: Σ |∂L/∂x|, Σ |∂L/∂y| per pixel, and the weight ``[N, 3]`` float32.
+        absgrad: Σ |∂L/∂x|, Σ |∂L/∂y| per pixel, and the weight ``[N, 3]`` float32.
         radii: Radius on the screen ``[N]`` int32, 0 for splats that were not seen.
         factors: Factors of the first two columns.
 
@@ -90,8 +90,8 @@ def add_observed(
         TypeError: A dtype is wrong.
     """
     rows = tuple(radii.shape[:1])
-    inputs = (flat_checked("observed", observed.contiguous(), (*rows, 3)), flat_checked("radii", radii, rows, INT32))
+    inputs = (flat_checked("absgrad", absgrad.contiguous(), (*rows, 3)), flat_checked("radii", radii, rows, INT32))
     tables = {"gradients": gradients, "views": views, "weights": weights}
     outputs = (flat_checked(name, table, rows) for name, table in tables.items())
     partial = np.empty(2 * CHUNKS)
-    _add_observed(thread_count(), *inputs, F(factors[0]), F(factors[1]), partial, *outputs)
+    _add_absgrad(thread_count(), *inputs, F(factors[0]), F(factors[1]), partial, *outputs)

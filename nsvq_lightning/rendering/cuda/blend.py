@@ -111,8 +111,8 @@ def blend_kernel(
 
 @triton.jit
 def blend_backward_kernel(
-    records, ranks, slots, offsets, order, ends, image, transmittance, depth, g_image, g_alpha, g_depth, pixel_map,
-    sums, columns, width, height, WITH_ALPHA: tl.constexpr, WITH_DEPTH: tl.constexpr, WITH_MAP: tl.constexpr,
+    records, ranks, slots, offsets, order, ends, image, transmittance, depth, g_image, g_alpha, g_depth, pixel_weights,
+    sums, columns, width, height, WITH_ALPHA: tl.constexpr, WITH_DEPTH: tl.constexpr, WITH_ABSGRAD: tl.constexpr,
 ):  # fmt: skip
     """Write the sums of every splat of a tile to its slot."""
     tile = tl.load(order + tl.program_id(0))
@@ -131,8 +131,8 @@ def blend_backward_kernel(
     if WITH_DEPTH:
         g_far = tl.load(g_depth + pixel, mask=inside, other=0.0)
         rest += g_far * tl.load(depth + pixel, mask=inside, other=0.0)
-    if WITH_MAP:
-        strength = tl.load(pixel_map + pixel, mask=inside, other=0.0)
+    if WITH_ABSGRAD:
+        strength = tl.load(pixel_weights + pixel, mask=inside, other=0.0)
     t = tl.where(inside, 1.0, 0.0)
     begin, end = tl.load(offsets + tile), tl.load(ends + tile)
     following = fetch(records, ranks, begin, end)
@@ -152,7 +152,7 @@ def blend_backward_kernel(
             h = tl.where(is_open & (raw <= rec.ALPHA_MAX), alpha / (1 - alpha) * (t * d - rest), 0.0)
             rest = tl.fma(-weight, d, rest)
             hu, hv = h * u, h * v
-            slot = sums + tl.load(slots + j).to(tl.int64) * (rec.OBSERVED_SLOT if WITH_MAP else rec.RECORD)
+            slot = sums + tl.load(slots + j).to(tl.int64) * (rec.ABSGRAD_SLOT if WITH_ABSGRAD else rec.RECORD)
             tl.store(slot + rec.SUM_RED, tl.sum(weight * g_red, 0))
             tl.store(slot + rec.SUM_GREEN, tl.sum(weight * g_green, 0))
             tl.store(slot + rec.SUM_BLUE, tl.sum(weight * g_blue, 0))
@@ -164,11 +164,11 @@ def blend_backward_kernel(
             tl.store(slot + rec.SUM_VV, tl.sum(hv * v, 0))
             if WITH_DEPTH:
                 tl.store(slot + rec.SUM_DEPTH, tl.sum(weight * g_far, 0))
-            if WITH_MAP:
+            if WITH_ABSGRAD:
                 along_y = tl.fma(hu, tl.load(record + rec.B), hv * tl.load(record + rec.C))
-                tl.store(slot + rec.SUM_ABS_X, tl.sum(tl.abs(hu), 0))
-                tl.store(slot + rec.SUM_ABS_Y, tl.sum(tl.abs(along_y), 0))
-                tl.store(slot + rec.SUM_MAP, tl.sum(weight * strength, 0))
+                tl.store(slot + rec.ABS_X, tl.sum(tl.abs(hu), 0))
+                tl.store(slot + rec.ABS_Y, tl.sum(tl.abs(along_y), 0))
+                tl.store(slot + rec.SUM_WEIGHT, tl.sum(weight * strength, 0))
         t = after
 
 
@@ -181,12 +181,12 @@ def field_of(total, field):
 
 @triton.jit(do_not_specialize=["count"])
 def total_kernel(
-    sums, slot_ends, ids, records, totals, g_means2d, observed, count,
-    WITH_MAP: tl.constexpr, SPLATS: tl.constexpr, SLOTS: tl.constexpr, LANES: tl.constexpr,
+    sums, slot_ends, ids, records, totals, g_means2d, absgrad, count,
+    WITH_ABSGRAD: tl.constexpr, SPLATS: tl.constexpr, SLOTS: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     """Add up the slots of some splats, and derive the gradients of their projected centres.
 
-    ``WITH_MAP`` also writes what the pass observed: Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · map over pixels.
+    ``WITH_ABSGRAD`` also writes the absolute gradients: Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · pixel weight over pixels.
     """
     rank = tl.program_id(0).to(tl.int64) * SPLATS + tl.arange(0, SPLATS)
     seen = rank < count
@@ -196,8 +196,8 @@ def total_kernel(
     acc = tl.zeros([SPLATS, SLOTS, LANES], tl.float32)
     for start in range(0, tl.max(end - begin, 0), SLOTS):
         slot = begin[:, None, None] + start + tl.arange(0, SLOTS)[None, :, None]
-        mask = (slot < end[:, None, None]) & (field < (rec.OBSERVED_FIELDS if WITH_MAP else rec.FIELDS))
-        place = slot.to(tl.int64) * (rec.OBSERVED_SLOT if WITH_MAP else rec.RECORD) + field
+        mask = (slot < end[:, None, None]) & (field < (rec.ABSGRAD_FIELDS if WITH_ABSGRAD else rec.FIELDS))
+        place = slot.to(tl.int64) * (rec.ABSGRAD_SLOT if WITH_ABSGRAD else rec.RECORD) + field
         acc += tl.load(sums + place, mask=mask, other=0.0)
     total = tl.sum(acc, 1)
     lane = tl.arange(0, LANES)[None, :]
@@ -209,10 +209,10 @@ def total_kernel(
     row = tl.load(ids + rank, mask=seen, other=0)
     tl.store(g_means2d + 2 * row, a * u * (2 * rec.LN2), mask=seen)
     tl.store(g_means2d + 2 * row + 1, (b * u + c * v) * (2 * rec.LN2), mask=seen)
-    if WITH_MAP:
-        tl.store(observed + 3 * row, tl.abs(a) * field_of(total, rec.SUM_ABS_X) * (2 * rec.LN2), mask=seen)
-        tl.store(observed + 3 * row + 1, field_of(total, rec.SUM_ABS_Y) * (2 * rec.LN2), mask=seen)
-        tl.store(observed + 3 * row + 2, field_of(total, rec.SUM_MAP), mask=seen)
+    if WITH_ABSGRAD:
+        tl.store(absgrad + 3 * row, tl.abs(a) * field_of(total, rec.ABS_X) * (2 * rec.LN2), mask=seen)
+        tl.store(absgrad + 3 * row + 1, field_of(total, rec.ABS_Y) * (2 * rec.LN2), mask=seen)
+        tl.store(absgrad + 3 * row + 2, field_of(total, rec.SUM_WEIGHT), mask=seen)
 
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:
@@ -265,11 +265,11 @@ def blend_backward(
     ends: Tensor,
     outputs: tuple[Tensor, Tensor, Tensor],
     gradients: tuple[Tensor | None, Tensor | None, Tensor | None],
-    pixel_map: Tensor | None = None,
+    pixel_weights: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Moments ``[V, RECORD]`` of the splats in view; of all splats the gradient of the centres and what was observed.
+    """Moments ``[V, RECORD]`` of the splats in view; of all splats the gradients of the centres.
 
-    The gradient is ``[n, 2]``. Observed are Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · map ``[n, 3]``; None without a map.
+    Those are ``[n, 2]``, and with pixel weights Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · pixel weight ``[n, 3]``.
 
     Args:
         lens: As in :func:`blend`.
@@ -280,7 +280,7 @@ def blend_backward(
         ends: What :func:`blend` returned, as are ``outputs``: image, transmittance and depth.
         outputs: See ``ends``.
         gradients: Of image, alpha and depth, contiguous; None for those on which nothing depends.
-        pixel_map: Strength of each pixel ``[H, W]``, contiguous; None if nobody observes.
+        pixel_weights: Strength of each pixel ``[H, W]``, contiguous; None for no absolute gradients.
 
     Raises:
         ValueError: The tensors do not fit together.
@@ -296,26 +296,26 @@ def blend_backward(
         check_tensor(name, value, shape, records.device)
         if gradient is not None:
             check_tensor(f"gradient of {name}", gradient, shape, records.device)
-    with_map = pixel_map is not None
-    if pixel_map is not None:
-        check_tensor("pixel_map", pixel_map, size, records.device)
+    with_absgrad = pixel_weights is not None
+    if pixel_weights is not None:
+        check_tensor("pixel_weights", pixel_weights, size, records.device)
     image, transmittance, depth = outputs
     g_image, g_alpha, g_depth = gradients
     totals, g_means2d = torch.zeros_like(records), records.new_zeros(n, 2)
-    observed = records.new_zeros(n, 3) if with_map else None
+    absgrad = records.new_zeros(n, 3) if with_absgrad else None
     if len(ids):
-        sums = records.new_zeros(len(tiles.slots), (rec.OBSERVED_SLOT if with_map else rec.RECORD).value)
+        sums = records.new_zeros(len(tiles.slots), (rec.ABSGRAD_SLOT if with_absgrad else rec.RECORD).value)
         blend_backward_kernel[(columns * rows,)](
             records, tiles.ranks, tiles.slots, tiles.offsets, tiles.order, ends, image, transmittance, depth,
             torch.zeros_like(image) if g_image is None else g_image,
             # Placeholders that are never read stand in for missing gradients and a missing map.
-            *(depth if given is None else given for given in (g_alpha, g_depth, pixel_map)),
+            *(depth if given is None else given for given in (g_alpha, g_depth, pixel_weights)),
             sums, columns, lens.width, lens.height,
-            WITH_ALPHA=g_alpha is not None, WITH_DEPTH=g_depth is not None, WITH_MAP=with_map,
+            WITH_ALPHA=g_alpha is not None, WITH_DEPTH=g_depth is not None, WITH_ABSGRAD=with_absgrad,
             num_warps=1, **COMPILE,
         )  # fmt: skip
         total_kernel[(triton.cdiv(len(ids), SPLATS),)](
-            sums, tiles.ends, ids, records, totals, g_means2d, g_means2d if observed is None else observed, len(ids),
-            WITH_MAP=with_map, SPLATS=SPLATS, SLOTS=SLOTS, LANES=16, num_warps=2, **COMPILE,
+            sums, tiles.ends, ids, records, totals, g_means2d, g_means2d if absgrad is None else absgrad, len(ids),
+            WITH_ABSGRAD=with_absgrad, SPLATS=SPLATS, SLOTS=SLOTS, LANES=16, num_warps=2, **COMPILE,
         )  # fmt: skip
-    return totals, g_means2d, observed
+    return totals, g_means2d, absgrad

@@ -56,29 +56,29 @@ class _Blend(torch.autograd.Function):
         records: Tensor,
         boxes: Tensor,
         background: Tensor,
-        pixel_map: Tensor | None,
-        observed: Tensor | None,
+        pixel_weights: Tensor | None,
+        absgrad: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         tiles = list_tiles(boxes, *tile_grid(lens.width, lens.height))
         image, transmittance, depth, ends = blend(lens, records, tiles, background.contiguous())
         ctx.lens, ctx.n = lens, len(means2d)
-        ctx.save_for_backward(ids, records, ends, image, transmittance, depth, pixel_map, *tiles)
+        ctx.save_for_backward(ids, records, ends, image, transmittance, depth, pixel_weights, *tiles)
         ctx.set_materialize_grads(False)
         return image, 1 - transmittance, depth
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> Any:
-        ids, records, ends, image, transmittance, depth, pixel_map, *tiles = ctx.saved_tensors
+        ids, records, ends, image, transmittance, depth, pixel_weights, *tiles = ctx.saved_tensors
         from_image, from_alpha, from_depth = (None if g is None else g.contiguous() for g in gradients)
-        moments, g_means2d, g_observed = blend_backward(
+        moments, g_means2d, g_absgrad = blend_backward(
             ctx.lens, records, ids, ctx.n, Tiles(*tiles), ends, (image, transmittance, depth),
-            (from_image, from_alpha, from_depth), pixel_map,
+            (from_image, from_alpha, from_depth), pixel_weights,
         )  # fmt: skip
         g_background = None
         if ctx.needs_input_grad[5] and from_image is not None:
             g_background = (from_image * transmittance[..., None]).sum((0, 1))
-        return None, g_means2d, None, moments, None, g_background, None, g_observed
+        return None, g_means2d, None, moments, None, g_background, None, g_absgrad
 
 
 def render(
@@ -86,8 +86,8 @@ def render(
     camera: Camera,
     sh_degree: int,
     background: Tensor,
-    pixel_map: Tensor | None = None,
-    observed: Tensor | None = None,
+    pixel_weights: Tensor | None = None,
+    absgrad: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
 
@@ -97,7 +97,7 @@ def render(
     with torch.cuda.device_of(attributes[0]):
         lens = Lens.of(camera, attributes[0].device)
         means2d, radii, ids, records, boxes = _Project.apply(lens, sh_degree, *attributes)
-        image, alpha, depth = _Blend.apply(lens, means2d, ids, records, boxes, background, pixel_map, observed)
+        image, alpha, depth = _Blend.apply(lens, means2d, ids, records, boxes, background, pixel_weights, absgrad)
     return image, alpha, radii, means2d, depth
 
 

@@ -22,17 +22,17 @@ from nsvq_lightning.splats import conventions
 RECORD = tl.constexpr(12)
 # Floats used in a record or slot.
 FIELDS = tl.constexpr(10)
-# Stride between slots, in floats, if somebody observes the pass.
-OBSERVED_SLOT = tl.constexpr(16)
+# Stride between slots, in floats, with absolute gradients.
+ABSGRAD_SLOT = tl.constexpr(16)
 # Floats used in such a slot.
-OBSERVED_FIELDS = tl.constexpr(13)
+ABSGRAD_FIELDS = tl.constexpr(13)
 
 # Fields of a record.
 X, Y, A, B, C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH = (tl.constexpr(field) for field in range(10))
 
 # Fields of a slot: with h = α·dL/dα, sums over pixels of w·g (colour), h, h·u, h·v, h·u², h·u·v, h·v², w·g (depth) and,
-# if somebody observes the pass, |h·u|, |B·h·u + C·h·v|, w·map.
-SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_DEPTH, SUM_ABS_X, SUM_ABS_Y, SUM_MAP = (
+# with absolute gradients, |h·u|, |B·h·u + C·h·v|, w·pixel weight.
+SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_DEPTH, ABS_X, ABS_Y, SUM_WEIGHT = (
     tl.constexpr(field) for field in range(13)
 )
 
