@@ -19,7 +19,8 @@ from nsvq_lightning.training.precompile import compile_kernels
 
 
 def rendering() -> None:
-    """A training step without quantization, on photos of bytes and of floats."""
+    """A file without codebooks and back, then a training step on photos of bytes and of floats."""
+    compile_kernels({"codebooks": None})
     camera = front_camera()
     for photo in (torch.zeros(camera.height, camera.width, 3), torch.zeros(camera.height, camera.width, 3).byte()):
         splats = RawSplats(*(tensor.requires_grad_() for tensor in random_splats(200)))
@@ -32,7 +33,6 @@ def quantizing() -> None:
     for degree in (1, 3):
         for quantizer in (NSVQ, StraightThrough):
             compile_kernels({"sh_degree": degree, "quantizer": quantizer, "codebooks": dict.fromkeys(QUANTIZED, 300)})
-    compile_kernels({"codebooks": None})
 
 
 if __name__ == "__main__":
