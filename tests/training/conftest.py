@@ -24,7 +24,7 @@ from runs import (
 
 from nsvq_lightning.callbacks import OPTIONAL, STANDARD, DensityControl, MetricReport, RunCheckpoint, standard
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.report import figures, page
+from nsvq_lightning.report import files, page
 from nsvq_lightning.training.module import SplatModule
 
 STEPS = 60
@@ -37,14 +37,14 @@ DRAWN: list[bytes] = []
 @pytest.fixture(scope="module", autouse=True)
 def one_curve() -> Iterator[None]:
     """Draw one curve for all runs: each would take as long as its training. tests/report look at what it shows."""
-    draw = figures.figure_png
+    draw = files.figure_png
 
     def draw_once(figure: Any) -> bytes:
         DRAWN.extend([] if DRAWN else [draw(figure)])
         return DRAWN[0]
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (figures, page):
+        for module in (files, page):
             patch.setattr(module, "figure_png", draw_once)
         yield
 
