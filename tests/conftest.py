@@ -14,10 +14,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from demo_room import write_synthetic_scene
 from guards import guarded
+from small_demo import write_small_demo
 
 from nsvq_lightning.data.colmap import import_pycolmap
+
+pytest_plugins = ["run_fixtures"]
 
 FIRST = ("test_triton.py", "test_fit.py", "test_interruption.py", "test_view_parallel.py", "test_kernel_entries.py")
 """Files that take longest: one that starts last would be waited for."""
@@ -54,8 +56,8 @@ def ctrl_c() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-WHOLE_RUNS = {"benchmark", "sweep", "training"}
-"""Folders whose tests train: ``training/test_skips.py`` does so for all of them between guard words."""
+WHOLE_RUNS = {"benchmark", "sweep", "training", "runs"}
+"""Folders whose tests train: ``properties/runs/test_skips.py`` does so for all of them between guard words."""
 
 
 @pytest.fixture(autouse=True)
@@ -79,8 +81,8 @@ def shared_scenes() -> Path:
 
 @pytest.fixture(scope="session")
 def demo_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small ray-traced scene of 9 views, 96x72, rendered once; read-only."""
-    return write_synthetic_scene(tmp_path_factory.mktemp("demo") / "scene", views=9, width=96, height=72, points=500)
+    """A small scene of 9 views, 96x72, written once; read-only."""
+    return write_small_demo(tmp_path_factory.mktemp("demo") / "scene", views=9, width=96, height=72, points=500)
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ EXECUTED = ("info", "convert")
 """Commands that are quick enough to be run, not only parsed."""
 SLOW_OPTIONS = ("--floaters", "--measure", "--up")
 ELSEWHERE = ("nsvq_format",)
-"""Pages whose code has tests of its own: ``tests/io/nsvq/test_readers.py``."""
+"""Pages whose code has tests of its own: ``tests/properties/files/test_readers.py``."""
 
 
 class Block(NamedTuple):

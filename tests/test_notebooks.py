@@ -51,6 +51,7 @@ def test_quickstart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert scene.stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_own_quantizer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = run("own_quantizer", tmp_path, monkeypatch)
     results = found["results"]

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -51,23 +52,20 @@ def sh_colors(directions: Tensor, sh0: Tensor, shN: Tensor, degree: int) -> Tens
 def sh_rotation(rotation: Tensor, degree: int) -> Tensor:
     """The matrix ``[(degree + 1)² - 1]²`` that turns higher coefficients: ``matrix @ shN`` are those of turned splats.
 
-    Colours seen along ``rotation @ direction`` are then those that were seen along ``direction``. A band turns into
-    itself, so each has a block, and the constant coefficients stay. The basis itself says what the blocks are: they
-    solve basis(turned directions) · block = basis(directions), for more directions than there are functions.
+    Colours seen along ``rotation @ direction`` are then those that were seen along ``direction``. The basis is
+    orthonormal, so an element is the integral over the sphere of a basis function at turned directions times one at
+    the directions, and 4 · 8 directions of a Gauss-Legendre rule give it exactly. A band turns into itself.
 
     Args:
         rotation: From old to new world axes ``[3, 3]``, float64 for an exact result.
         degree: Of the spherical harmonics, 0 to 3.
     """
-    probes = 32  # directions, evenly spread: four for each function of the largest band
-    steps = torch.arange(probes, dtype=rotation.dtype, device=rotation.device)
-    height = (2 * steps + 1) / probes - 1
-    across, turn = (1 - height * height).sqrt(), math.pi * (3 - math.sqrt(5)) * steps
+    heights, shares = (torch.from_numpy(each).to(rotation) for each in np.polynomial.legendre.leggauss(4))
+    height, turn = torch.cartesian_prod(heights, torch.arange(8).to(rotation) * (math.pi / 4)).unbind(1)
+    across = (1 - height * height).sqrt()
     directions = torch.stack([across * turn.cos(), across * turn.sin(), height], 1)
-    before, after = sh_basis(directions, degree), sh_basis(directions @ rotation.T, degree)
-    bands = [slice(band * band, (band + 1) ** 2) for band in range(1, degree + 1)]
-    blocks = [torch.linalg.lstsq(after[:, band], before[:, band]).solution for band in bands]
-    turned = rotation.new_zeros(2 * (sh_coefficients(degree),))
-    for band, block in zip(bands, blocks, strict=True):
-        turned[band.start - 1 : band.stop - 1, band.start - 1 : band.stop - 1] = block
-    return turned
+    weights = shares.repeat_interleave(8) * (math.pi / 4)
+    before, after = sh_basis(directions, degree)[:, 1:], sh_basis(directions @ rotation.T, degree)[:, 1:]
+    turned = ((weights[:, None] * after)[:, :, None] * before[:, None, :]).sum(0)
+    band = torch.arange(1, (degree + 1) ** 2).sqrt().floor().to(turned)
+    return torch.where(band[:, None] == band, turned, 0.0)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from demo_room import write_synthetic_scene
+from small_demo import write_small_demo
 
 from nsvq_lightning.commands.arguments import check_config, expand, find_config
 from nsvq_lightning.commands.fit import SplatCLI
@@ -249,7 +249,7 @@ def test_predict_and_validate_take_a_checkpoint(
 def test_a_checkpoint_of_another_scene_is_refused_unless_allowed(
     finished: Path, demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = write_synthetic_scene(tmp_path / "garden", views=8, width=48, height=36, points=300)
+    other = write_small_demo(tmp_path / "garden", views=8, width=48, height=36, points=300)
     arguments = [f"--ckpt_path={finished / 'checkpoints' / 'last.ckpt'}", f"--data.root={other}"]
     arguments += [f"--trainer.default_root_dir={tmp_path}", "--callbacks.progress=null"]
     assert main(["validate", *arguments]) == 1

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import PIL.Image
 import pytest
-from demo_room import write_synthetic_scene
+from small_demo import write_small_demo
 
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.data import reconstruct
@@ -99,7 +99,7 @@ def test_a_model_whose_photos_are_all_in_a_larger_one_is_left_out() -> None:
 def test_cameras_are_found_and_a_killed_run_continues(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = write_synthetic_scene(tmp_path / "made", views=48, width=480, height=360, points=500)
+    made = write_small_demo(tmp_path / "made", views=40, width=480, height=360, points=500)
     photos, scene = tmp_path / "photos", tmp_path / "scene"
     photos.mkdir()
     for index in range(12):

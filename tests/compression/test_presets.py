@@ -202,7 +202,7 @@ def test_photos_train_the_codebooks_and_the_origin_stays(
     assert ("PSNR" in capsys.readouterr().out) == (steps > 0)
 
 
-@pytest.mark.parametrize("aim", ["--target-bytes", "--max-error"])
+@pytest.mark.parametrize("aim", ["--target-bytes", pytest.param("--max-error", marks=pytest.mark.slow)])
 def test_photos_keep_to_the_aim(
     aim: str,
     tmp_path: Path,

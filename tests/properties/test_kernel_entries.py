@@ -56,7 +56,7 @@ def makes_one():
     sys.modules.pop("nsvq_lightning.planted")
 
 
-@pytest.mark.parametrize("compiler", ["numba", "triton"])
+@pytest.mark.parametrize("compiler", ["numba", pytest.param("triton", marks=pytest.mark.slow)])
 def test_arrays_that_do_not_fit_are_refused_or_used_rightly(compiler: str) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     if compiler == "triton":

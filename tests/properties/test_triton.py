@@ -17,18 +17,19 @@ TESTS = Path(__file__).parents[1]
 
 
 CASES = (
-    "rendering/triton_cases.py",
-    "rendering/triton_loss_cases.py",
-    "quantize/triton_cases.py",
     "training/triton_step_cases.py",
+    *(
+        pytest.param(cases, marks=pytest.mark.slow)
+        for cases in ("rendering/triton_cases.py", "rendering/triton_loss_cases.py", "quantize/triton_cases.py")
+    ),
 )
 
 
-def test_against_the_oracle() -> None:
+@pytest.mark.parametrize("cases", CASES)
+def test_against_the_oracle(cases: str) -> None:
     pytest.importorskip("triton", reason="the CUDA back-end needs Triton")
     environment = dict(os.environ, **({} if torch.cuda.is_available() else {"TRITON_INTERPRET": "1"}))
-    files = [str(TESTS / cases) for cases in CASES]
-    command = [sys.executable, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider", *files]
+    command = [sys.executable, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider", str(TESTS / cases)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=1200)
     assert done.returncode == 0, done.stdout + done.stderr
 

@@ -236,11 +236,11 @@ def _mend_sog(data: bytes) -> bytes:
 
 
 def _build_colmap(folder: Path, suffix: str) -> list[Path]:
-    from demo_room import write_synthetic_scene
+    from small_demo import write_small_demo
 
     from nsvq_lightning.data.colmap import import_pycolmap
 
-    model = write_synthetic_scene(folder / "scene", views=3, width=16, height=12, points=8) / "sparse" / "0"
+    model = write_small_demo(folder / "scene", views=3, width=16, height=12, points=8) / "sparse" / "0"
     if suffix == ".txt":
         reconstruction = import_pycolmap().Reconstruction(str(model))
         for path in model.iterdir():
@@ -268,8 +268,9 @@ def _build_checkpoint(folder: Path) -> list[Path]:
     from nsvq_lightning.training.module import SplatModule
 
     path = folder / "small.ckpt"
-    version = {"pytorch-lightning_version": "2.6.6"}
-    torch.save({"state_dict": SplatModule(codebooks={}).state_dict(), "global_step": 3, **version}, path)
+    rest = {"pytorch-lightning_version": "2.6.6", "global_step": 3, "history": [], "schedule": {}}
+    state = SplatModule(codebooks={}).state_dict()
+    torch.save({"state_dict": state, "quantizer_settings": {}, **rest}, path)
     return [path]
 
 

@@ -1,5 +1,7 @@
-"""Readers of damaged files, see tests/support/fuzzing.py; ``NSVQ_FUZZ_CASES=10000 pytest tests/test_fuzz.py`` looks
-deeper."""
+"""Readers of damaged files, see tests/support/fuzzing.py.
+
+``NSVQ_FUZZ_CASES=10000 pytest tests/properties/files/test_fuzz.py`` looks deeper.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ pytestmark = pytest.mark.skipif(
     not Path("/proc/self/statm").exists(), reason="the memory of a case is limited in the way of Linux"
 )
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[3]
 CASES = {
     "ply": 100,
     "nsvq": 80,

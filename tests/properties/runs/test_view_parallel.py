@@ -30,7 +30,7 @@ pytestmark = pytest.mark.skipif(
     reason="this torch has no gloo, which several processes on the CPU need",
 )
 
-TESTS = Path(__file__).resolve().parents[1]
+TESTS = Path(__file__).resolve().parents[2]
 IN_QUANTIZE = 42
 """Iteration of a checkpoint between two replacements of codes."""
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 import torch
-from demo_room import write_synthetic_scene
 from lightning.pytorch import Callback, LightningModule, Trainer
+from small_demo import write_small_demo
 from torch import Tensor
 
 from nsvq_lightning.callbacks import DensityControl
@@ -53,7 +53,7 @@ def _numbers(trainer: Trainer, module: SplatModule) -> Iterator[tuple[str, Tenso
 @pytest.fixture(scope="module")
 def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """9 views that are trained at 32x24, 150 points."""
-    return write_synthetic_scene(tmp_path_factory.mktemp("tiny") / "scene", views=9, width=64, height=48, points=150)
+    return write_small_demo(tmp_path_factory.mktemp("tiny") / "scene", views=9, width=64, height=48, points=150)
 
 
 def _bad_splats(root: Path) -> Splats:

@@ -153,7 +153,7 @@ def test_post_hoc_stores_kmeans_of_the_final_rows(run: RunFactory, recipe: Recip
 
 
 def test_the_table_of_the_docs_is_complete() -> None:
-    path = Path(__file__).resolve().parents[2] / "docs" / "quantizers.md"
+    path = Path(__file__).resolve().parents[3] / "docs" / "quantizers.md"
     if not path.exists():
         pytest.skip("a source distribution has no docs")
     page = path.read_text()

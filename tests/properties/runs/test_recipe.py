@@ -27,6 +27,7 @@ from nsvq_lightning.callbacks import (
 )
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.io.formats import load
+from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.quantize.nearest import code_rates
 from nsvq_lightning.rendering.reference import rotation_matrices
@@ -209,10 +210,15 @@ def test_kmeans_gets_contributions_as_weights(run: RunFactory, recipe: Recipe) -
 def test_moments_of_replaced_codes_are_reset(
     reset: bool, run: RunFactory, recipe: Recipe, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Codes out of use for a window of 5 views are rare here: call every third one unused.
-    monkeypatch.setattr(
-        "nsvq_lightning.quantize.codebook.inactive_codes", lambda usage, *_: torch.arange(len(usage)) % 3 == 0
-    )
+    replace = CodebookQuantizer.replace_unused
+
+    def replace_a_third(quantizer: CodebookQuantizer, *args: Any, **kwargs: Any) -> torch.Tensor:
+        """Codes out of use for a window of 5 views are rare here: call every third one unused."""
+        quantizer.usage.fill_(quantizer.window)
+        quantizer.usage[::3] = 0
+        return replace(quantizer, *args, **kwargs)
+
+    monkeypatch.setattr(CodebookQuantizer, "replace_unused", replace_a_third)
     zero_rows: list[int] = []
 
     class Moments(Callback):
