@@ -57,7 +57,7 @@ def test_exposures_are_found(uneven_scene: Path, tmp_path: Path, caplog: pytest.
     assert changes.shape == (7, 3, 4)
     gains = 1 + (changes - changes.mean(0))[:, :, :3].diagonal(dim1=1, dim2=2).mean(1)
     found, true = gains.log2(), torch.tensor(STOPS[1:8])
-    assert float(torch.corrcoef(torch.stack([found, true]))[0, 1]) > 0.85
+    assert float(torch.corrcoef(torch.stack([found, true]))[0, 1]) > 0.8
     assert "exposures of the train photos: " in caplog.text
     assert module.loss_terms == {"photometric": module._photometric_term}
 

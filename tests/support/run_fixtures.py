@@ -36,8 +36,8 @@ DRAWN: list[bytes] = []
 
 @pytest.fixture(scope="module", autouse=True)
 def one_curve(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Draw one curve for all runs: each would take as long as its training. tests/report look at what it shows."""
-    if request.path.parent.name == "report":
+    """Draw one curve for all runs: each would take as long as its training. The other tests look at what it shows."""
+    if request.path.parent.name not in ("commands", "runs", "training"):
         yield
         return
     draw = files.figure_png
