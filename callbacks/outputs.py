@@ -15,7 +15,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import FORMATS, save
 from nsvq_lightning.io.nsvq.file import as_stored
 from nsvq_lightning.io.nsvq.precision import Storage
-from nsvq_lightning.report import pictures, viewer
+from nsvq_lightning.report import files, viewer
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 from nsvq_lightning.training.scene_access import scene_of
@@ -115,8 +115,8 @@ class RenderWriter(BasePredictionWriter):
         if is_fast_dev_run(trainer):
             return
         scene = scene_of(trainer)
-        stem = pictures.file_stem(prediction["name"], scene.names if scene is not None else ())
-        pictures.write_png(self._target / f"{stem}.png", prediction["image"])
+        stem = files.file_stem(prediction["name"], scene.names if scene is not None else ())
+        files.write_png(self._target / f"{stem}.png", prediction["image"])
 
     def on_predict_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Say where the pictures are."""

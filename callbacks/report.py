@@ -22,7 +22,7 @@ from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_bit, psnr
-from nsvq_lightning.report import files, page, pictures
+from nsvq_lightning.report import files, page
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
@@ -150,7 +150,7 @@ class MetricReport(WritingCallback):
 
         def show(image: Tensor, photo: Tensor) -> None:
             if self.pictures and trainer.is_global_zero:
-                pictures.write_png(folder / "preview.png", torch.cat([eight_bit(photo), image], dim=1))
+                files.write_png(folder / "preview.png", torch.cat([eight_bit(photo), image], dim=1))
 
         mean_psnr, mean_ssim = files.evaluate(
             lambda camera: module.render_splats(splats, camera).image, views, module.device, show
@@ -230,12 +230,12 @@ class MetricReport(WritingCallback):
         if self.pictures:
             path = self._picture(trainer, batch.name)
             path.parent.mkdir(exist_ok=True)
-            pictures.write_png(path, pictures.comparison(image, photo))
+            files.write_png(path, files.comparison(image, photo))
 
     def _picture(self, trainer: Trainer, view: str) -> Path:
         """File of the picture of a view."""
         scene = scene_of(trainer)
-        return self._folder / "renders" / f"{pictures.file_stem(view, scene.names if scene is not None else ())}.png"
+        return self._folder / "renders" / f"{files.file_stem(view, scene.names if scene is not None else ())}.png"
 
     def on_test_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Write the figures."""
@@ -255,7 +255,7 @@ class MetricReport(WritingCallback):
             written = page.write_page(folder, module.history, module.schedule, self._other_seconds(), metrics, views)
             log.info(f"report: {written}")
             if self.pictures:
-                pictures.log_pictures(trainer.loggers, paths, trainer.global_step)
+                files.log_pictures(trainer.loggers, paths, trainer.global_step)
         self._scene, self._lpips = None, None
 
 

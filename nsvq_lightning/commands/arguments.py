@@ -1,7 +1,5 @@
 """What commands take: lists, numbers, short options, configs, scenes; and what is said of wrong ones."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import re
@@ -242,7 +240,7 @@ def _limited(loader: Any) -> Any:
 
     compose = loader.get_single_node
 
-    def checked(self: object) -> Node | None:
+    def checked(self: object) -> "Node | None":
         node: Node | None = compose(self)
         if _values(node, {}) > _MOST_VALUES:
             raise yaml.YAMLError(f"more than {_MOST_VALUES} values by aliases (*name)")
@@ -252,7 +250,7 @@ def _limited(loader: Any) -> Any:
     return loader
 
 
-def _values(node: Node | None, known: dict[int, float]) -> float:
+def _values(node: "Node | None", known: dict[int, float]) -> float:
     """Number of values in a node of YAML with all its aliases written out; infinite for one that holds itself."""
     if node is None:
         return 0
@@ -313,7 +311,7 @@ def photos_of(path: Path) -> Path | None:
     return Path(root) if isinstance(root, str) and Path(root).is_dir() else None
 
 
-def cameras_of(path: Path) -> dict[str, Camera]:
+def cameras_of(path: Path) -> "dict[str, Camera]":
     """Cameras by name that the run has recorded that a scene lies in, for when its photos are gone; none without it.
 
     Raises:

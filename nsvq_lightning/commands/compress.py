@@ -13,8 +13,6 @@ Examples:
   nsvq compress scene.ply scene.nsvq --data.root photos --max-steps 3000     # codebooks trained with the photos
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import sys
@@ -123,7 +121,9 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _candidate(options: argparse.Namespace, scene: CompressedScene, cameras: list[Camera]) -> tuple[Candidate, int]:
+def _candidate(
+    options: argparse.Namespace, scene: "CompressedScene", cameras: "list[Camera]"
+) -> "tuple[Candidate, int]":
     """The scene as the options ask for it, and the number of pictures in which its error was measured."""
     from nsvq_lightning.compression import presets
 
@@ -138,7 +138,7 @@ def _candidate(options: argparse.Namespace, scene: CompressedScene, cameras: lis
     return candidate, len(compressor.cameras)
 
 
-def _train(options: argparse.Namespace, candidate: Candidate, folder: Path) -> int:
+def _train(options: argparse.Namespace, candidate: "Candidate", folder: Path) -> int:
     """Train the candidate's codebooks with photos: only the quantize and fine-tune phases, from the given splats.
 
     Returns:

@@ -10,8 +10,6 @@ Examples:
   nsvq convert scene.nsvq clean.nsvq --floaters --up z --data.root my/scene
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import sys
@@ -153,10 +151,10 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     splats = scene.decode().raw()
     look = partial(render, antialiased=scene.antialiased)
 
-    def views() -> Iterator[View]:
+    def views() -> "Iterator[View]":
         return (photos.view(index) for index in tqdm(photos.train, unit=" photos", mininterval=1))
 
-    def psnr(keep: torch.Tensor) -> float:
+    def psnr(keep: "torch.Tensor") -> float:
         kept = type(splats)(*(tensor[keep] for tensor in splats))
         tests = (photos.view(index) for index in photos.test)
         return evaluate(lambda camera: look(kept, camera).image, tests, torch.device("cpu"))[0]

@@ -8,14 +8,13 @@ Examples:
   nsvq doctor path/to/scene --json > doctor.json
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import logging
 import math
 import os
 import platform
+import re
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -27,6 +26,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
+
+from nsvq_lightning.data.scene import Scene
 
 # Each check imports what it needs: --help answers at once, and a package that is missing or broken fails only the
 # checks that need it.
@@ -73,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
     return 1 if problems else 0
 
 
-def check_all(folder: Path | None) -> Iterator[Finding]:
+def check_all(folder: Path | None) -> "Iterator[Finding]":
     """All findings about this machine and, if given, a scene folder."""
     checks = {"machine": check_machine(), "packages": check_packages(), "threads": check_threads()}
     checks |= {"memory": check_room(Path()), "self-test": check_backends()}
@@ -171,8 +172,6 @@ def check_threads() -> Iterator[Finding]:
 
 def check_room(folder: Path) -> Iterator[Finding]:
     """Memory for a run, and disk space for checkpoints, report and exports where runs are written."""
-    from nsvq_lightning.training.memory_estimate import available_memory, readable_bytes
-
     free, disk = available_memory(), shutil.disk_usage(folder).free
     text = "not told by this system" if free is None else f"{readable_bytes(free)} available"
     advice = "a usual run takes 2 to 4 GB; end programs, or try --data.max_width 800 --data.cache_bytes 500000000"
@@ -192,7 +191,7 @@ def check_backends() -> Iterator[Finding]:
     from nsvq_lightning.compute.kernel_cache import kernel_folder
     from nsvq_lightning.splats.splats import RawSplats
 
-    def results(workload: workloads.Workload, backend: str, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+    def results(workload: workloads.Workload, backend: str, dtype: "torch.dtype") -> "dict[str, torch.Tensor]":
         traced = render.trace(workload, render.painter(backend), dtype)
         return {"image": traced.image, **render.gradients_of(traced, workload.image_gradient.to(dtype))}
 
@@ -236,7 +235,7 @@ def check_model(root: Path) -> Iterator[Finding]:
     yield from attempt("scene", check_scene(root, model))
 
 
-def check_cameras(model: ColmapModel) -> Iterator[Finding]:
+def check_cameras(model: "ColmapModel") -> Iterator[Finding]:
     """Number, models and sizes of the cameras, and what distortion does to the corners."""
     cameras = [model.cameras[number] for number in {image.camera_id for image in model.images}]
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
@@ -251,7 +250,7 @@ def _range(sizes: Sequence[tuple[int, int]]) -> str:
     return " to ".join(f"{width}x{height}" for width, height in dict.fromkeys((min(sizes), max(sizes))))
 
 
-def check_points(model: ColmapModel) -> Iterator[Finding]:
+def check_points(model: "ColmapModel") -> Iterator[Finding]:
     """Number of points, and outliers."""
     count, finite = len(model.points), model.points[np.isfinite(model.points).all(1)]
     if not count:
@@ -271,7 +270,7 @@ def check_points(model: ColmapModel) -> Iterator[Finding]:
         yield judged("points", text, few, spread)
 
 
-def check_overlap(model: ColmapModel) -> Iterator[Finding]:
+def check_overlap(model: "ColmapModel") -> Iterator[Finding]:
     """Whether each view shares points with another, and all are connected."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
@@ -295,7 +294,7 @@ def check_overlap(model: ColmapModel) -> Iterator[Finding]:
     yield judged("overlap", text, apart, little)
 
 
-def check_scene(root: Path, model: ColmapModel) -> Iterator[Finding]:
+def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
     """Load the folder as a run does it, then check its split, its photos, and what a run will take."""
     from nsvq_lightning.data.scene import ONE_PLACE, load_scene
 
@@ -311,7 +310,7 @@ def check_scene(root: Path, model: ColmapModel) -> Iterator[Finding]:
     yield from attempt("run time", check_budget(scene))
 
 
-def check_sizes(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
+def check_sizes(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     """Whether files are of the size that the model says, and what becomes of those that lie on their side."""
     from nsvq_lightning.data.scene import OTHER_SHAPE, same_shape
 
@@ -328,7 +327,7 @@ def check_sizes(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
         yield judged("sizes", f"{text}are scaled from what {model.source} says, their cameras with them")
 
 
-def check_photos(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
+def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     """Decode all photos, in parallel: whether that works, how much masks exclude, and which are not in the model."""
     import torch
 
@@ -367,11 +366,10 @@ def check_photos(scene: Scene, model: ColmapModel) -> Iterator[Finding]:
         yield judged("registered", text, "they are not used; if many, photos lack overlap or sharpness")
 
 
-def check_budget(scene: Scene) -> Iterator[Finding]:
+def check_budget(scene: "Scene") -> Iterator[Finding]:
     """Memory against what is available; time from renders of the scene grown as two recipes grow it."""
     from nsvq_lightning.compression.budget import splats_for_photos
     from nsvq_lightning.data.scene import detailed_pixels
-    from nsvq_lightning.training.memory_estimate import CACHE_BYTES, available_memory, readable_bytes, run_bytes
 
     # Splats over a run, on average, as a multiple of the default for the photos.
     default = splats_for_photos(len(scene.train), detailed_pixels(scene))
@@ -390,7 +388,7 @@ def check_budget(scene: Scene) -> Iterator[Finding]:
     yield judged("run time", text)
 
 
-def render_seconds(scene: Scene, count: int) -> float:
+def render_seconds(scene: "Scene", count: int) -> float:
     """Median over views of the shortest time to render ``count`` splats forward and backward."""
     from nsvq_lightning.commands.benchmark.timing import milliseconds
     from nsvq_lightning.rendering.rasterize import render
@@ -404,7 +402,7 @@ def render_seconds(scene: Scene, count: int) -> float:
     return float(np.median([min(milliseconds(case) for _ in range(REPEATS)) for case in cases])) / 1000
 
 
-def grown(scene: Scene, count: int) -> Splats:
+def grown(scene: "Scene", count: int) -> "Splats":
     """The scene's points as splats, repeated with small shifts until there are ``count``, and shrunk to match."""
     import torch
 
@@ -421,3 +419,51 @@ def grown(scene: Scene, count: int) -> Splats:
     tensors["scales"] = tensors["scales"] - math.log(copies) / 2 + 0.5
     tensors["opacities"] = torch.randn(len(rows), generator=draw) - 0.5
     return Splats.from_tensors(**tensors)
+
+
+# Default of ``--data.cache_bytes``.
+CACHE_BYTES = 4 << 30
+
+
+def run_bytes(scene: "Scene", splats: int, cache_bytes: int = CACHE_BYTES) -> float:
+    """Most memory that a run on a CPU takes.
+
+    Args:
+        scene: What it is trained on.
+        splats: Most splats that it has at a time.
+        cache_bytes: Memory for decoded photos.
+    """
+    base = 1.2e9  # Python, torch, Lightning, compiled kernels and evaluations
+    a_splat = 59 * 4 * 6  # 59 float32, each with gradient, two moments, and copies while quantizing or editing
+    a_pixel = 100  # buffers of the renderer, the loss and the picture itself
+    pixels = max(camera.width * camera.height for camera in scene.cameras)
+    return base + min(scene.images.nbytes, cache_bytes) + a_splat * splats + a_pixel * pixels
+
+
+def readable_bytes(count: float) -> str:
+    """A number of bytes in readable form."""
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
+
+
+def available_memory() -> int | None:
+    """Bytes that this process may still allocate: of the machine, or of its control group if less."""
+    limits = [_machine_available(), _group_available()]
+    return min((limit for limit in limits if limit is not None), default=None)
+
+
+def _machine_available() -> int | None:
+    try:
+        found = re.search(r"^MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text(encoding="ascii"), re.MULTILINE)
+    except OSError:
+        return None
+    return 1024 * int(found[1]) if found else None
+
+
+def _group_available() -> int | None:
+    """What the container may still allocate; its usage includes page cache, which is reclaimable."""
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit, used = ((group / name).read_text(encoding="ascii").strip() for name in ("memory.max", "memory.current"))
+        return None if limit == "max" else max(0, int(limit) - int(used))
+    except (OSError, ValueError):
+        return None

@@ -9,8 +9,6 @@ Examples:
   nsvq prepare walk.mp4 scenes/garden --frames 200
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import shutil
@@ -129,7 +127,7 @@ def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
     write_text(path, json.dumps(record, indent=2) + "\n")
 
 
-def _told(verdict: Verdict, images: Path) -> Iterator[str]:
+def _told(verdict: "Verdict", images: Path) -> Iterator[str]:
     """What came out, and what to take again."""
     from nsvq_lightning.data.frames import sharpness
     from nsvq_lightning.data.images import read_image

@@ -10,8 +10,6 @@ Examples:
   nsvq render scene.nsvq --data.root scenes/fox --path cameras -o frames/
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import math
@@ -84,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
 
     from nsvq_lightning.io.formats import read_scene
     from nsvq_lightning.rendering.rasterize import render
-    from nsvq_lightning.report.pictures import VIDEO
+    from nsvq_lightning.report.files import VIDEO
 
     file = scene_file(options.scene)
     output = options.output or file.with_name("render.mp4")
@@ -108,7 +106,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _path(options: argparse.Namespace, splats: Splats, is_video: bool) -> tuple[list[Camera], float]:
+def _path(options: argparse.Namespace, splats: "Splats", is_video: bool) -> "tuple[list[Camera], float]":
     """The cameras and frames per second that the options ask for."""
     from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.data.scene import load_scene
@@ -147,9 +145,9 @@ def _path(options: argparse.Namespace, splats: Splats, is_video: bool) -> tuple[
 
 
 @contextmanager
-def _writer(path: Path, width: int, height: int, fps: float) -> Iterator[Callable[[int, Tensor], object]]:
+def _writer(path: Path, width: int, height: int, fps: float) -> "Iterator[Callable[[int, Tensor], object]]":
     """A function that writes the picture ``[H, W, 3]`` of a frame."""
-    from nsvq_lightning.report.pictures import as_bytes, video_writer, write_png
+    from nsvq_lightning.report.files import as_bytes, video_writer, write_png
 
     if path.suffix:
         path.parent.mkdir(parents=True, exist_ok=True)

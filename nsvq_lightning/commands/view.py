@@ -7,8 +7,6 @@ Examples:
   nsvq view scene.nsvq -o scene.html            one file to send to somebody, no server
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile
@@ -104,7 +102,7 @@ def _nsvq_file(options: argparse.Namespace) -> Iterator[Path]:
         yield made
 
 
-def _cameras(options: argparse.Namespace, file: Path) -> dict[str, Camera]:
+def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     """Cameras of the photos, or guessed ones."""
     from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.data.scene import load_scene

@@ -1,7 +1,5 @@
 """A scene: registered views with pinhole cameras, sparse points, the split into train and test, and photos' detail."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -44,7 +42,7 @@ class View:
     image: Tensor
     mask: Tensor | None = None
 
-    def to(self, device: torch.device | str, **kwargs: object) -> View:
+    def to(self, device: torch.device | str, **kwargs: object) -> "View":
         """The view with its photo on another device, or itself if that is there already; Lightning moves batches by it.
 
         The camera stays: kernels take its numbers from the host.

@@ -1,7 +1,5 @@
 """Turns any of COLMAP's camera models into a pinhole camera and its images into pinhole images."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -40,7 +38,7 @@ class Pinhole:
     width: int
     height: int
 
-    def resized(self, width: int, height: int) -> Pinhole:
+    def resized(self, width: int, height: int) -> "Pinhole":
         """The camera of the image scaled to another size; with centres at .5 the whole of ``K`` scales linearly."""
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return Pinhole(scale @ self.K, width, height)

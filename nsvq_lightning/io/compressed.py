@@ -1,7 +1,5 @@
 """A scene as files hold it, some of whose attributes are codes; it is turned and cropped without decoding these."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -76,7 +74,7 @@ class CompressedScene:
             _check_codes(name, codes, self.codebooks[name], n, dims[name])
 
     @classmethod
-    def from_splats(cls, splats: SplatTensors, **header: Any) -> CompressedScene:
+    def from_splats(cls, splats: "SplatTensors", **header: Any) -> "CompressedScene":
         """A copy of splats, on any device, without any codebook: valid, but not compressed.
 
         Args:
@@ -122,7 +120,7 @@ class CompressedScene:
             values = (self.raw[name] if name in self.raw else getattr(self, name))[rows]
         return values.reshape(len(values), *splat.attribute_shapes(self.sh_degree)[name])
 
-    def decode(self) -> Splats:
+    def decode(self) -> "Splats":
         """The decoded scene as :class:`nsvq_lightning.Splats`.
 
         Positions stay relative to ``origin``: adding a large origin in float32 would lose the detail that
@@ -161,7 +159,7 @@ class CompressedScene:
         values = function(self.table(name)[0], self.uses(name))
         return values if name in self.raw else values[self.codes[name]]
 
-    def take(self, splats: NDArray[np.integer] | NDArray[np.bool_]) -> CompressedScene:
+    def take(self, splats: NDArray[np.integer] | NDArray[np.bool_]) -> "CompressedScene":
         """The scene of some of the splats, by index or by mask ``[N]``; codebooks stay as they are."""
         return replace(
             self,
@@ -172,7 +170,7 @@ class CompressedScene:
             stored_bytes=None,
         )
 
-    def in_use(self) -> CompressedScene:
+    def in_use(self) -> "CompressedScene":
         """The same splats, with codebooks of only the rows that they use; without splats, of the first one."""
         rows = {name: np.unique(codes, return_inverse=True) for name, codes in self.codes.items()}
         return replace(
@@ -187,7 +185,7 @@ class CompressedScene:
         flags = {name: flags.astype(np.float32)[self.codes[name]] for name, flags in bad.items()}
         return splat.finite_rows({"means": self.means, "opacities": self.opacities, **self.raw, **flags})
 
-    def finite(self) -> CompressedScene:
+    def finite(self) -> "CompressedScene":
         """The splats without NaN or infinite values; a warning counts the others by attribute."""
         keep, culprits = self.finite_rows()
         if not culprits:

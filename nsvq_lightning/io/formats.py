@@ -1,7 +1,5 @@
 """Load, save and convert scenes; the file's suffix selects the format."""
 
-from __future__ import annotations
-
 import logging
 import os
 from collections.abc import Callable
@@ -41,7 +39,7 @@ class Format:
     in_order: Callable[[CompressedScene], CompressedScene] | None = None
 
 
-def load(path: str | os.PathLike[str]) -> Splats:
+def load(path: str | os.PathLike[str]) -> "Splats":
     """Load a scene of any supported format.
 
     Args:
@@ -67,7 +65,7 @@ def read_scene(path: str | os.PathLike[str]) -> CompressedScene:
 
 
 def save(
-    scene: SplatTensors | CompressedScene,
+    scene: "SplatTensors | CompressedScene",
     path: str | os.PathLike[str],
     storage: Storage | None = None,
     **options: Any,

@@ -1,7 +1,5 @@
 """The ``.ply`` of 3D Gaussian Splatting, which every viewer reads (Kerbl et al. 2023, the authors' layout)."""
 
-from __future__ import annotations
-
 import math
 import os
 import re
@@ -43,7 +41,7 @@ class PlyHeader:
     offset: int
     lines: int
     antialiased: bool = False
-    others: Mapping[str, PlyHeader] = field(default_factory=dict)
+    others: "Mapping[str, PlyHeader]" = field(default_factory=dict)
 
     @property
     def packed(self) -> bool:

@@ -1,7 +1,5 @@
 """The scene: six raw attributes of N Gaussian splats."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -94,7 +92,7 @@ class Splats(nn.Module):
     @classmethod
     def from_tensors(
         cls, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor
-    ) -> Splats:
+    ) -> "Splats":
         """Splats from raw attributes.
 
         Args:
@@ -116,7 +114,7 @@ class Splats(nn.Module):
         return splats
 
     @classmethod
-    def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3) -> Splats:
+    def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3) -> "Splats":
         """One isotropic splat per point, as 3D Gaussian Splatting starts from a COLMAP model.
 
         Opacity 0.1, no rotation, log-scale ½·log of the mean squared distance to the three nearest neighbours (clamped

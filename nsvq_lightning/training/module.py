@@ -19,7 +19,8 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, visible
 from nsvq_lightning.splats.splats import RawSplats, Splats
-from nsvq_lightning.training import optim, resume, scene_access, stopwatch
+from nsvq_lightning.training import optim, resume, scene_access
+from nsvq_lightning.training.scene_module import Stopwatch
 from nsvq_lightning.training.schedule import Phase, Schedule
 
 log = logging.getLogger(__name__)
@@ -99,7 +100,7 @@ class SplatModule(resume.ResumedModule):
         self.phase = Phase.WARMUP
         self.active_sh_degree = 0 if splats is None else splats.sh_degree
         self.extent = 0.0
-        self.stopwatch = stopwatch.Stopwatch()
+        self.stopwatch = Stopwatch()
         self.schedule = Schedule()
         self.loss_terms: dict[str, LossTerm] = {"photometric": self._photometric_term}
         """Terms of the loss by name; callbacks add some, or wrap the first."""

@@ -1,7 +1,5 @@
 """One Adam with a named parameter group per attribute and codebook, and the position's learning rate."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -53,7 +51,7 @@ class LearningRates:
                     f"rate {field.name} must be finite and {'above' if positive else 'at least'} 0, got {value}"
                 )
 
-    def of_step(self, views: int) -> LearningRates:
+    def of_step(self, views: int) -> "LearningRates":
         """The rates for a step of ``views`` views, with nothing left to scale."""
         factor = math.sqrt(views) if self.scale_with_views else 1.0
         scaled = {name: factor * getattr(self, name) for name in (*ATTRIBUTES, "means_final")}

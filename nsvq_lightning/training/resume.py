@@ -22,9 +22,8 @@ from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.splats.splats import sh_degree_of
 from nsvq_lightning.training.scene_access import scene_of
-from nsvq_lightning.training.scene_module import SceneModule
+from nsvq_lightning.training.scene_module import SceneModule, Stopwatch
 from nsvq_lightning.training.schedule import Phase, Schedule
-from nsvq_lightning.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 

@@ -1,7 +1,9 @@
 """The part of the Lightning module that knows what a file would hold: it renders, measures and stores that."""
 
 import logging
-from collections.abc import Mapping
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from typing import Any, cast
 
@@ -10,6 +12,7 @@ from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
 from nsvq_lightning.compression.stored import to_compressed
+from nsvq_lightning.compute.jit import compile_seconds
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.precision import Storage
@@ -150,3 +153,47 @@ class SceneModule(LightningModule):
     def predict_step(self, batch: View, batch_idx: int) -> dict[str, Any]:
         """Render one view: ``name`` and ``image [H, W, 3]`` (8-bit values in [0, 1])."""
         return {"name": batch.name, "image": self._evaluated_image(batch.camera)}
+
+
+class Stopwatch:
+    """Adds the time between two laps to :attr:`seconds`, without pauses and the compilation of kernels."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        """Seconds spent training, over all resumed parts of the run."""
+        self._since: float | None = None
+
+    def start(self) -> None:
+        """Start counting now; earlier time is forgotten."""
+        self._since = _working_time()
+
+    def lap(self) -> None:
+        """Add the time since the last lap; does nothing if the watch is not running."""
+        if self._since is not None:
+            now = _working_time()
+            self.seconds += now - self._since
+            self._since = now
+
+    def stop(self) -> None:
+        """Add the time since the last lap and stop."""
+        self.lap()
+        self._since = None
+
+    @contextmanager
+    def paused(self, device: torch.device) -> Iterator[None]:
+        """Leave out the time of the body. Work already queued on ``device`` still counts as training."""
+        running = self._since is not None
+        if running:
+            torch.get_device_module(device).synchronize()
+            self.stop()
+        try:
+            yield
+        finally:
+            if running:
+                torch.get_device_module(device).synchronize()
+                self.start()
+
+
+def _working_time() -> float:
+    """Seconds on a clock that stops while kernels are compiled."""
+    return time.perf_counter() - compile_seconds()

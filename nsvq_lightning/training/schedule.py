@@ -4,8 +4,6 @@ Only this module decides what scales. Every other part of the package uses the p
 iterations) and asks the :class:`Schedule` for the numbers of this run.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import IntEnum

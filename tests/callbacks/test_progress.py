@@ -20,7 +20,7 @@ from nsvq_lightning.callbacks.progress import SplatProgressBar
 from nsvq_lightning.compute import jit
 from nsvq_lightning.compute.jit import compile_seconds, compile_watcher
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.stopwatch import Stopwatch
+from nsvq_lightning.training.scene_module import Stopwatch
 
 
 def compiled() -> Callable[[float], float]:
@@ -53,8 +53,8 @@ def test_the_clock_counts_compilation_and_tells_those_who_watch() -> None:
 
 def test_training_time_leaves_compilation_out(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0, 0.0]
-    monkeypatch.setattr("nsvq_lightning.training.stopwatch.time.perf_counter", lambda: now[0])
-    monkeypatch.setattr("nsvq_lightning.training.stopwatch.compile_seconds", lambda: now[1])
+    monkeypatch.setattr("nsvq_lightning.training.scene_module.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("nsvq_lightning.training.scene_module.compile_seconds", lambda: now[1])
     watch = Stopwatch()
     watch.start()
     now[:] = [100.0, 93.0]

@@ -22,7 +22,6 @@ from nsvq_lightning.compute import environment, jit
 from nsvq_lightning.data.colmap import import_pycolmap, read_model
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.rendering.rasterize import Render, render
-from nsvq_lightning.training import memory_estimate
 
 GOOD = Finding("good", "run time", "not measured")
 
@@ -114,7 +113,7 @@ def test_one_opencv_of_any_name_is_wanted(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_little_memory_and_disk_are_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory_estimate, "available_memory", lambda: 10**9)
+    monkeypatch.setattr(doctor, "available_memory", lambda: 10**9)
     monkeypatch.setattr(doctor, "SMALL_DISK", 1 << 70)
     assert [finding.verdict for finding in doctor.check_room(tmp_path)] == ["note", "note"]
 
@@ -153,7 +152,7 @@ def test_the_estimate_of_a_run_is_measured(demo_scene: Path, monkeypatch: pytest
     found = re.search(r"about (\d+) min .* ([\d.]+) h for the paper", time.text)
     assert found is not None
     assert 1 < int(found[1]) / 60 < float(found[2])
-    monkeypatch.setattr(memory_estimate, "available_memory", lambda: 10**9)
+    monkeypatch.setattr(doctor, "available_memory", lambda: 10**9)
     assert "max_width" in next(doctor.check_budget(scene)).text
 
 

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from nsvq_lightning.report.files import curve_figure
+from nsvq_lightning.report.files import comparison, curve_figure, write_png
 from nsvq_lightning.report.page import write_page
-from nsvq_lightning.report.pictures import comparison, write_png
 from nsvq_lightning.training.schedule import Schedule
 
 SCHEDULE = Schedule(total=450)

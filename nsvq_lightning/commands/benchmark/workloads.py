@@ -1,7 +1,5 @@
 """Synthetic scenes with the statistics of captured ones, always the same for a name; and scenes of the user."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 
@@ -36,7 +34,7 @@ class Workload:
     background: Tensor
     image_gradient: Tensor
 
-    def crop(self, width: int, height: int) -> Workload:
+    def crop(self, width: int, height: int) -> "Workload":
         """The middle ``width`` x ``height`` pixels of the view, with the splats and the depth they have there.
 
         The pixels are not quite the same: the projection of splats outside a margin around the view is clamped.
@@ -48,7 +46,7 @@ class Workload:
         gradient = self.image_gradient[top : top + height, left : left + width].contiguous()
         return replace(self, camera=Camera(K, self.camera.viewmat, width, height), image_gradient=gradient)
 
-    def to(self, device: torch.device | str) -> Workload:
+    def to(self, device: torch.device | str) -> "Workload":
         """The workload with its splats, background and gradient on a device; the camera stays where it is."""
         splats = RawSplats(*(tensor.to(device) for tensor in self.splats))
         background, image_gradient = self.background.to(device), self.image_gradient.to(device)

@@ -8,8 +8,6 @@ Examples:
   nsvq sweep --scenes fox,horns --configs paper,plain,own.yaml --output sweeps/own
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import logging
@@ -116,7 +114,7 @@ def run_subprocess(arguments: Sequence[str], log: Path) -> int:
 CHECKPOINT = Path("checkpoints", "last.ckpt")
 
 
-def prepare(folder: Path, settings: Settings) -> list[str]:
+def prepare(folder: Path, settings: "Settings") -> list[str]:
     """Make the folder of a training ready and write its settings there.
 
     Args:
@@ -146,7 +144,7 @@ def prepare(folder: Path, settings: Settings) -> list[str]:
     return [*arguments, f"--ckpt_path={folder / CHECKPOINT}"] if begun else arguments
 
 
-def train(folder: Path, settings: Settings) -> str:
+def train(folder: Path, settings: "Settings") -> str:
     """Train, from the checkpoint in the folder if there is one.
 
     Returns:
@@ -168,12 +166,12 @@ def train(folder: Path, settings: Settings) -> str:
     return f"{(errors or lines or [f'exit status {status}'])[-1]} (see {said})"
 
 
-def folder_of(output: Path, run: Run) -> Path:
+def folder_of(output: Path, run: "Run") -> Path:
     """Folder of a run, named after its digest: no other run writes there. The title is that of the first."""
     return next((output / "runs").glob(f"*-{run.digest}"), output / "runs" / f"{run.title}-{run.digest}")
 
 
-def commands(output: Path, runs: Sequence[Run]) -> Iterator[str]:
+def commands(output: Path, runs: "Sequence[Run]") -> Iterator[str]:
     """A line for a shell in any folder for each run that is neither finished nor being trained."""
     for run in runs:
         folder = folder_of(output.absolute(), run)
@@ -184,7 +182,7 @@ def commands(output: Path, runs: Sequence[Run]) -> Iterator[str]:
                 log.info("%s", error)
 
 
-def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> list[Row]:
+def sweep(output: Path, runs: "Sequence[Run]", keep_checkpoints: bool = False) -> "list[Row]":
     """Train what is not finished yet; a run that fails does not keep the others from theirs.
 
     The tables are written anew after each run, so they are complete whenever this is interrupted.

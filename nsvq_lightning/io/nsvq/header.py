@@ -6,8 +6,6 @@ Nothing in the file is executable, and every length is checked against the avail
 add storage kinds of attributes, stream names and stream encodings; the frame stays the same.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -101,7 +99,7 @@ class Header:
         level: str,
         attributes: tuple[AttributeEntry, ...],
         streams: tuple[StreamEntry, ...],
-    ) -> Header:
+    ) -> "Header":
         """Header of the file of a scene."""
         x, y, z = map(float, scene.origin)
         told = dict(scene.config), dict(scene.metrics)
@@ -138,7 +136,7 @@ class Header:
             raise ValueError(f"config and metrics must hold plain JSON values only: {error}") from None
 
     @classmethod
-    def from_json(cls, text: bytes) -> Header:
+    def from_json(cls, text: bytes) -> "Header":
         """Header from its JSON text.
 
         Raises:

@@ -1,7 +1,5 @@
 """How a scene is stored: at which level, and how exactly."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -88,6 +86,6 @@ class Storage:
             raise ValueError(f"unknown compression level {self.level!r}; there are {', '.join(LEVELS)}")
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Storage:
+    def from_dict(cls, values: Mapping[str, Any]) -> "Storage":
         """The settings from plain data, as stored in a checkpoint."""
         return cls(values["level"], Precision(**values["precision"]))
