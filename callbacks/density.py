@@ -19,7 +19,7 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training import distributed, row_ops, scene_access
+from nsvq_lightning.training import distributed, row_ops, scene_module
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
@@ -101,7 +101,7 @@ class Densification(SplatCallback, ABC):
         if count > limit and module.phase > Phase.PRUNE:
             log.warning(f"{self.limit_name}={limit} comes too late for {count} splats with codebooks; all are kept")
         elif count > limit:
-            kept = most_contributing(scene_access.train_contributions(trainer, module), limit)
+            kept = most_contributing(scene_module.train_contributions(trainer, module), limit)
             row_ops.keep_rows(module.splats, trainer.optimizers[0], kept)
             distributed.check_replicas(trainer, "the limit of splats")
             log.info("kept %d of %d splats, those that contribute most to the train views", limit, count)

@@ -9,7 +9,7 @@ from lightning.pytorch import Trainer
 
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.rendering.rasterize import Render
-from nsvq_lightning.training import distributed, scene_access
+from nsvq_lightning.training import distributed, scene_module
 from nsvq_lightning.training.module import LossTerm, SplatModule
 
 from .base import SplatCallback
@@ -61,7 +61,7 @@ class ExposureCompensation(SplatCallback):
         Raises:
             ValueError: The trainer has no data module with a scene, or the checkpoint is of another number of photos.
         """
-        scene = scene_access.needed_scene(
+        scene = scene_module.needed_scene(
             trainer, "exposures are those of the train photos", "leave out ExposureCompensation"
         )
         self._row = {view: row for row, view in enumerate(scene.train)}

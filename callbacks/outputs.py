@@ -18,7 +18,7 @@ from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.report import files, viewer
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
-from nsvq_lightning.training.scene_access import scene_of
+from nsvq_lightning.training.scene_module import scene_of
 
 from .base import WritingCallback
 

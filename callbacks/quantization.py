@@ -15,11 +15,11 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.quantize import attributes
-from nsvq_lightning.quantize.base import Quantizer, held_codes
+from nsvq_lightning.quantize.codebook import Quantizer, held_codes
 from nsvq_lightning.quantize.nearest import cheapest, code_rates
 from nsvq_lightning.random import generator
-from nsvq_lightning.splats.canonical_covariance import canonical
-from nsvq_lightning.training import distributed, optim, row_ops, scene_access
+from nsvq_lightning.splats.splats import canonical
+from nsvq_lightning.training import distributed, optim, row_ops, scene_module
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
@@ -33,7 +33,7 @@ class CanonicalCovariance(SplatCallback):
     """After the last iteration before the quantize phase, gives like covariances like scales and rotations.
 
     Of the 48 equivalent pairs of scale and rotation that a covariance has, each splat takes one
-    (:mod:`nsvq_lightning.splats.canonical_covariance`), so that k-means groups them; renderings do not change. The form
+    (:mod:`nsvq_lightning.splats.splats`), so that k-means groups them; renderings do not change. The form
     is not enforced afterwards: rows move continuously and keep their codes, while a row that jumped to another
     equivalent pair would lose its code.
 
@@ -111,7 +111,7 @@ class CodebookInit(SplatCallback):
             return
         keep_finite_splats(trainer, module)
         weights = (
-            row_weights(scene_access.train_contributions(trainer, module)) if self.weights == "contribution" else None
+            row_weights(scene_module.train_contributions(trainer, module)) if self.weights == "contribution" else None
         )
         for name, quantizer in module.quantizers.items():
             if trainer.is_global_zero:
@@ -373,7 +373,7 @@ class RateDistortion(SplatCallback):
         return all(len(price) == len(module.splats) for price in (self.prices or {}).values())
 
     def _measure(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
-        scene = scene_access.needed_scene(
+        scene = scene_module.needed_scene(
             trainer, "codes are to be chosen by what shows in the train views", "leave RateDistortion out"
         )
         taking_part = [name for name, q in module.quantizers.items() if hasattr(q, "hold")]

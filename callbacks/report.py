@@ -26,7 +26,7 @@ from nsvq_lightning.report import files, page
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
-from nsvq_lightning.training.scene_access import scene_of
+from nsvq_lightning.training.scene_module import scene_of
 
 from .base import WritingCallback
 

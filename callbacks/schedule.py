@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields
 from lightning.pytorch import Trainer
 
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.training import scene_access
+from nsvq_lightning.training import scene_module
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 
@@ -84,7 +84,7 @@ class PhaseSchedule(SplatCallback):
             return
         if self.iterations_per_photo is not None and self.total is None:
             need = "a number of iterations for each photo needs the photos"
-            photos = len(scene_access.needed_scene(trainer, need, "leave iterations_per_photo unset").train)
+            photos = len(scene_module.needed_scene(trainer, need, "leave iterations_per_photo unset").train)
             limit = self.iterations_per_photo * photos
             if not 0 < trainer.max_steps <= limit:
                 trainer.fit_loop.epoch_loop.max_steps = limit

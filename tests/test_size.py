@@ -14,15 +14,15 @@ PACKAGE = Path(nsvq_lightning.__file__).parent
 ROOT = PACKAGE.parent
 # To be lowered with what the code loses, never raised.
 LIMITS = {
-    "code lines": 17_950,
-    "files": 180,
-    "files under 60 lines": 25,
-    "lines before the first definition": 3_640,
-    "private functions used once": 250,
+    "code lines": 16_850,
+    "files": 150,
+    "files under 60 lines": 15,
+    "lines before the first definition": 3_000,
+    "private functions used once": 215,
     "lines of README.md": 100,
     "lines of the longest config": 25,
-    "commands, per cent of the code": 18,
-    "training/module.py": 270,
+    "commands, per cent of the code": 17,
+    "training/module.py": 260,
     "files of callbacks": 14,
 }
 NO_CODE = {

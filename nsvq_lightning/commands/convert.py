@@ -142,7 +142,7 @@ def _up(options: argparse.Namespace) -> NDArray[np.float64]:
 def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     import torch
 
-    from nsvq_lightning.compression.floaters import floaters
+    from nsvq_lightning.compression.importance import floaters
     from nsvq_lightning.data.scene import load_scene
     from nsvq_lightning.rendering.rasterize import render
     from nsvq_lightning.report.files import evaluate

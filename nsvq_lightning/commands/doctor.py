@@ -38,11 +38,8 @@ if TYPE_CHECKING:
     from nsvq_lightning.data.scene import Scene
     from nsvq_lightning.splats.splats import Splats
 
-OPENCV = "opencv-contrib-python-headless"
 # Bytes; less may not hold checkpoints and report.
 SMALL_DISK = 2 << 30
-# Views that are rendered for the time of a run, each as often.
-REPEATS = 3
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -135,6 +132,9 @@ def check_machine() -> Iterator[Finding]:
     alone = facts["machine"]["gpu"] is None and f"torch finds no GPU: {advice}"
     yield judged("machine", timing.listed(facts["machine"]), alone)
     yield judged("versions", timing.listed(facts["versions"]))
+
+
+OPENCV = "opencv-contrib-python-headless"
 
 
 def check_packages() -> Iterator[Finding]:
@@ -331,7 +331,7 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     """Decode all photos, in parallel: whether that works, how much masks exclude, and which are not in the model."""
     import torch
 
-    from nsvq_lightning.data.frames import PHOTOS
+    from nsvq_lightning.data.reconstruct import PHOTOS
 
     def read(index: int) -> float | str:
         """The share of a photo that counts, or why it cannot be used."""
@@ -368,7 +368,7 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
 
 def check_budget(scene: "Scene") -> Iterator[Finding]:
     """Memory against what is available; time from renders of the scene grown as two recipes grow it."""
-    from nsvq_lightning.compression.budget import splats_for_photos
+    from nsvq_lightning.callbacks.growth import splats_for_photos
     from nsvq_lightning.data.scene import detailed_pixels
 
     # Splats over a run, on average, as a multiple of the default for the photos.
@@ -386,6 +386,10 @@ def check_budget(scene: "Scene") -> Iterator[Finding]:
     text = f"about {4000 * step / 60:.0f} min for fast.yaml (4,000 steps, {fast:,} splats on average), "
     text += f"{45_000 * paper_step / 3600:.1f} h for the paper's run (45,000, {paper:,}), on a machine as busy as now"
     yield judged("run time", text)
+
+
+# Views that are rendered for the time of a run, each as often.
+REPEATS = 3
 
 
 def render_seconds(scene: "Scene", count: int) -> float:

@@ -50,15 +50,14 @@ def run(options: argparse.Namespace) -> int:
         OSError: There are none, or a file cannot be read or written.
     """
     from nsvq_lightning.commands.doctor import check_folder
-    from nsvq_lightning.data import frames
-    from nsvq_lightning.data.reconstruct import reconstruct
+    from nsvq_lightning.data import reconstruct
 
     source, scene = options.source, options.scene
     if not source.exists():
         raise FileNotFoundError(f"{source}: no such file or folder of photos")
-    is_video = source.is_file() and source.suffix.lower() in frames.VIDEOS
+    is_video = source.is_file() and source.suffix.lower() in reconstruct.VIDEOS
     if source.is_file() and not is_video:
-        raise ValueError(f"{source}: neither a folder of photos nor a video ({', '.join(frames.VIDEOS)})")
+        raise ValueError(f"{source}: neither a folder of photos nor a video ({', '.join(reconstruct.VIDEOS)})")
     images = scene / "images"
     in_place = source.resolve() == images.resolve()
     _claim(options, is_video, in_place)
@@ -75,19 +74,19 @@ def run(options: argparse.Namespace) -> int:
     if is_video and not (any(images.iterdir()) and (scene / "database.db").exists()):
         for old in images.iterdir():
             old.unlink()
-        total = frames.frame_count(source)
+        total = reconstruct.frame_count(source)
         show = partial(report, "choosing frames", total=total)
-        chosen = frames.write_frames(source, images, options.frames, show)
+        chosen = reconstruct.write_frames(source, images, options.frames, show)
         sys.stdout.write(f"{len(chosen)} sharp frames of {total:,}\n")
     elif not (is_video or in_place):
-        photos = frames.photos_in(source)
+        photos = reconstruct.photos_in(source)
         show = partial(report, "copying photos", total=len(photos))
-        for path, reason in frames.copy_photos(photos, images, show):
+        for path, reason in reconstruct.copy_photos(photos, images, show):
             sys.stdout.write(f"left out: {path.name} cannot be read ({reason})\n")
-    names = [path.name for path in frames.photos_in(images)]
+    names = [path.name for path in reconstruct.photos_in(images)]
     if len(names) < 2:
         raise ValueError(f"{source}: {len(names)} pictures are too few; a scene takes 50 to 300")
-    verdict = reconstruct(scene, names, report, is_video, options.max_size, options.threads)
+    verdict = reconstruct.reconstruct(scene, names, report, is_video, options.max_size, options.threads)
     sys.stdout.writelines(f"{line}\n" for line in _told(verdict, images))
     print(flush=True)
     problems = 0
@@ -129,8 +128,8 @@ def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
 
 def _told(verdict: "Verdict", images: Path) -> Iterator[str]:
     """What came out, and what to take again."""
-    from nsvq_lightning.data.frames import sharpness
     from nsvq_lightning.data.images import read_image
+    from nsvq_lightning.data.reconstruct import sharpness
 
     count, total = len(verdict.registered), len(verdict.registered) + len(verdict.missing)
     yield (

@@ -110,7 +110,7 @@ def _path(options: argparse.Namespace, splats: "Splats", is_video: bool) -> "tup
     """The cameras and frames per second that the options ask for."""
     from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.data.scene import load_scene
-    from nsvq_lightning.rendering.camera_path import orbit, read_camera_path, reframed, smooth_path
+    from nsvq_lightning.rendering.camera import orbit, read_camera_path, reframed, smooth_path
 
     fps = options.fps or FPS
     root = options.root or photos_of(options.scene)

@@ -24,8 +24,7 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.attributes import ATTRIBUTES
-from nsvq_lightning.splats.canonical_covariance import canonical
-from nsvq_lightning.splats.splats import RawSplats, detached
+from nsvq_lightning.splats.splats import RawSplats, canonical, detached
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.quantize.attributes import attribute_rows, codes_of
-from nsvq_lightning.quantize.base import Quantizer
+from nsvq_lightning.quantize.codebook import Quantizer
 from nsvq_lightning.splats.attributes import QUANTIZABLE, dropped, finite_rows
 from nsvq_lightning.splats.splats import RawSplats, sh_degree_of
 

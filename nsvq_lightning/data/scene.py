@@ -15,10 +15,9 @@ from torch import Tensor
 
 from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, larger_models
-from nsvq_lightning.data.frames import PHOTOS
-from nsvq_lightning.data.images import ON_ITS_SIDE, ROUNDED, ImageSource, ImageStore, image_head
+from nsvq_lightning.data.images import ON_ITS_SIDE, ROUNDED, ImageSource, ImageStore, image_head, rectify
+from nsvq_lightning.data.reconstruct import PHOTOS
 from nsvq_lightning.data.transforms import random_points, read_poses
-from nsvq_lightning.data.undistort import rectify
 from nsvq_lightning.rendering.camera import Camera
 
 log = logging.getLogger(__name__)

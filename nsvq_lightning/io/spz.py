@@ -59,10 +59,6 @@ DEFAULT_VERSION = 3
 # Axes that are written; viewers take a file to have the default, whatever it says.
 SPZ_AXES = ("rdf", "rub")
 DEFAULT_AXES = "rdf"
-# Bits of a position, and the largest number of them that are fractional.
-_POSITION, MOST_FRACTION = 24, 30
-_USUAL_FRACTION = 12
-_COLOR = 0.15
 
 
 @dataclass(frozen=True)
@@ -261,6 +257,10 @@ def _inflate(gunzip: "zlib._Decompress", data: bytes, most: int) -> bytes:
         raise FormatError(f"damaged, or not a .spz file: no valid gzip stream ({error})") from None
 
 
+# Bits of a position, and the largest number of them that are fractional.
+_POSITION, MOST_FRACTION = 24, 30
+
+
 def _parse(start: bytes, file_bytes: int) -> SpzHeader:
     """Header of any version; refuses more splats than a file of that many bytes can hold."""
     if len(start) < _HEADER.size or start[:4] != _MAGIC:
@@ -301,6 +301,9 @@ def in_spz_order(scene: CompressedScene) -> CompressedScene:
     scene = scene.take(spatial_order(scene.means))
     codes = [scene.codes[name] for name in ("quats", "scales", "sh0", "shN") if name in scene.codes]  # shN sorts first
     return scene.take(np.lexsort([np.arange(len(scene)), *codes]))
+
+
+_COLOR = 0.15
 
 
 def write_spz(
@@ -345,6 +348,9 @@ def write_spz(
     }
     clamped.warn(path, len(scene))
     return _write_frame(path, SpzHeader(version, len(scene), scene.sh_degree, fraction, flags, stated), arrays)
+
+
+_USUAL_FRACTION = 12
 
 
 def _fraction_bits(scene: CompressedScene) -> int:

@@ -2,8 +2,7 @@
 
 from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.quantize.attributes import QUANTIZED, codebook_sizes
-from nsvq_lightning.quantize.base import Quantizer
-from nsvq_lightning.quantize.codebook import CodebookQuantizer
+from nsvq_lightning.quantize.codebook import CodebookQuantizer, Quantizer
 from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest, nearest_reference
 from nsvq_lightning.quantize.nsvq import NSVQ, DiVeQ

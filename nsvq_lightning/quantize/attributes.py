@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from nsvq_lightning.compute.rows import take_rows
-from nsvq_lightning.quantize.base import Quantizer, as_quantizer, held_codes
+from nsvq_lightning.quantize.codebook import Quantizer, as_quantizer, held_codes
 from nsvq_lightning.splats.attributes import ATTRIBUTES, QUANTIZABLE, attribute_dims
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
@@ -51,7 +51,7 @@ def build_quantizers(
 
     Raises:
         ValueError: A codebook is for an unknown attribute, or has no code.
-        TypeError: What ``quantizer`` makes does not implement :class:`~nsvq_lightning.quantize.base.Quantizer`.
+        TypeError: What ``quantizer`` makes does not implement :class:`~nsvq_lightning.quantize.codebook.Quantizer`.
     """
     sizes = codebook_sizes(codebooks) if isinstance(codebooks, str) else dict(codebooks or {})
     unknown = sorted(set(sizes) - set(QUANTIZED))

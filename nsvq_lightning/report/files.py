@@ -30,8 +30,8 @@ from nsvq_lightning.data.images import encode_png
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import atomic_path, atomic_write, write_text
 from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.nsvq.file import paper_header
 from nsvq_lightning.io.nsvq.header import read_header
-from nsvq_lightning.io.nsvq.paper import paper_header
 from nsvq_lightning.io.ply import plain_ply_bytes
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import eight_bit, psnr

@@ -19,7 +19,7 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, visible
 from nsvq_lightning.splats.splats import RawSplats, Splats
-from nsvq_lightning.training import optim, resume, scene_access
+from nsvq_lightning.training import optim, resume, scene_module
 from nsvq_lightning.training.scene_module import Stopwatch
 from nsvq_lightning.training.schedule import Phase, Schedule
 
@@ -59,7 +59,7 @@ class SplatModule(resume.ResumedModule):
 
     Raises:
         ValueError: A codebook is for an unknown attribute or has no code, or an argument is out of range.
-        TypeError: What ``quantizer`` makes does not implement :class:`nsvq_lightning.quantize.base.Quantizer`.
+        TypeError: What ``quantizer`` makes does not implement :class:`nsvq_lightning.quantize.codebook.Quantizer`.
     """
 
     def __init__(
@@ -166,13 +166,13 @@ class SplatModule(resume.ResumedModule):
                 "whatever it says, and a scaled loss would grow splats needlessly; leave it at 32-true"
             )
         self.evaluation_splats = None  # an interrupted evaluation may have left some
-        scene = scene_access.scene_of(self.trainer)
+        scene = scene_module.scene_of(self.trainer)
         if scene is not None:
-            self.background = scene_access.background_of(scene, self.background)
+            self.background = scene_module.background_of(scene, self.background)
         if stage == "fit" and self.extent == 0.0:
-            self.extent = scene_access.extent_of(scene)
+            self.extent = scene_module.extent_of(scene)
         if stage == "fit" and len(self.splats) == 0:
-            splats = scene_access.first_splats(self.init_from, scene, self.splats.sh_degree)
+            splats = scene_module.first_splats(self.init_from, scene, self.splats.sh_degree)
             self.splats = splats.to(self.device)
             self.active_sh_degree = 0 if self.init_from is None else self.splats.sh_degree
 
@@ -182,7 +182,7 @@ class SplatModule(resume.ResumedModule):
 
     def on_train_start(self) -> None:
         """Set the learning rates of this run, not those of a checkpoint; start measuring the training time."""
-        scene_access.warn_of_device(self.device)
+        scene_module.warn_of_device(self.device)
         views = self.trainer.world_size * self.trainer.accumulate_grad_batches
         optim.check_groups(self.trainer.optimizers, self.quantizers)
         optim.apply_rates(self.trainer.optimizers[0], self.rates, self.extent, views)

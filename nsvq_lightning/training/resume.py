@@ -21,8 +21,7 @@ from torch import Tensor
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.splats.splats import sh_degree_of
-from nsvq_lightning.training.scene_access import scene_of
-from nsvq_lightning.training.scene_module import SceneModule, Stopwatch
+from nsvq_lightning.training.scene_module import SceneModule, Stopwatch, scene_of
 from nsvq_lightning.training.schedule import Phase, Schedule
 
 log = logging.getLogger(__name__)
@@ -335,7 +334,7 @@ class ResumedModule(SceneModule):
 
         Raises:
             ValueError: A fit cannot continue from the checkpoint, or it is of another scene than the trainer's, which
-                ``allow_other_scene`` of :class:`nsvq_lightning.training.trainer.SplatTrainer` lets pass.
+                ``allow_other_scene`` of :class:`nsvq_lightning.training.run_folder.SplatTrainer` lets pass.
         """
         scene = scene_of(self._trainer)
         if scene is not None and SCENE in checkpoint and not getattr(self._trainer, "allow_other_scene", False):

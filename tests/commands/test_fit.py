@@ -18,8 +18,8 @@ from nsvq_lightning.commands.main import main
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.run_folder import SplatTrainer
 from nsvq_lightning.training.schedule import Phase
-from nsvq_lightning.training.trainer import SplatTrainer
 
 CODES = ["--model.quantizer=NSVQ", "--model.codebooks.scales=16", "--model.codebooks.sh0=8"]
 

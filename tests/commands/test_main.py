@@ -18,9 +18,8 @@ import torch
 import nsvq_lightning
 from nsvq_lightning.callbacks import STANDARD
 from nsvq_lightning.commands import main as main_module
-from nsvq_lightning.commands.fit import SplatCLI
+from nsvq_lightning.commands.fit import SplatCLI, class_help
 from nsvq_lightning.commands.main import main
-from nsvq_lightning.commands.option_help import class_help
 from nsvq_lightning.commands.registry import COMMANDS
 
 

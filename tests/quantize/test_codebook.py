@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from nsvq_lightning.quantize import NSVQ, nearest
 from nsvq_lightning.quantize import codebook as codebook_module
-from nsvq_lightning.quantize.codebook import copy_codes, split_codes
+from nsvq_lightning.quantize.codebook import as_quantizer, copy_codes, split_codes
 from nsvq_lightning.quantize.kmeans import lookup
 from nsvq_lightning.quantize.tracking import NearestTracker
 from nsvq_lightning.random import generator
@@ -267,3 +267,22 @@ def test_held_codes_replace_the_nearest_ones_until_they_are_frozen() -> None:
     assert torch.equal(quantizer(x[:50])[1], quantizer.encode(x[:50]))
     quantizer.freeze(held)
     assert len(quantizer.held) == 0
+
+
+def test_what_a_quantizer_lacks_is_named() -> None:
+    class NearlyOne(NSVQ):
+        freeze = property()  # type: ignore[assignment]  # reading it raises AttributeError
+
+    assert as_quantizer(quantizer := NSVQ(4, 3)) is quantizer
+    with pytest.raises(TypeError, match=r"NearlyOne is not a quantizer; it lacks: freeze; derive it from"):
+        as_quantizer(NearlyOne(4, 3))
+    with pytest.raises(TypeError, match=r"lacks: codebook, codes, decode, encode, fit, forward, freeze"):
+        as_quantizer(object())
+
+
+def test_a_codebook_that_nothing_trains_is_refused() -> None:
+    quantizer = NSVQ(4, 3)
+    del quantizer.codebook
+    quantizer.register_buffer("codebook", torch.zeros(4, 3))
+    with pytest.raises(TypeError, match=r"codebook is an nn\.Parameter"):
+        as_quantizer(quantizer)

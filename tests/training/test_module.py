@@ -209,7 +209,7 @@ def test_splats_of_a_file_that_are_not_finite_are_left_out(
 ) -> None:
     start = make_splats()
     start.quats.data[7, 2] = torch.nan
-    monkeypatch.setattr("nsvq_lightning.training.scene_access.load", lambda _: start)
+    monkeypatch.setattr("nsvq_lightning.training.scene_module.load", lambda _: start)
     data = ColmapDataModule(str(demo_scene), factor=4)
 
     def fitted() -> SplatModule:

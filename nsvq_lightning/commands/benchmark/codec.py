@@ -13,7 +13,7 @@ from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.compression.stored import to_compressed
 from nsvq_lightning.io.formats import load, save
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
-from nsvq_lightning.quantize.base import as_quantizer
+from nsvq_lightning.quantize.codebook import as_quantizer
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import SplatTensors
 

@@ -30,8 +30,6 @@ PHOTO = (533, 800, 3)
 
 # Renders splats as the camera of a workload sees them: image ``[H, W, 3]``.
 Painter = Callable[[RawSplats, Workload], Tensor]
-# Of an image and a photo ``[H, W, 3]``, with the weight of D-SSIM.
-Loss = Callable[[Tensor, Tensor, float], Tensor]
 
 
 class Traced(NamedTuple):
@@ -133,6 +131,10 @@ def image_errors(image: Tensor, truth: Tensor) -> tuple[dict[str, float], Tensor
         "pixels above 1e-3": float((error > 1e-3).sum()),
     }
     return errors, usual
+
+
+# Of an image and a photo ``[H, W, 3]``, with the weight of D-SSIM.
+Loss = Callable[[Tensor, Tensor, float], Tensor]
 
 
 def _loss_rows(scope: Scope, device: str) -> Iterator[Measurement]:

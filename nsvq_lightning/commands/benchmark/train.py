@@ -29,8 +29,6 @@ from nsvq_lightning.report.files import evaluate
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
-# Callbacks of ``nsvq fit`` that write files or lines but train nothing; the benchmark measures by itself.
-WATCHING = ("report", "export", "predictions", "checkpoint", "kernels", "progress")
 QUICK_DEMO = ("--data.factor=4",)
 
 
@@ -93,6 +91,10 @@ class _Run(SplatCLI):
 
     def after_fit(self) -> None:
         """Nothing: the steps are all that is asked for."""
+
+
+# Callbacks of ``nsvq fit`` that write files or lines but train nothing; the benchmark measures by itself.
+WATCHING = ("report", "export", "predictions", "checkpoint", "kernels", "progress")
 
 
 def _train(scope: Scope, threads: int, clock: StepClock, options: Sequence[str] = ()) -> dict[str, Tensor]:

@@ -27,23 +27,14 @@ from nsvq_lightning.io import errors, morton
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.nsvq import entropy, rounding
-from nsvq_lightning.io.nsvq.codebook_order import leaf_paths
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
 from nsvq_lightning.io.nsvq.precision import MOST_OPACITY_LEVELS, Precision
+from nsvq_lightning.io.nsvq.rounding import leaf_paths
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims
 
 # Attributes by when their streams come; the cells of the positions, which are between, follow from the early ones.
 _EARLY, _LATE = ("opacities", "scales"), tuple(name for name in QUANTIZABLE if name != "scales")
-# Endings of the names and encodings of the streams that an attribute has, by its storage.
-_STREAMS = {
-    "levels": {"": "paths"},
-    "steps": {"": "integers"},
-    "codes": {".codebook": "integers", "": "paths"},
-    "cells": {".grid": "grid", "": "keys", ".far": "float32"},
-}
 _GRID = struct.Struct("<qqqd")
-# Three float32.
-_FAR_BYTES = 12
 
 
 def encode_compact(scene: CompressedScene, precision: Precision) -> tuple[Header, dict[str, bytes]]:
@@ -167,9 +158,22 @@ def _decoded(
     return rounding.Stored(entry, values, codebook)
 
 
+# Endings of the names and encodings of the streams that an attribute has, by its storage.
+_STREAMS = {
+    "levels": {"": "paths"},
+    "steps": {"": "integers"},
+    "codes": {".codebook": "integers", "": "paths"},
+    "cells": {".grid": "grid", "": "keys", ".far": "float32"},
+}
+
+
 def _stream_names(attributes: tuple[AttributeEntry, ...]) -> list[tuple[str, str]]:
     """Name and encoding of the streams that the attributes have."""
     return [(entry.name + end, kind) for entry in attributes for end, kind in _STREAMS[entry.storage].items()]
+
+
+# Three float32.
+_FAR_BYTES = 12
 
 
 def _check_tables(header: Header) -> None:

@@ -1,15 +1,18 @@
 """Write and read ``.nsvq`` files."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
-from nsvq_lightning.io.nsvq.header import Header, frame, read_frame
+from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry, frame, read_frame
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
-from nsvq_lightning.splats.attributes import listed
+from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, listed
 
 
 def encode(scene: CompressedScene, storage: Storage) -> tuple[Header, dict[str, bytes]]:
@@ -27,7 +30,7 @@ def encode(scene: CompressedScene, storage: Storage) -> tuple[Header, dict[str, 
         from nsvq_lightning.io.nsvq.compact import encode_compact
 
         return encode_compact(scene, storage.precision)
-    from nsvq_lightning.io.nsvq.paper import encode_paper
+    from nsvq_lightning.io.nsvq.file import encode_paper
 
     return encode_paper(scene)
 
@@ -92,9 +95,148 @@ def decode(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene
 
         return decode_compact(header, streams)
     if header.level == "paper":
-        from nsvq_lightning.io.nsvq.paper import decode_paper
+        from nsvq_lightning.io.nsvq.file import decode_paper
 
         return decode_paper(header, streams)
     raise FormatError(
         f"compression level {header.level!r}; this release reads {', '.join(LEVELS)}", "update nsvq-lightning"
     )
+
+
+# Rows per chunk: a multiple of 8, so that every chunk ends on a whole byte, and small enough for the cache.
+_CHUNK = 1 << 14
+
+
+def pack_fields(fields: Sequence[NDArray[np.integer]], widths: Sequence[int]) -> bytes:
+    """Pack one record per row: field after field, lowest bit first, rows without any padding between them.
+
+    Bit ``b`` of the stream is bit ``b % 8`` of byte ``b // 8``; row ``i`` starts at bit ``i · Σ widths``; the bits
+    after the last row are 0.
+
+    Args:
+        fields: Integer arrays ``[N]``, at least one, each number not negative and within its width.
+        widths: Bits of each field, 0 to 32. A field of 0 bits holds only zeros and takes no space.
+
+    Returns:
+        ⌈N · Σ widths / 8⌉ bytes.
+    """
+    chunks = []
+    for start in range(0, len(fields[0]), _CHUNK):
+        number_bytes = (field[start : start + _CHUNK].astype("<u4").view(np.uint8).reshape(-1, 4) for field in fields)
+        columns = [
+            np.unpackbits(numbers, axis=1, count=width, bitorder="little")
+            for numbers, width in zip(number_bytes, widths, strict=True)
+        ]
+        chunks.append(np.packbits(np.concatenate(columns, axis=1), bitorder="little").tobytes())
+    return b"".join(chunks)
+
+
+def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) -> list[NDArray[np.unsignedinteger]]:
+    """Invert :func:`pack_fields`.
+
+    Args:
+        data: The packed stream.
+        rows: N.
+        widths: Bits of each field, 0 to 32.
+
+    Returns:
+        One array ``[N]`` per field: uint16 up to 16 bits, uint32 above.
+    """
+    packed, record = np.frombuffer(data, np.uint8), sum(widths)
+    fields: list[NDArray[np.unsignedinteger]] = [
+        np.zeros(rows, np.uint16 if width <= 16 else np.uint32) for width in widths
+    ]
+    for start in range(0, rows, _CHUNK):
+        count = min(_CHUNK, rows - start)
+        chunk = packed[start * record // 8 : (start + _CHUNK) * record // 8]
+        bits = np.unpackbits(chunk, count=count * record, bitorder="little").reshape(count, record)
+        first = 0
+        for field, width in zip(fields, widths, strict=True):
+            number = np.zeros((count, 32), np.uint8)
+            number[:, :width] = bits[:, first : first + width]
+            field[start : start + count] = np.packbits(number, axis=1, bitorder="little").view("<u4")[:, 0]
+            first += width
+    return fields
+
+
+def paper_header(scene: CompressedScene) -> Header:
+    """Header of the scene's file; cheap, since it depends only on counts."""
+    rows = {name: len(codebook) for name, codebook in scene.codebooks.items()}
+    attributes = tuple(
+        AttributeEntry(name, dim, "codes", rows[name]) if name in rows else AttributeEntry(name, dim, "raw")
+        for name, dim in _dims(scene.sh_degree).items()
+    )
+    return Header.of(scene, "paper", attributes, _layout(len(scene), attributes))
+
+
+def encode_paper(scene: CompressedScene) -> tuple[Header, dict[str, bytes]]:
+    """Header and streams of a scene."""
+    header = paper_header(scene)
+    coded = [entry for entry in header.attributes if entry.storage == "codes"]
+    floats = {"means": scene.means, "opacities": scene.opacities, **scene.raw}
+    floats |= {f"{name}.codebook": values for name, values in scene.codebooks.items()}
+    streams = {name: values.astype("<f4", copy=False).tobytes() for name, values in floats.items()}
+    if coded:
+        streams["codes"] = pack_fields([scene.codes[entry.name] for entry in coded], [entry.bits for entry in coded])
+    return header, streams
+
+
+def decode_paper(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene:
+    """Scene from header and streams.
+
+    Raises:
+        FormatError: The tables do not belong to this level, or a code is not a row of its codebook.
+    """
+    _check_tables(header)
+    n = header.splats
+    coded = [entry for entry in header.attributes if entry.storage == "codes"]
+    packed = unpack_fields(streams["codes"], n, [entry.bits for entry in coded]) if coded else []
+    raw = [entry for entry in header.attributes if entry.storage == "raw" and entry.name in QUANTIZABLE]
+    try:
+        return CompressedScene(
+            means=_floats(streams["means"], n, 3),
+            opacities=_floats(streams["opacities"], n, 1)[:, 0],
+            codes={entry.name: codes for entry, codes in zip(coded, packed, strict=True)},
+            codebooks={
+                entry.name: _floats(streams[f"{entry.name}.codebook"], entry.codes, entry.dim) for entry in coded
+            },
+            raw={entry.name: _floats(streams[entry.name], n, entry.dim) for entry in raw},
+            **header.of_scene,
+        )
+    except ValueError as error:
+        raise FormatError(f"damaged: {error}") from None
+
+
+def _dims(sh_degree: int) -> dict[str, int]:
+    """Values per splat of each attribute, in file order."""
+    dims = attribute_dims(sh_degree)
+    return {name: dims[name] for name in ("means", "opacities", *QUANTIZABLE)}
+
+
+def _layout(n: int, attributes: tuple[AttributeEntry, ...]) -> tuple[StreamEntry, ...]:
+    """The streams: raw attributes, codes, codebooks."""
+    coded = [entry for entry in attributes if entry.storage == "codes"]
+    bits = sum(entry.bits for entry in coded)
+    return (
+        *(StreamEntry(entry.name, 4 * n * entry.dim, "float32") for entry in attributes if entry.storage == "raw"),
+        *([StreamEntry("codes", -(-n * bits // 8), "bits")] if coded else []),
+        *(StreamEntry(f"{entry.name}.codebook", 4 * entry.codes * entry.dim, "float32") for entry in coded),
+    )
+
+
+def _check_tables(header: Header) -> None:
+    """Compare with the tables this release would write, before anything is allocated from their sizes."""
+    dims = _dims(header.sh_degree)
+    if [(entry.name, entry.dim) for entry in header.attributes] != list(dims.items()):
+        raise FormatError(f"damaged: the attribute table must list {dims}, got {header.attributes}")
+    for entry in header.attributes:
+        raw = entry.storage == "raw" and entry.codes == 0
+        coded = entry.name in QUANTIZABLE and entry.storage == "codes" and 1 <= entry.codes <= 1 << 32
+        if entry.step or not (raw or coded):
+            raise FormatError(f"damaged: impossible attribute {entry}")
+    if header.streams != _layout(header.splats, header.attributes):
+        raise FormatError("damaged: the stream table does not fit the attribute table and the number of splats")
+
+
+def _floats(data: memoryview, rows: int, dim: int) -> NDArray[np.float32]:
+    return np.frombuffer(data, "<f4").astype(np.float32).reshape(rows, dim)

@@ -9,8 +9,6 @@ from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES
 
 DIGIT_BITS = 11
 DIGITS = 1 << DIGIT_BITS
-# How many splats ahead a box is prefetched.
-AHEAD = 16
 
 
 @kernel
@@ -66,6 +64,10 @@ def tile_range(boxes, place):
     box = np.int64(get(boxes, place))
     x, y = box & 0xFFFF, (box >> 16) & 0xFFFF
     return x, y, x + ((box >> 32) & 0xFFFF), y + (box >> 48)
+
+
+# How many splats ahead a box is prefetched.
+AHEAD = 16
 
 
 @kernel

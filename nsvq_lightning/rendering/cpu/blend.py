@@ -20,14 +20,6 @@ from nsvq_lightning.rendering.cpu import records as rec
 ALPHA_MAX = F(constants.ALPHA_MAX)
 TRANSMITTANCE_MIN = F(constants.TRANSMITTANCE_MIN)
 BATCH = 128
-# Lower bound on the transmittance of closed pixels: far below the threshold, far above denormal numbers.
-TINY = F(1e-20)
-# How far below the threshold, in log2 α, a block still counts as reached: what rounding can add to the exponent of a
-# pixel, so that culling blocks changes no bit. It lets one block in a thousand more through.
-REACH_MARGIN = F(2.0**-8)
-# How many entries ahead a record is prefetched; its slot, whose number is in the record, a little later.
-AHEAD = 24
-SLOT_AHEAD = 10
 BLOCKS = 16
 BLOCK_SIDE = 4
 
@@ -41,7 +33,6 @@ BACK_T, BACK_REST, BACK_RED, BACK_GREEN, BACK_BLUE, BACK_DEPTH, BACK_WEIGHT, BAC
 )
 BLOCK_STATE = 16 * 9
 BACKWARD_SCRATCH = BLOCKS * BLOCK_STATE
-TWO_LN2 = F(2 * np.log(2.0))
 
 
 def pixel_grid() -> np.ndarray[tuple[int], np.dtype[np.float32]]:
@@ -75,6 +66,11 @@ def highest_exponent(a, b, c, slope_x, slope_y, left, right, top, bottom):
     first, _, _ = exponent(a, b, c, 0, 0, 0, dx, along_y)
     second, _, _ = exponent(a, b, c, 0, 0, 0, along_x, dy)
     return simd.vmax(first, second)
+
+
+# How far below the threshold, in log2 α, a block still counts as reached: what rounding can add to the exponent of a
+# pixel, so that culling blocks changes no bit. It lets one block in a thousand more through.
+REACH_MARGIN = F(2.0**-8)
 
 
 @inline
@@ -132,6 +128,10 @@ def blend_one(batch, r, alpha, t, after, left, sums):
     open_ = after >= TRANSMITTANCE_MIN
     weight = simd.select(open_, alpha * t, 0)
     return simd.select(open_, after, left), accumulate(batch, r, weight, sums)
+
+
+# Lower bound on the transmittance of closed pixels: far below the threshold, far above denormal numbers.
+TINY = F(1e-20)
 
 
 @inline
@@ -207,6 +207,10 @@ def write_block(block, corner, size, background, state, planes):
             simd.put(image, 3 * pixel, simd.get(state, R_SUM + s))
             simd.put(image, 3 * pixel + 1, simd.get(state, G_SUM + s))
             simd.put(image, 3 * pixel + 2, simd.get(state, B_SUM + s))
+
+
+# How many entries ahead a record is prefetched.
+AHEAD = 24
 
 
 @inline
@@ -409,6 +413,10 @@ def splat_backward(records, row, blocks, corner, wanted, state):
     return simd.lane_sums((s_r, s_g, s_b, s_h, s_u, s_v, s_uu, s_uv, s_vv, s_z, s_ax, s_ay, s_map))
 
 
+# How many entries ahead a slot is prefetched, whose number is in the record: later than that.
+SLOT_AHEAD = 10
+
+
 @inline
 def tile_backward(records, integers, entries, begin, end, corner, group, wanted, touched, sums, state):
     """Add up the gradients of all splats of a tile, front to back."""
@@ -458,6 +466,9 @@ def blend_backward(
                     start_block(block, corner, size, planes, gradients, pixel_weights, wanted, grid, state)
                 place = group % group_columns, group // group_columns
                 tile_backward(records, integers, entries, begin, end, corner, place, wanted, touched, sums, state)
+
+
+TWO_LN2 = F(2 * np.log(2.0))
 
 
 @kernel

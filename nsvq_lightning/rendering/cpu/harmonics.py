@@ -13,8 +13,6 @@ C2A, C2B, C2C = (F(value) for value in sh.C2)
 C3A, C3B, C3C, C3D, C3E = (F(value) for value in sh.C3)
 # How many splats ahead the rows of a list are prefetched.
 AHEAD = 32
-# Floats in a row of degree-3 coefficients, which is read in whole vectors.
-SH_ROW = 45
 
 
 @inline
@@ -40,6 +38,10 @@ def prefetch_sh(array, ids, start, end, stride, used):
 def coefficients_of(degree):
     """Floats in an SH row beyond the constant term."""
     return 3 * ((degree + 1) * (degree + 1) - 1)
+
+
+# Floats in a row of degree-3 coefficients, which is read in whole vectors.
+SH_ROW = 45
 
 
 @inline

@@ -9,7 +9,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import Recipe, RunFactory, Whole
 
 from nsvq_lightning.callbacks import DensityControl
-from nsvq_lightning.training.scene_access import train_contributions
+from nsvq_lightning.training.scene_module import train_contributions
 
 
 class Counts(Callback):

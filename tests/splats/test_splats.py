@@ -9,7 +9,7 @@ from splat_scenes import front_camera, random_splats
 from torch import Tensor
 
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.canonical_covariance import canonical
+from nsvq_lightning.splats.splats import canonical
 
 
 def rows(count: int = 500, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:

@@ -9,8 +9,8 @@ import PIL.Image
 import pytest
 
 from nsvq_lightning.data.colmap import SceneError
-from nsvq_lightning.data.frames import copy_photos, photos_in, sharpness, write_frames
 from nsvq_lightning.data.images import image_head, read_image
+from nsvq_lightning.data.reconstruct import copy_photos, photos_in, sharpness, write_frames
 
 
 def _texture(shift: int = 0) -> np.ndarray[Any, Any]:

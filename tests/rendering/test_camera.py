@@ -8,8 +8,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.camera_path import orbit, read_camera_path, reframed, smooth_path
+from nsvq_lightning.rendering.camera import Camera, orbit, read_camera_path, reframed, smooth_path
 
 
 def camera(position: Any, rotation: Rotation | None = None, focal: float = 100.0) -> Camera:

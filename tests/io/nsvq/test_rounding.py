@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nsvq_lightning.io.nsvq.codebook_order import leaf_paths, sibling_distance, tree_order
+from nsvq_lightning.io.nsvq.rounding import leaf_paths, sibling_distance, tree_order
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 64, 1000])
