@@ -27,8 +27,6 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from nsvq_lightning.data.scene import Scene
-
 # Each check imports what it needs: --help answers at once, and a package that is missing or broken fails only the
 # checks that need it.
 if TYPE_CHECKING:

@@ -37,7 +37,7 @@ def _compiled(processor: str, *kernels: str) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("processor", "kernels"),
     [
-        ("generic", MAIN),
+        pytest.param("generic", MAIN, marks=pytest.mark.slow),
         pytest.param("nehalem", MAIN[:1], marks=pytest.mark.slow),
         *(pytest.param(processor, tuple(SIGNATURES), marks=pytest.mark.long) for processor in PROCESSORS),
     ],

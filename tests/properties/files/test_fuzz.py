@@ -33,10 +33,13 @@ CASES = {
     "checkpoint": 60,
 }
 """Cases in a quick test; in a slow one three times as many."""
+ALIKE = ("spz4", "splat", "colmap-txt")
+"""Kinds whose reader is mostly that of another: slow tests only."""
+KINDS = [pytest.param(kind, marks=[pytest.mark.slow] if kind in ALIKE else []) for kind in CASES]
 
 
 @pytest.mark.parametrize("times", [1, pytest.param(3, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kind", CASES)
+@pytest.mark.parametrize("kind", KINDS)
 def test_damaged_files_are_read_or_refused_with_one_clear_error(kind: str, times: int, tmp_path: Path) -> None:
     if kind == "spz4" and not HAS_ZSTD:
         pytest.skip("no Zstandard: pip install 'nsvq-lightning[spz]'")
