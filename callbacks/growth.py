@@ -353,7 +353,7 @@ class BudgetedGrowth(Densification):
 
 
 # A scene of fewer splats is no scene.
-LEAST = 1000
+MIN_BUDGET = 1000
 
 
 def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:
@@ -366,7 +366,7 @@ def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:
         detail: Detailed pixels of a photo (:func:`nsvq_lightning.data.scene.detailed_pixels`).
         quality: Factor.
     """
-    return max(LEAST, round(quality * 0.165 * math.cbrt(photos) * detail))
+    return max(MIN_BUDGET, round(quality * 0.165 * math.cbrt(photos) * detail))
 
 
 def splats_for_bytes(
@@ -403,7 +403,7 @@ def splats_for_bytes(
         else:
             bits += 32 * attribute_dims(sh_degree)[name]
     splats = int((8 * size - fixed) / bits)
-    if splats < LEAST:
+    if splats < MIN_BUDGET:
         raise ValueError(
             f"{size} bytes leave room for {max(splats, 0)} splats beside codebooks of {round(fixed / 8)} bytes; allow "
             "more, or take smaller codebooks (--model.codebooks=0.5k)"

@@ -102,7 +102,7 @@ def run(options: argparse.Namespace) -> int:
 # File that shows that a folder was made by this command, and from what.
 RECORD = "prepare.json"
 # Photos below which a scene is likely to look good only from where they were taken.
-FEW = 20
+MIN_PHOTOS = 20
 
 
 def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
@@ -138,14 +138,14 @@ def _told(verdict: "Verdict", images: Path) -> Iterator[str]:
     )
     if verdict.error > 1.5:
         yield "  the error is large: was zoom or focus changing, or something moving?"
-    if count < FEW:
+    if count < MIN_PHOTOS:
         yield f"  {count} photos are few: 50 and more make a scene that can be walked around"
     if verdict.models > 1:
         apart = f"  the photos fall apart into {verdict.models} scenes; sparse/0 is the largest: "
         yield f"{apart}take more photos between"
     if not verdict.missing:
         return
-    some = verdict.registered[:: max(1, count // FEW)]
+    some = verdict.registered[:: max(1, count // MIN_PHOTOS)]
     usual = sorted(sharpness(read_image(images / name)) for name in some)[len(some) // 2]
     yield "  without a place, better taken again:"
     listed = 8
