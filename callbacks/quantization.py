@@ -361,7 +361,7 @@ class RateDistortion(SplatCallback):
         # Where non-finite splats were just dropped, the next iteration starts with a measurement.
         if not self.prices or not self._fits(module) or module.schedule.phase_at(iteration + 1) is not Phase.QUANTIZE:
             return
-        start, end = module.schedule.ends[Phase.PRUNE], module.schedule.ends[Phase.QUANTIZE]
+        start, end = (module.schedule.ends[phase] for phase in (Phase.QUANTIZE - 1, Phase.QUANTIZE))
         every = -(-(end - start) // MEASUREMENTS)
         due = (iteration - start) % every == 0
         if due:

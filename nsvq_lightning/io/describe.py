@@ -82,7 +82,11 @@ def _describe_nsvq(path: Path, total: int) -> dict[str, Any]:
 
 
 def _describe_others(path: Path, start: bytes, total: int) -> dict[str, Any]:
-    if start.startswith(ply.PLY_MAGIC):
+    suffix = path.suffix.lower()
+    if suffix in FORMATS.keys() - {".nsvq", ".ply", ".sog", ".spz", ".splat"}:
+        scene = FORMATS[suffix].read(path)
+        count, sh_degree, kind, encoding, sizes = len(scene), scene.sh_degree, suffix[1:], suffix[1:], {"file": total}
+    elif start.startswith(ply.PLY_MAGIC):
         header = ply.read_ply_header(path)
         with naming_file(path):
             count, sh_degree = header.count, ply.splat_degree(header)
@@ -97,7 +101,7 @@ def _describe_others(path: Path, start: bytes, total: int) -> dict[str, Any]:
         found, sizes = spz.read_spz_header(path)
         count, sh_degree, encoding = found.count, found.sh_degree, "zstd" if found.version == 4 else "gzip"
         kind = f"spz, version {found.version}, axes {found.axes or f'not stated, taken as {spz.DEFAULT_AXES.upper()}'}"
-    elif path.suffix.lower() == ".splat":
+    elif suffix == ".splat":
         count, sh_degree, kind, encoding = splat.count_splats(path), 0, "splat", "splat"
         sizes = {name: count * size for name, size in splat.SPLAT_LAYOUT.items()}
     else:

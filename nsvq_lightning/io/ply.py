@@ -320,7 +320,9 @@ def _parts(words: NDArray[np.uint32], *bits: int) -> NDArray[np.float64]:
     return np.stack(shares, axis=1)
 
 
-# Order of the columns; the normals of points, which splats do not have, are 0.
+# The normals of points, which other programs expect, are 0 unless an attribute is called so.
+_UNUSED = [] if any("nx" in attribute.ply.split() for attribute in ATTRIBUTES.values()) else ["nx", "ny", "nz"]
+# Order of the columns.
 _ORDER = tuple(dict.fromkeys(("means", "unused", "sh0", "shN", "opacities", "scales", "quats", *ATTRIBUTES)))
 
 
@@ -342,7 +344,7 @@ def write_ply(path: str | os.PathLike[str], scene: CompressedScene) -> int:
             # All red coefficients first; ours are [coefficient, channel].
             values = {name: scene.values(name, rows).swapaxes(1 if name == "shN" else -1, -1) for name in dims}
             columns = {name: values[name].reshape(len(values[name]), dim) for name, dim in dims.items()}
-            columns["unused"] = np.zeros_like(columns["means"])
+            columns["unused"] = np.zeros((len(columns["means"]), len(_UNUSED)), np.float32)
             file.write(np.concatenate([columns[name] for name in _ORDER], axis=1).astype("<f4", copy=False).tobytes())
         return file.tell()
 
@@ -355,7 +357,7 @@ def plain_ply_bytes(splats: int, sh_degree: int) -> int:
 
 def _header_text(count: int, sh_degree: int, antialiased: bool = False) -> bytes:
     comments = "".join(f"comment {key} {value}\n" for key, value in _MIP_COMMENTS.items()) if antialiased else ""
-    columns = splat_columns(sh_degree) | {"unused": ["nx", "ny", "nz"]}
+    columns = splat_columns(sh_degree) | {"unused": _UNUSED}
     properties = "".join(f"property float {column}\n" for name in _ORDER for column in columns[name])
     head = f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {count}\n{properties}end_header\n"
     return head.encode("ascii")

@@ -105,7 +105,7 @@ def _compensated(splats: SplatTensors, camera: Camera, module: Any) -> RawSplats
     opacity = take_rows(splats.opacities, rows).sigmoid() * module.light_kept(splats, camera, rows)
     opacity = opacity.clamp_max(1 - 2.0**-20)  # the rasterizer caps it lower, and its logit is finite
     seen = splats.opacities.index_copy(0, rows, opacity.log() - (-opacity).log1p())
-    return RawSplats(splats.means, splats.quats, splats.scales, seen, splats.sh0, splats.shN)
+    return RawSplats(**{name: getattr(splats, name) for name in ATTRIBUTES} | {"opacities": seen})
 
 
 def _check_alike(splats: SplatTensors) -> None:

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import sha256
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 from unicodedata import normalize
@@ -133,7 +134,7 @@ def summarize(
         "codes": {name: _codes_in_use(codes, len(scene.codebooks[name])) for name, codes in scene.codes.items()},
         "paper_level": dict(paper),
         "train_seconds": module.stopwatch.seconds,
-        "before_quantization": last.get(Phase.PRUNE.name.lower()) if scene.codebooks else None,
+        "before_quantization": last.get(Phase(Phase.QUANTIZE - 1).name.lower()) if scene.codebooks else None,
         "phases": ends,
     }
 
@@ -199,7 +200,7 @@ def curve_figure(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> An
     count = quality.twinx()
     iterations = [entry["iteration"] for entry in history]
     start, colours = 0, ("#dfe8f5", "#f8e6d0", "#dcefdc", "#efe0f0")
-    for phase, end, colour in zip(Phase, schedule.ends, colours, strict=True):
+    for phase, end, colour in zip(Phase, schedule.ends, cycle(colours), strict=False):
         if end > start:
             quality.axvspan(start, end, color=colour, label=phase.name.lower(), linewidth=0)
         start = end

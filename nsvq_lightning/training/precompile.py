@@ -20,7 +20,7 @@ from nsvq_lightning.quantize.attributes import decoded, noisy_rows
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import visible
-from nsvq_lightning.splats.conventions import sh_coefficients
+from nsvq_lightning.splats.attributes import attribute_shapes
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
@@ -72,9 +72,11 @@ def _backward(splats: RawSplats) -> None:
 
 def _random_splats(count: int, sh_degree: int) -> Splats:
     """Splats before a camera at the origin that looks along z."""
-    shapes = (count, 3), (count, 4), (count, 3), (count,), (count, 1, 3), (count, sh_coefficients(sh_degree), 3)
-    means, quats, scales, *others = (torch.randn(shape, generator=generator(0, 2, *shape)) for shape in shapes)
-    return Splats.from_tensors(means + torch.tensor([0.0, 0.0, 4.0]), quats, scales - 3.0, *others)
+    shapes = attribute_shapes(sh_degree).items()
+    raw = {name: torch.randn(count, *shape, generator=generator(0, 2, name)) for name, shape in shapes}
+    raw["means"] += torch.tensor([0.0, 0.0, 4.0])
+    raw["scales"] -= 3.0
+    return Splats.from_tensors(**raw)
 
 
 if __name__ == "__main__":

@@ -104,7 +104,7 @@ def _colors(n: int, sh0: Tensor, shN: Tensor) -> tuple[Array, Array]:
 
 def _check_kept(attributes: tuple[Tensor, ...], shapes: tuple[tuple[int, ...], ...]) -> None:
     """Refuse attributes whose data were replaced since the forward pass, which autograd does not notice."""
-    for name, tensor, shape in zip(ATTRIBUTES, attributes, shapes, strict=True):
+    for name, tensor, shape in zip(ATTRIBUTES, attributes, shapes, strict=False):
         if tensor.shape != shape:
             raise ValueError(
                 f"{name} had shape {list(shape)} when it was rendered and {list(tensor.shape)} in the backward pass; "
