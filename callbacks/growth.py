@@ -104,7 +104,7 @@ CHILD_OPACITY = 0.6
 def add_absgrad(
     gradients: Tensor, views: Tensor, weights: Tensor, absgrad: Tensor, radii: Tensor, width: int, height: int
 ) -> None:
-    """Add what one view says to the statistics ``[N]`` of the splats that it saw, in place.
+    """Add the absolute gradients and edge weights of a view to the statistics ``[N]`` of what it saw, in place.
 
     Args:
         gradients: Sum over the views of the norm of the two absolute sums, in normalised device coordinates, in which
@@ -352,7 +352,7 @@ class BudgetedGrowth(Densification):
         return room, len(splats) - before
 
 
-# A scene of fewer splats is no scene.
+# Fewest splats of a scene.
 MIN_BUDGET = 1000
 
 

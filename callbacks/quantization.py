@@ -33,7 +33,7 @@ class CanonicalCovariance(SplatCallback):
     """After the last iteration before the quantize phase, gives like covariances like scales and rotations.
 
     Of the 48 equivalent pairs of scale and rotation that a covariance has, each splat takes one
-    (:mod:`nsvq_lightning.splats.splats`), so that k-means groups them; renderings do not change. The form
+    (:func:`nsvq_lightning.splats.splats.canonical`), so that k-means groups them; renderings do not change. The form
     is not enforced afterwards: rows move continuously and keep their codes, while a row that jumped to another
     equivalent pair would lose its code.
 

@@ -1,4 +1,4 @@
-"""LightningCLI with this package's module, data, callbacks and defaults."""
+"""LightningCLI with this package's module, data, callbacks and defaults, and its help."""
 
 import inspect
 import json
@@ -54,7 +54,7 @@ class QuietParser(LightningArgumentParser):
     """The command line, and what its configs set, as options."""
 
     def format_help(self, *args: Any) -> str:
-        """Help of a command, see :mod:`nsvq_lightning.commands.fit`."""
+        """Help of a command, see :func:`command_help`."""
         subcommand = self.prog.rpartition(" ")[2]
         if subcommand not in COMMANDS:
             return super().format_help(*args)
@@ -344,7 +344,10 @@ class Option(NamedTuple):
 
 
 def command_help(parser: ArgumentParser, command: str, data: type | None, own_trainer: Collection[str]) -> str:
-    """Help text of a command.
+    """Help text of a command: every option once, with its default and a one-sentence description.
+
+    The parser's own help lists all classes that any option might take, even those of torch, but none of the options of
+    the default callbacks.
 
     Args:
         parser: Its parser, with options named ``group.name``.

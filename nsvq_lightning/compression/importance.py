@@ -1,4 +1,4 @@
-"""How much each splat matters to the pictures: its weight, the effect of its attributes, its size in pixels."""
+"""How much each splat matters to the pictures: its weight, the effect of its attributes and of its removal."""
 
 import logging
 import math

@@ -1,4 +1,4 @@
-"""Image files: decoding to RGB bytes and which of them count, and a cache of them with a byte budget."""
+"""Photos: decoded to RGB bytes and which of them count, undistorted, and kept while a byte budget lasts."""
 
 import io
 import logging

@@ -1,4 +1,4 @@
-"""Where photos were taken from: structure from motion by COLMAP, in steps that can be continued."""
+"""Photos and frames of a video, and where they were taken from: COLMAP, in steps that can be continued."""
 
 import contextlib
 import itertools

@@ -1,4 +1,4 @@
-"""A codebook that is fitted, counted, repaired, frozen and stored: the base of every vector quantizer here."""
+"""What callbacks expect of a quantizer, and the base of those here: a codebook from its placement to the file."""
 
 import logging
 from abc import ABC, abstractmethod

@@ -1,4 +1,4 @@
-"""A pinhole camera, and what several have in common: where up is, and the point that they look at."""
+"""A pinhole camera; what several have in common (where up is, what they look at); and cameras along a path."""
 
 import json
 import math

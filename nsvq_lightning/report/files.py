@@ -1,4 +1,4 @@
-"""The numbers of a report: from the scores of views to ``metrics.json``, tables, and the curve of ``curve.png``."""
+"""The files of a report: scores of views, ``metrics.json``, tables, the curve, pictures and videos."""
 
 import csv
 import io

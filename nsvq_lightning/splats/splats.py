@@ -1,4 +1,4 @@
-"""The scene: six raw attributes of N Gaussian splats."""
+"""The scene: six raw attributes of N Gaussian splats, and the canonical form of their covariances."""
 
 import math
 from collections.abc import Mapping
@@ -256,6 +256,10 @@ class Canonical(NamedTuple):
 
 def canonical(scales: Tensor, quats: Tensor) -> Canonical:
     """Scales and rotations of the same covariances in a canonical form.
+
+    The covariance R·diag(s²)·Rᵀ does not change when the three axes change their order or direction (24 rotations of
+    the cube), nor when the quaternion changes its sign or length. Vectors that mean the same but lie apart waste codes
+    of a codebook; here one of the 48 pairs of scale and rotation stands for all of them.
 
     The axes are sorted, longest first; of the remaining rotations it is the smallest one, with the largest w; and the
     quaternion has length 1. One too short to have a direction is the identity, as for the renderer; NaN and infinity

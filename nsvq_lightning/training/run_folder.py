@@ -1,4 +1,4 @@
-"""Where a run writes its files: a folder of its own, whatever the logger, which never overwrites another run."""
+"""Where a run writes: a folder of its own, which never overwrites another run; and the trainer that knows it."""
 
 import atexit
 import errno

@@ -1,4 +1,4 @@
-"""The part of the Lightning module that knows what a file would hold: it renders, measures and stores that."""
+"""What a run takes from its scene, and the part of the Lightning module that renders, measures and stores it."""
 
 import logging
 import os

@@ -1,4 +1,4 @@
-"""Write and read ``.nsvq`` files."""
+"""Write and read ``.nsvq`` files, and what level ``paper`` holds."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -160,7 +160,16 @@ def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) ->
 
 
 def paper_header(scene: CompressedScene) -> Header:
-    """Header of the scene's file; cheap, since it depends only on counts."""
+    """Header of the scene's file at level ``paper``; cheap, since it depends only on counts.
+
+    The storage is as the paper counts it: positions and opacities are float32, the codes of all quantized attributes
+    are one bit-packed stream, and codebooks are float32:
+
+        16 · N + ⌈N · Σ bits / 8⌉ + Σ 4 · K · D + header bytes,
+
+    with bits = ⌈log2 K⌉ (0 for a single row). An attribute that is not quantized adds 4 · N · D instead of its bits and
+    its codebook. The header is the 32-byte prefix and the JSON.
+    """
     rows = {name: len(codebook) for name, codebook in scene.codebooks.items()}
     attributes = tuple(
         AttributeEntry(name, dim, "codes", rows[name]) if name in rows else AttributeEntry(name, dim, "raw")
@@ -170,7 +179,7 @@ def paper_header(scene: CompressedScene) -> Header:
 
 
 def encode_paper(scene: CompressedScene) -> tuple[Header, dict[str, bytes]]:
-    """Header and streams of a scene."""
+    """Header and streams of a scene at level ``paper``."""
     header = paper_header(scene)
     coded = [entry for entry in header.attributes if entry.storage == "codes"]
     floats = {"means": scene.means, "opacities": scene.opacities, **scene.raw}

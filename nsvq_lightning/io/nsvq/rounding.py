@@ -1,4 +1,4 @@
-"""A scene as integers: what level ``compact`` rounds it to before anything is coded.
+"""A scene as integers, which level ``compact`` rounds it to before anything is coded, and the order of codes.
 
 Steps of positions and of codebooks are powers of two. So rounding is idempotent: a scene read from a file is written
 again without another error.

@@ -75,7 +75,7 @@ def _add_absgrad(threads, absgrad, radii, x_factor, y_factor, partial, gradients
 def add_absgrad(
     gradients: Tensor, views: Tensor, weights: Tensor, absgrad: Tensor, radii: Tensor, factors: tuple[float, float]
 ) -> None:
-    """Add what one view says, where a splat was seen; in place.
+    """Add the absolute gradients and weights of a view, where a splat was seen; in place.
 
     Args:
         gradients: Sum of the norms of absolute gradients ``[N]`` float32.
