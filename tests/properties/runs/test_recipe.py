@@ -27,8 +27,8 @@ from nsvq_lightning.callbacks import (
 )
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.io.formats import load
-from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize import NSVQ
+from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize.nearest import code_rates
 from nsvq_lightning.rendering.reference import rotation_matrices
 from nsvq_lightning.training.module import SplatModule
