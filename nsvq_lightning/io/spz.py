@@ -53,12 +53,6 @@ logger = logging.getLogger(__name__)
 _MAGIC = b"NGSP"
 # First bytes: those of gzip up to version 3, those of the plain header from version 4 on.
 SPZ_MAGICS = (b"\x1f\x8b", _MAGIC)
-# Versions that are written; every reader of the format supports the default.
-SPZ_VERSIONS = (3, 4)
-DEFAULT_VERSION = 3
-# Axes that are written; viewers take a file to have the default, whatever it says.
-SPZ_AXES = ("rdf", "rub")
-DEFAULT_AXES = "rdf"
 
 
 @dataclass(frozen=True)
@@ -304,6 +298,14 @@ def in_spz_order(scene: CompressedScene) -> CompressedScene:
 
 
 _COLOR = 0.15
+
+
+# Versions that are written; every reader of the format supports the default.
+SPZ_VERSIONS = (3, 4)
+DEFAULT_VERSION = 3
+# Axes that are written; viewers take a file to have the default, whatever it says.
+SPZ_AXES = ("rdf", "rub")
+DEFAULT_AXES = "rdf"
 
 
 def write_spz(

@@ -29,13 +29,13 @@ from kernel_entries import entry_points, stand_in_for_a_gpu
 from splat_scenes import front_camera, random_splats, some_pixel_weights
 from torch import Tensor
 
+from nsvq_lightning.callbacks.precompile import compile_kernels
 from nsvq_lightning.io import formats
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, TrainedStraightThrough
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render, visible
 from nsvq_lightning.splats.splats import RawSplats, Splats
-from nsvq_lightning.training.precompile import compile_kernels
 
 TIMEOUT = 500
 """Seconds after which a call that hangs is reported."""

@@ -11,11 +11,11 @@ import sys
 import torch
 from splat_scenes import front_camera, random_splats
 
+from nsvq_lightning.callbacks.precompile import compile_kernels
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, StraightThrough
 from nsvq_lightning.rendering.rasterize import render, visible
 from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training.precompile import compile_kernels
 
 
 def rendering() -> None:

@@ -11,10 +11,8 @@ import pytest
 from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import Recipe, RunFactory
 
-from nsvq_lightning.callbacks import CompileAhead
-from nsvq_lightning.callbacks import precompile as callback_module
+from nsvq_lightning.callbacks import CompileAhead, precompile
 from nsvq_lightning.quantize import NSVQ, CodebookQuantizer, DiVeQ, PostHoc, StraightThrough, TrainedStraightThrough
-from nsvq_lightning.training import precompile
 from nsvq_lightning.training.module import SplatModule
 
 CODES = {"scales": 24, "quats": 24, "sh0": 16, "shN": 16}
@@ -79,8 +77,8 @@ def processes(monkeypatch: pytest.MonkeyPatch) -> list[Process]:
         started.append(Process(*args, **options))
         return started[-1]
 
-    monkeypatch.setattr(callback_module.subprocess, "Popen", start)
-    monkeypatch.setattr(callback_module, "usable_cores", lambda: 2)
+    monkeypatch.setattr(precompile.subprocess, "Popen", start)
+    monkeypatch.setattr(precompile, "usable_cores", lambda: 2)
     return started
 
 
@@ -89,7 +87,9 @@ def test_the_first_compilation_starts_one_process_that_ends_with_the_fit(
 ) -> None:
     run([*recipe(kernels=CompileAhead()).values(), Compiles()], max_steps=3)
     (process,) = processes
-    assert process.command[1:] == ["-m", "nsvq_lightning.training.precompile"]
+    assert process.command[1] == "-c"
+    compile(process.command[2], "what it runs", "exec")
+    assert "compile_what_is_sent()" in process.command[2]
     assert process.options["env"]["OMP_NUM_THREADS"] == "1"
     assert process.calls == ["sent", "terminate", "wait"]
     precompile.compile_kernels(pickle.loads(process.stdin.getvalue()))
@@ -119,7 +119,7 @@ def test_nothing_is_started_where_it_is_of_no_use(
     processes: list[Process],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(callback_module, "usable_cores", lambda: cores)
+    monkeypatch.setattr(precompile, "usable_cores", lambda: cores)
     run([*recipe(kernels=CompileAhead()).values(), Compiles()], max_steps=3, module=module)
     assert not processes
 
@@ -127,7 +127,7 @@ def test_nothing_is_started_where_it_is_of_no_use(
 def test_a_process_that_cannot_start_does_not_stop_the_fit(
     recipe: Recipe, run: RunFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(callback_module.subprocess, "Popen", refuse)
-    monkeypatch.setattr(callback_module, "usable_cores", lambda: 2)
+    monkeypatch.setattr(precompile.subprocess, "Popen", refuse)
+    monkeypatch.setattr(precompile, "usable_cores", lambda: 2)
     trainer, _ = run([*recipe(kernels=CompileAhead()).values(), Compiles()], max_steps=3)
     assert trainer.global_step == 3
