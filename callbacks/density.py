@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 
 import torch
 from lightning.pytorch import Trainer
-from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 
 from nsvq_lightning.compression.importance import most_contributing
@@ -71,22 +70,10 @@ class Densification(SplatCallback, ABC):
         """Do what is due after a complete iteration; the same on every process."""
 
     def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
-        """Reject strategies that would lose the replaced parameters.
-
-        Raises:
-            ValueError: The strategy wraps the module in ``DistributedDataParallel``.
-        """
+        """Forget an earlier fit."""
         super().setup(trainer, module, stage)
         if stage == "fit":
             self._warned = False
-        # A strategy that follows replaced parameters has this attribute.
-        follows = getattr(trainer.strategy, "follows_replaced_parameters", False)
-        if stage == "fit" and isinstance(trainer.strategy, DDPStrategy) and not follows:
-            raise ValueError(
-                "DistributedDataParallel binds gradient hooks to the parameters it finds at the start: after the first "
-                "clone it crashes or silently stops averaging. Train with --trainer.strategy=view_parallel, or on one "
-                "device (--trainer.devices=1)"
-            )
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Remove splats if there are already too many.

@@ -13,7 +13,7 @@ from torch import Tensor
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.data.scene import View, detailed_pixels, edge_strength
 from nsvq_lightning.io.nsvq.precision import Precision
-from nsvq_lightning.random import generator
+from nsvq_lightning.random import draw_rows, generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.attributes import ATTRIBUTES, QUANTIZABLE, attribute_dims
@@ -41,6 +41,8 @@ class SplatBudget(SplatCallback):
         quality: Times the default for the photos (:func:`nsvq_lightning.callbacks.growth.splats_for_photos`).
         splats: Number of splats.
         bytes: Size of the file at level ``compact``.
+        start: Points to start with, as a share of the number of splats: those of SfM, and as many more as that takes
+            from the flow between photos (:func:`nsvq_lightning.data.dense_start.dense_points`); 0 for those of SfM.
 
     Raises:
         ValueError: Splats and bytes are both given, or a number is not above 0.
@@ -55,24 +57,28 @@ class SplatBudget(SplatCallback):
     quality: float = 1.0
     splats: int | None = None
     bytes: int | None = None
+    start: float = 0.8
 
     def __post_init__(self) -> None:
-        self.check({"above 0": ("quality", "splats", "bytes")})
+        self.check({"above 0": ("quality", "splats", "bytes"), "at least 0": ("start",)})
         if self.splats is not None and self.bytes is not None:
             raise ValueError("splats and bytes both say how large the scene is to be: give one of them")
 
-    def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
-        """Set the module's budget.
+    def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
+        """Set the module's budget, and how many points it starts with.
 
         Raises:
             ValueError: The budget in bytes has no room for codebooks; or it is to come from photos, and the trainer has
                 no data module with a scene.
         """
-        module.splat_budget, reason = self.splats, "as asked"
+        super().setup(trainer, module, stage)
+        if stage != "fit":
+            return
+        budget, reason = self.splats or 0, "as asked"
         if self.bytes is not None:
             codebooks = {name: tuple(quantizer.codebook.shape) for name, quantizer in module.quantizers.items()}
             choices = [c.strength for c in trainer.callbacks if isinstance(c, RateDistortion)]  # type: ignore[attr-defined]
-            module.splat_budget = splats_for_bytes(
+            budget = splats_for_bytes(
                 self.bytes, codebooks, module.splats.sh_degree, module.storage.precision, max(choices, default=0.0)
             )
             reason = f"for a file of {self.bytes} bytes"
@@ -83,12 +89,13 @@ class SplatBudget(SplatCallback):
                 "give a number of splats (--splats) or bytes (--bytes)",
             )
             detail = detailed_pixels(scene)
-            module.splat_budget = splats_for_photos(len(scene.train), detail, self.quality)
+            budget = splats_for_photos(len(scene.train), detail, self.quality)
             reason = (
                 f"quality {self.quality:g} times what {len(scene.train)} photos with {detail:,.0f} detailed pixels "
                 "each support; --quality changes it"
             )
-        log.info("budget: %d splats, %s", module.splat_budget, reason)
+        module.splat_budget, module.first_points = budget, round(self.start * budget)
+        log.info("budget: %d splats, %s", budget, reason)
 
 
 # Distance of a child from its parent's centre, in units of the parent's longest axis (Improved-GS, section 3.2).
@@ -129,26 +136,6 @@ def add_absgrad(
     weights.add_(edges / mean.clamp_min(torch.finfo(edges.dtype).tiny) * seen)
 
 
-def draw_rows(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Mask ``[N]`` of ``count`` rows drawn without replacement in proportion to their weight; never one of weight 0.
-
-    The ``count`` largest of log weight + Gumbel noise are such a sample (Efraimidis and Spirakis 2006): one draw per
-    row, whatever is chosen.
-
-    Args:
-        weight: Weight of each row ``[N]``, not negative; with fewer positive ones than ``count``, all those.
-        count: How many to draw.
-        generator: Source of the draws, on the CPU.
-    """
-    uniform = torch.rand(weight.shape[0], generator=generator, dtype=torch.float64)
-    tiny = torch.finfo(torch.float64).tiny
-    key = weight.detach().double().cpu().log() - (-uniform.clamp_min(tiny).log()).clamp_min(tiny).log()
-    chosen = torch.zeros(weight.shape[0], dtype=torch.bool)
-    count = min(max(count, 0), int((weight > 0).sum()))
-    chosen[key.argsort(descending=True, stable=True)[:count]] = True
-    return chosen.to(weight.device)
-
-
 def split_longest(parents: RawSplats) -> RawSplats:
     """Two children for each parent, all first ones before all second ones, along its longest axis.
 
@@ -168,13 +155,6 @@ def split_longest(parents: RawSplats) -> RawSplats:
     return RawSplats(*(torch.cat(two) for two in zip(*pair, strict=True)))
 
 
-def lowest_share(opacities: Tensor, share: float) -> Tensor:
-    """Mask ``[N]`` of the ``share`` of the splats with the lowest opacity; ties go to the first."""
-    mask = torch.zeros_like(opacities, dtype=torch.bool)
-    mask[opacities.argsort(stable=True)[: int(share * opacities.shape[0])]] = True
-    return mask
-
-
 # Growth is idle if it adds at most this share of what it may add, or of what there is.
 IDLE = 0.01
 
@@ -186,8 +166,8 @@ class BudgetedGrowth(Densification):
     During warm-up each view adds, in its own backward pass, the absolute screen-space gradient of every splat (AbsGS,
     Ye et al. 2024) and its blending weight times the strength of the photo's edges. At the scheduled iterations as many
     splats as the budget allows are drawn, in proportion to their edge weight, from those whose gradient reaches a
-    threshold, and each is split along its longest axis (Improved-GS, Deng et al. 2025). Transparent splats are pruned,
-    and opacities reset. Growth ends with the warm-up phase, or ends that phase early if hardly any splat needs to be
+    threshold, and each is split along its longest axis (Improved-GS, Deng et al. 2025). Transparent splats are pruned.
+    Growth ends with the warm-up phase, or ends that phase early if hardly any splat needs to be
     split; non-finite splats are dropped in every phase.
 
     Iterations are those of the reference run; :class:`~nsvq_lightning.training.schedule.Schedule` scales them.
@@ -207,12 +187,6 @@ class BudgetedGrowth(Densification):
         min_opacity: Splats with a lower opacity are pruned at each growth but the last.
         first_prune: Iteration at which opacities below ``first_opacity`` are pruned once; 0 for never.
         first_opacity: See ``first_prune``.
-        reset_every: Interval of opacity resets.
-        reset_last: Last opacity reset.
-        reset_opacity: Opacities are reset to at most this.
-        recovery: Iterations after a reset at which those with the lowest opacity are pruned.
-        recoveries: After how many resets, from the first, that is done.
-        recovery_share: Share of the splats that this prunes.
         patience: After so many times at which there is room, but hardly a splat over the threshold, the warm-up phase
             ends; 0 for never.
         min_splats: A pruning that would leave fewer splats is skipped with a warning.
@@ -242,12 +216,6 @@ class BudgetedGrowth(Densification):
     min_opacity: float = 0.005
     first_prune: int = 300
     first_opacity: float = 0.02
-    reset_every: int = 2600
-    reset_last: int = 5400
-    reset_opacity: float = 0.05
-    recovery: int = 600
-    recoveries: int = 2
-    recovery_share: float = 0.2
     patience: int = 5
     min_splats: int = 10
     finite_every: int = 100
@@ -258,10 +226,9 @@ class BudgetedGrowth(Densification):
     def __post_init__(self) -> None:
         self.check(
             {
-                "at least 1": ("every", "reset_every", "recovery", "min_splats", "overshoot", "finite_every"),
-                "at least 0": ("start", "first_prune", "recoveries", "patience", "grad_threshold", "late_threshold"),
-                "between 0 and 1": ("min_opacity", "first_opacity", "reset_opacity"),
-                "in [0, 1)": ("recovery_share",),
+                "at least 1": ("every", "min_splats", "overshoot", "finite_every"),
+                "at least 0": ("start", "first_prune", "patience", "grad_threshold", "late_threshold"),
+                "between 0 and 1": ("min_opacity", "first_opacity"),
             }
         )
         if self.full <= self.start:
@@ -300,7 +267,7 @@ class BudgetedGrowth(Densification):
         add_absgrad(gradients, views, edges, render.absgrad.grad, render.radii, *size)
 
     def act(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
-        """Split, prune and reset when due."""
+        """Split and prune when due."""
         schedule = module.schedule
         if schedule.phase_at(iteration) is not Phase.WARMUP:
             return
@@ -322,12 +289,6 @@ class BudgetedGrowth(Densification):
                     f"iteration {iteration}: growth ends with {len(module.splats)} splats, as hardly any needs to be "
                     f"split; the run will be {last - iteration} iterations shorter"
                 )
-        resets = schedule.reset_times(self.reset_last, self.reset_every)
-        if iteration in resets:
-            self.reset_opacities(trainer, module, self.reset_opacity)
-            distributed.check_replicas(trainer, "the opacity reset")
-        if iteration in (reset + schedule.interval(self.recovery) for reset in resets[: self.recoveries]):
-            self.prune(trainer, module, lowest_share(module.splats.opacities, self.recovery_share))
 
     @torch.no_grad()
     def _grow(self, trainer: Trainer, module: SplatModule, iteration: int) -> tuple[int, int]:

@@ -9,13 +9,12 @@ from torch import Tensor
 
 from nsvq_lightning.compression.importance import most_contributing
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.random import generator
+from nsvq_lightning.random import draw_rows, generator
 from nsvq_lightning.training import distributed, row_ops
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
 from .base import SplatCallback
-from .growth import draw_rows
 
 
 @dataclass(eq=False)

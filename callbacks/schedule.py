@@ -36,6 +36,7 @@ class PhaseSchedule(SplatCallback):
         min_finetune: Lower limit of the length of the fine-tune phase, up to half of what follows the prune phase.
         iterations_per_photo: Most iterations for each train photo, as few are soon overfitted. None is
             ``trainer.max_steps`` whatever the photos; ``total`` goes before it.
+        least_iterations: What ``iterations_per_photo`` leaves in any case.
 
     Raises:
         ValueError: ``iterations_per_photo`` is below 1; or see :class:`~nsvq_lightning.training.schedule.Schedule`.
@@ -59,10 +60,11 @@ class PhaseSchedule(SplatCallback):
     min_replacement_interval: int = Schedule.min_replacement_interval
     min_finetune: int = Schedule.min_finetune
     iterations_per_photo: int | None = None
+    least_iterations: int = 1
     _steps: int = field(default=-1, init=False)
 
     def __post_init__(self) -> None:
-        self.check({"at least 1": ("iterations_per_photo",)})
+        self.check({"at least 1": ("iterations_per_photo", "least_iterations")})
         if self.total is not None or self.reference_total is not None:
             # Report wrong settings at once, not after the scene is loaded.
             self.schedule(self.total or self.reference_total or 1)
@@ -85,10 +87,14 @@ class PhaseSchedule(SplatCallback):
         if self.iterations_per_photo is not None and self.total is None:
             need = "a number of iterations for each photo needs the photos"
             photos = len(scene_module.needed_scene(trainer, need, "leave iterations_per_photo unset").train)
-            limit = self.iterations_per_photo * photos
-            if not 0 < trainer.max_steps <= limit:
+            limit = max(self.iterations_per_photo * photos, self.least_iterations)
+            if not 0 <= trainer.max_steps <= limit:
                 trainer.fit_loop.epoch_loop.max_steps = limit
-                log.info("iterations: %d, %d for each of %d photos", limit, self.iterations_per_photo, photos)
+                log.info(
+                    "iterations: %d for %d photos; more with a larger --callbacks.phases.iterations_per_photo",
+                    limit,
+                    photos,
+                )
         self._steps = trainer.max_steps
         total = self.total if self.total is not None else trainer.max_steps
         if total < 1:

@@ -10,7 +10,7 @@ from nsvq_lightning.top_level import folder_of
 from . import checkpoint, growth, outputs, precompile, progress, pruning, quantization, report, schedule
 
 # Callback by name. Density control comes before the canonical form, which may act after the same iteration; codebooks
-# are placed before rate and distortion choose among their codes.
+# are placed, and codes replaced, before rate and distortion choose among them.
 STANDARD: dict[str, type[Callback]] = {
     "phases": schedule.PhaseSchedule,
     "sh_degree": schedule.ShDegreeSchedule,

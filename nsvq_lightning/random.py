@@ -7,6 +7,7 @@ the number of threads, nor on the number of processes, nor on whether a run was 
 import hashlib
 
 import torch
+from torch import Tensor
 
 
 def derive_seed(seed: int, step: int = 0, *salts: int | str) -> int:
@@ -27,3 +28,23 @@ def derive_seed(seed: int, step: int = 0, *salts: int | str) -> int:
 def generator(seed: int, step: int = 0, *salts: int | str, device: torch.device | str = "cpu") -> torch.Generator:
     """A fresh ``torch.Generator`` for one draw, see :func:`derive_seed`."""
     return torch.Generator(device=device).manual_seed(derive_seed(seed, step, *salts))
+
+
+def draw_rows(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Mask ``[N]`` of ``count`` rows drawn without replacement in proportion to their weight; never one of weight 0.
+
+    The ``count`` largest of log weight + Gumbel noise are such a sample (Efraimidis and Spirakis 2006): one draw per
+    row, whatever is chosen.
+
+    Args:
+        weight: Weight of each row ``[N]``, not negative; with fewer positive ones than ``count``, all those.
+        count: How many to draw.
+        generator: Source of the draws, on the CPU.
+    """
+    uniform = torch.rand(weight.shape[0], generator=generator, dtype=torch.float64)
+    tiny = torch.finfo(torch.float64).tiny
+    key = weight.detach().double().cpu().log() - (-uniform.clamp_min(tiny).log()).clamp_min(tiny).log()
+    chosen = torch.zeros(weight.shape[0], dtype=torch.bool)
+    count = min(max(count, 0), int((weight > 0).sum()))
+    chosen[key.argsort(descending=True, stable=True)[:count]] = True
+    return chosen.to(weight.device)

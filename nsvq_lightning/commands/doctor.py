@@ -381,7 +381,8 @@ def check_budget(scene: "Scene") -> Iterator[Finding]:
     yield judged("run memory", text, free is not None and needed > free and advice)
     # A step is a render forward and backward, and as long again for loss, optimizer and codebooks.
     step, paper_step = (2.0 * render_seconds(scene, count) for count in (fast, paper))
-    text = f"about {4000 * step / 60:.0f} min for fast.yaml (4,000 steps, {fast:,} splats on average), "
+    steps = min(max(20 * len(scene.train), 2500), 4500)
+    text = f"about {steps * step / 60:.0f} min for fast.yaml ({steps:,} steps, {fast:,} splats on average), "
     text += f"{45_000 * paper_step / 3600:.1f} h for the paper's run (45,000, {paper:,}), on a machine as busy as now"
     yield judged("run time", text)
 

@@ -114,17 +114,18 @@ class Splats(nn.Module):
         return splats
 
     @classmethod
-    def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3) -> "Splats":
+    def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3, opacity: float = 0.1) -> "Splats":
         """One isotropic splat per point, as 3D Gaussian Splatting starts from a COLMAP model.
 
-        Opacity 0.1, no rotation, log-scale ½·log of the mean squared distance to the three nearest neighbours (clamped
-        to [1e-7, 4]), constant colour. Non-finite and duplicate points are dropped: a duplicate adds nothing and has no
-        distance of its own.
+        No rotation, constant colour, axes as long as the root of the mean squared distance to the three nearest
+        neighbours (clamped to [1e-7, 4]). Non-finite and duplicate points are dropped: a duplicate
+        adds nothing and has no distance of its own.
 
         Args:
             points: World positions ``[N, 3]``.
             colors: RGB in [0, 1], ``[N, 3]``.
             sh_degree: Highest degree of the spherical harmonics; the coefficients above 0 start at 0.
+            opacity: Of each splat, between 0 and 1.
 
         Raises:
             ValueError: No usable point is left.
@@ -142,7 +143,7 @@ class Splats(nn.Module):
             means=points,
             quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
             scales=(0.5 * spread.log())[:, None].repeat(1, 3),
-            opacities=torch.full((n,), math.log(0.1 / 0.9)),
+            opacities=torch.full((n,), math.log(opacity / (1 - opacity))),
             sh0=((colors - 0.5) / SH_C0)[:, None, :],
             shN=torch.zeros(n, sh_coefficients(sh_degree), 3),
         )

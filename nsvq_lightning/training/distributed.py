@@ -15,6 +15,20 @@ from torch.distributed import all_reduce, broadcast
 from nsvq_lightning.compute.devices import to_device
 
 
+def check_strategy(strategy: Strategy) -> None:
+    """Refuse a strategy that would lose the parameters that callbacks replace.
+
+    Raises:
+        ValueError: The strategy wraps the module in ``DistributedDataParallel``.
+    """
+    if isinstance(strategy, DDPStrategy) and not getattr(strategy, "follows_replaced_parameters", False):
+        raise ValueError(
+            "DistributedDataParallel binds gradient hooks to the parameters it finds at the start: after the first "
+            "clone it crashes or silently stops averaging. Train with --trainer.strategy=view_parallel, or on one "
+            "device (--trainer.devices=1)"
+        )
+
+
 def follow_first(strategy: Strategy, module: nn.Module) -> None:
     """Copy the first process's parameters and buffers to the module on every process; row counts may differ before."""
     module.load_state_dict(strategy.broadcast(module.state_dict()))
@@ -93,7 +107,7 @@ class ViewParallelStrategy(DDPStrategy):
     """
 
     follows_replaced_parameters = True
-    """What :class:`~nsvq_lightning.callbacks.DensityControl` requires of a strategy for several processes."""
+    """What :func:`check_strategy` requires of a strategy for several processes."""
 
     _accumulates = False
     _failed: Tensor | None = None

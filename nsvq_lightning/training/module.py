@@ -19,7 +19,7 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, visible
 from nsvq_lightning.splats.splats import RawSplats, Splats
-from nsvq_lightning.training import optim, resume, scene_module
+from nsvq_lightning.training import distributed, optim, resume, scene_module
 from nsvq_lightning.training.scene_module import Stopwatch
 from nsvq_lightning.training.schedule import Phase, Schedule
 
@@ -155,29 +155,29 @@ class SplatModule(resume.ResumedModule):
         return generator(self.seed, self.global_step, 0, *salts, self._micro_batch * processes + self.global_rank)
 
     def setup(self, stage: str) -> None:
-        """Fill empty splats from ``init_from`` or the scene's points, and set the extent of the scene.
+        """Set the background and the extent of the scene.
 
         Raises:
-            ValueError: There is nothing to start from, or the trainer has another precision than ``32-true``.
+            ValueError: There is no scene, or the trainer has another precision than ``32-true`` or a strategy that
+                loses replaced parameters.
         """
+        distributed.check_strategy(self.trainer.strategy)
         if self.trainer.precision != "32-true":
             raise ValueError(
                 f"splats train in float32, trainer.precision is {self.trainer.precision}: kernels compute in float32 "
                 "whatever it says, and a scaled loss would grow splats needlessly; leave it at 32-true"
             )
         self.evaluation_splats = None  # an interrupted evaluation may have left some
-        scene = scene_module.scene_of(self.trainer)
-        if scene is not None:
+        if (scene := scene_module.scene_of(self.trainer)) is not None:
             self.background = scene_module.background_of(scene, self.background)
         if stage == "fit" and self.extent == 0.0:
             self.extent = scene_module.extent_of(scene)
-        if stage == "fit" and len(self.splats) == 0:
-            splats = scene_module.first_splats(self.init_from, scene, self.splats.sh_degree)
-            self.splats = splats.to(self.device)
-            self.active_sh_degree = 0 if self.init_from is None else self.splats.sh_degree
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """One Adam optimiser with one named group for each attribute and codebook."""
+        """One Adam optimiser with a named group for each attribute and codebook; first splats, if there are none."""
+        if len(self.splats) == 0:
+            self.splats = scene_module.first_splats(self).to(self.device)
+            self.active_sh_degree = 0 if self.init_from is None else self.splats.sh_degree
         return optim.build_adam(optim.param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
 
     def on_train_start(self) -> None:

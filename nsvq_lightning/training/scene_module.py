@@ -10,12 +10,14 @@ from typing import Any, cast
 
 import torch
 from lightning.pytorch import LightningModule, Trainer
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from nsvq_lightning.compression.importance import contributions
 from nsvq_lightning.compression.stored import to_compressed
 from nsvq_lightning.compute.environment import threads_spin
 from nsvq_lightning.compute.jit import compile_seconds
+from nsvq_lightning.data.dense_start import dense_points
 from nsvq_lightning.data.scene import ONE_PLACE, Scene, View
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import load
@@ -56,6 +58,9 @@ class SceneModule(LightningModule):
     """1.1 × the largest distance of a train camera from the mean of all, scene units; 0 while unknown."""
     rates: LearningRates
     storage: Storage
+    init_from: str | None
+    first_points: int | None = None
+    """How many points of SfM and of flow the first splats are made from; None for those of SfM, as in 3DGS."""
     background: str
     dssim_weight: float
     antialiased: bool
@@ -256,27 +261,46 @@ def extent_of(scene: Scene | None) -> float:
     return scene.extent
 
 
-def first_splats(path: str | None, scene: Scene | None, sh_degree: int) -> Splats:
-    """The splats of a scene file without the non-finite ones, or one for each point of the scene.
+# First splats of a run with a budget (docs/recipe.md): opacity; largest size in pixels of the nearest photo, as a lone
+# point would hide what is behind it.
+FIRST_OPACITY, MOST_PIXELS = 0.3, 50.0
 
-    Args:
-        path: Scene file of any format; None for the points.
-        scene: The photos' scene, if there is one.
-        sh_degree: Degree of the module's spherical harmonics.
+
+def first_splats(module: SceneModule) -> Splats:
+    """What the module starts from: a scene file without its non-finite splats, or one splat for each point.
+
+    Points are those of SfM and, where the module asks for more, those of :mod:`nsvq_lightning.data.dense_start`.
 
     Raises:
-        ValueError: There is neither, or the file has another degree.
+        ValueError: There is neither a file nor a scene, or the file has another SH degree than the module.
+        SceneError: A photo cannot be decoded.
     """
-    if path is None:
-        if scene is None:
-            raise ValueError("no splats to start from: fit with a data module that has a scene, or set init_from")
-        return Splats.from_points(scene.points, scene.colors, sh_degree)
-    loaded = load(path)
-    if loaded.sh_degree != sh_degree:
-        raise ValueError(
-            f"{path} has SH degree {loaded.sh_degree}, the module has {sh_degree}; set sh_degree={loaded.sh_degree}"
-        )
-    return finite_splats(loaded, path)
+    sh_degree, path, scene = module.splats.sh_degree, module.init_from, scene_of(module.trainer)
+    if path is not None:
+        loaded = load(path)
+        if loaded.sh_degree != sh_degree:
+            raise ValueError(
+                f"{path} has SH degree {loaded.sh_degree}, the module has {sh_degree}; set sh_degree={loaded.sh_degree}"
+            )
+        return finite_splats(loaded, path)
+    if scene is None:
+        raise ValueError("no splats to start from: fit with a data module that has a scene, or set init_from")
+    points, colors = scene.points, scene.colors
+    if module.first_points is None:
+        return Splats.from_points(points, colors, sh_degree)
+    if (missing := module.first_points - len(points)) > 0:
+        start = time.perf_counter()
+        more, their_colors = dense_points(scene, missing, module.seed)
+        log.info("dense start: %d points beside %d of SfM, %.1f s", len(more), len(points), time.perf_counter() - start)
+        if not len(more):
+            log.warning("neighbouring photos show nothing that could be followed: training starts from SfM's points")
+        points, colors = torch.cat([points, more]), torch.cat([colors, their_colors])
+    splats = Splats.from_points(points, colors, sh_degree, FIRST_OPACITY)
+    cameras = [scene.cameras[index] for index in scene.train]
+    distances, _ = cKDTree(torch.stack([camera.position for camera in cameras])).query(splats.means.detach())
+    pixel = torch.from_numpy(distances).float() / max(camera.intrinsics[0] for camera in cameras)
+    splats.scales.data.clamp_(max=(MOST_PIXELS * pixel).log()[:, None])
+    return splats
 
 
 def background_of(scene: Scene, asked: str) -> str:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from density_stage import EXTENT, Stage, make_splats
-from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.callbacks import DensityControl
@@ -19,8 +17,6 @@ from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training.distributed import ViewParallelStrategy
-from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.row_ops import append_rows, keep_rows
 from nsvq_lightning.training.schedule import Schedule
 
@@ -220,11 +216,3 @@ def test_frozen_codes_go_with_the_splats_that_are_dropped_in_fine_tuning() -> No
     assert stage.module.splats.means.detach().tolist() == [[0, 1, 2], [6, 7, 8], [9, 10, 11]]
     assert frozen.codes.tolist() == [2, 1, 2]
     assert not free.frozen
-
-
-def test_ddp_is_refused_with_the_reason() -> None:
-    control, host = DensityControl(), SplatModule(codebooks=None)
-    with pytest.raises(ValueError, match=r"silently stops averaging.*strategy=view_parallel"):
-        control.setup(SimpleNamespace(strategy=DDPStrategy()), host, "fit")  # type: ignore[arg-type]
-    control.setup(SimpleNamespace(strategy=SingleDeviceStrategy()), host, "fit")  # type: ignore[arg-type]
-    control.setup(SimpleNamespace(strategy=ViewParallelStrategy()), host, "fit")  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Budgeted growth: its decisions against plain definitions; statistics, budget, edits, resets on a few splats."""
+"""Budgeted growth: its decisions against plain definitions; statistics, budget, edits on a few splats."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import torch
 from density_stage import Stage, make_splats
 
 from nsvq_lightning.callbacks import BudgetedGrowth
-from nsvq_lightning.callbacks.growth import add_absgrad, draw_rows, lowest_share, split_longest
+from nsvq_lightning.callbacks.growth import add_absgrad, split_longest
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices
@@ -47,34 +46,6 @@ def test_the_kernel_adds_what_plain_torch_adds(count: int) -> None:
         torch.testing.assert_close(ours.double(), theirs, rtol=1e-6, atol=1e-6)
 
 
-def test_rows_are_drawn_without_replacement_in_proportion_to_their_weight() -> None:
-    weight = torch.tensor([0.0, 1.0, 2.0, 4.0, 0.0, 8.0])
-    single = torch.zeros(6, dtype=torch.float64)
-    pairs = torch.zeros(6, dtype=torch.float64)
-    trials = 4000
-    for trial in range(trials):
-        single += draw_rows(weight, 1, generator(0, trial))
-        chosen = draw_rows(weight, 2, generator(1, trial))
-        assert int(chosen.sum()) == 2
-        pairs += chosen
-    share = (weight / weight.sum()).double()
-    # Four standard deviations of a binomial count.
-    assert ((single / trials - share).abs() <= 4 * (share * (1 - share) / trials).sqrt()).all()
-    # Drawn second: Σ over first draws j of p_j · p_i / (1 - p_j).
-    both = share + torch.stack([share * share[j] / (1 - share[j]) * (torch.arange(6) != j) for j in range(6)]).sum(0)
-    assert ((pairs / trials - both).abs() <= 4 * (both * (1 - both) / trials).sqrt() + 1e-12).all()
-
-
-def test_a_draw_takes_no_row_of_weight_zero_and_repeats() -> None:
-    weight = torch.tensor([0.0, 3.0, 0.0, 1e-30])
-    assert draw_rows(weight, 10, generator(0)).tolist() == [False, True, False, True]
-    assert not draw_rows(torch.zeros(4), 2, generator(0)).any()
-    assert not draw_rows(weight, -5, generator(0)).any()
-    many = torch.rand(1000, generator=generator(2))
-    assert torch.equal(draw_rows(many, 100, generator(7)), draw_rows(many, 100, generator(7)))
-    assert not torch.equal(draw_rows(many, 100, generator(7)), draw_rows(many, 100, generator(8)))
-
-
 def test_children_lie_on_the_longest_axis_of_their_parent() -> None:
     draw = torch.Generator().manual_seed(0)
     count = 50
@@ -101,20 +72,11 @@ def test_children_lie_on_the_longest_axis_of_their_parent() -> None:
             assert torch.equal(getattr(children, name)[child], getattr(parents, name))
 
 
-def test_the_lowest_share_is_counted_and_ties_go_to_the_first() -> None:
-    logits = torch.tensor([0.0, -2.0, 3.0, -2.0, -2.0])
-    assert lowest_share(logits, 0.4).tolist() == [False, True, False, True, False]
-    assert not lowest_share(logits, 0.1).any()
-
-
 WIDTH, HEIGHT = 40, 20
 PHOTO = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8)
 PHOTO[:, WIDTH // 2 :] = 200
 BATCH = View("a", 0, Camera(torch.eye(3), torch.eye(4), WIDTH, HEIGHT), PHOTO)
-RULES: dict[str, Any] = {
-    **{"start": 0, "full": 100, "every": 10, "first_prune": 5, "reset_every": 40, "reset_last": 80},
-    **{"recovery": 7, "recoveries": 1, "min_splats": 2},
-}
+RULES: dict[str, Any] = {"start": 0, "full": 100, "every": 10, "first_prune": 5, "min_splats": 2}
 SCHEDULE = Schedule(
     total=200,
     reference_total=200,
@@ -186,18 +148,6 @@ def test_the_first_prune_and_the_transparent_ones() -> None:
     stage = stage_of([0.5, 0.019, 0.004, 0.021], BudgetedGrowth(**RULES, budget=1000))
     stage.step(120, batch=BATCH)  # the last growth prunes none
     assert stage.count == 4
-
-
-def test_opacities_are_reset_and_the_faintest_go_when_the_others_have_recovered() -> None:
-    opacities = [0.9, 0.04, 0.6, 0.03, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
-    stage = stage_of(opacities, BudgetedGrowth(**RULES, budget=1000))
-    stage.step(40, batch=BATCH)
-    assert stage.opacities == pytest.approx([min(value, 0.05) for value in opacities])
-    stage.step(47, batch=BATCH)
-    assert stage.opacities == pytest.approx([0.05] * 8)  # a fifth of them went
-    stage.step(80, batch=BATCH)
-    stage.step(87, batch=BATCH)  # only after the first reset
-    assert stage.count == 8
 
 
 def test_nothing_happens_after_warm_up() -> None:

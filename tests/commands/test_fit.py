@@ -285,7 +285,7 @@ def test_callbacks_can_be_configured_exchanged_removed_and_added(capsys: pytest.
 def test_shipped_configs_are_what_their_names_say(capsys: pytest.CaptureFixture[str]) -> None:
     default = settings(capsys, "--data.root=x")
     assert default == settings(capsys, "--data.root=x", "--config=fast")
-    assert (default["trainer"]["max_steps"], default["callbacks"]["budget"]["init_args"]["quality"]) == (4000, 0.9)
+    assert (default["trainer"]["max_steps"], default["callbacks"]["budget"]["init_args"]["quality"]) == (4500, 0.9)
     assert default["trainer"]["devices"] == 1  # whatever the machine has
     assert default["model"]["quantizer"]["class_path"].endswith("TrainedStraightThrough")
     plain = settings(capsys, "--config=plain", "--data.root=x")

@@ -71,7 +71,7 @@ def test_help_says_what_there_is_and_names_none_of_torchs_classes(fit_help: str)
     for key, kind in STANDARD.items():
         assert f"--callbacks.{key}" in fit_help or not inspect.signature(kind).parameters
     assert "--data.root\n        Scene folder" in fit_help
-    assert "--trainer.max_steps=4000" in fit_help
+    assert "--trainer.max_steps=4500" in fit_help
     assert "torch.nn" not in fit_help
     assert len(fit_help.splitlines()) < 510
     assert max(len(line) for line in fit_help.splitlines() if line.startswith("        ")) <= 80

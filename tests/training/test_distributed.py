@@ -8,13 +8,19 @@ from typing import Any
 import pytest
 import torch
 from lightning.pytorch import LightningModule
-from lightning.pytorch.strategies import DDPStrategy
+from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from torch import Tensor, nn
 
 import nsvq_lightning.training.distributed as strategies
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
-from nsvq_lightning.training.distributed import ViewParallelStrategy, check_replicas, checksum, follow_first
+from nsvq_lightning.training.distributed import (
+    ViewParallelStrategy,
+    check_replicas,
+    check_strategy,
+    checksum,
+    follow_first,
+)
 
 LOSS = torch.tensor(1.0)
 
@@ -212,3 +218,10 @@ def test_a_quantizer_takes_over_the_first_one_with_fewer_codes() -> None:
     assert torch.equal(other.codebook, first.codebook)
     assert other.usage.shape == (40,)
     assert bool(other.fitted)
+
+
+def test_ddp_is_refused_with_the_reason() -> None:
+    with pytest.raises(ValueError, match=r"silently stops averaging.*strategy=view_parallel"):
+        check_strategy(DDPStrategy())
+    check_strategy(SingleDeviceStrategy())
+    check_strategy(ViewParallelStrategy())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -25,6 +26,7 @@ from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
+from nsvq_lightning.training.scene_module import first_splats
 from nsvq_lightning.training.schedule import Phase
 
 CODES = {"scales": 6, "quats": 5, "sh0": 4, "shN": 3}
@@ -229,6 +231,25 @@ def test_trained_splats_are_rendered_with_all_their_coefficients() -> None:
     splats = Splats.from_points(torch.randn(5, 3), torch.rand(5, 3), 2)
     assert SplatModule(splats=splats).active_sh_degree == 2
     assert SplatModule(sh_degree=2).active_sh_degree == 0  # from points, the degree grows
+
+
+def test_a_lone_point_before_the_cameras_does_not_hide_the_scene(make_scene: Callable[..., Path]) -> None:
+    data = ColmapDataModule(str(make_scene()))
+    scene = data.scene
+    centres = torch.stack([scene.cameras[index].position for index in scene.train])
+    lone = centres[0] + torch.tensor([0.0, 0.0, 0.5])
+    points = torch.cat([lone[None], 1e3 + 0.01 * torch.arange(9.0).view(3, 3)])
+    data.scene = replace(scene, points=points, colors=torch.zeros(4, 3))
+    module = SplatModule(sh_degree=0)
+    module.trainer = SimpleNamespace(datamodule=data)  # type: ignore[assignment]
+    free = first_splats(module)
+    module.first_points = 4
+    capped = first_splats(module)
+    nearest = torch.cdist(capped.means, centres).min(1).values
+    pixels = capped.scales.exp()[:, 0] / nearest * scene.cameras[0].intrinsics[0]
+    assert float(pixels[0]) == pytest.approx(50.0, rel=1e-4)
+    assert torch.equal(capped.scales[1:], free.scales[1:])
+    assert capped.opacities.sigmoid().tolist() == pytest.approx([0.3] * 4)
 
 
 def test_photos_from_one_place_are_named(make_scene: Callable[..., Path]) -> None:

@@ -60,7 +60,8 @@ def test_a_configuration_may_bring_everything(tmp_path: Path) -> None:
 
 def test_the_short_options_of_fit_hold_for_every_run(scenes: tuple[Path, Path]) -> None:
     (run,) = plan(scenes[:1], options=("--splats", "3000"))
-    assert run.settings["callbacks"]["budget"]["init_args"] == {"quality": 0.9, "splats": 3000, "bytes": None}
+    budget = run.settings["callbacks"]["budget"]["init_args"]
+    assert budget == {"quality": 0.9, "splats": 3000, "bytes": None, "start": 0.8}
     with pytest.raises(ValueError, match="--splats and --bytes both say"):
         plan(scenes[:1], options=("--splats=3000", "--bytes=100000"))
 

@@ -26,6 +26,7 @@ from nsvq_lightning.callbacks import (
     SplatBudget,
 )
 from nsvq_lightning.commands.main import main
+from nsvq_lightning.data.datamodule import DEMO
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
@@ -66,7 +67,8 @@ def test_rates_fall_at_the_end_and_rise_for_the_selection(fast: Whole) -> None:
 
 def test_the_order_of_callbacks_matters_only_where_it_is_said_to(fast: Whole, run: RunFactory, recipe: Recipe) -> None:
     callbacks = recipe(**recipe_options())
-    first = ["budget", "density", "canonical", "codebook_init"]  # each needs the one before, or acts at the same time
+    # Each needs the one before, or acts at the same time.
+    first = ["budget", "density", "canonical", "codebook_init", "codebook_replacement"]
     names = [*first, *(name for name in reversed(callbacks) if name not in first)]
     assert scene_bytes(run([callbacks[name] for name in names], module=RECIPE_MODULE)[0]) == fast.scene
 
@@ -103,14 +105,51 @@ def test_a_budget_from_photos_or_bytes_is_explained(
     assert ("quality 2 times what 7 photos with" if budget == "quality" else "for a file of 60000 bytes") in line
 
 
+def test_a_dense_start_adds_points_to_those_of_sfm(
+    run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
+) -> None:
+    def splats(share: float) -> int:
+        chosen = recipe(budget=SplatBudget(splats=10_000, start=share), density=None)
+        return len(run(chosen.values(), max_steps=1, scene=DEMO)[1].splats)
+
+    with caplog.at_level(logging.INFO):
+        known, more = splats(0.0), splats(0.8)
+    (line,) = [message for message in caplog.messages if message.startswith("dense start: ")]
+    assert line.startswith(f"dense start: {8000 - known} points beside {known} of SfM, ")
+    assert more == 8000
+
+
+def test_where_flow_finds_nothing_the_run_starts_from_sfm(
+    run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nothing = torch.empty(0, 3)
+    monkeypatch.setattr("nsvq_lightning.training.scene_module.dense_points", lambda *_: (nothing, nothing))
+    _, module = run(recipe(budget=SplatBudget(splats=2000), density=None).values(), max_steps=1)
+    assert len(module.splats) > 0
+    assert "training starts from SfM's points" in caplog.text
+
+
+def test_a_resumed_run_looks_for_no_points(
+    run: RunFactory, recipe: Recipe, fast: Whole, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("the checkpoint has its splats")
+
+    monkeypatch.setattr("nsvq_lightning.training.scene_module.dense_points", refuse)
+    checkpoint = sorted((fast.folder / "checkpoints").glob("*.ckpt"))[0]
+    run(recipe(**recipe_options()).values(), ckpt_path=checkpoint, module=RECIPE_MODULE)
+
+
 def test_few_photos_shorten_the_run(run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture) -> None:
     phases = PhaseSchedule(reference_total=60, iterations_per_photo=2, **ENDS)
     with caplog.at_level(logging.INFO):
         trainer, module = run(recipe(phases=phases).values())
-    assert "iterations: 14, 2 for each of 7 photos" in caplog.text
+    assert "iterations: 14 for 7 photos; more with" in caplog.text
     assert trainer.global_step == module.schedule.total == trainer.max_steps == 14
     assert module.phase is Phase.FINETUNE  # which ends with it
     assert run(recipe(phases=phases).values(), max_steps=3)[0].global_step == 3
+    phases.least_iterations = 17
+    assert run(recipe(phases=phases).values())[0].global_step == 17
 
 
 def test_growth_that_has_nothing_to_split_ends_the_warm_up_and_shortens_the_run(
