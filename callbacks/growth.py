@@ -155,6 +155,13 @@ def split_longest(parents: RawSplats) -> RawSplats:
     return RawSplats(*(torch.cat(two) for two in zip(*pair, strict=True)))
 
 
+def lowest_share(opacities: Tensor, share: float) -> Tensor:
+    """Mask ``[N]`` of the ``share`` of the splats with the lowest opacity; ties go to the first."""
+    mask = torch.zeros_like(opacities, dtype=torch.bool)
+    mask[opacities.argsort(stable=True)[: int(share * opacities.shape[0])]] = True
+    return mask
+
+
 # Growth is idle if it adds at most this share of what it may add, or of what there is.
 IDLE = 0.01
 
@@ -166,9 +173,9 @@ class BudgetedGrowth(Densification):
     During warm-up each view adds, in its own backward pass, the absolute screen-space gradient of every splat (AbsGS,
     Ye et al. 2024) and its blending weight times the strength of the photo's edges. At the scheduled iterations as many
     splats as the budget allows are drawn, in proportion to their edge weight, from those whose gradient reaches a
-    threshold, and each is split along its longest axis (Improved-GS, Deng et al. 2025). Transparent splats are pruned.
-    Growth ends with the warm-up phase, or ends that phase early if hardly any splat needs to be
-    split; non-finite splats are dropped in every phase.
+    threshold, and each is split along its longest axis (Improved-GS, Deng et al. 2025). Transparent splats are pruned,
+    and opacities reset if asked. Growth ends with the warm-up phase, or ends that phase early if hardly any splat needs
+    to be split; non-finite splats are dropped in every phase.
 
     Iterations are those of the reference run; :class:`~nsvq_lightning.training.schedule.Schedule` scales them.
 
@@ -187,6 +194,12 @@ class BudgetedGrowth(Densification):
         min_opacity: Splats with a lower opacity are pruned at each growth but the last.
         first_prune: Iteration at which opacities below ``first_opacity`` are pruned once; 0 for never.
         first_opacity: See ``first_prune``.
+        reset_every: Interval of opacity resets.
+        reset_last: Last opacity reset; 0 for none. Long runs need them (docs/recipe.md).
+        reset_opacity: Opacities are reset to at most this.
+        recovery: Iterations after a reset at which those with the lowest opacity are pruned.
+        recoveries: After how many resets, from the first, that is done.
+        recovery_share: Share of the splats that this prunes.
         patience: After so many times at which there is room, but hardly a splat over the threshold, the warm-up phase
             ends; 0 for never.
         min_splats: A pruning that would leave fewer splats is skipped with a warning.
@@ -216,6 +229,12 @@ class BudgetedGrowth(Densification):
     min_opacity: float = 0.005
     first_prune: int = 300
     first_opacity: float = 0.02
+    reset_every: int = 2600
+    reset_last: int = 0
+    reset_opacity: float = 0.05
+    recovery: int = 600
+    recoveries: int = 2
+    recovery_share: float = 0.2
     patience: int = 5
     min_splats: int = 10
     finite_every: int = 100
@@ -226,9 +245,10 @@ class BudgetedGrowth(Densification):
     def __post_init__(self) -> None:
         self.check(
             {
-                "at least 1": ("every", "min_splats", "overshoot", "finite_every"),
-                "at least 0": ("start", "first_prune", "patience", "grad_threshold", "late_threshold"),
-                "between 0 and 1": ("min_opacity", "first_opacity"),
+                "at least 1": ("every", "reset_every", "recovery", "min_splats", "overshoot", "finite_every"),
+                "at least 0": ("start", "first_prune", "recoveries", "patience", "grad_threshold", "late_threshold"),
+                "between 0 and 1": ("min_opacity", "first_opacity", "reset_opacity"),
+                "in [0, 1)": ("recovery_share",),
             }
         )
         if self.full <= self.start:
@@ -267,7 +287,7 @@ class BudgetedGrowth(Densification):
         add_absgrad(gradients, views, edges, render.absgrad.grad, render.radii, *size)
 
     def act(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
-        """Split and prune when due."""
+        """Split, prune and reset when due."""
         schedule = module.schedule
         if schedule.phase_at(iteration) is not Phase.WARMUP:
             return
@@ -289,6 +309,12 @@ class BudgetedGrowth(Densification):
                     f"iteration {iteration}: growth ends with {len(module.splats)} splats, as hardly any needs to be "
                     f"split; the run will be {last - iteration} iterations shorter"
                 )
+        resets = schedule.reset_times(self.reset_last, self.reset_every)
+        if iteration in resets:
+            self.reset_opacities(trainer, module, self.reset_opacity)
+            distributed.check_replicas(trainer, "the opacity reset")
+        if iteration in (reset + schedule.interval(self.recovery) for reset in resets[: self.recoveries]):
+            self.prune(trainer, module, lowest_share(module.splats.opacities, self.recovery_share))
 
     @torch.no_grad()
     def _grow(self, trainer: Trainer, module: SplatModule, iteration: int) -> tuple[int, int]:

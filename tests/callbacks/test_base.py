@@ -108,6 +108,7 @@ OUT_OF_RANGE = [
     (BudgetedGrowth, {"start": -1}, "start must be at least 0, got -1"),
     (BudgetedGrowth, {"grad_threshold": math.nan}, "grad_threshold must be at least 0, got nan"),
     (BudgetedGrowth, {"start": 900, "full": 900}, "growth must be full after its start=900, got full=900"),
+    (BudgetedGrowth, {"recovery_share": 1.0}, r"recovery_share must be in \[0, 1\), got 1.0"),
     (BudgetedGrowth, {"budget": 1}, "budget must be at least min_splats=10, got 1"),
     (BudgetedGrowth, {"overshoot": 0.9}, "overshoot must be at least 1, got 0.9"),
     (OpacitySelection, {"budget": 0}, "budget must be at least 1, got 0"),

@@ -10,7 +10,7 @@ import torch
 from density_stage import Stage, make_splats
 
 from nsvq_lightning.callbacks import BudgetedGrowth
-from nsvq_lightning.callbacks.growth import add_absgrad, split_longest
+from nsvq_lightning.callbacks.growth import add_absgrad, lowest_share, split_longest
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render
@@ -72,11 +72,20 @@ def test_children_lie_on_the_longest_axis_of_their_parent() -> None:
             assert torch.equal(getattr(children, name)[child], getattr(parents, name))
 
 
+def test_the_lowest_share_is_counted_and_ties_go_to_the_first() -> None:
+    logits = torch.tensor([0.0, -2.0, 3.0, -2.0, -2.0])
+    assert lowest_share(logits, 0.4).tolist() == [False, True, False, True, False]
+    assert not lowest_share(logits, 0.1).any()
+
+
 WIDTH, HEIGHT = 40, 20
 PHOTO = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8)
 PHOTO[:, WIDTH // 2 :] = 200
 BATCH = View("a", 0, Camera(torch.eye(3), torch.eye(4), WIDTH, HEIGHT), PHOTO)
-RULES: dict[str, Any] = {"start": 0, "full": 100, "every": 10, "first_prune": 5, "min_splats": 2}
+RULES: dict[str, Any] = {
+    **{"start": 0, "full": 100, "every": 10, "first_prune": 5, "reset_every": 40, "reset_last": 80},
+    **{"recovery": 7, "recoveries": 1, "min_splats": 2},
+}
 SCHEDULE = Schedule(
     total=200,
     reference_total=200,
@@ -148,6 +157,18 @@ def test_the_first_prune_and_the_transparent_ones() -> None:
     stage = stage_of([0.5, 0.019, 0.004, 0.021], BudgetedGrowth(**RULES, budget=1000))
     stage.step(120, batch=BATCH)  # the last growth prunes none
     assert stage.count == 4
+
+
+def test_opacities_are_reset_and_the_faintest_go_when_the_others_have_recovered() -> None:
+    opacities = [0.9, 0.04, 0.6, 0.03, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
+    stage = stage_of(opacities, BudgetedGrowth(**RULES, budget=1000))
+    stage.step(40, batch=BATCH)
+    assert stage.opacities == pytest.approx([min(value, 0.05) for value in opacities])
+    stage.step(47, batch=BATCH)
+    assert stage.opacities == pytest.approx([0.05] * 8)  # a fifth of them went
+    stage.step(80, batch=BATCH)
+    stage.step(87, batch=BATCH)  # only after the first reset
+    assert stage.count == 8
 
 
 def test_nothing_happens_after_warm_up() -> None:

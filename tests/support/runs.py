@@ -63,7 +63,9 @@ def recipe_options(**replaced: Callback | None) -> dict[str, Callback | None]:
         "phases": PhaseSchedule(reference_total=60, position_decay=40, **ENDS, **intervals),
         "sh_degree": ShDegreeSchedule(every=10),
         "budget": SplatBudget(splats=BUDGET),
-        "density": BudgetedGrowth(start=0, full=20, every=4, grad_threshold=1e-6, first_prune=3),
+        "density": BudgetedGrowth(
+            start=0, full=20, every=4, grad_threshold=1e-6, first_prune=3, reset_every=9, reset_last=9, recovery=3
+        ),
         "selection": OpacitySelection(strength=1e-2),
         "opacity": None,
         "rate_decay": LearningRateDecay(start=50),
