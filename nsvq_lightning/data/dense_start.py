@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nsvq_lightning.compute.environment import usable_cores
+from nsvq_lightning.data.images import resized_mask
 from nsvq_lightning.data.scene import Scene, edge_strength
 from nsvq_lightning.random import draw_rows, generator
 
@@ -115,9 +116,7 @@ def _photo(scene: Scene, index: int, known: Floats) -> _Photo:
     if scale < 1:
         pixels = np.asarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
         if counts is not None:
-            counts = (
-                cv2.resize(counts.view(np.uint8) * np.uint8(255), (width, height), interpolation=cv2.INTER_AREA) == 255
-            )
+            counts = resized_mask(counts, (width, height))
     view = camera.viewmat.numpy().astype(np.float64)
     rotation, translation = view[:3, :3], view[:3, 3]
     size = np.array([width / camera.width, height / camera.height])

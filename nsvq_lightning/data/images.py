@@ -157,6 +157,11 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     return kept.astype(bool)
 
 
+def resized_mask(kept: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Which pixels count of a picture made ``size`` (width, height): those all of whose sources do."""
+    return np.asarray(cv2.resize(kept.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255, bool)
+
+
 def encode_png(rgb: NDArray[np.uint8]) -> bytes:
     """A PNG file of RGB bytes ``[H, W, 3]``.
 
@@ -239,7 +244,7 @@ class ImageSource:
         if image.shape[1::-1] != size:
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
             if kept is not None:
-                kept = cv2.resize(kept.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255
+                kept = resized_mask(kept, size)
         if kept is None or kept.all():
             return Picture(torch.from_numpy(np.ascontiguousarray(image)), None)
         if not kept.any():

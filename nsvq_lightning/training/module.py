@@ -158,10 +158,9 @@ class SplatModule(resume.ResumedModule):
         """Set the background and the extent of the scene.
 
         Raises:
-            ValueError: There is no scene, or the trainer has another precision than ``32-true`` or a strategy that
+            ValueError: The trainer has another precision than ``32-true`` or, for a fit, no scene or a strategy that
                 loses replaced parameters.
         """
-        distributed.check_strategy(self.trainer.strategy)
         if self.trainer.precision != "32-true":
             raise ValueError(
                 f"splats train in float32, trainer.precision is {self.trainer.precision}: kernels compute in float32 "
@@ -170,8 +169,9 @@ class SplatModule(resume.ResumedModule):
         self.evaluation_splats = None  # an interrupted evaluation may have left some
         if (scene := scene_module.scene_of(self.trainer)) is not None:
             self.background = scene_module.background_of(scene, self.background)
-        if stage == "fit" and self.extent == 0.0:
-            self.extent = scene_module.extent_of(scene)
+        if stage == "fit":
+            distributed.check_strategy(self.trainer.strategy)
+            self.extent = self.extent or scene_module.extent_of(scene)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """One Adam optimiser with a named group for each attribute and codebook; first splats, if there are none."""
