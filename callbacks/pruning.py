@@ -8,6 +8,7 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nsvq_lightning.compression.importance import most_contributing
+from nsvq_lightning.compute.devices import mean
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import draw_rows, generator
 from nsvq_lightning.training import distributed, row_ops
@@ -217,9 +218,9 @@ def pressure(opacities: Tensor, strength: float, *, gentle: bool) -> Tensor:
     """
     count = opacities.shape[0]
     if not gentle:
-        return torch.full_like(opacities, 6 * strength * float(opacities.mean() + SHIFT) / count)
+        return torch.full_like(opacities, 6 * strength * (mean(opacities) + SHIFT) / count)
     above, transparency = opacities + SHIFT, 1 - opacities.sigmoid()
     held = transparency.clamp_min(0.05)
     # d/do of (o + 20)/h is 1/h + (o + 20)/h² · σ(1 - σ), the second term only where h is not clamped.
     slope = torch.where(transparency > 0.05, above / held.square() * opacities.sigmoid() * transparency, 0.0)
-    return 2 * strength * (above / held).mean() * (1 / held + slope) / count
+    return 2 * strength * mean(above / held) * (1 / held + slope) / count

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 from torch import Tensor
 
+from nsvq_lightning.compute.devices import mean
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import eight_bit
@@ -62,7 +63,7 @@ def row_weights(contribution: Tensor, least: float = 0.01) -> Tensor:
 
     The smallest weight is ``least`` times the mean contribution.
     """
-    return contribution + (least * contribution.mean()).clamp_min(torch.finfo(contribution.dtype).tiny)
+    return contribution + max(least * mean(contribution), torch.finfo(contribution.dtype).tiny)
 
 
 def sensitivity(

@@ -119,3 +119,16 @@ def test_it_does_nothing_where_there_are_few_splats_already() -> None:
     assert len(stage.module.splats) == 20
     assert torch.equal(stage.module.splats.opacities.detach()[10:], before[10:])
     assert not stage.rates
+
+
+def test_the_pressure_does_not_depend_on_the_number_of_threads() -> None:
+    """Torch adds up more than 32 768 numbers in as many parts as there are threads."""
+    logits = 4 * torch.randn(100_003, generator=torch.Generator().manual_seed(0))
+    before = torch.get_num_threads()
+    found = []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        found.append([pressure(logits, 1e-3, gentle=gentle) for gentle in (True, False)])
+    torch.set_num_threads(before)
+    for other in found[1:]:
+        assert all(torch.equal(one, two) for one, two in zip(found[0], other, strict=True))
