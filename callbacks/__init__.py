@@ -11,7 +11,7 @@ from .growth import BudgetedGrowth, SplatBudget
 from .outputs import ExportScene, LiveScene, RenderWriter
 from .precompile import CompileAhead
 from .progress import SplatProgressBar
-from .pruning import OpacityRegularization, OpacitySelection
+from .pruning import OpacityRegularization, SplatSelection
 from .quantization import (
     CanonicalCovariance,
     CodebookInit,
@@ -43,7 +43,6 @@ __all__ = [
     "LiveScene",
     "MetricReport",
     "OpacityRegularization",
-    "OpacitySelection",
     "PhaseSchedule",
     "RateDistortion",
     "RenderWriter",
@@ -51,5 +50,6 @@ __all__ = [
     "ShDegreeSchedule",
     "SplatBudget",
     "SplatProgressBar",
+    "SplatSelection",
     "standard",
 ]

@@ -34,7 +34,7 @@ class SplatBudget(SplatCallback):
     """Decides how many splats the scene is to have, and says why.
 
     :class:`~nsvq_lightning.callbacks.BudgetedGrowth` grows up to it,
-    :class:`~nsvq_lightning.callbacks.OpacitySelection` removes what is above it. Without a number of splats or bytes it
+    :class:`~nsvq_lightning.callbacks.SplatSelection` removes what is above it. Without a number of splats or bytes it
     comes from the photos.
 
     Args:
@@ -183,7 +183,7 @@ class BudgetedGrowth(Densification):
         budget: How many splats the scene is to have in the end; None for the module's
             (:class:`nsvq_lightning.callbacks.SplatBudget`).
         overshoot: Growth may reach this many times the budget: more than 1 is for a run that selects the best of them
-            afterwards (:class:`nsvq_lightning.callbacks.OpacitySelection`).
+            afterwards (:class:`nsvq_lightning.callbacks.SplatSelection`).
         start: Iteration at which growth may begin.
         full: Iteration at which the number of splats may reach the budget; between the two it may grow with the root of
             the time. From here on the gradient itself is a splat's weight.

@@ -10,7 +10,7 @@ from lightning.pytorch import Trainer
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from nsvq_lightning.compression.importance import row_weights, sensitivity
+from nsvq_lightning.compression.importance import row_weights
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import eight_bit
@@ -353,7 +353,7 @@ class RateDistortion(SplatCallback):
         if module.schedule.phase_at(iteration) is not Phase.QUANTIZE:
             return
         if iteration == module.schedule.first_of(Phase.QUANTIZE) or not self._fits(module):
-            self._measure(trainer, module, iteration)
+            self._measure(trainer, module)
             self._choose(module, slice(None))
 
     def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
@@ -365,25 +365,19 @@ class RateDistortion(SplatCallback):
         every = -(-(end - start) // MEASUREMENTS)
         due = (iteration - start) % every == 0
         if due:
-            self._measure(trainer, module, iteration)
+            self._measure(trainer, module)
         self._choose(module, slice(None) if due else slice(iteration % TURNS, None, TURNS))
 
     def _fits(self, module: SplatModule) -> bool:
         """Whether the prices are those of the splats that there are now."""
         return all(len(price) == len(module.splats) for price in (self.prices or {}).values())
 
-    def _measure(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
-        scene = scene_module.needed_scene(
-            trainer, "codes are to be chosen by what shows in the train views", "leave RateDistortion out"
-        )
+    def _measure(self, trainer: Trainer, module: SplatModule) -> None:
         taking_part = [name for name, q in module.quantizers.items() if hasattr(q, "hold")]
         splats = module.hard_splats(Phase.QUANTIZE)
         shown = {name: torch.zeros_like(splats.opacities) for name in taking_part}
         error = torch.zeros((), dtype=torch.float64, device=module.device)
-        for index in scene.some_train(VIEWS)[trainer.global_rank :: trainer.world_size]:
-            view = scene.view(index).to(module.device)
-            signs = generator(module.seed, iteration, "signs", index)
-            squares, image = sensitivity(splats, view.camera, module.render_splats, signs)
+        for view, squares, image in scene_module.train_sensitivities(trainer, module, splats, VIEWS):
             error += (apply_mask(image, view.mask) - eight_bit(view.image)).square().sum(dtype=torch.float64)
             for name, total in shown.items():
                 total += getattr(squares, name).flatten(1).mean(1)

@@ -17,7 +17,7 @@ STANDARD: dict[str, type[Callback]] = {
     "rate_decay": schedule.LearningRateDecay,
     "budget": growth.SplatBudget,
     "density": growth.BudgetedGrowth,
-    "selection": pruning.OpacitySelection,
+    "selection": pruning.SplatSelection,
     "opacity": pruning.OpacityRegularization,
     "canonical": quantization.CanonicalCovariance,
     "codebook_init": quantization.CodebookInit,

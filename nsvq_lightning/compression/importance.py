@@ -4,10 +4,10 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from nsvq_lightning.compute.devices import mean
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import eight_bit
@@ -63,11 +63,17 @@ def row_weights(contribution: Tensor, least: float = 0.01) -> Tensor:
 
     The smallest weight is ``least`` times the mean contribution.
     """
-    return contribution + max(least * mean(contribution), torch.finfo(contribution.dtype).tiny)
+    # Not torch's mean, whose last bits depend on the number of threads.
+    mean = float(contribution.cpu().numpy().mean(dtype=np.float64))
+    return contribution + max(least * mean, torch.finfo(contribution.dtype).tiny)
 
 
 def sensitivity(
-    splats: SplatTensors, camera: Camera, render: Callable[[SplatTensors, Camera], Render], signs: torch.Generator
+    splats: SplatTensors,
+    camera: Camera,
+    render: Callable[[SplatTensors, Camera], Render],
+    signs: torch.Generator,
+    mask: Tensor | None = None,
 ) -> tuple[RawSplats, Tensor]:
     """Σ (∂I/∂θ)² over the pixels and channels I of a picture, for every number θ of every splat, and the picture.
 
@@ -80,6 +86,7 @@ def sensitivity(
         camera: The view.
         render: The rasterizer.
         signs: Generator of the signs, on the CPU.
+        mask: Which pixels count ``[H, W]`` bool; None if all do.
 
     Returns:
         The estimate, shaped as the raw attributes, in squared channel values over squared units of the attribute; and
@@ -89,12 +96,23 @@ def sensitivity(
     with torch.enable_grad():
         image = render(raw, camera).image
     draws = torch.randint(0, 2, image.shape, generator=signs, dtype=torch.int8).to(image) * 2 - 1
-    gradients = torch.autograd.grad(image, raw, draws, allow_unused=True)
+    gradients = torch.autograd.grad(image, raw, apply_mask(draws, mask), allow_unused=True)
     squares = (
         torch.zeros_like(tensor) if gradient is None else gradient.square_()
         for tensor, gradient in zip(raw, gradients, strict=True)
     )
     return RawSplats(*squares), image.detach()
+
+
+def below_cap(splats: SplatTensors) -> RawSplats:
+    """The splats, detached, with opacities below the rasterizer's cap, where pixels have no gradient."""
+    raw = detached(splats)
+    return raw._replace(opacities=raw.opacities.clamp_max(torch.logit(torch.tensor(ALPHA_MAX - 0.01)).item()))
+
+
+def by_opacity(opacities: Tensor) -> Tensor:
+    """Factors ``[N]`` from ∂I/∂x, with an opacity logit x, to α ∂I/∂α of its opacity α = σ(x) · G in a pixel."""
+    return 1 / torch.sigmoid(-opacities)
 
 
 # Size in pixels below which the scale of a splat is not visible; the rasterizer blurs every splat by 0.55 pixels.
@@ -219,12 +237,8 @@ def removal_effects(
     Returns:
         Both sums ``[N]``, and Σ e².
     """
-    # No opacity reaches the rasterizer's cap, which has no gradient.
-    cap = torch.logit(torch.tensor(ALPHA_MAX - 0.01)).item()
-    opacities = splats.opacities.detach().clamp_max(cap).requires_grad_()
-    raw = detached(splats)._replace(opacities=opacities)
-    # α ∂/∂α of a pixel's opacity α = σ(x) · G, from ∂/∂x.
-    scale = -1 / torch.sigmoid(-opacities.detach())
+    raw = below_cap(splats)
+    scale, opacities = -by_opacity(raw.opacities), raw.opacities.requires_grad_()
     slope, curvature, error = torch.zeros_like(scale), torch.zeros_like(scale), 0.0
     for view in views:
         with torch.enable_grad():

@@ -11,7 +11,6 @@ import os
 from functools import cache
 from typing import Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -109,11 +108,6 @@ def to_device(tensor: Tensor, device: torch.device | str) -> Tensor:
     if device.type == "cuda" and tensor.device.type == "cpu":
         tensor = tensor.pin_memory()  # from other memory, the driver copies before the call returns
     return tensor.to(device, non_blocking=True)
-
-
-def mean(values: Tensor) -> float:
-    """Mean of all elements. Unlike torch's, its bits do not depend on the number of threads."""
-    return float(values.detach().cpu().numpy().mean(dtype=np.float64))
 
 
 class AsyncScalar:

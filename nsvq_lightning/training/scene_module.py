@@ -13,7 +13,7 @@ from lightning.pytorch import LightningModule, Trainer
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from nsvq_lightning.compression.importance import contributions
+from nsvq_lightning.compression.importance import contributions, sensitivity
 from nsvq_lightning.compression.stored import to_compressed
 from nsvq_lightning.compute.environment import threads_spin
 from nsvq_lightning.compute.jit import compile_seconds
@@ -26,6 +26,7 @@ from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import eight_bit, psnr
 from nsvq_lightning.quantize.attributes import attribute_rows, decoded
 from nsvq_lightning.quantize.codebook import Quantizer
+from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, render
 from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, sh_degree_of
@@ -246,6 +247,30 @@ def train_contributions(trainer: Trainer, module: SceneModule) -> Tensor:
     scene = needed_scene(trainer, need, "leave weights by contribution off")
     cameras = (scene.cameras[index] for index in scene.train[trainer.global_rank :: trainer.world_size])
     return sum_over_processes(trainer, contributions(module.splats, cameras, module.render_splats))
+
+
+def train_sensitivities(
+    trainer: Trainer, module: SceneModule, splats: SplatTensors, most: int
+) -> Iterator[tuple[View, RawSplats, Tensor]]:
+    """How much the numbers of splats show in the train views: each view, its estimate and its picture.
+
+    See :func:`nsvq_lightning.compression.importance.sensitivity`.
+
+    Args:
+        trainer: The trainer; several processes share the views.
+        module: Renders the splats.
+        splats: Raw attributes.
+        most: Most views to render.
+
+    Raises:
+        ValueError: The trainer has no data module with a scene.
+    """
+    need = "what shows of splats is seen in the train views"
+    scene = needed_scene(trainer, need, "leave out the callbacks that ask (selection, rate_distortion)")
+    for index in scene.some_train(most)[trainer.global_rank :: trainer.world_size]:
+        view = scene.view(index).to(module.device)
+        signs = generator(module.seed, trainer.global_step, "signs", index)
+        yield view, *sensitivity(splats, view.camera, module.render_splats, signs, view.mask)
 
 
 def extent_of(scene: Scene | None) -> float:

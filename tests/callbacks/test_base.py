@@ -21,12 +21,12 @@ from nsvq_lightning.callbacks import (
     LearningRateDecay,
     MetricReport,
     OpacityRegularization,
-    OpacitySelection,
     PhaseSchedule,
     RateDistortion,
     RunCheckpoint,
     ShDegreeSchedule,
     SplatBudget,
+    SplatSelection,
 )
 from nsvq_lightning.callbacks.base import SplatCallback
 from nsvq_lightning.training.module import SplatModule
@@ -111,9 +111,7 @@ OUT_OF_RANGE = [
     (BudgetedGrowth, {"recovery_share": 1.0}, r"recovery_share must be in \[0, 1\), got 1.0"),
     (BudgetedGrowth, {"budget": 1}, "budget must be at least min_splats=10, got 1"),
     (BudgetedGrowth, {"overshoot": 0.9}, "overshoot must be at least 1, got 0.9"),
-    (OpacitySelection, {"budget": 0}, "budget must be at least 1, got 0"),
-    (OpacitySelection, {"strength": -1.0}, "strength must be above 0, got -1.0"),
-    (OpacitySelection, {"gentle": 1.0}, r"gentle must be in \[0, 1\), got 1.0"),
+    (SplatSelection, {"budget": 0}, "budget must be at least 1, got 0"),
     (OpacityRegularization, {"weight": -1.0}, "weight must be at least 0, got -1.0"),
     (CodebookInit, {"weights": "area"}, "weights must be 'none' or 'contribution', got 'area'"),
     (CodebookInit, {"values_per_splat": math.inf}, "values_per_splat must be above 0, got inf"),

@@ -17,11 +17,11 @@ from nsvq_lightning.callbacks import (
     CodebookInit,
     CodebookReplacement,
     LearningRateDecay,
-    OpacitySelection,
     PhaseSchedule,
     RateDistortion,
     ShDegreeSchedule,
     SplatBudget,
+    SplatSelection,
 )
 from nsvq_lightning.commands.fit import default_loggers
 from nsvq_lightning.quantize import NSVQ, TrainedStraightThrough
@@ -66,7 +66,7 @@ def recipe_options(**replaced: Callback | None) -> dict[str, Callback | None]:
         "density": BudgetedGrowth(
             start=0, full=20, every=4, grad_threshold=1e-6, first_prune=3, reset_every=9, reset_last=9, recovery=3
         ),
-        "selection": OpacitySelection(strength=1e-2),
+        "selection": SplatSelection(),
         "opacity": None,
         "rate_decay": LearningRateDecay(start=50),
         "canonical": CanonicalCovariance(),

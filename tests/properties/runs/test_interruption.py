@@ -20,7 +20,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from runs import RECIPE_MODULE, Recipe, RunFactory, Whole, paper_phases, recipe_options
 
-from nsvq_lightning.callbacks import MetricReport, OpacitySelection, PhaseSchedule, RunCheckpoint
+from nsvq_lightning.callbacks import MetricReport, PhaseSchedule, RunCheckpoint, SplatSelection
 from nsvq_lightning.commands.fit import continuation
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.training.module import SplatModule
@@ -172,7 +172,7 @@ def test_a_callback_that_fails_half_way_acts_again(
     # That it has acted is noted before it has; the checkpoint must not know of it.
     runner = Runner(run, recipe, "fast")
     with monkeypatch.context() as patch:
-        patch.setattr(OpacitySelection, "before_step", lambda *_: fail())
+        patch.setattr(SplatSelection, "before_step", lambda *given: fail() if given[-1] == 25 else None)
         path = runner.stopped(Broken, Callback(), start=shortly_before(whole("fast"), 24))
     assert iteration_of(path) == 24
     assert_same_end(runner.continued(path), whole("fast"))

@@ -43,7 +43,7 @@ RECIPE = [
     *("--callbacks.phases.reference_total=60", "--callbacks.phases.min_reset_interval=1", "--splats=500"),
     *("--callbacks.phases.warmup_end=24", "--callbacks.phases.prune_end=40", "--callbacks.phases.quantize_end=50"),
     *(f"--callbacks.density.{name}={value}" for name, value in {**GROWTH, "first_prune": 3}.items()),
-    *("--callbacks.selection.strength=0.01", "--callbacks.rate_decay.start=50", "--callbacks.sh_degree.every=10"),
+    *("--callbacks.rate_decay.start=50", "--callbacks.sh_degree.every=10"),
     *("--callbacks.codebook_replacement.start=45", "--callbacks.codebook_replacement.early_end=45"),
     "--callbacks.codebook_init.weights=none",  # contributions are sums over views, whose order differs
     *("--callbacks.codebook_replacement.end=47", "--callbacks.codebook_replacement.late_every=2"),
