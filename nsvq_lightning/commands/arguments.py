@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from yaml.nodes import Node
 
     from nsvq_lightning.rendering.camera import Camera
+    from nsvq_lightning.splats.splats import SplatTensors
 
 
 def names(text: str) -> tuple[str, ...]:
@@ -321,3 +322,27 @@ def cameras_of(path: Path) -> "dict[str, Camera]":
 
     page = (path if path.is_dir() else path.parent) / "viewer.html"
     return page_cameras(page) if page.is_file() else {}
+
+
+def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -> "tuple[list[Camera], Path | None]":
+    """At most ``most`` views of a scene file in which its pictures count, and the folder of the photos if it is known.
+
+    Args:
+        path: The file. In the folder of a run, they are those of its train photos, or what the run has recorded.
+        splats: Raw attributes of N > 0 splats; without a run, views are those from where they show detail.
+        most: Number of views.
+        root: Scene folder whose train photos they are instead.
+
+    Raises:
+        SceneError: The folder is not a scene.
+    """
+    from nsvq_lightning.compression.viewpoints import likely_cameras
+    from nsvq_lightning.data.scene import load_scene
+
+    root = root or photos_of(path)
+    if root is not None:
+        scene = load_scene(root)
+        return [scene.cameras[index] for index in scene.some_train(most)], root
+    recorded = list(cameras_of(path).values())
+    # A square picture with the pixels of a photo: what a wide one shows at its edges, photos seldom do.
+    return recorded[:: -(-len(recorded) // most) or 1] or likely_cameras(splats, most, 640, 640, degrees=50), None

@@ -169,16 +169,16 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
 
 def _measure(source: Path, output: Path, root: Path | None) -> None:
     """Say how pictures of two files differ."""
-    from nsvq_lightning.compression.presets import MEASURED
-    from nsvq_lightning.compression.viewpoints import decibels, picture_error, pictures, views_of
+    from nsvq_lightning.commands.arguments import views_of
+    from nsvq_lightning.compression.viewpoints import MEASURED, Measure, decibels
 
     original = formats.read_scene(source).finite()
     if len(original) == 0:
         raise ValueError(f"{source} holds no finite splat; there is nothing to measure")
     splats = original.decode()
-    cameras = views_of(splats, root, MEASURED)
-    expected = pictures(splats, cameras, original.antialiased)
-    error = picture_error(formats.read_scene(output).decode(), cameras, expected, original.antialiased)
+    cameras, _ = views_of(source, splats, MEASURED, root)
+    measure = Measure(splats, cameras, original.antialiased)
+    error = measure.error(formats.read_scene(output).decode())
     sys.stdout.write(
-        f"  error {error:.4g} ({decibels(error):.2f} dB against {source.name} in {len(cameras)} pictures)\n"
+        f"  error {error:.4g} ({decibels(error):.2f} dB against {source.name} in {len(measure.cameras)} pictures)\n"
     )

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nsvq_lightning.data.images import ImageStore, Picture
+from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.rasterize import render
@@ -51,12 +54,80 @@ def pictures(splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool 
     return [render(splats, camera, antialiased=antialiased).image.clamp(0, 1) for camera in cameras]
 
 
-def picture_error(
-    splats: SplatTensors, cameras: Sequence[Camera], expected: Sequence[Tensor], antialiased: bool = False
-) -> float:
-    """Root mean square difference between the pictures of a scene and expected ones, for channels in [0, 1]."""
-    found = zip(pictures(splats, cameras, antialiased), expected, strict=True)
-    return math.sqrt(float(np.mean([float((a - b).double().square().mean()) for a, b in found])))
+# Largest number of views in which errors are measured.
+MEASURED = 24
+
+
+class Measure:
+    """How far pictures of a scene are from those of the original.
+
+    Attributes:
+        cameras: Where pictures are compared, at most :data:`MEASURED`.
+
+    Args:
+        original: Raw attributes.
+        cameras: Views, some of which are taken.
+        antialiased: Whether the scene is to be rendered with anti-aliasing.
+
+    Raises:
+        ValueError: No camera shows any splat.
+    """
+
+    def __init__(self, original: SplatTensors, cameras: Sequence[Camera], antialiased: bool = False) -> None:
+        self.cameras = cameras[:: -(-len(cameras) // MEASURED) or 1]
+        self._antialiased = antialiased
+        self._expected = pictures(original, self.cameras, antialiased)
+        if not any(bool(picture.any()) for picture in self._expected):
+            raise ValueError(
+                f"all {len(self.cameras)} pictures of the scene are black, so no error can be measured: photos "
+                "(--data.root) must be of this scene, in its coordinates"
+            )
+
+    def error(self, splats: SplatTensors) -> float:
+        """Root mean square difference for channels in [0, 1]."""
+        found = zip(pictures(splats, self.cameras, self._antialiased), self._expected, strict=True)
+        return math.sqrt(float(np.mean([float((a - b).double().square().mean()) for a, b in found])))
+
+
+@dataclass(frozen=True)
+class _Rendered:
+    """A picture of a scene in place of a photo."""
+
+    picture: Picture
+    mask: None = None
+    has_alpha: bool = False
+
+    @property
+    def nbytes(self) -> int:
+        return self.picture.nbytes
+
+    def load(self) -> Picture:
+        return self.picture
+
+
+def own_scene(splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool = False) -> Scene:
+    """A scene whose photos are pictures of splats, all of them to train on.
+
+    Args:
+        splats: Raw attributes.
+        cameras: Where from, at least one.
+        antialiased: Whether the splats are to be rendered with anti-aliasing.
+    """
+    photos = ((255 * picture).round().to(torch.uint8) for picture in pictures(splats, cameras, antialiased))
+    centres = torch.stack([camera.position for camera in cameras]).double()
+    reach = float((centres - centres.mean(0)).norm(dim=1).max())
+    return Scene(
+        root=Path("own pictures"),
+        names=tuple(f"{number:03d}" for number in range(len(cameras))),
+        cameras=tuple(cameras),
+        images=ImageStore([_Rendered(Picture(photo, None)) for photo in photos]),  # type: ignore[misc]
+        points=splats.means.detach(),
+        colors=torch.zeros_like(splats.means),
+        train=tuple(range(len(cameras))),
+        test=(0,),
+        extent=1.1 * reach or middle_of(splats.means.detach().cpu().numpy())[1],
+        split="none",
+    )
 
 
 def decibels(error: float) -> float:
@@ -64,27 +135,8 @@ def decibels(error: float) -> float:
     return math.inf if error == 0 else -20 * math.log10(error)
 
 
-def views_of(splats: SplatTensors, root: Path | None, most: int) -> list[Camera]:
-    """At most ``most`` views in which the pictures of a scene count.
-
-    Args:
-        splats: Raw attributes of N > 0 splats.
-        root: COLMAP folder whose train views are used; None for views from where photos were probably taken.
-        most: Their number.
-
-    Raises:
-        SceneError: The folder is not a COLMAP scene.
-    """
-    if root is None:
-        return likely_cameras(splats, most)
-    from nsvq_lightning.data.scene import load_scene
-
-    scene = load_scene(root)
-    return [scene.cameras[index] for index in scene.some_train(most)]
-
-
 def likely_cameras(
-    splats: SplatTensors, count: int, width: int = 560, height: int = 392, seed: int = 0
+    splats: SplatTensors, count: int, width: int = 560, height: int = 392, seed: int = 0, degrees: float = 70
 ) -> list[Camera]:
     """Cameras from which a scene shows much detail, as it does where photos were taken, the best one first.
 
@@ -98,10 +150,13 @@ def likely_cameras(
         width: Pixels.
         height: Pixels.
         seed: Seed of the candidates.
+        degrees: Horizontal field of view.
     """
-    angle = math.radians(70)
+    angle = math.radians(degrees)
     eyes, targets = _candidates(splats, 5 * count, np.random.default_rng(seed))
-    scores = [_detail(splats, look_at(target, eye, 96, 67, angle)) for eye, target in zip(eyes, targets, strict=True)]
+    views = zip(eyes, targets, strict=True)
+    low = 96, round(96 * height / width)
+    scores = [_detail(splats, look_at(target, eye, *low, angle)) for eye, target in views]
     best = np.argsort(-np.array(scores), kind="stable")[:count]
     return [look_at(targets[k], eyes[k], width, height, angle) for k in best]
 

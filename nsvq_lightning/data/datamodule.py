@@ -1,6 +1,6 @@
-"""Lightning data modules: a scene folder, and the embedded demo scene."""
+"""Lightning data modules: any scene, a scene folder, and the embedded demo scene."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from itertools import count, pairwise
 from pathlib import Path
@@ -82,47 +82,23 @@ def _spare(device: torch.device) -> int:
 DEMO = Path(__file__).parent / "demo"
 
 
-class ColmapDataModule(LightningDataModule):
+class SceneDataModule(LightningDataModule):
     """Views of a scene, one per batch.
 
-    Every 8th of the sorted image names is a test view (validated and tested on, never trained on), unless the folder
-    says which are, see :func:`~nsvq_lightning.data.scene.load_scene`. The train views come
-    in the endless order of :func:`~nsvq_lightning.data.datamodule.view_order`, which starts at the trainer's step: a
-    resumed run sees the views that the uninterrupted run would have seen. With R processes, each takes its own draws
-    of that one sequence, and every R-th of the test views.
+    The train views come in the endless order of :func:`~nsvq_lightning.data.datamodule.view_order`, which starts at the
+    trainer's step: a resumed run sees the views that the uninterrupted run would have seen. With R processes, each
+    takes its own draws of that one sequence, and every R-th of the test views.
 
     Args:
-        root: Scene folder: photos with a COLMAP model or a ``transforms.json``.
-        factor: Divide the image size by 1, 2, 4 or 8; None: see ``max_width``.
-        max_width: Without a factor, scale wider images down to it; None: never.
-        test_every: Every ``test_every``-th view is a test view, at least 2.
+        scene: The scene, or what loads it when it is first used.
         seed: Seed of the order of the train views.
-        cache_bytes: Bytes for decoded images; what does not fit is decoded anew.
-        images_folder: Name of the image folder.
-        model: What to read instead of ``sparse/0``: a number, a folder or a ``.json``.
-        masks: Name of the folder of masks; None ignores them.
-        allow_outside: Also read photos and masks that the model names outside ``root``.
+        cache_bytes: Bytes for photos on a GPU.
     """
 
-    def __init__(
-        self,
-        root: str,
-        factor: Factor | None = None,
-        max_width: int | None = 1600,
-        test_every: int = 8,
-        seed: int = 0,
-        cache_bytes: int = 4 << 30,
-        images_folder: str = "images",
-        model: str | None = None,
-        masks: str | None = "masks",
-        allow_outside: bool = False,
-    ) -> None:
+    def __init__(self, scene: Scene | Callable[[], Scene], seed: int = 0, cache_bytes: int = 4 << 30) -> None:
         super().__init__()
-        self.root, self.seed, self.cache_bytes = Path(root), seed, cache_bytes
-        self._load = partial(
-            load_scene, root, factor, max_width, test_every, cache_bytes, images_folder, model, masks, allow_outside
-        )
-        self._photos = DevicePhotos(cache_bytes)
+        self.seed = seed
+        self._scene, self._photos = scene, DevicePhotos(cache_bytes)
 
     @cached_property
     def scene(self) -> Scene:
@@ -131,7 +107,9 @@ class ColmapDataModule(LightningDataModule):
         Raises:
             SceneError: The folder cannot be used.
         """
-        scene = self._load()
+        if isinstance(self._scene, Scene):
+            return self._scene
+        scene = self._scene()
         rank_zero_info(_summary(scene))
         return scene
 
@@ -193,6 +171,45 @@ class ColmapDataModule(LightningDataModule):
         return DataLoader(views, batch_size=None, sampler=sampler)
 
 
+class ColmapDataModule(SceneDataModule):
+    """Views of a scene folder, one per batch.
+
+    Every 8th of the sorted image names is a test view (validated and tested on, never trained on), unless the folder
+    says which are, see :func:`~nsvq_lightning.data.scene.load_scene`.
+
+    Args:
+        root: Scene folder: photos with a COLMAP model or a ``transforms.json``.
+        factor: Divide the image size by 1, 2, 4 or 8; None: see ``max_width``.
+        max_width: Without a factor, scale wider images down to it; None: never.
+        test_every: Every ``test_every``-th view is a test view, at least 2.
+        seed: Seed of the order of the train views.
+        cache_bytes: Bytes for decoded images; what does not fit is decoded anew.
+        images_folder: Name of the image folder.
+        model: What to read instead of ``sparse/0``: a number, a folder or a ``.json``.
+        masks: Name of the folder of masks; None ignores them.
+        allow_outside: Also read photos and masks that the model names outside ``root``.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        factor: Factor | None = None,
+        max_width: int | None = 1600,
+        test_every: int = 8,
+        seed: int = 0,
+        cache_bytes: int = 4 << 30,
+        images_folder: str = "images",
+        model: str | None = None,
+        masks: str | None = "masks",
+        allow_outside: bool = False,
+    ) -> None:
+        load = partial(
+            load_scene, root, factor, max_width, test_every, cache_bytes, images_folder, model, masks, allow_outside
+        )
+        super().__init__(load, seed, cache_bytes)
+        self.root, self.cache_bytes = Path(root), cache_bytes
+
+
 class DemoDataModule(ColmapDataModule):
     """The embedded demo scene: 40 photos of a small room, which the package contains.
 
@@ -208,7 +225,7 @@ class DemoDataModule(ColmapDataModule):
 class _TrainViews(IterableDataset[View]):
     """Train views in the sampler's order; a new iterator starts at the trainer's step."""
 
-    def __init__(self, data: ColmapDataModule) -> None:
+    def __init__(self, data: SceneDataModule) -> None:
         self._data = data
 
     def __iter__(self) -> Iterator[View]:

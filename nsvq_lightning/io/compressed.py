@@ -24,19 +24,21 @@ class CompressedScene:
     """N splats, some of whose attributes are codes into codebooks.
 
     Every attribute that may have a codebook is either in ``codes`` and ``codebooks`` or in ``raw``; spaces are those of
-    :meth:`nsvq_lightning.Splats.from_tensors` (log-scales, quaternions wxyz, SH coefficients).
+    :meth:`nsvq_lightning.Splats.from_tensors` (log-scales, quaternions wxyz, SH coefficients). What ``raw`` holds of an
+    attribute in ``bases`` are whole numbers, its coefficients: its values are their product with the basis.
 
     Attributes:
         means: Positions ``[N, 3]`` float32, relative to ``origin``.
         opacities: Opacity logits ``[N]`` float32.
         codes: Codebook row of each splat, ``[N]`` of any integer type, by attribute.
         codebooks: Codebooks ``[K, D]`` float32 by attribute; ``shN`` as row-major ``[coefficients, 3]``.
-        raw: Attributes that are not quantized, ``[N, D]`` float32.
+        raw: Attributes without a codebook, ``[N, D]`` float32, or ``[N, C]`` coefficients.
         sh_degree: Degree of the spherical harmonics, 0 to 3.
         config: Settings of the run; JSON values only, keys are strings.
         metrics: Quality measured on the decoded scene; non-finite values are stored as None.
         origin: World coordinates of the point that is 0 in ``means``, float64.
         stored_bytes: Bytes of the file the scene was read from, None if it was not.
+        bases: Bases ``[C, D]`` float32 by attribute, C from 1 to D; only ``shN`` may have one.
 
     Raises:
         ValueError: Shapes do not fit each other, a code is not a row of its codebook, or an attribute is missing or
@@ -54,6 +56,7 @@ class CompressedScene:
     metrics: Mapping[str, float | None] = field(default_factory=dict)
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     stored_bytes: int | None = None
+    bases: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n, dims = len(self.means), splat.attribute_dims(self.sh_degree)
@@ -68,8 +71,12 @@ class CompressedScene:
                 f"each of {', '.join(splat.QUANTIZABLE)} must be either in codes and codebooks or in raw; "
                 f"got codes of {sorted(self.codes)} and raw {sorted(self.raw)}"
             )
+        if not set(self.bases) <= {"shN"} & set(self.raw):
+            raise ValueError(f"only shN may have a basis, and then no codebook; got bases of {sorted(self.bases)}")
         for name, values in self.raw.items():
-            _check_floats(f"raw[{name!r}]", values, (n, dims[name]))
+            _check_floats(f"raw[{name!r}]", values, (n, len(self.bases[name]) if name in self.bases else dims[name]))
+        for name, basis in self.bases.items():
+            _check_floats(f"bases[{name!r}]", basis, (max(1, min(len(basis), dims[name])), dims[name]))
         for name, codes in self.codes.items():
             _check_codes(name, codes, self.codebooks[name], n, dims[name])
 
@@ -118,6 +125,8 @@ class CompressedScene:
             values = self.codebooks[name][self.codes[name][rows]]
         else:
             values = (self.raw[name] if name in self.raw else getattr(self, name))[rows]
+        if name in self.bases:  # exact in float64 for whole numbers, so rounded once
+            values = (values.astype(np.float64) @ self.bases[name].astype(np.float64)).astype(np.float32)
         return values.reshape(len(values), *splat.attribute_shapes(self.sh_degree)[name])
 
     def decode(self) -> "Splats":
@@ -136,7 +145,10 @@ class CompressedScene:
 
     def table(self, name: str) -> tuple[NDArray[np.float32], NDArray[np.integer] | None]:
         """Distinct rows ``[K, D]`` of an attribute and the row of each splat ``[N]``; None where row i is splat i's."""
-        return (self.raw[name], None) if name in self.raw else (self.codebooks[name], self.codes[name])
+        if name in self.codes:
+            return self.codebooks[name], self.codes[name]
+        values = self.values(name)
+        return values.reshape(len(values), splat.attribute_dims(self.sh_degree)[name]), None
 
     def uses(self, name: str) -> NDArray[np.int64] | None:
         """How many splats use each row of :meth:`table` ``[K]``; None where each splat has its own."""
@@ -273,7 +285,8 @@ def rotated(scene: CompressedScene, rotation: NDArray[np.float64]) -> Compressed
         scene,
         means=(scene.means.astype(np.float64) @ rotation.T).astype(np.float32),
         codebooks=rows(scene.codebooks),
-        raw=rows(scene.raw),
+        raw={**scene.raw, **rows({name: values for name, values in scene.raw.items() if name not in scene.bases})},
+        bases=rows(scene.bases),
         origin=(x, y, z),
         stored_bytes=None,
     )

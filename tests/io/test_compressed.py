@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from compressed_scenes import on_basis
 from compressed_scenes import scene as coded
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -26,14 +27,20 @@ def picture(scene: CompressedScene, camera: Camera) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("kind", ["codebooks", "plain"])
+@pytest.mark.parametrize("kind", ["codebooks", "plain", "basis"])
 def test_a_turned_scene_is_the_same_scene(degree: int, kind: str) -> None:
     plain = replace(ball(200, degree), origin=(0.5, -1.0, 2.0))
     sizes = {"scales": 9, "quats": 7, "sh0": 8} | ({"shN": 6} if degree else {})
     scene = coded(200, sizes, degree, origin=(0.5, -1.0, 2.0)) if kind == "codebooks" else plain
+    if kind == "basis" and degree:
+        scene = on_basis(plain)
     rotation = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
     turned = rotated(scene, rotation)
     assert [len(rows) for rows in turned.codebooks.values()] == [len(rows) for rows in scene.codebooks.values()]
+    if scene.bases:
+        expanded = replace(scene, raw={name: scene.table(name)[0] for name in scene.raw}, bases={})
+        np.testing.assert_allclose(turned.values("shN"), rotated(expanded, rotation).values("shN"), rtol=0, atol=1e-6)
+        np.testing.assert_array_equal(turned.raw["shN"], scene.raw["shN"])
     middle = np.array(scene.origin)
     before = look_at(middle, middle + np.array([1.0, 2.0, -6.0]), 60, 40, 0.9)
     back = np.eye(4)

@@ -7,13 +7,16 @@ import json
 import math
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from nsvq_lightning.compression.components import components
 from nsvq_lightning.io import CompressedScene
 from nsvq_lightning.splats.attributes import ATTRIBUTES, QUANTIZABLE, attribute_dims
 
@@ -39,6 +42,30 @@ def scene(n: int, sizes: dict[str, int] = SIZES, degree: int = 3, **header: Any)
         sh_degree=degree,
         **header,
     )
+
+
+def on_basis(scene: CompressedScene) -> CompressedScene:
+    """The scene, N > 0, with coefficients and a basis in place of spherical harmonics without a codebook."""
+    coefficients, basis = components(torch.from_numpy(scene.raw["shN"]), torch.ones(len(scene)), 0.3)
+    return replace(scene, raw=dict(scene.raw) | {"shN": coefficients}, bases={"shN": basis})
+
+
+ON_NO_BASIS: dict[str, Callable[[Any], object]] = {
+    "no row": lambda header: header["attributes"][5].__setitem__(3, 0),
+    "more rows than columns": lambda header: header["attributes"][5].__setitem__(3, 46),
+    "step of no power of two": lambda header: header["attributes"][5].__setitem__(4, 0.1),
+    "step above 1": lambda header: header["attributes"][5].__setitem__(4, 2.0),
+    "step below float32": lambda header: header["attributes"][5].__setitem__(4, 2.0**-150),
+    "no column": lambda header: (
+        header.update(sh_degree=0),
+        header["attributes"][5].__setitem__(slice(1, 5), [0, "components", 0, 1.0]),
+    ),
+    "other attribute": lambda header: header["attributes"][4].__setitem__(slice(2, 5), ["components", 3, 1.0]),
+    "basis of codes": lambda header: header["attributes"][5].__setitem__(2, "codes"),
+    "coefficients first": lambda header: header["streams"].__setitem__(slice(-2, None), header["streams"][:-3:-1]),
+    "codebook for a basis": lambda header: header["streams"][-2].__setitem__(0, "shN.codebook"),
+}
+"""Changes of the header of a file of :func:`on_basis` at degree 3 that no reader accepts."""
 
 
 def scene_of(**arrays: NDArray[np.float32]) -> CompressedScene:
@@ -70,9 +97,10 @@ def text_and_body(path: Path) -> tuple[bytes, bytes]:
     return data[32 : 32 + length], data[32 + length :]
 
 
-def forge(path: Path, change: Callable[[Any], object], version: int = 2, body: bytes | None = None) -> None:
-    """Change the header of a ``.nsvq`` file, and perhaps its streams; the checksum fits."""
+def forge(path: Path, change: Callable[[Any], object], version: int | None = None, body: bytes | None = None) -> None:
+    """Change the header of a ``.nsvq`` file, and perhaps its version and streams; the checksum fits."""
     text, old = text_and_body(path)
+    version = version or path.read_bytes()[24]
     header = json.loads(text)
     change(header)
     framed(path, json.dumps(header).encode(), old if body is None else body, version)

@@ -22,7 +22,7 @@ from hashlib import blake2b
 from pathlib import Path
 
 import numpy as np
-from compressed_scenes import scene
+from compressed_scenes import on_basis, scene
 from guards import guarded
 
 from nsvq_lightning.io.compressed import CompressedScene
@@ -179,6 +179,8 @@ def _build_nsvq(folder: Path) -> list[Path]:
     files = [folder / f"{level}.nsvq" for level in LEVELS]
     for path in files:
         save(_scene(40), path, Storage(path.stem))
+    files.append(folder / "basis.nsvq")
+    save(on_basis(scene(40, {})), files[-1])
     return files
 
 
@@ -187,7 +189,7 @@ def _mend_nsvq(data: bytes) -> bytes:
     rest = data[24:]
     end = rest.rfind(b"}]}")
     if len(rest) > 8 and end > 0:
-        rest = (1).to_bytes(4, "little") + (end + 3 - 8).to_bytes(4, "little") + rest[8:]
+        rest = (3).to_bytes(4, "little") + (end + 3 - 8).to_bytes(4, "little") + rest[8:]
     return b"\x89NSVQ\r\n\x1a" + blake2b(rest, digest_size=16).digest() + rest
 
 

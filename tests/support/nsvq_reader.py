@@ -21,7 +21,7 @@ def unframe(data):
     assert len(data) >= 32
     assert hashlib.blake2b(data[24:], digest_size=16).digest() == data[8:24]
     version, length = struct.unpack_from("<II", data, 24)
-    assert version == 2
+    assert version in (2, 3)
     assert 32 + length <= len(data)
     header = json.loads(data[32 : 32 + length].decode("utf-8"), parse_constant=refuse)
     streams, at = {}, 32 + length
@@ -74,13 +74,16 @@ def check(header, streams):
         assert natural(dim)
         assert dim == DIMS.get(name, 3 * ((degree + 1) ** 2 - 1))
         own = {"means": "cells", "opacities": "levels"}.get(name, "steps") if compact else "raw"
-        assert storage == own or (storage == "codes" and name not in ("means", "opacities") and dim > 0)
-        most = {"codes": 2**32, "levels": 2**20}.get(storage, 0)
+        coded = storage == "codes" and name not in ("means", "opacities")
+        components = compact and storage == "components" and name == "shN"
+        assert storage == own or ((coded or components) and dim > 0)
+        most = {"codes": 2**32, "levels": 2**20, "components": dim}.get(storage, 0)
         assert natural(codes)
         assert min(most, 1) <= codes <= most
         assert number(step)
         assert 0 <= step < math.inf
         assert (step > 0) == (compact and storage != "levels")
+        assert not components or step in [2.0**-power for power in range(150)]
     expected = expected_streams(table.values(), count, compact)
     for row, (name, encoding, length) in zip(header["streams"], expected, strict=True):
         assert row == [name, row[1], encoding]
@@ -111,6 +114,8 @@ def expected_streams(rows, count, compact):
             found += [("means.grid", "grid", 32), ("means", "keys", None), ("means.far", "float32", None)]
         elif storage == "codes":
             found += [(f"{name}.codebook", "integers", None), (name, "paths", None)]
+        elif storage == "components":
+            found += [(f"{name}.basis", "integers", None), (name, "integers", None)]
         else:
             found.append((name, "paths" if storage == "levels" else "integers", None))
     return found
@@ -321,6 +326,12 @@ def decode_compact(header, streams):
         entry = table[name]
         if entry["storage"] == "steps":
             integers[name] = decode_integers(streams[name], count, entry["dim"])
+            return
+        if entry["storage"] == "components":
+            basis = decode_integers(streams[f"{name}.basis"], entry["codes"], entry["dim"])
+            coefficients = decode_integers(streams[name], count, entry["codes"])
+            assert all((np.abs(values) < 2**23).all() for values in (basis, coefficients))
+            integers[name] = coefficients @ basis
             return
         leaves[name] = decode_paths(streams[name], entry["codes"], neighbours)
         if entry["storage"] == "codes":

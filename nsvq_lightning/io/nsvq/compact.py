@@ -7,7 +7,8 @@
   decision is predicted from the codes of two nearby splats. Rows that no splat uses are left out, equal rows merged.
 * Codebooks are integer multiples of a step that follows the distance between codes. Quaternions are normalised first.
 * Opacities are rounded to equal steps of [0, 1] and coded like codes.
-* Attributes without a codebook are integer multiples of a step.
+* Attributes without a codebook are integer multiples of a step. Spherical harmonics may instead be whole multiples of
+  the rows of a basis, few of which are not 0.
 
 Decoding never depends on floating-point arithmetic that two machines might round differently.
 
@@ -94,13 +95,16 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
         means = np.concatenate([grid.centers(morton.unmorton(keys), depths), far])
         stored |= {name: late[name].result() for name in _LATE}
     levels = stored.pop("opacities")
-    coded = {name: stored[name] for name in QUANTIZABLE if stored[name].codebook is not None}
+    coded = {name: stored[name] for name in QUANTIZABLE if stored[name].entry.storage == "codes"}
+    on_basis = {name: stored[name] for name in QUANTIZABLE if stored[name].entry.storage == "components"}
+    plain = {name: stored[name].floats() for name in QUANTIZABLE if name not in coded | on_basis}
     return CompressedScene(
         means=means,
         opacities=rounding.logits_of_levels(levels.entry.codes)[levels.values],
         codes={name: attribute.values for name, attribute in coded.items()},
         codebooks={name: attribute.floats() for name, attribute in coded.items()},
-        raw={name: stored[name].floats() for name in QUANTIZABLE if name not in coded},
+        raw=plain | {name: attribute.values.astype(np.float32) for name, attribute in on_basis.items()},
+        bases={name: attribute.floats() for name, attribute in on_basis.items()},
         **header.of_scene,
     )
 
@@ -137,6 +141,9 @@ def _encoded(attribute: rounding.Stored, order: NDArray[np.int64], neighbours: N
     entry, values, codebook = attribute.entry, attribute.values[order], attribute.codebook
     if entry.storage == "steps":
         return {entry.name: entropy.encode_integers(values)}
+    if entry.storage == "components":
+        assert codebook is not None
+        return {f"{entry.name}.basis": entropy.encode_integers(codebook), entry.name: entropy.encode_integers(values)}
     paths = {entry.name: entropy.encode_paths(leaf_paths(entry.codes)[values], entry.bits, neighbours)}
     return paths if codebook is None else paths | {f"{entry.name}.codebook": entropy.encode_integers(codebook)}
 
@@ -147,6 +154,13 @@ def _decoded(
     """Invert :func:`_encoded`."""
     if entry.storage == "steps":
         return rounding.Stored(entry, entropy.decode_integers(streams[entry.name], len(neighbours), entry.dim))
+    if entry.storage == "components":
+        basis = entropy.decode_integers(streams[f"{entry.name}.basis"], entry.codes, entry.dim)
+        coefficients = entropy.decode_integers(streams[entry.name], len(neighbours), entry.codes)
+        for integers in (basis, coefficients):
+            if max(-int(integers.min(initial=0)), int(integers.max(initial=0))) >= rounding.SMALL:
+                raise FormatError(f"damaged: a component of {entry.name} is not below 2^23 in size")
+        return rounding.Stored(entry, coefficients, basis)
     leaf_of = np.full(1 << entry.bits, -1)
     leaf_of[leaf_paths(entry.codes)] = np.arange(entry.codes)
     values = leaf_of[entropy.decode_paths(streams[entry.name], entry.bits, neighbours)]
@@ -162,6 +176,7 @@ def _decoded(
 _STREAMS = {
     "levels": {"": "paths"},
     "steps": {"": "integers"},
+    "components": {".basis": "integers", "": "integers"},
     "codes": {".codebook": "integers", "": "paths"},
     "cells": {".grid": "grid", "": "keys", ".far": "float32"},
 }
@@ -200,7 +215,9 @@ def _check_tables(header: Header) -> None:
 
 def _possible(entry: AttributeEntry) -> bool:
     own = {"means": "cells", "opacities": "levels"}.get(entry.name, "steps")
-    coded = entry.storage == "codes" and entry.name in QUANTIZABLE and entry.dim > 0
-    most = {"codes": 1 << 32, "levels": MOST_OPACITY_LEVELS}.get(entry.storage, 0)
+    coded = entry.dim > 0 and entry.name in {"codes": QUANTIZABLE, "components": ("shN",)}.get(entry.storage, ())
+    most = {"codes": 1 << 32, "levels": MOST_OPACITY_LEVELS, "components": entry.dim}.get(entry.storage, 0)
     numbers = min(most, 1) <= entry.codes <= most and (entry.step > 0) == (entry.storage != "levels")
+    # Float32 has all multiples of such a step below 2^23.
+    numbers &= entry.storage != "components" or (math.frexp(entry.step)[0] == 0.5 and 2.0**-149 <= entry.step <= 1)
     return (coded or entry.storage == own) and numbers

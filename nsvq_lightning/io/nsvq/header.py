@@ -22,7 +22,8 @@ from nsvq_lightning.io.errors import FormatError, naming_file
 
 # Its line ends and high bit expose transfers that treat it as text.
 MAGIC = b"\x89NSVQ\r\n\x1a"
-VERSION = 2
+# Versions that are read. A file has the first one unless an attribute has what came with the second: a basis.
+VERSIONS = 2, 3
 
 # Magic, BLAKE2b digest of everything after it, version, and bytes of the JSON, whose keys are sorted, without spaces.
 _PREFIX = struct.Struct("<8s16sII")
@@ -37,9 +38,10 @@ class AttributeEntry(NamedTuple):
         name: Attribute, for example ``quats``.
         dim: Values per splat, D.
         storage: ``raw`` (float32, one row per splat), ``codes`` (rows of a codebook), ``steps`` (integers, one row per
-            splat), ``levels`` (equal steps of [0, 1]), or ``cells`` (of a grid).
-        codes: Rows of the codebook K, or number of levels; 0 where there are none.
-        step: Step of which the integers of this attribute, or of its codebook, are multiples; 0 for float32.
+            splat), ``components`` (integers, times a basis), ``levels`` (equal steps of [0, 1]), or ``cells`` (of a
+            grid).
+        codes: Rows of the codebook K or of the basis C, or number of levels; 0 where there are none.
+        step: Step of which the integers of this attribute, its codebook or basis are multiples; 0 for float32.
     """
 
     name: str
@@ -201,7 +203,8 @@ def _origin(values: list[Any]) -> tuple[float, float, float]:
 def frame(header: Header, streams: Mapping[str, bytes]) -> list[bytes]:
     """The parts of the file, in order; the header's stream table has the names and lengths of ``streams``."""
     text = header.to_json()
-    parts = [struct.pack("<II", VERSION, len(text)), text, *(streams[stream.name] for stream in header.streams)]
+    version = VERSIONS[any(entry.storage == "components" for entry in header.attributes)]
+    parts = [struct.pack("<II", version, len(text)), text, *(streams[stream.name] for stream in header.streams)]
     digest = blake2b(digest_size=16)
     for part in parts:
         digest.update(part)
@@ -231,8 +234,9 @@ def unframe(data: bytes) -> tuple[Header, dict[str, memoryview]]:
     _, digest, version, json_bytes = _PREFIX.unpack_from(data)
     if blake2b(memoryview(data)[_DIGEST_END:], digest_size=len(digest)).digest() != digest:
         raise FormatError("truncated or altered: the checksum does not fit the content")
-    if version != VERSION:
-        raise FormatError(f"version {version} of the format; this release reads {VERSION}", "update nsvq-lightning")
+    if version not in VERSIONS:
+        known = " and ".join(map(str, VERSIONS))
+        raise FormatError(f"version {version} of the format; this release reads {known}", "update nsvq-lightning")
     payload = memoryview(data)[_PREFIX.size + json_bytes :]
     if _PREFIX.size + json_bytes > len(data):
         raise FormatError(f"damaged: a header of {json_bytes} bytes in a file of {len(data)}")

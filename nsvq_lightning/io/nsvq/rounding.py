@@ -21,14 +21,17 @@ from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.io.numbers import coarsest_power, nearest_power, opacity_of
 from nsvq_lightning.splats.conventions import unit
 
+# Coefficients and integers of a basis are below it in size: float32 has them, and 45 products add up to less than 2^52.
+SMALL = 1 << 23
+
 
 class Stored(NamedTuple):
     """One attribute as integers.
 
     Attributes:
         entry: Its line in the header.
-        values: Codes ``[N]`` (row of the codebook, or level) or integers ``[N, D]``, one row per splat.
-        codebook: Integers ``[K, D]`` of the codebook; None if there is none.
+        values: Codes ``[N]`` (row of the codebook, or level), integers ``[N, D]`` or coefficients ``[N, C]``.
+        codebook: Integers of the codebook ``[K, D]`` or of the basis ``[C, D]``; None if there is none.
     """
 
     entry: AttributeEntry
@@ -42,7 +45,7 @@ class Stored(NamedTuple):
         return sums
 
     def floats(self) -> NDArray[np.float32]:
-        """The codebook ``[K, D]``, or the rows ``[N, D]`` where there is none."""
+        """The codebook ``[K, D]`` or the basis ``[C, D]``, or the rows ``[N, D]`` where there is none."""
         integers = self.values if self.codebook is None else self.codebook
         # In place of a float64 copy, which would take twice the memory of the result.
         return np.multiply(integers, self.entry.step, out=np.empty(integers.shape, np.float32), casting="same_kind")
@@ -56,6 +59,11 @@ def rounded(scene: CompressedScene, name: str, precision: Precision) -> Stored:
     """
     if name == "opacities":
         return _levels(scene.opacities, precision.opacity_levels)
+    if name in scene.bases:
+        basis = scene.bases[name]
+        step = min(_step(basis, nearest_power(float(np.abs(basis).max()) * 2.0**-13 or 1.0)), 1.0)
+        entry = AttributeEntry(name, basis.shape[1], "components", len(basis), step)
+        return Stored(entry, _integers(name, scene.raw[name], 1.0, SMALL), _integers(name, basis, step, SMALL))
     if name in scene.raw:
         rows, step = scene.raw[name], 2 * precision.of(name)
         return Stored(AttributeEntry(name, rows.shape[1], "steps", step=step), _integers(name, rows, step))
@@ -77,25 +85,27 @@ def _coded(name: str, codes: NDArray[np.integer], codebook: NDArray[np.float32],
 def _codebook_step(name: str, rows: NDArray[np.float32], error: float) -> float:
     """Step of the codebook of an attribute, a power of two.
 
-    It is that lattice which all values lie on already, unless it is over four times finer than ``error`` asks for.
-
     Args:
         name: The attribute.
         rows: The rows ``[K, D]`` in use.
         error: Largest error, as a share of how much neighbouring codes typically differ.
     """
-    lattice = coarsest_power(rows)
     distinct = np.unique(unit(rows).astype(np.float32) if name == "quats" else rows, axis=0)
-    wanted = nearest_power(2 * error * sibling_distance(distinct[tree_order(distinct)]) or 2.0**-16)
+    return _step(rows, nearest_power(2 * error * sibling_distance(distinct[tree_order(distinct)]) or 2.0**-16))
+
+
+def _step(rows: NDArray[np.float32], wanted: float) -> float:
+    """The lattice which all values lie on already, unless it is over four times finer than ``wanted``: then this."""
+    lattice = coarsest_power(rows)
     return lattice if 4 * lattice >= wanted else wanted
 
 
-def _integers(name: str, rows: NDArray[np.float32], step: float) -> NDArray[np.int64]:
+def _integers(name: str, rows: NDArray[np.float32], step: float, limit: float = 2.0**52) -> NDArray[np.int64]:
     """The rows ``[N, D]`` as multiples of a step; quaternions are normalised first, unless they are multiples of it."""
     values = np.rint(rows.astype(np.float64) / step)
     if name == "quats" and not np.array_equal((values * step).astype(np.float32), rows):
         values = np.rint(unit(rows).astype(np.float32).astype(np.float64) / step)
-    if not (np.abs(values) < 2.0**52).all():
+    if not (np.abs(values) < limit).all():
         raise ValueError(f"{name}: {np.abs(rows).max():.3g} is too large for steps of {step:.3g}; use level 'paper'")
     return values.astype(np.int64)
 

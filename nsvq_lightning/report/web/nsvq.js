@@ -10,6 +10,7 @@
   const PREFIX = 32;
   const TWO32 = 2 ** 32;
   const LARGEST = 2 ** 52; // integers below it add up exactly in a double
+  const SMALL = 2 ** 23; // the products of 45 pairs of integers below it add up to less than 2^52
   const FEW_SPLATS = 2 ** 18, FEW_ROWS = 2 ** 16; // what any file may hold; beyond, a splat takes two bytes or more, a row one
   const DIMS = { means: 3, opacities: 1, quats: 4, scales: 3, sh0: 3 };
   const ORDERS = {
@@ -100,7 +101,7 @@
     if (checksum(data.subarray(24)).some((byte, i) => data[8 + i] !== byte)) refuse("its checksum does not fit its content");
     const view = new DataView(data.buffer, data.byteOffset, data.length);
     const version = view.getUint32(24, true), length = view.getUint32(28, true);
-    if (version !== 2) throw new Error(`.nsvq version ${version} is not 2, the one that this reader knows`);
+    if (version !== 2 && version !== 3) throw new Error(`.nsvq version ${version} is not 2 or 3, those that this reader knows`);
     if (PREFIX + length > data.length) refuse("its header is longer than the file");
     let header;
     try {
@@ -145,14 +146,18 @@
       const stored = level === "paper" ? storage === "raw" || (storage === "codes" && codable)
         : name === "means" ? storage === "cells"
         : name === "opacities" ? storage === "levels"
-        : storage === "steps" || (storage === "codes" && codable);
-      const coded = storage === "codes" || storage === "levels";
-      const most = storage === "levels" ? 2 ** 20 : TWO32;
+        : storage === "steps" || (storage === "codes" && codable) || (storage === "components" && name === "shN" && dim > 0);
+      const coded = storage === "codes" || storage === "levels" || storage === "components";
+      const most = storage === "levels" ? 2 ** 20 : storage === "components" ? dim : TWO32;
       if (!stored || (coded ? codes < 1 || codes > most : codes !== 0)) refuse(`its entry of ${name} is not possible`);
       if ((level === "compact" && storage !== "levels") !== step > 0) refuse(`its step of ${name} is not possible`);
+      let power = 1; // the largest one up to the step, of those that a basis may have
+      for (let i = 0; i < 149 && power > step; i++) power /= 2;
+      if (storage === "components" && step !== power) refuse(`its step of ${name} is not possible`);
       table[name] = entry;
       if (level === "compact" && name === "means") expected.push("means.grid:grid", "means:keys", "means.far:float32");
       else if (level === "compact" && storage === "codes") expected.push(`${name}.codebook:integers`, `${name}:paths`);
+      else if (storage === "components") expected.push(`${name}.basis:integers`, `${name}:integers`);
       else if (level === "compact") expected.push(`${name}:${storage === "levels" ? "paths" : "integers"}`);
     }
     const entries = Object.values(table), coded = entries.filter(entry => entry.storage === "codes");
@@ -433,6 +438,23 @@
     return values;
   }
 
+  // Whole multiples of the rows of a basis, added up: of each splat, one row at a time.
+  function decodeComponents(basisData, data, rows, { dim, codes, step }) {
+    const basis = new Int32Array(codes * dim), sums = new Float64Array(dim), values = new Float32Array(rows * dim);
+    const small = value => Math.abs(value) < SMALL || refuse("a component is beyond 2^23");
+    decodeIntegers(basisData, codes, dim, (row, column, value) => {
+      small(value);
+      basis[row * dim + column] = value;
+    });
+    decodeIntegers(data, rows, codes, (row, column, value) => {
+      small(value);
+      if (column === 0) sums.fill(0);
+      if (value !== 0) for (let i = 0, at = column * dim; i < dim; i++) sums[i] += value * basis[at + i];
+      if (column === codes - 1) for (let i = 0, at = row * dim; i < dim; i++) values[at + i] = sums[i] * step;
+    });
+    return values;
+  }
+
   function decodeCompact({ splats, table, streams }) {
     const values = {}, leaves = {}, integers = {};
     if (streams["means.grid"].length !== 32) refuse("its grid is not 32 bytes");
@@ -440,6 +462,10 @@
 
     function decode(name, neighbours) {
       const { storage, dim, codes, step } = table[name];
+      if (storage === "components") {
+        values[name] = decodeComponents(streams[`${name}.basis`], streams[name], splats, table[name]);
+        return;
+      }
       const rows = storage === "codes" ? codes : storage === "steps" ? splats : 0, found = new Float32Array(rows * dim);
       const exact = name === "scales" ? (integers[name] = new Float64Array(rows * dim)) : null;
       if (storage !== "levels") {

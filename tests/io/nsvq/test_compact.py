@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,10 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from compressed_scenes import SIZES, arrays_of, forge, scene
+from compressed_scenes import ON_NO_BASIS, SIZES, arrays_of, forge, on_basis, scene
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.io import CompressedScene, FormatError, read_header, read_nsvq, write_nsvq
+from nsvq_lightning.io.compressed import rotated
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.file import encode
 from nsvq_lightning.io.nsvq.precision import OPACITY_ERRORS, Precision, Storage
@@ -72,6 +75,30 @@ def test_a_file_that_is_read_and_written_again_loses_nothing_more(tmp_path: Path
     # A coarser precision rounds again.
     write_nsvq(twice, read_nsvq(once), Storage(precision=Precision(position=0.4, opacity=1 / 16)))
     assert twice.stat().st_size < once.stat().st_size
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_coefficients_and_basis_are_exact(tmp_path: Path, degree: int) -> None:
+    original, once, twice = on_basis(scene(600, {"scales": 9}, degree)), tmp_path / "once.nsvq", tmp_path / "twice.nsvq"
+    write_nsvq(once, original)
+    back = read_nsvq(once)
+    rows = matched(arrays_of(original), arrays_of(back))
+    np.testing.assert_array_equal(back.bases["shN"], original.bases["shN"], strict=True)
+    np.testing.assert_array_equal(back.raw["shN"], original.raw["shN"][rows], strict=True)
+    expected = original.values("shN")[rows]
+    np.testing.assert_array_equal(back.values("shN"), expected, strict=True)
+    part = back.take(np.arange(0, 600, 7))
+    np.testing.assert_array_equal(part.values("shN"), expected[::7])
+    np.testing.assert_array_equal(part.table("shN")[0], expected[::7].reshape(len(part), -1))
+    write_nsvq(twice, back)
+    assert twice.read_bytes() == once.read_bytes()
+    write_nsvq(twice, back, Storage("paper"))
+    plain = read_nsvq(twice)
+    assert (once.read_bytes()[24], twice.read_bytes()[24], plain.bases) == (3, 2, {})
+    np.testing.assert_array_equal(plain.values("shN"), expected)
+    # Zeros of a quarter turn are not quite 0; the step does not follow them.
+    write_nsvq(twice, rotated(back, Rotation.from_rotvec([np.pi / 2, 0, 0]).as_matrix()))
+    assert twice.stat().st_size < 1.3 * once.stat().st_size
 
 
 def test_finer_precision_is_nearer_and_larger(tmp_path: Path) -> None:
@@ -185,6 +212,24 @@ def test_tables_that_do_not_fit_are_refused(tmp_path: Path, change: Any) -> None
     forge(path, change)
     with pytest.raises(FormatError, match="damaged"):
         read_nsvq(path)
+
+
+@pytest.mark.parametrize("change", ON_NO_BASIS.values(), ids=ON_NO_BASIS)
+def test_tables_that_do_not_fit_a_basis_are_refused(tmp_path: Path, change: Any) -> None:
+    path = tmp_path / "x.nsvq"
+    write_nsvq(path, on_basis(scene(30, {})))
+    forge(path, change)
+    with pytest.raises(FormatError, match=r"damaged: (impossible|the (attribute|stream) table)"):
+        read_nsvq(path)
+
+
+def test_components_that_are_too_large_are_refused_by_name(tmp_path: Path) -> None:
+    original = on_basis(scene(30, {}))
+    original.raw["shN"][3, 0] = 2.0**23
+    with pytest.raises(ValueError, match=r"shN: 8\.39e\+06 is too large for steps of 1"):
+        write_nsvq(tmp_path / "x.nsvq", original)
+    write_nsvq(tmp_path / "x.nsvq", replace(on_basis(scene(30, {})), bases={"shN": 0 * original.bases["shN"]}))
+    assert not read_nsvq(tmp_path / "x.nsvq").values("shN").any()
 
 
 @pytest.mark.parametrize(

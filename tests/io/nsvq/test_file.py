@@ -169,8 +169,8 @@ def test_a_code_beyond_its_codebook_is_refused(tmp_path: Path) -> None:
 def test_a_newer_version_says_so(tmp_path: Path) -> None:
     path = tmp_path / "x.nsvq"
     write_nsvq(path, scene(4, {}))
-    forge(path, lambda header: None, version=3)
-    with pytest.raises(FormatError, match="version 3 of the format; this release reads 2; update"):
+    forge(path, lambda header: None, version=4)
+    with pytest.raises(FormatError, match="version 4 of the format; this release reads 2 and 3; update"):
         read_nsvq(path)
 
 
@@ -197,6 +197,12 @@ def test_wrong_scenes_are_refused_at_construction() -> None:
         broken(raw={"scales": raw["scales"]})
     with pytest.raises(ValueError, match="origin"):
         broken(origin=(0.0, np.nan, 0.0))
+    for count in (0, 46):
+        wide, basis = np.zeros((5, count), np.float32), np.zeros((count, 45), np.float32)
+        with pytest.raises(ValueError, match=r"bases\['shN'\] must have shape \[(1|45), 45\]"):
+            broken(raw={**raw, "shN": wide}, bases={"shN": basis})
+    with pytest.raises(ValueError, match="only shN may have a basis"):
+        broken(bases={"scales": np.eye(3, dtype=np.float32)})
     with pytest.raises(ValueError, match="SH degree must be"):
         broken(sh_degree=4)
     with pytest.raises(ValueError, match="no coefficients at SH degree 0"):

@@ -12,10 +12,11 @@ from typing import Any
 import nsvq_reader
 import numpy as np
 import pytest
-from compressed_scenes import SIZES, arrays_of, forge, framed, scene, text_and_body
+from compressed_scenes import ON_NO_BASIS, SIZES, arrays_of, forge, framed, on_basis, scene, text_and_body
 
 from nsvq_lightning.io import CompressedScene, FormatError, read_nsvq, write_nsvq
-from nsvq_lightning.io.nsvq.header import read_frame
+from nsvq_lightning.io.nsvq.entropy import encode_integers
+from nsvq_lightning.io.nsvq.header import read_frame, read_header
 from nsvq_lightning.io.nsvq.precision import LEVELS, Precision, Storage
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 
@@ -74,15 +75,34 @@ def test_numbers_are_those_of_the_package(tmp_path: Path, level: str, degree: in
         kept = {name: count for name, count in sizes.items() if degree or name != "shN"}
         paths.append(tmp_path / f"{len(paths)}.nsvq")
         write_nsvq(paths[-1], scene(120, kept, degree), Storage(level))
+    if degree:
+        paths.append(tmp_path / "basis.nsvq")
+        write_nsvq(paths[-1], on_basis(scene(120, {"sh0": 8}, degree)), Storage(level))
+    compare(*paths)
+
+
+def test_components_at_their_limits(tmp_path: Path) -> None:
+    """Sums above 2^50, at the finest and the coarsest step; the version does not matter."""
+    generator, most, paths = np.random.default_rng(3), 2**23 - 1, [tmp_path / "fine.nsvq", tmp_path / "coarse.nsvq"]
+    for path, step, version in zip(paths, (2.0**-149, 1.0), (2, 3), strict=True):
+        made = on_basis(scene(40, {}))
+        write_nsvq(path, made)
+        for name, rows in (("shN.basis", made.bases["shN"]), ("shN", made.raw["shN"])):
+            numbers = most - generator.integers(0, 3, rows.shape)
+            numbers[1:, 1:] *= generator.choice([-1, 0, 1], numbers[1:, 1:].shape)
+            _with_stream(path, name, lambda _, numbers=numbers: encode_integers(numbers))
+        forge(path, lambda header, step=step: header["attributes"][5].__setitem__(4, step), version)
+    assert np.abs(read_nsvq(paths[1]).values("shN")).max() > 2.0**50
     compare(*paths)
 
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_few_splats(tmp_path: Path, level: str) -> None:
     paths = [tmp_path / f"{count}.nsvq" for count in (0, 1, 2, 17)]
-    for path in paths:
-        write_nsvq(path, scene(int(path.stem)), Storage(level))
-    compare(*paths)
+    for made in (scene, lambda count: on_basis(scene(17, {})).take(np.arange(count))):
+        for path in paths:
+            write_nsvq(path, made(int(path.stem)), Storage(level))
+        compare(*paths)
 
 
 def test_far_splats_at_any_precision(tmp_path: Path) -> None:
@@ -156,12 +176,12 @@ def test_a_header_that_cannot_be_is_refused(tmp_path: Path, change: Any, words: 
 
 
 @needs_node
-@pytest.mark.parametrize("version", [1, 3])
+@pytest.mark.parametrize("version", [1, 4])
 def test_another_version_is_told(tmp_path: Path, version: int) -> None:
     path = tmp_path / "a.nsvq"
     write_nsvq(path, scene(20))
     forge(path, lambda _: None, version=version)
-    assert f"version {version} is not 2" in refusal(path)
+    assert f"version {version} is not 2 or 3" in refusal(path)
 
 
 def _with_stream(path: Path, name: str, change: Any) -> None:
@@ -207,17 +227,33 @@ CHANGES: dict[str, tuple[Any, str]] = {
 }
 
 
+def _too_large(path: Path, name: str) -> None:
+    rows = read_header(path).attributes[5].codes
+    numbers = np.full((rows, 45) if name == "shN.basis" else (60, rows), -(1 << 23))
+    _with_stream(path, name, lambda _: encode_integers(numbers))
+
+
+ON_BASIS: dict[str, tuple[Any, str]] = {
+    **{name: (lambda p, change=change: forge(p, change), "damaged") for name, change in ON_NO_BASIS.items()},
+    "coefficients too large": (lambda p: _too_large(p, "shN"), r"2\^23"),
+    "basis too large": (lambda p: _too_large(p, "shN.basis"), r"2\^23"),
+}
+
+
 @needs_node
 def test_all_readers_refuse_the_same_files(tmp_path: Path) -> None:
     """The package, the Python of the page and the JavaScript: what the page refuses, and noise in the streams."""
-    paths = [tmp_path / f"{index:02}.nsvq" for index in range(len(CHANGES) + 24)]
-    for path, (change, words) in zip(paths, CHANGES.values(), strict=False):
-        write_nsvq(path, scene(60))
+    based = on_basis(scene(60, {}))
+    cases = [*((scene(60), *case) for case in CHANGES.values()), *((based, *case) for case in ON_BASIS.values())]
+    paths = [tmp_path / f"{index:02}.nsvq" for index in range(len(cases) + 30)]
+    for path, (made, change, words) in zip(paths, cases, strict=False):
+        write_nsvq(path, made)
         change(path)
         with pytest.raises(FormatError, match=words):
             read_nsvq(path)
-    for seed, path in enumerate(paths[len(CHANGES) :]):
-        write_nsvq(path, scene(60, SIZES if seed % 3 else {}), Storage(LEVELS[seed % 2]))
+    for seed, path in enumerate(paths[len(cases) :]):
+        made = (scene(60, {}), scene(60), based)[seed % 3]
+        write_nsvq(path, made, Storage(LEVELS[seed % 2]))
         generator = np.random.default_rng(seed)
         name = str(generator.choice([name for name, stream in read_frame(path)[1].items() if len(stream)]))
 
@@ -240,4 +276,4 @@ def test_all_readers_refuse_the_same_files(tmp_path: Path) -> None:
             assert path in refused, f"the page refuses {path}"
         else:
             assert path not in refused, f"the page reads {path}"
-    assert len(lines) == len(refused) > len(CHANGES)
+    assert len(lines) == len(refused) > len(cases)

@@ -1,0 +1,270 @@
+"""Compress a scene that is already trained: the last phases of a run, on its own pictures or on photos.
+
+Small files have codebooks of all attributes. Where there is room for more, spherical harmonics, of which codebooks lose
+most, are coefficients on a basis instead (:mod:`nsvq_lightning.compression.components`). How exactly they, or what else
+is stored, are rounded is chosen after training, so that the file has the bytes or the error that it is to have.
+"""
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from lightning.pytorch import Trainer
+from torch import Tensor
+
+from nsvq_lightning.callbacks import LearningRateDecay, PhaseSchedule, SplatBudget, standard
+from nsvq_lightning.compression.components import components
+from nsvq_lightning.compression.importance import contributions, row_weights
+from nsvq_lightning.compression.viewpoints import Measure
+from nsvq_lightning.data.datamodule import SceneDataModule
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.nsvq.file import decode, encode
+from nsvq_lightning.io.nsvq.header import frame, unframe
+from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.quantize import codebook_sizes
+from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
+from nsvq_lightning.splats.splats import Splats, detached
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.optim import LearningRates
+from nsvq_lightning.training.schedule import Phase
+
+log = logging.getLogger("nsvq_lightning.compress")
+
+
+# Codebook sizes from the most exact to the smallest, by the paper's name.
+SIZES = ("16k", "8k", "4k", "2k", "1k", "0.5k")
+# With the first, spherical harmonics may be on a basis, at these prices of a bit; then a splat has so many bits, about.
+PRICES = 0.005, 0.2
+BITS_ON_BASIS = 115
+# Factors on the errors of all that is stored.
+COARSENESS = 0.5, 2.0
+# Bits of a splat's position and opacity, about.
+PLACE = 24.0
+# Rather than keep fewer splats than this share, a file takes smaller codebooks; it has at least so many splats.
+SHARE, FEWEST_SPLATS = 0.85, 100
+# A file may be this much smaller than it is to be.
+SLACK = 0.01
+FEWEST_STEPS, USUAL_STEPS = 20, 500
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How a scene is compressed.
+
+    Attributes:
+        splats: How many are left.
+        codebooks: The paper's name of their sizes, or "none".
+        price: What a bit of spherical harmonics on a basis costs; 0 gives them a codebook.
+        coarseness: Factor on the errors of :class:`~nsvq_lightning.io.nsvq.precision.Precision`.
+    """
+
+    splats: int
+    codebooks: str
+    price: float = 0.0
+    coarseness: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A scene compressed at one setting, and its file's bytes."""
+
+    setting: Setting
+    scene: CompressedScene
+    data: bytes
+
+
+def setting_for(size: int, most: int, sh_degree: int) -> Setting:
+    """The setting that ``size`` bytes have room for, about, with at most ``most`` splats.
+
+    Raises:
+        ValueError: There is none.
+    """
+    if sh_degree and 8 * size >= BITS_ON_BASIS * most:
+        return Setting(most, SIZES[0], PRICES[0])
+    dims = attribute_dims(sh_degree)
+    for name in SIZES:
+        sizes = {attribute: codes for attribute, codes in codebook_sizes(name).items() if dims[attribute]}
+        fixed = sum(codes * dims[each] * ATTRIBUTES[each].code_bits for each, codes in sizes.items())
+        bits = PLACE + sum(math.log2(codes) for codes in sizes.values())
+        room = int((8 * size - fixed) / bits)
+        if room >= SHARE * most:
+            break
+    if room < min(FEWEST_SPLATS, most):
+        raise ValueError(f"{size} bytes leave room for {max(room, 0)} of {most} splats beside codebooks: allow more")
+    return Setting(min(most, room), name)
+
+
+def _turned(setting: Setting, turn: float) -> Setting:
+    """The setting with its price, or else its coarseness, from the most exact at 0 to the smallest at 1."""
+    name, (low, high) = ("price", PRICES) if setting.price else ("coarseness", COARSENESS)
+    return replace(setting, **{name: low * (high / low) ** turn})
+
+
+class Compressor:
+    """Compresses one scene at any setting; each pair of codebooks and number of splats is trained at most once.
+
+    Attributes:
+        stopped: Whether Ctrl-C has ended a training before its end.
+
+    Args:
+        scene: The scene, finite.
+        data: Views to train on.
+        measure: Measures errors.
+        storage: Level and precision.
+        seed: Seed of all draws.
+        minutes: What one training may take, about.
+        steps: Steps of a training; None as many as the minutes allow, at most :data:`USUAL_STEPS`.
+    """
+
+    def __init__(
+        self,
+        scene: CompressedScene,
+        data: SceneDataModule,
+        measure: Measure,
+        storage: Storage,
+        seed: int = 0,
+        minutes: float = math.inf,
+        steps: int | None = None,
+    ) -> None:
+        self._scene, self._data, self._measure, self._storage, self._seed = scene, data, measure, storage, seed
+        self._splats = detached(scene.decode())
+        self._render = partial(render, antialiased=scene.antialiased)
+        self._steps = steps or self._affordable(60 * minutes)
+        self._trained: dict[tuple[int, str, bool], tuple[CompressedScene, Tensor]] = {}
+        self.stopped = False
+
+    def at(self, setting: Setting) -> Candidate:
+        """The scene at a setting."""
+        key = setting.splats, setting.codebooks, setting.price > 0
+        if key not in self._trained:
+            scene = self._train(setting)
+            weights = row_weights(contributions(scene.decode(), self._measure.cameras, self._render)).sqrt()
+            self._trained[key] = scene, weights
+        scene, weights = self._trained[key]
+        if setting.price:
+            rows, basis = components(torch.from_numpy(scene.raw["shN"]), weights, setting.price)
+            scene = replace(scene, raw={**scene.raw, "shN": rows}, bases={"shN": basis})
+        data = b"".join(frame(*encode(scene, self._storage.coarser(setting.coarseness))))
+        return Candidate(setting, decode(*unframe(data)), data)
+
+    def error(self, candidate: Candidate) -> float:
+        """Root mean square difference between its pictures and those of the original, for channels in [0, 1]."""
+        return self._measure.error(candidate.scene.decode())
+
+    def finest_within(self, target: int, setting: Setting) -> Candidate:
+        """The best file of at most ``target`` bytes, with the codebooks of a setting and at most its splats.
+
+        Raises:
+            ValueError: None was found.
+        """
+        for _ in range(3):
+            found = self._between(
+                setting, True, lambda each: len(each.data) <= target, lambda size: size >= (1 - SLACK) * target
+            )
+            if found is not None:
+                return found
+            size = len(self.at(_turned(setting, 1.0)).data)
+            setting = replace(setting, splats=max(1, int((1 - 2 * SLACK) * setting.splats * target / size)))
+        raise ValueError(f"no file of at most {target} bytes was found, the smallest has {size}: allow more")
+
+    def smallest_within(self, error: float, splats: int) -> Candidate:
+        """The smallest file with this many splats and an error of at most ``error``.
+
+        Raises:
+            ValueError: Even the most exact one has a larger one.
+        """
+
+        def fits(candidate: Candidate) -> bool:
+            return self.error(candidate) <= error
+
+        plain, settings = self.at(Setting(splats, "none")), [Setting(splats, name) for name in SIZES]
+        if self._scene.sh_degree:
+            settings.insert(0, Setting(splats, SIZES[0], PRICES[0]))
+        found, first, end = [plain] if fits(plain) else [], -1, len(settings)
+        while end - first > 1:
+            middle = (first + end) // 2
+            candidate = self._between(settings[middle], False, fits, lambda _: False)
+            first, end = (first, middle) if candidate is None else (middle, end)
+            found += [] if candidate is None else [candidate]
+        if not found:
+            raise ValueError(
+                f"no setting has an error of at most {error:g}: the most exact one has {self.error(plain):.3g} in "
+                f"{len(plain.data)} bytes; allow more, or use level 'paper' without codebooks, which loses nothing"
+            )
+        return min(found, key=lambda each: len(each.data))
+
+    def _between(
+        self, setting: Setting, small: bool, fits: Callable[[Candidate], bool], is_close: Callable[[int], bool]
+    ) -> Candidate | None:
+        """The candidate nearest to the most exact one, or with ``small`` False to the smallest, that fits; or None."""
+        good, bad = (1.0, 0.0) if small else (0.0, 1.0)
+        for turn in (bad, good):
+            best = self.at(_turned(setting, turn))
+            if fits(best):
+                break
+        else:
+            return None
+        while turn != bad and abs(good - bad) > 0.02 and not is_close(len(best.data)):
+            middle = (good + bad) / 2
+            candidate = self.at(_turned(setting, middle))
+            if fits(candidate):
+                best, good = candidate, middle
+            else:
+                bad = middle
+        return best
+
+    def _train(self, setting: Setting) -> CompressedScene:
+        """Select and quantize splats, and train what is left; spherical harmonics with a price have no codebook."""
+        sizes = {} if setting.codebooks == "none" else codebook_sizes(setting.codebooks)
+        prune = -(-self._steps // 4) if setting.splats < len(self._scene) else 0
+        # What is left of the steps after the selection, three quarters before codes freeze.
+        quantize = prune + max(1, 2 * (self._steps - prune) // 3) if sizes else self._steps
+        phases = {"warmup_end": 0, "prune_end": prune, "quantize_end": quantize, "position_decay": 1}
+        module = SplatModule(
+            splats=Splats.from_tensors(*(tensor.clone() for tensor in self._splats)),
+            codebooks={name: codes for name, codes in sizes.items() if name != "shN" or not setting.price} or None,
+            rates=LearningRates(means=LearningRates.means_final),  # a trained scene is in its place
+            antialiased=self._scene.antialiased,
+            seed=self._seed,
+            storage=self._storage,
+        )
+        if sizes or prune:
+            names = "density", "sh_degree", "codebook_replacement", "report", "live", "export", "predictions"
+            callbacks = standard(
+                phases=PhaseSchedule(total=self._steps, reference_total=None, min_finetune=1, **phases),
+                budget=SplatBudget(splats=setting.splats),
+                rate_decay=LearningRateDecay(start=prune),
+                **dict.fromkeys((*names, "checkpoint", "kernels")),
+            )
+            trainer = Trainer(
+                max_steps=self._steps,
+                max_epochs=-1,
+                limit_val_batches=0,
+                callbacks=callbacks,
+                logger=False,
+                enable_checkpointing=False,
+                enable_model_summary=False,
+                use_distributed_sampler=False,
+            )
+            try:
+                trainer.fit(module, self._data)
+            except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
+                if module.phase < Phase.QUANTIZE:
+                    raise
+                self.stopped = True
+        return replace(module.compressed().finite(), origin=self._scene.origin)
+
+    def _affordable(self, seconds: float) -> int:
+        """How many steps a time is enough for."""
+        leaves = type(self._splats)(*(tensor.clone().requires_grad_() for tensor in self._splats))
+        times = []
+        for camera in self._measure.cameras[:3]:
+            start = time.perf_counter()
+            self._render(leaves, camera).image.sum().backward()  # type: ignore[no-untyped-call]
+            times.append(time.perf_counter() - start)
+        return int(min(max(seconds / (2 * min(times)), FEWEST_STEPS), USUAL_STEPS))

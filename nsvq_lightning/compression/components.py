@@ -1,0 +1,60 @@
+"""Spherical harmonics as whole multiples of the rows of a basis, few of which are not 0."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+# Numbers in the basis are whole multiples of 1/2048 of a step, about: so decoders multiply integers.
+FINENESS = 2048
+# Times that bits are counted anew for the coefficients chosen.
+ROUNDS = 3
+
+
+@torch.no_grad()
+def components(rows: Tensor, weights: Tensor, price: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Coefficients and a basis of rows x, chosen by weighted error and bits.
+
+    The basis are the principal axes of the rows, weighted, times a step: the root mean square of a number in a row. Of
+    each row, the coefficients c have the least w·|x − c·B|² + price · step² · bits: one that hardly shows is cheap, and
+    has few. The bits of a coefficient are −log2 of how often it has that value.
+
+    Args:
+        rows: ``[N, D]``, N > 0.
+        weights: How much each row shows ``[N]``, not negative.
+        price: What a bit costs, for a row of mean weight, in squared steps.
+
+    Returns:
+        Whole numbers ``[N, C]`` and the basis ``[C, D]``, C ≥ 1, float32.
+    """
+    weights = weights.double() / weights.double().mean().clamp_min(torch.finfo(torch.float64).tiny)
+    wide = rows.double()
+    spread = (wide * weights[:, None]).T @ wide
+    axes = torch.linalg.eigh(spread)[1].flip(1).T
+    step = math.sqrt(float(spread.trace()) / rows.numel()) or 1.0
+    unit = 2.0 ** round(math.log2(step / FINENESS))
+    basis = (axes * (step / unit)).round() * unit
+    places = (wide @ axes.T / step).float()  # what each coefficient would be
+    worth, chosen = weights.float() / price, places.round()
+    for _ in range(ROUNDS):
+        for column in range(rows.shape[1]):
+            chosen[:, column] = _cheapest(places[:, column], chosen[:, column], worth)
+    used = chosen.any(0)
+    used[0] = True
+    return chosen[:, used].numpy(), basis[used].float().numpy()
+
+
+def _cheapest(places: Tensor, before: Tensor, worth: Tensor) -> Tensor:
+    """The values ``[N]`` with the least worth · squared distance to ``places`` + bits, if all others stay as before."""
+    nearest = places.round()
+    if not nearest.any():
+        return nearest
+    most = int(torch.maximum(nearest.abs(), before.abs()).max())
+    counts = torch.bincount((before + most).long(), minlength=2 * most + 1)
+    bits = math.log2(len(places) + 1) - (counts + 0.5).log2()
+    choices: Sequence[Tensor] = (nearest, nearest - nearest.sign(), torch.zeros_like(nearest))
+    costs = torch.stack([worth * (places - each).square() + bits[(each + most).long()] for each in choices])
+    return torch.stack(list(choices)).gather(0, costs.argmin(0, keepdim=True))[0]

@@ -1,0 +1,118 @@
+"""``nsvq compress``: from a file to a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from splat_scenes import ball
+
+from nsvq_lightning.commands.main import main
+from nsvq_lightning.io import CompressedScene, read_header, read_nsvq, write_ply
+from nsvq_lightning.io.formats import save
+
+
+@pytest.fixture(autouse=True)
+def few_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nsvq_lightning.commands.compress.VIEWS", 4)
+
+
+def test_a_file_is_compressed_and_again_to_the_same_bytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, output = tmp_path / "scene.ply", tmp_path / "new" / "scene.nsvq"
+    scene = ball(700)
+    scene.raw["sh0"][3] = np.nan
+    write_ply(source, scene)
+    command = ["compress", str(source), str(output), "--codebooks", "0.5k", "--steps=4"]
+    assert main(command) == 0
+    assert f"699 of 699 splats in {output.stat().st_size:,} bytes" in capsys.readouterr().out
+    stored = read_nsvq(output)
+    assert isinstance(stored, CompressedScene)
+    assert stored.codebooks.keys() == {"quats", "scales", "sh0", "shN"}
+    first = output.read_bytes()
+    assert main(command) == 0
+    assert output.read_bytes() == first
+    assert main(["compress", str(output), str(tmp_path / "again.nsvq"), "--codebooks=none", "--level=paper"]) == 0
+    assert read_header(tmp_path / "again.nsvq").level == "paper"
+
+
+@pytest.mark.parametrize(("splats", "left"), [("25%", 100), ("150", 150), ("9000", 400)])
+def test_a_share_or_a_number_of_splats_is_left(splats: str, left: int, tmp_path: Path) -> None:
+    write_ply(tmp_path / "scene.ply", ball(400, degree=0))
+    paths = str(tmp_path / "scene.ply"), str(tmp_path / "x.nsvq")
+    assert main(["compress", *paths, "--codebooks=none", "--steps=3", f"--splats={splats}"]) == 0
+    assert len(read_nsvq(tmp_path / "x.nsvq")) == left
+
+
+def test_photos_are_trained_on(tmp_path: Path, demo_scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, output = tmp_path / "scene.nsvq", tmp_path / "out.nsvq"
+    save(ball(400, degree=0), source)
+    assert (
+        main(["compress", str(source), str(output), "--codebooks=0.5k", "--steps=3", f"--data.root={demo_scene}"]) == 0
+    )
+    assert len(read_nsvq(output)) == 400
+    assert f"fitted to the photos of {demo_scene}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("aim", "value"), [("--target-bytes", "9000"), ("--max-error", "0.2")])
+def test_an_aim_is_met(aim: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_ply(tmp_path / "scene.ply", ball(400))
+    output = tmp_path / "x.nsvq"
+    assert main(["compress", str(tmp_path / "scene.ply"), str(output), "--steps=2", aim, value]) == 0
+    if aim == "--target-bytes":
+        assert output.stat().st_size <= 9000
+    else:
+        assert float(capsys.readouterr().out.rpartition("error ")[2].split()[0]) <= 0.2
+
+
+def test_ctrl_c_keeps_what_was_reached(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from nsvq_lightning.training.module import SplatModule
+
+    def interrupted(module: SplatModule, *_: object) -> None:
+        if module.global_step == 5:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(SplatModule, "on_train_batch_end", interrupted, raising=False)
+    write_ply(tmp_path / "scene.ply", ball(300))
+    output = tmp_path / "x.nsvq"
+    assert main(["compress", str(tmp_path / "scene.ply"), str(output), "--codebooks=0.5k", "--steps=50"]) == 130
+    assert len(read_nsvq(output)) == 300
+    assert "ended the training early" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("missing.ply", "missing.ply"), ("empty.ply", "no finite splat"), ("scene.ply", "100 bytes leave room for 0")],
+)
+def test_bad_files_and_aims_are_one_line_and_status_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, message: str
+) -> None:
+    write_ply(tmp_path / "empty.ply", ball(0))
+    write_ply(tmp_path / "scene.ply", ball(300))
+    assert main(["compress", str(tmp_path / name), str(tmp_path / "x.nsvq"), "--target-bytes=100"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("nsvq compress: ")
+    assert message in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["a.ply", "b.ply"], "is a .nsvq file"),
+        (["a.ply", "b.nsvq", "--max-error", "0"], "must be above 0"),
+        (["a.ply", "b.nsvq", "--steps=0"], "--steps: must be above 0, got 0"),
+        (["a.ply", "b.nsvq", "--splats=0"], "expected a number of splats, or a share such as 25%, got '0'"),
+        (["a.ply", "b.nsvq", "--splats=130%"], "got '130%'"),
+        (["a.ply", "b.nsvq", "--max-error", "1", "--target-bytes", "5"], "not allowed with"),
+    ],
+)
+def test_wrong_options_end_with_status_2(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["compress", *arguments])
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err

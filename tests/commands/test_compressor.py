@@ -1,0 +1,126 @@
+"""Compressing a scene that is trained already: what is trained, and how an aim is met."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ring import cameras_around
+from splat_scenes import ball
+
+from nsvq_lightning.commands.compressor import SIZES, SLACK, Compressor, Setting, setting_for
+from nsvq_lightning.compression.viewpoints import Measure, own_scene
+from nsvq_lightning.data.datamodule import SceneDataModule
+from nsvq_lightning.io import CompressedScene
+from nsvq_lightning.io.nsvq.file import decode
+from nsvq_lightning.io.nsvq.header import unframe
+from nsvq_lightning.io.nsvq.precision import Storage
+
+ORIGIN = (500_000.0, 4.5e6, 30.0)
+
+
+def compressor(scene: CompressedScene, steps: int = 4, views: int = 6, storage: Storage | None = None) -> Compressor:
+    splats, cameras = scene.decode(), cameras_around(scene.means, views, 80, 60)
+    others = cameras_around(scene.means, 7, 96, 64)
+    data = SceneDataModule(own_scene(splats, cameras))
+    return Compressor(scene, data, Measure(splats, others), storage or Storage(), steps=steps)
+
+
+@pytest.fixture(scope="module")
+def small() -> Compressor:
+    return compressor(replace(ball(400), origin=ORIGIN))
+
+
+def test_a_candidate_is_what_its_bytes_hold(small: Compressor) -> None:
+    candidate = small.at(Setting(400, "0.5k"))
+    stored = decode(*unframe(candidate.data))
+    assert (len(stored), stored.origin, sorted(stored.codes)) == (400, ORIGIN, ["quats", "scales", "sh0", "shN"])
+    for name in ("means", "quats", "shN"):
+        np.testing.assert_array_equal(stored.values(name), candidate.scene.values(name))
+    assert small.at(Setting(400, "0.5k")).data == candidate.data
+    assert stored.config["phase_ends"][:2] == [0, 0]
+
+
+def test_training_brings_pictures_nearer_in_other_views_too() -> None:
+    few, many = (compressor(ball(600), steps, 12) for steps in (1, 60))
+    setting = Setting(600, "0.5k")
+    assert many.error(many.at(setting)) < 0.9 * few.error(few.at(setting))
+
+
+def test_fewer_splats_are_those_that_show(small: Compressor) -> None:
+    candidate = small.at(Setting(100, "none"))
+    assert len(candidate.scene) == 100
+    assert not candidate.scene.codes
+    scene = ball(400)
+    faintest = np.argsort(scene.opacities)[300:]
+    shown = Measure(scene.decode(), cameras_around(scene.means, 7, 96, 64))
+    assert small.error(candidate) < shown.error(scene.take(np.sort(faintest)).decode())
+
+
+def test_harmonics_with_a_price_are_on_a_basis(small: Compressor) -> None:
+    dear, cheap = (small.at(Setting(400, "0.5k", price)) for price in (0.2, 0.005))
+    assert dear.scene.bases["shN"].shape[1] == 45
+    assert sorted(dear.scene.codes) == ["quats", "scales", "sh0"]
+    assert len(dear.data) < len(cheap.data)
+    assert small.error(dear) > small.error(cheap)
+
+
+@pytest.mark.parametrize("setting", [Setting(400, "0.5k"), Setting(400, "0.5k", 0.1)])
+def test_a_file_has_the_bytes_that_it_may_have(small: Compressor, setting: Setting) -> None:
+    usual = len(small.at(setting).data)
+    for target in (usual, usual - 300):
+        assert (1 - 3 * SLACK) * target <= len(small.finest_within(target, setting).data) <= target
+
+
+def test_a_file_that_codes_cannot_make_small_enough_has_fewer_splats(small: Compressor) -> None:
+    setting = Setting(400, "0.5k")
+    found = small.finest_within(len(small.at(setting).data) // 2, setting)
+    assert len(found.scene) < 400
+
+
+def test_the_smallest_file_within_an_error(small: Compressor) -> None:
+    errors = {name: small.error(small.at(Setting(400, name))) for name in (SIZES[0], SIZES[-1])}
+    loose, tight = (small.smallest_within(1.01 * errors[name], 400) for name in (SIZES[-1], SIZES[0]))
+    assert small.error(loose) <= 1.01 * errors[SIZES[-1]]
+    assert small.error(tight) <= 1.01 * errors[SIZES[0]]
+    assert len(loose.data) <= len(small.at(Setting(400, SIZES[-1])).data)
+    with pytest.raises(ValueError, match="no setting has an error of at most 1e-09: the most exact one has"):
+        small.smallest_within(1e-9, 400)
+
+
+def test_settings_for_bytes_go_from_a_basis_to_fewer_splats() -> None:
+    found = [setting_for(size, 100_000, 3) for size in (2_000_000, 1_300_000, 800_000, 500_000, 100_000)]
+    assert found[0].price > 0
+    assert [setting.codebooks for setting in found[1:]] == ["16k", "4k", "0.5k", "0.5k"]
+    assert [setting.splats for setting in found[:3]] == [100_000, 100_000, 100_000]
+    assert found[4].splats < found[3].splats < 100_000
+    with pytest.raises(ValueError, match="100 bytes leave room for 0 of 100000 splats"):
+        setting_for(100, 100_000, 3)
+
+
+def test_level_paper_and_scenes_without_harmonics_are_compressed() -> None:
+    paper = compressor(ball(200), storage=Storage("paper")).at(Setting(200, "0.5k"))
+    assert unframe(paper.data)[0].level == "paper"
+    plain = compressor(ball(200, degree=0))
+    assert sorted(plain.at(Setting(200, "0.5k")).scene.codes) == ["quats", "scales", "sh0"]
+    assert setting_for(10**6, 200, 0).price == 0
+
+
+@pytest.mark.parametrize("scale", [0.01, 100.0])
+def test_an_error_does_not_depend_on_the_unit_of_the_scene(scale: float) -> None:
+    scene, errors = ball(300), []
+    for factor in (1.0, scale):
+        means, scales = scene.means * np.float32(factor), scene.raw["scales"] + np.float32(math.log(factor))
+        scaled = compressor(replace(scene, means=means, raw={**scene.raw, "scales": scales}))
+        errors.append(scaled.error(scaled.at(Setting(300, "0.5k"))))
+    assert errors[1] == pytest.approx(errors[0], rel=0.2)
+
+
+def test_minutes_limit_the_steps() -> None:
+    scene = ball(300)
+    splats, cameras = scene.decode(), cameras_around(scene.means, 3, 80, 60)
+    data, measure = SceneDataModule(own_scene(splats, cameras)), Measure(splats, cameras)
+    steps = [Compressor(scene, data, measure, Storage(), minutes=minutes)._steps for minutes in (1e-9, 1e9)]
+    assert steps == [20, 500]
