@@ -1,8 +1,8 @@
 """Compress a scene that is already trained: the last phases of a run, on its own pictures or on photos.
 
-Small files have codebooks of all attributes. Where there is room for more, spherical harmonics, of which codebooks lose
-most, are coefficients on a basis instead (:mod:`nsvq_lightning.compression.components`). How exactly they, or what else
-is stored, are rounded is chosen after training, so that the file has the bytes or the error that it is to have.
+Small files have codebooks of all attributes. Where there is room for more, spherical harmonics, of which codebooks
+lose most, are coefficients on a basis instead (:mod:`nsvq_lightning.compression.components`). How exact these are, or
+how many splats are stored, is chosen after training, so that the file has the bytes or the error that it is to have.
 """
 
 import logging
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from nsvq_lightning.callbacks import LearningRateDecay, PhaseSchedule, SplatBudget, standard
 from nsvq_lightning.compression.components import components
-from nsvq_lightning.compression.importance import contributions, row_weights
+from nsvq_lightning.compression.importance import contributions, most_contributing, row_weights
 from nsvq_lightning.compression.viewpoints import Measure
 from nsvq_lightning.data.datamodule import SceneDataModule
 from nsvq_lightning.io.compressed import CompressedScene
@@ -38,11 +38,11 @@ log = logging.getLogger("nsvq_lightning.compress")
 
 # Codebook sizes from the most exact to the smallest, by the paper's name.
 SIZES = ("16k", "8k", "4k", "2k", "1k", "0.5k")
-# With the first, spherical harmonics may be on a basis, at these prices of a bit; then a splat has so many bits, about.
-PRICES = 0.005, 0.2
-BITS_ON_BASIS = 115
-# Factors on the errors of all that is stored.
-COARSENESS = 0.5, 2.0
+# Steps of spherical harmonics on a basis, and from how many bits a splat they are: without codebooks, with the first.
+STEPS = 0.2, 1.6
+ON_BASIS = {"none": 140, "16k": 120}
+# Shares of the trained splats that are stored: those that contribute least go where a file is too large.
+KEPT = 1.0, 0.85
 # Bits of a splat's position and opacity, about.
 PLACE = 24.0
 # Rather than keep fewer splats than this share, a file takes smaller codebooks; it has at least so many splats.
@@ -59,14 +59,15 @@ class Setting:
     Attributes:
         splats: How many are left.
         codebooks: The paper's name of their sizes, or "none".
-        price: What a bit of spherical harmonics on a basis costs; 0 gives them a codebook.
-        coarseness: Factor on the errors of :class:`~nsvq_lightning.io.nsvq.precision.Precision`.
+        step: Of spherical harmonics on a basis (:func:`nsvq_lightning.compression.components.components`); 0 gives
+            them a codebook.
+        kept: Share of these that are stored.
     """
 
     splats: int
     codebooks: str
-    price: float = 0.0
-    coarseness: float = 1.0
+    step: float = 0.0
+    kept: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +85,9 @@ def setting_for(size: int, most: int, sh_degree: int) -> Setting:
     Raises:
         ValueError: There is none.
     """
-    if sh_degree and 8 * size >= BITS_ON_BASIS * most:
-        return Setting(most, SIZES[0], PRICES[0])
+    for name, least in ON_BASIS.items():
+        if sh_degree and 8 * size >= least * most:
+            return Setting(most, name, STEPS[0])
     dims = attribute_dims(sh_degree)
     for name in SIZES:
         sizes = {attribute: codes for attribute, codes in codebook_sizes(name).items() if dims[attribute]}
@@ -100,8 +102,8 @@ def setting_for(size: int, most: int, sh_degree: int) -> Setting:
 
 
 def _turned(setting: Setting, turn: float) -> Setting:
-    """The setting with its price, or else its coarseness, from the most exact at 0 to the smallest at 1."""
-    name, (low, high) = ("price", PRICES) if setting.price else ("coarseness", COARSENESS)
+    """The setting with its step, or else its share of splats, from the most exact at 0 to the smallest at 1."""
+    name, (low, high) = ("step", STEPS) if setting.step else ("kept", KEPT)
     return replace(setting, **{name: low * (high / low) ** turn})
 
 
@@ -140,16 +142,19 @@ class Compressor:
 
     def at(self, setting: Setting) -> Candidate:
         """The scene at a setting."""
-        key = setting.splats, setting.codebooks, setting.price > 0
+        key = setting.splats, setting.codebooks, setting.step > 0
         if key not in self._trained:
             scene = self._train(setting)
             weights = row_weights(contributions(scene.decode(), self._measure.cameras, self._render)).sqrt()
             self._trained[key] = scene, weights
         scene, weights = self._trained[key]
-        if setting.price:
-            rows, basis = components(torch.from_numpy(scene.raw["shN"]), weights, setting.price)
+        if setting.step:
+            rows, basis = components(torch.from_numpy(scene.raw["shN"]), weights, setting.step)
             scene = replace(scene, raw={**scene.raw, "shN": rows}, bases={"shN": basis})
-        data = b"".join(frame(*encode(scene, self._storage.coarser(setting.coarseness))))
+        if setting.kept < 1:
+            kept = most_contributing(weights, math.ceil(setting.kept * len(scene)))
+            scene = scene.take(kept.numpy()).in_use()
+        data = b"".join(frame(*encode(scene, self._storage)))
         return Candidate(setting, decode(*unframe(data)), data)
 
     def error(self, candidate: Candidate) -> float:
@@ -162,7 +167,7 @@ class Compressor:
         Raises:
             ValueError: None was found.
         """
-        for _ in range(3):
+        for _ in range(5):
             found = self._between(
                 setting, True, lambda each: len(each.data) <= target, lambda size: size >= (1 - SLACK) * target
             )
@@ -184,7 +189,7 @@ class Compressor:
 
         plain, settings = self.at(Setting(splats, "none")), [Setting(splats, name) for name in SIZES]
         if self._scene.sh_degree:
-            settings.insert(0, Setting(splats, SIZES[0], PRICES[0]))
+            settings = [*(Setting(splats, name, STEPS[0]) for name in ON_BASIS), *settings]
         found, first, end = [plain] if fits(plain) else [], -1, len(settings)
         while end - first > 1:
             middle = (first + end) // 2
@@ -219,16 +224,17 @@ class Compressor:
         return best
 
     def _train(self, setting: Setting) -> CompressedScene:
-        """Select and quantize splats, and train what is left; spherical harmonics with a price have no codebook."""
+        """Select and quantize splats, and train what is left; spherical harmonics with a step have no codebook."""
         sizes = {} if setting.codebooks == "none" else codebook_sizes(setting.codebooks)
         prune = -(-self._steps // 4) if setting.splats < len(self._scene) else 0
         # What is left of the steps after the selection, three quarters before codes freeze.
         quantize = prune + max(1, 2 * (self._steps - prune) // 3) if sizes else self._steps
-        phases = {"warmup_end": 0, "prune_end": prune, "quantize_end": quantize, "position_decay": 1}
+        phases = {"warmup_end": 0, "prune_end": prune, "quantize_end": quantize, "position_decay": max(1, prune)}
         module = SplatModule(
             splats=Splats.from_tensors(*(tensor.clone() for tensor in self._splats)),
-            codebooks={name: codes for name, codes in sizes.items() if name != "shN" or not setting.price} or None,
-            rates=LearningRates(means=LearningRates.means_final),  # a trained scene is in its place
+            codebooks={name: codes for name, codes in sizes.items() if name != "shN" or not setting.step} or None,
+            # A trained scene is in its place; what is left of some splats has to cover that of the others.
+            rates=LearningRates() if prune else LearningRates(means=LearningRates.means_final),
             antialiased=self._scene.antialiased,
             seed=self._seed,
             storage=self._storage,

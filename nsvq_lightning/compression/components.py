@@ -10,22 +10,26 @@ from torch import Tensor
 
 # Numbers in the basis are whole multiples of 1/2048 of a step, about: so decoders multiply integers.
 FINENESS = 2048
+# What a bit costs in squared steps, for a row of mean weight. On fox, 0.2 lost 0.05 dB more at equal bits, 0.4 0.15 dB.
+PRICE = 0.1
+# Largest coefficient.
+LARGEST = 4095.0
 # Times that bits are counted anew for the coefficients chosen.
 ROUNDS = 3
 
 
 @torch.no_grad()
-def components(rows: Tensor, weights: Tensor, price: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def components(rows: Tensor, weights: Tensor, step: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Coefficients and a basis of rows x, chosen by weighted error and bits.
 
-    The basis are the principal axes of the rows, weighted, times a step: the root mean square of a number in a row. Of
-    each row, the coefficients c have the least w·|x − c·B|² + price · step² · bits: one that hardly shows is cheap, and
-    has few. The bits of a coefficient are −log2 of how often it has that value.
+    The basis are the principal axes of the rows, weighted, times a step. Of each row, the coefficients c have the least
+    w·|x − c·B|² + :data:`PRICE` · step² · bits: one that hardly shows is cheap, and has few. The bits of a coefficient
+    are −log2 of how often it has that value.
 
     Args:
         rows: ``[N, D]``, N > 0.
         weights: How much each row shows ``[N]``, not negative.
-        price: What a bit costs, for a row of mean weight, in squared steps.
+        step: In units of the root mean square of the numbers in the rows, weighted; above 0.
 
     Returns:
         Whole numbers ``[N, C]`` and the basis ``[C, D]``, C ≥ 1, float32.
@@ -34,11 +38,11 @@ def components(rows: Tensor, weights: Tensor, price: float) -> tuple[NDArray[np.
     wide = rows.double()
     spread = (wide * weights[:, None]).T @ wide
     axes = torch.linalg.eigh(spread)[1].flip(1).T
-    step = math.sqrt(float(spread.trace()) / rows.numel()) or 1.0
-    unit = 2.0 ** round(math.log2(step / FINENESS))
-    basis = (axes * (step / unit)).round() * unit
-    places = (wide @ axes.T / step).float()  # what each coefficient would be
-    worth, chosen = weights.float() / price, places.round()
+    size = step * math.sqrt(float(spread.trace()) / rows.numel()) or 1.0
+    unit = 2.0 ** round(math.log2(size / FINENESS))
+    basis = (axes * (size / unit)).round() * unit
+    places = (wide @ axes.T / size).float().clamp_(-LARGEST, LARGEST)  # what each coefficient would be
+    worth, chosen = weights.float() / PRICE, places.round()
     for _ in range(ROUNDS):
         for column in range(rows.shape[1]):
             chosen[:, column] = _cheapest(places[:, column], chosen[:, column], worth)

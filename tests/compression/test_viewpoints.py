@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
+import pytest
 import torch
 
-from nsvq_lightning.compression.viewpoints import likely_cameras, views_of
-from nsvq_lightning.data.scene import load_scene
+from nsvq_lightning.compression.viewpoints import Measure, likely_cameras, own_scene
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats
 
 
@@ -59,15 +58,23 @@ def test_a_single_splat_and_one_above_another_have_views() -> None:
         assert all(camera.viewmat.isfinite().all() for camera in cameras)
 
 
-def test_photos_give_their_own_views(demo_scene: Path) -> None:
-    scene = load_scene(demo_scene)
-    found = views_of(painting(), demo_scene, 3)
-    assert 0 < len(found) <= 3
-    assert all(
-        any(
-            camera is scene_camera or torch.equal(camera.viewmat, scene_camera.viewmat)
-            for scene_camera in (scene.cameras[i] for i in scene.train)
-        )
-        for camera in found
-    )
-    assert len(views_of(painting(), None, 2)) == 2
+def test_pictures_of_a_scene_are_its_photos() -> None:
+    cameras = likely_cameras(painting(), 4, 64, 48)
+    scene = own_scene(painting(), cameras)
+    assert (len(scene), scene.train, scene.extent > 0) == (4, (0, 1, 2, 3), True)
+    for index, camera in enumerate(cameras):
+        view = scene.view(index)
+        assert view.image.dtype == torch.uint8
+        assert float((view.image / 255 - render(painting(), camera).image.clamp(0, 1)).abs().max()) < 0.51 / 255
+
+
+def test_an_error_is_the_root_mean_square_difference_of_pictures() -> None:
+    cameras = likely_cameras(painting(), 3, 64, 48)
+    measure = Measure(painting(), cameras)
+    assert measure.error(painting()) == 0
+    other = painting()._replace(sh0=painting().sh0 + 0.1)
+    pairs = [[render(splats, camera).image.clamp(0, 1) for splats in (painting(), other)] for camera in cameras]
+    expected = np.sqrt(np.mean([float((a - b).square().mean()) for a, b in pairs]))
+    assert measure.error(other) == pytest.approx(expected, rel=1e-5)
+    with pytest.raises(ValueError, match="all 1 pictures of the scene are black"):
+        Measure(painting()._replace(means=painting().means + 1e4), cameras[:1])

@@ -89,9 +89,3 @@ class Storage:
     def from_dict(cls, values: Mapping[str, Any]) -> "Storage":
         """The settings from plain data, as stored in a checkpoint."""
         return cls(values["level"], Precision(**values["precision"]))
-
-    def coarser(self, factor: float) -> "Storage":
-        """With this factor on all errors; that of the opacity stays in its bounds."""
-        errors = {name: factor * error for name, error in vars(self.precision).items()}
-        least, most = OPACITY_ERRORS
-        return Storage(self.level, Precision(**errors | {"opacity": min(max(errors["opacity"], least), most)}))
