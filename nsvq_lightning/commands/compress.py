@@ -1,16 +1,14 @@
 """Make a splat file small: splats that nothing shows go, the others get codebooks, fitted to the scene's own pictures.
 
-It is the last part of a training run: selection, codebooks trained together with the splats, frozen codes. Pictures
-are those of the scene from where it shows detail or, with --data.root, the train photos of that folder.
+Pictures are those from where the scene shows detail, or the train photos of --data.root, or of the run it lies in.
 The error is the root mean square difference between pictures of the scene before and after, for channels in [0, 1]:
-0.01 is 40 dB, 0.003 is 50 dB. Ctrl-C keeps the best file so far.
+0.01 is 40 dB, 0.003 is 50 dB. Ctrl-C keeps what was reached.
 
 Examples:
   nsvq compress scene.ply scene.nsvq
   nsvq compress scene.ply scene.nsvq --target-bytes 2000000
   nsvq compress scene.ply scene.nsvq --splats 25%
-  nsvq compress scene.ply scene.nsvq --max-error 0.01
-  nsvq compress scene.ply scene.nsvq --data.root photos --steps 3000
+  nsvq compress scene.ply scene.nsvq --max-error 0.01 --data.root photos
 """
 
 import argparse
@@ -22,14 +20,6 @@ from pathlib import Path
 from nsvq_lightning.commands.arguments import positive, views_of
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
-
-log = logging.getLogger("nsvq_lightning.compress")
-
-# Codebook sizes, from the most exact to the smallest.
-SIZES = ("16k", "8k", "4k", "2k", "1k", "0.5k")
-DEFAULT_SIZE, MINUTES = "8k", 4.0
-# Number of own pictures.
-VIEWS = 96
 
 
 def share_or_number(text: str) -> float:
@@ -43,6 +33,15 @@ def share_or_number(text: str) -> float:
     if not match or not (0 < value <= 1 if match[2] else value >= 1 and value.is_integer()):
         raise argparse.ArgumentTypeError(f"expected a number of splats, or a share such as 25%, got {text!r}")
     return value
+
+
+log = logging.getLogger("nsvq_lightning.compress")
+
+# Codebook sizes, from the most exact to the smallest.
+SIZES = ("16k", "8k", "4k", "2k", "1k", "0.5k")
+DEFAULT_SIZE, MINUTES = "8k", 4.0
+# Number of own pictures.
+VIEWS = 96
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

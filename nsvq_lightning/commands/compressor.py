@@ -1,11 +1,10 @@
 """Compress a scene that is already trained: the last phases of a run, on its own pictures or on photos.
 
-Small files have codebooks of all attributes. Where there is room for more, spherical harmonics, of which codebooks
-lose most, are coefficients on a basis instead (:mod:`nsvq_lightning.compression.components`). How exact these are, or
-how many splats are stored, is chosen after training, so that the file has the bytes or the error that it is to have.
+Small files have codebooks of all attributes. Where there is room for more, spherical harmonics, of which these lose
+most, are on a basis instead (:mod:`nsvq_lightning.compression.components`). How exactly, or how many splats are stored,
+is chosen after training, so that the file has the bytes or the error that it is to have.
 """
 
-import logging
 import math
 import time
 from collections.abc import Callable
@@ -17,6 +16,7 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nsvq_lightning.callbacks import LearningRateDecay, PhaseSchedule, SplatBudget, standard
+from nsvq_lightning.commands.compress import SIZES
 from nsvq_lightning.compression.components import components
 from nsvq_lightning.compression.importance import contributions, most_contributing, row_weights
 from nsvq_lightning.compression.viewpoints import Measure
@@ -33,24 +33,6 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.schedule import Phase
 
-log = logging.getLogger("nsvq_lightning.compress")
-
-
-# Codebook sizes from the most exact to the smallest, by the paper's name.
-SIZES = ("16k", "8k", "4k", "2k", "1k", "0.5k")
-# Steps of spherical harmonics on a basis, and from how many bits a splat they are: without codebooks, with the first.
-STEPS = 0.2, 1.6
-ON_BASIS = {"none": 140, "16k": 120}
-# Shares of the trained splats that are stored: those that contribute least go where a file is too large.
-KEPT = 1.0, 0.85
-# Bits of a splat's position and opacity, about.
-PLACE = 24.0
-# Rather than keep fewer splats than this share, a file takes smaller codebooks; it has at least so many splats.
-SHARE, FEWEST_SPLATS = 0.85, 100
-# A file may be this much smaller than it is to be.
-SLACK = 0.01
-FEWEST_STEPS, USUAL_STEPS = 20, 500
-
 
 @dataclass(frozen=True)
 class Setting:
@@ -62,12 +44,14 @@ class Setting:
         step: Of spherical harmonics on a basis (:func:`nsvq_lightning.compression.components.components`); 0 gives
             them a codebook.
         kept: Share of these that are stored.
+        more: Codes of spherical harmonics beyond those of the size.
     """
 
     splats: int
     codebooks: str
     step: float = 0.0
     kept: float = 1.0
+    more: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +61,21 @@ class Candidate:
     setting: Setting
     scene: CompressedScene
     data: bytes
+
+
+# Steps of spherical harmonics on a basis, and from how many bits a splat they are: without codebooks, with the first.
+STEPS = 0.2, 1.6
+ON_BASIS = {"none": 140, "16k": 120}
+# Shares of the trained splats that are stored: those that contribute least go where a file is too large.
+KEPT = 1.0, 0.85
+# Bits of a splat's position and opacity, about.
+PLACE = 22.0
+# Rather than keep fewer splats than this share, a file takes smaller codebooks; it has at least so many splats.
+SHARE, FEWEST_SPLATS = 0.85, 100
+# A file may be this much smaller than it is to be.
+SLACK = 0.01
+# Steps of a training, and how many times as many for a thinned scene.
+FEWEST_STEPS, USUAL_STEPS, THINNING = 20, 500, 3
 
 
 def setting_for(size: int, most: int, sh_degree: int) -> Setting:
@@ -92,13 +91,15 @@ def setting_for(size: int, most: int, sh_degree: int) -> Setting:
     for name in SIZES:
         sizes = {attribute: codes for attribute, codes in codebook_sizes(name).items() if dims[attribute]}
         fixed = sum(codes * dims[each] * ATTRIBUTES[each].code_bits for each, codes in sizes.items())
-        bits = PLACE + sum(math.log2(codes) for codes in sizes.values())
+        bits = PLACE + sum(math.log2(codes) + ATTRIBUTES[each].row_bits for each, codes in sizes.items())
         room = int((8 * size - fixed) / bits)
         if room >= SHARE * most:
             break
     if room < min(FEWEST_SPLATS, most):
         raise ValueError(f"{size} bytes leave room for {max(room, 0)} of {most} splats beside codebooks: allow more")
-    return Setting(min(most, room), name)
+    spare = max(0.0, 8 * size - fixed - most * bits)
+    more = min(spare / (dims["shN"] * ATTRIBUTES["shN"].code_bits), most / 8) if dims["shN"] else 0
+    return Setting(min(most, room), name, more=int(more))
 
 
 def _turned(setting: Setting, turn: float) -> Setting:
@@ -120,7 +121,7 @@ class Compressor:
         storage: Level and precision.
         seed: Seed of all draws.
         minutes: What one training may take, about.
-        steps: Steps of a training; None as many as the minutes allow, at most :data:`USUAL_STEPS`.
+        steps: Steps of a training, at least 4; None as many as the minutes allow, at most :data:`USUAL_STEPS`.
     """
 
     def __init__(
@@ -136,13 +137,13 @@ class Compressor:
         self._scene, self._data, self._measure, self._storage, self._seed = scene, data, measure, storage, seed
         self._splats = detached(scene.decode())
         self._render = partial(render, antialiased=scene.antialiased)
-        self._steps = steps or self._affordable(60 * minutes)
-        self._trained: dict[tuple[int, str, bool], tuple[CompressedScene, Tensor]] = {}
+        self._steps = max(steps or self._affordable(60 * minutes), 4)
+        self._trained: dict[Setting, tuple[CompressedScene, Tensor]] = {}
         self.stopped = False
 
     def at(self, setting: Setting) -> Candidate:
         """The scene at a setting."""
-        key = setting.splats, setting.codebooks, setting.step > 0
+        key = replace(setting, step=float(setting.step > 0), kept=1.0)
         if key not in self._trained:
             scene = self._train(setting)
             weights = row_weights(contributions(scene.decode(), self._measure.cameras, self._render)).sqrt()
@@ -225,14 +226,19 @@ class Compressor:
 
     def _train(self, setting: Setting) -> CompressedScene:
         """Select and quantize splats, and train what is left; spherical harmonics with a step have no codebook."""
-        sizes = {} if setting.codebooks == "none" else codebook_sizes(setting.codebooks)
-        prune = -(-self._steps // 4) if setting.splats < len(self._scene) else 0
-        # What is left of the steps after the selection, three quarters before codes freeze.
-        quantize = prune + max(1, 2 * (self._steps - prune) // 3) if sizes else self._steps
+        sizes = {} if setting.codebooks == "none" else dict(codebook_sizes(setting.codebooks))
+        if "shN" in sizes:
+            sizes["shN"] += setting.more
+            if setting.step:
+                del sizes["shN"]
+        # Few splats take time to cover what many did.
+        steps = self._steps * (THINNING if setting.splats < SHARE * len(self._scene) else 1)
+        prune = steps // 4 if setting.splats < len(self._scene) else 0
+        quantize = prune + 2 * (steps - prune) // 3 if sizes else steps
         phases = {"warmup_end": 0, "prune_end": prune, "quantize_end": quantize, "position_decay": max(1, prune)}
         module = SplatModule(
             splats=Splats.from_tensors(*(tensor.clone() for tensor in self._splats)),
-            codebooks={name: codes for name, codes in sizes.items() if name != "shN" or not setting.step} or None,
+            codebooks=sizes or None,
             # A trained scene is in its place; what is left of some splats has to cover that of the others.
             rates=LearningRates() if prune else LearningRates(means=LearningRates.means_final),
             antialiased=self._scene.antialiased,
@@ -242,13 +248,13 @@ class Compressor:
         if sizes or prune:
             names = "density", "sh_degree", "codebook_replacement", "report", "live", "export", "predictions"
             callbacks = standard(
-                phases=PhaseSchedule(total=self._steps, reference_total=None, min_finetune=1, **phases),
+                phases=PhaseSchedule(total=steps, reference_total=None, min_finetune=1, **phases),
                 budget=SplatBudget(splats=setting.splats),
                 rate_decay=LearningRateDecay(start=prune),
                 **dict.fromkeys((*names, "checkpoint", "kernels")),
             )
             trainer = Trainer(
-                max_steps=self._steps,
+                max_steps=steps,
                 max_epochs=-1,
                 limit_val_batches=0,
                 callbacks=callbacks,

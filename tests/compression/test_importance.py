@@ -1,12 +1,10 @@
-"""Contributions and sensitivities of splats against their definitions, and the size of a pixel at a splat."""
+"""Contributions and sensitivities of splats against their definitions, and floaters."""
 
 from __future__ import annotations
 
-import math
 from typing import cast
 
 import numpy as np
-import pytest
 import torch
 from splat_scenes import front_camera, random_splats
 from torch import Tensor
@@ -15,9 +13,7 @@ from nsvq_lightning.compression.importance import (
     contributions,
     floaters,
     most_contributing,
-    pixel_sizes,
     row_weights,
-    scale_floor,
     sensitivity,
 )
 from nsvq_lightning.compression.viewpoints import look_at
@@ -113,43 +109,6 @@ def test_the_picture_comes_with_it_and_nothing_is_tracked() -> None:
     assert not any(tensor.requires_grad for tensor in (*squares, *splats))
     again, _ = sensitivity(splats, CAMERA, render, generator(1))
     assert all(torch.equal(first, second) for first, second in zip(squares, again, strict=True))
-
-
-def camera(focal: float = 100.0, back: float = 0.0) -> Camera:
-    """Looks along +z from ``back`` behind the origin, 60×40 pixels."""
-    K = torch.tensor([[focal, 0.0, 30.0], [0.0, 0.9 * focal, 20.0], [0.0, 0.0, 1.0]])
-    viewmat = torch.eye(4)
-    viewmat[2, 3] = back
-    return Camera(K, viewmat, 60, 40)
-
-
-def test_a_pixel_is_depth_over_focal_length_in_the_closest_view() -> None:
-    means = torch.tensor([[0.0, 0.0, 2.0], [0.1, -0.1, 4.0]])
-    torch.testing.assert_close(pixel_sizes(means, [camera()]), torch.tensor([0.02, 0.04]))
-    views = [camera(back=1.0), camera(), camera(focal=10.0)]
-    torch.testing.assert_close(pixel_sizes(means, views), torch.tensor([0.02, 0.04]))
-
-
-def test_only_views_that_show_the_centre_count() -> None:
-    behind, too_near, left, below = [0.0, 0.0, -1.0], [0.0, 0.0, 0.1], [-0.4, 0.0, 1.0], [0.0, 0.3, 1.0]
-    broken, seen = [math.nan, 0.0, 1.0], [-0.2, 0.1, 1.0]
-    sizes = pixel_sizes(torch.tensor([behind, too_near, left, below, broken, seen]), [camera()])
-    assert sizes.tolist() == [math.inf] * 5 + [pytest.approx(0.01)]
-
-
-def test_the_floor_is_where_all_but_a_few_splats_are_seen_from_farther_away() -> None:
-    means = torch.zeros(101, 3)
-    means[:, 2] = torch.arange(101) / 100 + 1
-    assert scale_floor(means, [camera()], 0.5) == pytest.approx(math.log(0.5 * 1.05 / 100))
-    # Nor do those count that no view shows, or more splats than are looked at.
-    means = torch.cat([means.repeat(2000, 1), -means])
-    assert scale_floor(means, [camera()], 0.5) == pytest.approx(math.log(0.5 * 1.05 / 100), abs=1e-3)
-
-
-def test_without_a_view_of_any_splat_there_is_no_floor() -> None:
-    assert scale_floor(torch.zeros(3, 3), [camera()]) is None
-    assert scale_floor(torch.zeros(0, 3), [camera()]) is None
-    assert scale_floor(torch.ones(3, 3), []) is None
 
 
 def joined(*parts: RawSplats) -> RawSplats:
