@@ -1,13 +1,11 @@
-"""Make a splat file small: splats that nothing shows go, the others get codebooks, fitted to the scene's own pictures.
+"""Make a splat file small: codebooks, and fewer splats, fitted to the scene's own pictures.
 
 Pictures are those from where the scene shows detail, or the train photos of --data.root, or of the run it lies in.
-The error is the root mean square difference between pictures of the scene before and after, for channels in [0, 1]:
-0.01 is 40 dB, 0.003 is 50 dB. Ctrl-C keeps what was reached.
+The error is the root mean square difference of pictures before and after, for channels in [0, 1]: 0.01 is 40 dB.
 
 Examples:
   nsvq compress scene.ply scene.nsvq
-  nsvq compress scene.ply scene.nsvq --target-bytes 2000000
-  nsvq compress scene.ply scene.nsvq --splats 25%
+  nsvq compress scene.ply scene.nsvq --target-bytes 2000000 --splats 50%
   nsvq compress scene.ply scene.nsvq --max-error 0.01 --data.root photos
 """
 
@@ -34,8 +32,6 @@ def share_or_number(text: str) -> float:
         raise argparse.ArgumentTypeError(f"expected a number of splats, or a share such as 25%, got {text!r}")
     return value
 
-
-log = logging.getLogger("nsvq_lightning.compress")
 
 # Codebook sizes, from the most exact to the smallest.
 SIZES = ("16k", "8k", "4k", "2k", "1k", "0.5k")
@@ -117,5 +113,5 @@ def run(options: argparse.Namespace) -> int:
         f"({decibels(error):.2f} dB against the original in {len(measure.cameras)} pictures)\n"
     )
     if compressor.stopped:
-        log.warning("Ctrl-C ended the training early: %s holds what it had reached", options.output)
+        sys.stderr.write(f"Ctrl-C ended the training early: {options.output} holds what it had reached\n")
     return 130 if compressor.stopped else 0

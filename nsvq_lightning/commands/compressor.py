@@ -1,8 +1,6 @@
 """Compress a scene that is already trained: the last phases of a run, on its own pictures or on photos.
 
-Small files have codebooks of all attributes. Where there is room for more, spherical harmonics, of which these lose
-most, are on a basis instead (:mod:`nsvq_lightning.compression.components`). How exactly, or how many splats are stored,
-is chosen after training, so that the file has the bytes or the error that it is to have.
+Small files have codebooks; in larger ones, spherical harmonics, which lose most by that, are on a basis.
 """
 
 import math
@@ -10,6 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import torch
 from lightning.pytorch import Trainer
@@ -41,8 +40,8 @@ class Setting:
     Attributes:
         splats: How many are left.
         codebooks: The paper's name of their sizes, or "none".
-        step: Of spherical harmonics on a basis (:func:`nsvq_lightning.compression.components.components`); 0 gives
-            them a codebook.
+        step: Of spherical harmonics on a basis (:func:`nsvq_lightning.compression.components.components`), without
+            codebooks; 0 stores them as the others.
         kept: Share of these that are stored.
         more: Codes of spherical harmonics beyond those of the size.
     """
@@ -63,15 +62,17 @@ class Candidate:
     data: bytes
 
 
-# Steps of spherical harmonics on a basis, and from how many bits a splat they are: without codebooks, with the first.
-STEPS = 0.2, 1.6
-ON_BASIS = {"none": 140, "16k": 120}
+# Steps of spherical harmonics on a basis, and from how many bits a splat they are, without any codebooks.
+STEPS, ON_BASIS = (0.2, 1.6), 125
 # Shares of the trained splats that are stored: those that contribute least go where a file is too large.
-KEPT = 1.0, 0.85
+KEPT = 1.0, 0.97
+# Most views in which contributions are measured.
+MOST_VIEWS = 96
 # Bits of a splat's position and opacity, about.
 PLACE = 22.0
-# Rather than keep fewer splats than this share, a file takes smaller codebooks; it has at least so many splats.
-SHARE, FEWEST_SPLATS = 0.85, 100
+# Rather than keep fewer splats than this share, a file takes smaller codebooks: other views may need what those that it
+# was trained on do not show. It has at least so many splats.
+SHARE, FEWEST_SPLATS = 0.97, 100
 # A file may be this much smaller than it is to be.
 SLACK = 0.01
 # Steps of a training, and how many times as many for a thinned scene.
@@ -84,9 +85,8 @@ def setting_for(size: int, most: int, sh_degree: int) -> Setting:
     Raises:
         ValueError: There is none.
     """
-    for name, least in ON_BASIS.items():
-        if sh_degree and 8 * size >= least * most:
-            return Setting(most, name, STEPS[0])
+    if 8 * size >= ON_BASIS * most:
+        return Setting(most, "none", STEPS[0] if sh_degree else 0.0)
     dims = attribute_dims(sh_degree)
     for name in SIZES:
         sizes = {attribute: codes for attribute, codes in codebook_sizes(name).items() if dims[attribute]}
@@ -143,10 +143,12 @@ class Compressor:
 
     def at(self, setting: Setting) -> Candidate:
         """The scene at a setting."""
-        key = replace(setting, step=float(setting.step > 0), kept=1.0)
+        key = replace(setting, step=0.0, kept=1.0)
         if key not in self._trained:
             scene = self._train(setting)
-            weights = row_weights(contributions(scene.decode(), self._measure.cameras, self._render)).sqrt()
+            views = self._data.scene
+            cameras = [views.cameras[index] for index in views.some_train(MOST_VIEWS)]
+            weights = row_weights(contributions(scene.decode(), cameras, self._render)).sqrt()
             self._trained[key] = scene, weights
         scene, weights = self._trained[key]
         if setting.step:
@@ -163,20 +165,36 @@ class Compressor:
         return self._measure.error(candidate.scene.decode())
 
     def finest_within(self, target: int, setting: Setting) -> Candidate:
-        """The best file of at most ``target`` bytes, with the codebooks of a setting and at most its splats.
+        """The best file of at most ``target`` bytes, near a setting.
 
         Raises:
             ValueError: None was found.
         """
-        for _ in range(5):
+        best: Candidate | None = None
+        if setting.codebooks == "none":
+            best = self.at(replace(setting, step=0.0))
+            if len(best.data) <= target:
+                return best
+        for _ in range(4):
             found = self._between(
                 setting, True, lambda each: len(each.data) <= target, lambda size: size >= (1 - SLACK) * target
             )
-            if found is not None:
+            best = found or best
+            if found is not None and (setting.step or len(found.data) >= (1 - 2 * SLACK) * target):
                 return found
-            size = len(self.at(_turned(setting, 1.0)).data)
-            setting = replace(setting, splats=max(1, int((1 - 2 * SLACK) * setting.splats * target / size)))
-        raise ValueError(f"no file of at most {target} bytes was found, the smallest has {size}: allow more")
+            setting = self._nearer(setting, target, len(self.at(_turned(setting, float(found is None))).data))
+        if best is None or len(best.data) > target:
+            raise ValueError(f"no file of at most {target} bytes was found: allow more")
+        return best
+
+    def _nearer(self, setting: Setting, target: int, size: int) -> Setting:
+        """A setting for ``target`` bytes instead of ``size``: with other codes of spherical harmonics, or splats."""
+        aim, dim = (1 - SLACK / 2) * target, attribute_dims(self._scene.sh_degree)["shN"]
+        if dim and setting.codebooks != "none":
+            more = setting.more + int(8 * (aim - size) / (dim * ATTRIBUTES["shN"].code_bits))
+            if -codebook_sizes(setting.codebooks)["shN"] // 2 <= more <= setting.splats / 8:
+                return replace(setting, more=more)
+        return replace(setting, splats=max(1, min(int(setting.splats * aim / size), len(self._scene))))
 
     def smallest_within(self, error: float, splats: int) -> Candidate:
         """The smallest file with this many splats and an error of at most ``error``.
@@ -190,7 +208,7 @@ class Compressor:
 
         plain, settings = self.at(Setting(splats, "none")), [Setting(splats, name) for name in SIZES]
         if self._scene.sh_degree:
-            settings = [*(Setting(splats, name, STEPS[0]) for name in ON_BASIS), *settings]
+            settings.insert(0, Setting(splats, "none", STEPS[0]))
         found, first, end = [plain] if fits(plain) else [], -1, len(settings)
         while end - first > 1:
             middle = (first + end) // 2
@@ -225,12 +243,10 @@ class Compressor:
         return best
 
     def _train(self, setting: Setting) -> CompressedScene:
-        """Select and quantize splats, and train what is left; spherical harmonics with a step have no codebook."""
+        """Select and quantize splats, and train what is left."""
         sizes = {} if setting.codebooks == "none" else dict(codebook_sizes(setting.codebooks))
         if "shN" in sizes:
             sizes["shN"] += setting.more
-            if setting.step:
-                del sizes["shN"]
         # Few splats take time to cover what many did.
         steps = self._steps * (THINNING if setting.splats < SHARE * len(self._scene) else 1)
         prune = steps // 4 if setting.splats < len(self._scene) else 0
@@ -253,16 +269,8 @@ class Compressor:
                 rate_decay=LearningRateDecay(start=prune),
                 **dict.fromkeys((*names, "checkpoint", "kernels")),
             )
-            trainer = Trainer(
-                max_steps=steps,
-                max_epochs=-1,
-                limit_val_batches=0,
-                callbacks=callbacks,
-                logger=False,
-                enable_checkpointing=False,
-                enable_model_summary=False,
-                use_distributed_sampler=False,
-            )
+            off: dict[str, Any] = dict.fromkeys(("logger", "enable_checkpointing", "enable_model_summary"), False)
+            trainer = Trainer(max_steps=steps, max_epochs=-1, limit_val_batches=0, callbacks=callbacks, **off)
             try:
                 trainer.fit(module, self._data)
             except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other

@@ -141,8 +141,9 @@ def likely_cameras(
     """Cameras from which a scene shows much detail, as it does where photos were taken, the best one first.
 
     A trained scene is sharp from where its photos were taken and blurred or empty from elsewhere. On two scenes with
-    known cameras, the detail of random views had a correlation of −0.8 with the angle to the nearest camera, and the
-    views chosen by detail and coverage were 6° and 14° from one, where random ones were 32° and 48°.
+    known cameras, the detail of random views had a correlation of −0.8 with the angle to the nearest camera. Candidates
+    stand farther away than most photographers (1.1 to 2 times the spread of the detail from its middle): nearer ones
+    see less each, and what was fitted to them lost 0.2 dB more on fox.
 
     Args:
         splats: Raw attributes of N > 0 splats.

@@ -36,8 +36,6 @@ from nsvq_lightning.training.row_ops import finite_splats
 from nsvq_lightning.training.schedule import Phase, Schedule
 from nsvq_lightning.version import __version__
 
-log = logging.getLogger(__name__)
-
 
 class SceneModule(LightningModule):
     """Splats, their codebooks and the settings that they are rendered and stored with; evaluates them.

@@ -66,7 +66,7 @@ def test_an_aim_is_met(aim: str, value: str, tmp_path: Path, capsys: pytest.Capt
 
 
 def test_ctrl_c_keeps_what_was_reached(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from nsvq_lightning.training.module import SplatModule
 
@@ -79,7 +79,7 @@ def test_ctrl_c_keeps_what_was_reached(
     output = tmp_path / "x.nsvq"
     assert main(["compress", str(tmp_path / "scene.ply"), str(output), "--codebooks=0.5k", "--steps=50"]) == 130
     assert len(read_nsvq(output)) == 300
-    assert "ended the training early" in caplog.text
+    assert "ended the training early" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import os
 import struct
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_type_hints
@@ -209,16 +209,6 @@ def frame(header: Header, streams: Mapping[str, bytes]) -> list[bytes]:
     for part in parts:
         digest.update(part)
     return [MAGIC, digest.digest(), *parts]
-
-
-def with_origin(data: bytes, origin: tuple[float, float, float]) -> bytes:
-    """A whole file with another origin for its positions; all else is unchanged.
-
-    Raises:
-        FormatError: As for :func:`unframe`.
-    """
-    header, streams = unframe(data)
-    return b"".join(frame(replace(header, origin=origin), {name: bytes(part) for name, part in streams.items()}))
 
 
 def unframe(data: bytes) -> tuple[Header, dict[str, memoryview]]:
