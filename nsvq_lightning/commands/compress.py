@@ -18,6 +18,7 @@ from pathlib import Path
 from nsvq_lightning.commands.arguments import positive, views_of
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
+from nsvq_lightning.splats.attributes import SIZES
 
 
 def share_or_number(text: str) -> float:
@@ -33,8 +34,6 @@ def share_or_number(text: str) -> float:
     return value
 
 
-# Codebook sizes, from the most exact to the smallest.
-SIZES = ("16k", "8k", "4k", "2k", "1k", "0.5k")
 DEFAULT_SIZE, MINUTES = "8k", 4.0
 # Number of own pictures.
 VIEWS = 96

@@ -15,7 +15,6 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nsvq_lightning.callbacks import LearningRateDecay, PhaseSchedule, SplatBudget, standard
-from nsvq_lightning.commands.compress import SIZES
 from nsvq_lightning.compression.components import components
 from nsvq_lightning.compression.importance import contributions, most_contributing, row_weights
 from nsvq_lightning.compression.viewpoints import Measure
@@ -26,7 +25,7 @@ from nsvq_lightning.io.nsvq.header import frame, unframe
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.quantize import codebook_sizes
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
+from nsvq_lightning.splats.attributes import ATTRIBUTES, SIZES, attribute_dims
 from nsvq_lightning.splats.splats import Splats, detached
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.quantize.codebook import Quantizer, as_quantizer, held_codes
-from nsvq_lightning.splats.attributes import ATTRIBUTES, QUANTIZABLE, attribute_dims
+from nsvq_lightning.splats.attributes import ATTRIBUTES, QUANTIZABLE, SIZES, attribute_dims
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
 _DIMS = attribute_dims(sh_degree=3)
@@ -33,10 +33,9 @@ def codebook_sizes(name: str) -> dict[str, int]:
     Raises:
         ValueError: The name is unknown.
     """
-    settings = {"0.5k": 512, "1k": 1024, "2k": 2048, "4k": 4096, "8k": 8192, "16k": 16384}
-    if name not in settings:
-        raise ValueError(f"unknown codebook setting {name!r}; choose one of {', '.join(settings)}")
-    return {attribute: int(settings[name] * share) for attribute, share in QUANTIZED.items()}
+    if name not in SIZES:
+        raise ValueError(f"unknown codebook setting {name!r}; choose one of {', '.join(SIZES)}")
+    return {attribute: int(SIZES[name] * share) for attribute, share in QUANTIZED.items()}
 
 
 def build_quantizers(

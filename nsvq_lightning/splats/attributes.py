@@ -44,6 +44,9 @@ ATTRIBUTES = {
     "shN": Attribute((-1, 3), "f_rest_", 5e-4, 0.25, error=0.01, row_bits=-1.4, code_bits=5.5),
 }
 
+# Codes of scales and rotations by the paper's names of codebook sizes, from the largest.
+SIZES = {"16k": 16384, "8k": 8192, "4k": 4096, "2k": 2048, "1k": 1024, "0.5k": 512}
+
 # Attributes that may have a codebook, in file order; positions and opacities never have (paper, section 3).
 QUANTIZABLE = tuple(name for name, attribute in ATTRIBUTES.items() if attribute.code_share)
 
