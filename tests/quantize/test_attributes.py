@@ -9,5 +9,5 @@ def test_paper_sizes() -> None:
 
 
 def test_unknown_setting_names_the_choices() -> None:
-    with pytest.raises(ValueError, match=r"'3k'.*0\.5k.*16k"):
+    with pytest.raises(ValueError, match=r"'3k'.*16k.*0\.5k"):
         codebook_sizes("3k")
