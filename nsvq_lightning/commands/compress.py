@@ -34,7 +34,7 @@ def share_or_number(text: str) -> float:
     return value
 
 
-DEFAULT_SIZE, MINUTES = "8k", 4.0
+DEFAULT_SIZE, MINUTES = "16k", 4.0
 # Number of own pictures.
 VIEWS = 96
 
