@@ -254,8 +254,8 @@ class Compressor:
         module = SplatModule(
             splats=Splats.from_tensors(*(tensor.clone() for tensor in self._splats)),
             codebooks=sizes or None,
-            # A trained scene is in its place; what is left of some splats has to cover that of the others.
-            rates=LearningRates() if prune else LearningRates(means=LearningRates.means_final),
+            # A trained scene is in its place; what is left of some splats moves into that of the others.
+            rates=LearningRates(means=4e-5 if prune else LearningRates.means_final),
             antialiased=self._scene.antialiased,
             seed=self._seed,
             storage=self._storage,
