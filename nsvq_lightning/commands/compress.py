@@ -10,7 +10,6 @@ Examples:
 """
 
 import argparse
-import logging
 import re
 import sys
 from pathlib import Path
@@ -77,7 +76,6 @@ def run(options: argparse.Namespace) -> int:
     from nsvq_lightning.data.datamodule import ColmapDataModule, SceneDataModule
     from nsvq_lightning.io.formats import read_scene
 
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     scene = read_scene(options.input).finite()
     if len(scene) == 0:
         raise ValueError(f"{options.input} holds no finite splat; there is nothing to compress")

@@ -3,6 +3,7 @@
 Small files have codebooks; in larger ones, spherical harmonics, which lose most by that, are on a basis.
 """
 
+import logging
 import math
 import time
 from collections.abc import Callable
@@ -268,6 +269,9 @@ class Compressor:
                 rate_decay=LearningRateDecay(start=prune),
                 **dict.fromkeys((*names, "checkpoint", "kernels")),
             )
+            chatter = logging.getLogger("lightning.pytorch")
+            level = chatter.level
+            chatter.setLevel(logging.WARNING)
             off: dict[str, Any] = dict.fromkeys(("logger", "enable_checkpointing", "enable_model_summary"), False)
             trainer = Trainer(max_steps=steps, max_epochs=-1, limit_val_batches=0, callbacks=callbacks, **off)
             try:
@@ -276,6 +280,8 @@ class Compressor:
                 if module.phase < Phase.QUANTIZE:
                     raise
                 self.stopped = True
+            finally:
+                chatter.setLevel(level)
         return replace(module.compressed().finite(), origin=self._scene.origin)
 
     def _affordable(self, seconds: float) -> int:

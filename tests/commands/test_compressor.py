@@ -10,7 +10,7 @@ import pytest
 from ring import cameras_around
 from splat_scenes import ball
 
-from nsvq_lightning.commands.compressor import SIZES, SLACK, Compressor, Setting, setting_for
+from nsvq_lightning.commands.compressor import SLACK, Compressor, Setting, setting_for
 from nsvq_lightning.compression.viewpoints import Measure, own_scene
 from nsvq_lightning.data.datamodule import SceneDataModule
 from nsvq_lightning.io import CompressedScene
@@ -19,6 +19,8 @@ from nsvq_lightning.io.nsvq.header import unframe
 from nsvq_lightning.io.nsvq.precision import Storage
 
 ORIGIN = (500_000.0, 4.5e6, 30.0)
+LIMITS = "0.5k", "16k"
+"""The smallest and the largest codebooks."""
 
 
 def compressor(scene: CompressedScene, steps: int = 4, views: int = 6, storage: Storage | None = None) -> Compressor:
@@ -81,11 +83,11 @@ def test_a_file_that_codes_cannot_make_small_enough_has_fewer_splats(small: Comp
 
 
 def test_the_smallest_file_within_an_error(small: Compressor) -> None:
-    errors = {name: small.error(small.at(Setting(400, name))) for name in (SIZES[0], SIZES[-1])}
-    loose, tight = (small.smallest_within(1.01 * errors[name], 400) for name in (SIZES[-1], SIZES[0]))
-    assert small.error(loose) <= 1.01 * errors[SIZES[-1]]
-    assert small.error(tight) <= 1.01 * errors[SIZES[0]]
-    assert len(loose.data) <= len(small.at(Setting(400, SIZES[-1])).data)
+    errors = {name: small.error(small.at(Setting(400, name))) for name in LIMITS}
+    loose, tight = (small.smallest_within(1.01 * errors[name], 400) for name in LIMITS)
+    assert small.error(loose) <= 1.01 * errors[LIMITS[0]]
+    assert small.error(tight) <= 1.01 * errors[LIMITS[1]]
+    assert len(loose.data) <= len(small.at(Setting(400, LIMITS[0])).data)
     with pytest.raises(ValueError, match="no setting has an error of at most 1e-09: the most exact one has"):
         small.smallest_within(1e-9, 400)
 

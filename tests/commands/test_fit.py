@@ -135,7 +135,7 @@ def test_a_checkpoint_of_another_phase_is_refused_with_the_way_out(
     ("arguments", "message"),
     [
         (["fit", "--data.root=scene\udcff"], "which is not UTF-8: rename"),
-        (["fit", "--model.codebooks=3k"], "choose one of 0.5k"),
+        (["fit", "--model.codebooks=3k"], "choose one of 16k"),
         (["fit", "--trainer.max_steps=0"], "set trainer.max_steps"),
         (["fit", "--trainer.precision=bf16-mixed"], "trainer.precision is bf16-mixed: "),
         (["fit", "--trainer.run_folder=file/run"], "the folder of the run, file/run, cannot be made ("),
