@@ -13,7 +13,7 @@ def components(rows: Tensor, weights: Tensor, step: float) -> tuple[NDArray[np.f
     """Coefficients and a basis of rows x, chosen by weighted error and bits.
 
     The basis are the principal axes of the rows, weighted, times a step. Of each row, the coefficients c have the least
-    w·|x − c·B|² + :data:`PRICE` · step² · bits: one that hardly shows is cheap, and has few. The bits of a coefficient
+    w·‖x − c·B‖² + :data:`PRICE` · step² · bits: one that hardly shows is cheap, and has few. The bits of a coefficient
     are −log2 of how often it has that value.
 
     Args:
