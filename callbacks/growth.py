@@ -16,7 +16,7 @@ from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.random import draw_rows, generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
-from nsvq_lightning.splats.attributes import ATTRIBUTES, QUANTIZABLE, attribute_dims
+from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, codebook_bits
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training import distributed, row_ops, scene_module
 from nsvq_lightning.training.module import SplatModule
@@ -382,13 +382,9 @@ def splats_for_bytes(
     bits = 23.5 - 3 * math.log2(position) - math.log2(opacity)
     # What remains of codes and codebooks where codes are chosen by rate and distortion, as measured.
     coded = 1 / (1 + 0.28 * strength)
-    for name in QUANTIZABLE:
-        if name in codebooks:
-            codes, dim = codebooks[name]
-            fixed += coded * codes * dim * ATTRIBUTES[name].code_bits
-            bits += coded * (math.log2(codes) + ATTRIBUTES[name].row_bits)
-        else:
-            bits += 32 * attribute_dims(sh_degree)[name]
+    books, codes = codebook_bits(codebooks)
+    fixed, bits = fixed + coded * books, bits + coded * codes
+    bits += 32 * sum(attribute_dims(sh_degree)[name] for name in QUANTIZABLE if name not in codebooks)
     splats = int((8 * size - fixed) / bits)
     if splats < MIN_BUDGET:
         raise ValueError(

@@ -15,6 +15,7 @@ from nsvq_lightning.top_level import folder_of
 if TYPE_CHECKING:
     from yaml.nodes import Node
 
+    from nsvq_lightning.data.scene import Scene
     from nsvq_lightning.rendering.camera import Camera
     from nsvq_lightning.splats.splats import SplatTensors
 
@@ -324,8 +325,8 @@ def cameras_of(path: Path) -> "dict[str, Camera]":
     return page_cameras(page) if page.is_file() else {}
 
 
-def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -> "tuple[list[Camera], Path | None]":
-    """At most ``most`` views of a scene file in which its pictures count, and the folder of the photos if it is known.
+def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -> "tuple[list[Camera], Scene | None]":
+    """At most ``most`` views of a scene file in which its pictures count, and its photos if they are known.
 
     Args:
         path: The file. In the folder of a run, they are those of its train photos, or what the run has recorded.
@@ -342,7 +343,7 @@ def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -
     root = root or photos_of(path)
     if root is not None:
         scene = load_scene(root)
-        return [scene.cameras[index] for index in scene.some_train(most)], root
+        return [scene.cameras[index] for index in scene.some_train(most)], scene
     recorded = list(cameras_of(path).values())
     # A square picture with the pixels of a photo: what a wide one shows at its edges, photos seldom do.
     return recorded[:: -(-len(recorded) // most) or 1] or likely_cameras(splats, most, 640, 640, degrees=50), None

@@ -73,7 +73,7 @@ def run(options: argparse.Namespace) -> int:
         raise argparse.ArgumentError(None, wrong)
     from nsvq_lightning.commands.compressor import Compressor, Setting, setting_for
     from nsvq_lightning.compression.viewpoints import Measure, decibels, own_scene
-    from nsvq_lightning.data.datamodule import ColmapDataModule, SceneDataModule
+    from nsvq_lightning.data.datamodule import SceneDataModule
     from nsvq_lightning.io.formats import read_scene
 
     scene = read_scene(options.input).finite()
@@ -84,13 +84,9 @@ def run(options: argparse.Namespace) -> int:
     # What is impossible is said before the scene is looked at.
     aimed = None if options.target_bytes is None else setting_for(options.target_bytes, most, scene.sh_degree)
     splats = scene.decode()
-    cameras, root = views_of(options.input, splats, VIEWS, options.root)
+    cameras, photos = views_of(options.input, splats, VIEWS, options.root)
     measure = Measure(splats, cameras, scene.antialiased)
-    data = (
-        SceneDataModule(own_scene(splats, cameras, scene.antialiased), options.seed)
-        if root is None
-        else ColmapDataModule(str(root), seed=options.seed)
-    )
+    data = SceneDataModule(photos or own_scene(splats, cameras, scene.antialiased), options.seed)
     compressor = Compressor(scene, data, measure, Storage(options.level), options.seed, options.minutes, options.steps)
     if options.max_error is not None:
         candidate = compressor.smallest_within(options.max_error, most)
@@ -103,10 +99,11 @@ def run(options: argparse.Namespace) -> int:
         file.write(candidate.data)
     before, after, error = options.input.stat().st_size, len(candidate.data), compressor.error(candidate)
     books = "no codebooks" if candidate.setting.codebooks == "none" else f"codebooks {candidate.setting.codebooks}"
+    views = "its own pictures" if photos is None else f"the photos of {photos.root}"
     sys.stdout.write(
         f"{options.output}: {len(candidate.scene):,} of {len(scene):,} splats in {after:,} bytes, "
         f"{before / after:.1f} times smaller than {options.input.name}\n"
-        f"  {books}, fitted to {'its own pictures' if root is None else f'the photos of {root}'}, error {error:.4g} "
+        f"  {books}, fitted to {views}, error {error:.4g} "
         f"({decibels(error):.2f} dB against the original in {len(measure.cameras)} pictures)\n"
     )
     if compressor.stopped:

@@ -1,14 +1,11 @@
-"""Compress a scene that is already trained: the last phases of a run, on its own pictures or on photos.
-
-Small files have codebooks; in larger ones, spherical harmonics, which lose most by that, are on a basis.
-"""
+"""Compress a scene that is already trained: the last phases of a run, on its own pictures or on photos."""
 
 import logging
 import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -26,7 +23,7 @@ from nsvq_lightning.io.nsvq.header import frame, unframe
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.quantize import codebook_sizes
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.attributes import ATTRIBUTES, SIZES, attribute_dims
+from nsvq_lightning.splats.attributes import ATTRIBUTES, SIZES, attribute_dims, codebook_bits
 from nsvq_lightning.splats.splats import Splats, detached
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
@@ -55,11 +52,15 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A scene compressed at one setting, and its file's bytes."""
+    """A setting, and the bytes of the file that it makes."""
 
     setting: Setting
-    scene: CompressedScene
     data: bytes
+
+    @cached_property
+    def scene(self) -> CompressedScene:
+        """What the file holds."""
+        return decode(*unframe(self.data))
 
 
 # Steps of spherical harmonics on a basis, and from how many bits a splat they are, without any codebooks.
@@ -89,15 +90,14 @@ def setting_for(size: int, most: int, sh_degree: int) -> Setting:
         return Setting(most, "none", STEPS[0] if sh_degree else 0.0)
     dims = attribute_dims(sh_degree)
     for name in SIZES:
-        sizes = {attribute: codes for attribute, codes in codebook_sizes(name).items() if dims[attribute]}
-        fixed = sum(codes * dims[each] * ATTRIBUTES[each].code_bits for each, codes in sizes.items())
-        bits = PLACE + sum(math.log2(codes) + ATTRIBUTES[each].row_bits for each, codes in sizes.items())
-        room = int((8 * size - fixed) / bits)
+        sizes = {each: (codes, dims[each]) for each, codes in codebook_sizes(name).items() if dims[each]}
+        fixed, bits = codebook_bits(sizes)
+        room = int((8 * size - fixed) / (PLACE + bits))
         if room >= SHARE * most:
             break
     if room < min(FEWEST_SPLATS, most):
         raise ValueError(f"{size} bytes leave room for {max(room, 0)} of {most} splats beside codebooks: allow more")
-    spare = max(0.0, 8 * size - fixed - most * bits)
+    spare = max(0.0, 8 * size - fixed - most * (PLACE + bits))
     more = min(spare / (dims["shN"] * ATTRIBUTES["shN"].code_bits), most / 8) if dims["shN"] else 0
     return Setting(min(most, room), name, more=int(more))
 
@@ -110,6 +110,8 @@ def _turned(setting: Setting, turn: float) -> Setting:
 
 class Compressor:
     """Compresses one scene at any setting; each pair of codebooks and number of splats is trained at most once.
+
+    Small files have codebooks; in larger ones, spherical harmonics, which lose most by that, are on a basis.
 
     Attributes:
         stopped: Whether Ctrl-C has ended a training before its end.
@@ -157,8 +159,7 @@ class Compressor:
         if setting.kept < 1:
             kept = most_contributing(weights, math.ceil(setting.kept * len(scene)))
             scene = scene.take(kept.numpy()).in_use()
-        data = b"".join(frame(*encode(scene, self._storage)))
-        return Candidate(setting, decode(*unframe(data)), data)
+        return Candidate(setting, b"".join(frame(*encode(scene, self._storage))))
 
     def error(self, candidate: Candidate) -> float:
         """Root mean square difference between its pictures and those of the original, for channels in [0, 1]."""

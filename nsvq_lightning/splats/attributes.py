@@ -1,7 +1,7 @@
 """The attributes of a splat, declared once, and which rows of them are finite. Without torch: files open fast."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -49,6 +49,16 @@ SIZES = {"16k": 16384, "8k": 8192, "4k": 4096, "2k": 2048, "1k": 1024, "0.5k": 5
 
 # Attributes that may have a codebook, in file order; positions and opacities never have (paper, section 3).
 QUANTIZABLE = tuple(name for name, attribute in ATTRIBUTES.items() if attribute.code_share)
+
+
+def codebook_bits(codebooks: Mapping[str, Sequence[int]]) -> tuple[float, float]:
+    """Bits of all codebooks, and of the codes of one splat, in files of level ``compact``, about.
+
+    Args:
+        codebooks: Codes and dimension of each codebook by attribute.
+    """
+    books = sum(codes * dim * ATTRIBUTES[name].code_bits for name, (codes, dim) in codebooks.items())
+    return books, sum(math.log2(codes) + ATTRIBUTES[name].row_bits for name, (codes, _) in codebooks.items())
 
 
 def attribute_shapes(sh_degree: int) -> dict[str, tuple[int, ...]]:
