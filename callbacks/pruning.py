@@ -54,6 +54,9 @@ log = logging.getLogger(__name__)
 
 # Most train views in which the effect of splats is measured.
 VIEWS = 64
+# Other views need what these do not show, and an estimate from few signs is noise: no effect counts as less than this
+# share of a splat's typical one, and what counts is this power of it, the typical one having the rest.
+LEAST_EFFECT, TRUST = 0.1, 0.75
 
 
 @dataclass(eq=False)
@@ -61,8 +64,9 @@ class SplatSelection(SplatCallback):
     """When the prune phase starts, removes the splats that the train views miss least, until a budget is left.
 
     Without a splat, a pixel I changes by Δ = -α ∂I/∂α, exactly; splats with the least Σ Δ² over the pixels of the train
-    views go (:func:`nsvq_lightning.compression.importance.sensitivity` estimates it). The rest of the phase fits the
-    others to what is missing. Growth to twice the budget, and this, is better than growth to the budget
+    views go (:func:`nsvq_lightning.compression.importance.sensitivity` estimates it, and it is moved towards what is
+    typical of a splat's size and opacity). The rest of the phase fits the others to what is missing. Growth to twice
+    the budget, and this, is better than growth to the budget
     (docs/recipe.md).
 
     It works after any density control, and on a finished scene: ``--model.init_from=scene.ply
@@ -97,10 +101,13 @@ class SplatSelection(SplatCallback):
         if iteration != module.schedule.first_of(Phase.PRUNE) or budget is None or count <= budget:
             return
         splats = below_cap(module.splats.raw())
-        squares = torch.zeros_like(splats.opacities)
-        for _, found, _ in scene_module.train_sensitivities(trainer, module, splats, VIEWS):
-            squares += found.opacities
+        views = scene_module.train_sensitivities(trainer, module, splats, VIEWS)
+        squares = sum((found.opacities for _, found, _ in views), torch.zeros_like(splats.opacities))
         effects = distributed.sum_over_processes(trainer, squares) * by_opacity(splats.opacities).square()
+        # An opaque splat shows more, a large one hardly: where splats are large, photos were taken from far away.
+        typical = splats.opacities.sigmoid().square() * (splats.scales.topk(2).values.sum(1) / 3).exp()
+        typical *= (effects / typical)[effects > 0].median()
+        effects = effects.fmax(LEAST_EFFECT * typical) ** TRUST * typical ** (1 - TRUST)
         row_ops.keep_rows(module.splats, trainer.optimizers[0], most_contributing(effects, budget))
         distributed.check_replicas(trainer, "the selection")
         log.info("iteration %d: the selection leaves %d of %d splats", iteration, budget, count)

@@ -52,7 +52,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=int, default=0, help="seed of all draws")
     help_ = "scene folder with the photos: splats and codebooks are fitted to its train photos"
     add("--data.root", dest="root", type=Path, metavar="FOLDER", help=help_)
-    add("--steps", type=positive(int), metavar="N", help="steps of training, 500 if they fit into --minutes")
+    help_ = "steps of a training; 500, or 1500 with fewer splats, if they fit into --minutes"
+    add("--steps", type=positive(int), metavar="N", help=help_)
     help_ = f"what one training may take, about; {MINUTES:g} by default"
     add("--minutes", type=positive(float), default=MINUTES, metavar="M", help=help_)
 
@@ -82,7 +83,8 @@ def run(options: argparse.Namespace) -> int:
     asked = len(scene) if options.splats is None else options.splats * (len(scene) if options.splats <= 1 else 1)
     most, books = min(len(scene), max(1, round(asked))), options.codebooks or DEFAULT_SIZE
     # What is impossible is said before the scene is looked at.
-    aimed = None if options.target_bytes is None else setting_for(options.target_bytes, most, scene.sh_degree)
+    if options.target_bytes is not None:
+        setting_for(options.target_bytes, most, scene.sh_degree)
     splats = scene.decode()
     cameras, photos = views_of(options.input, splats, VIEWS, options.root)
     measure = Measure(splats, cameras, scene.antialiased)
@@ -90,8 +92,8 @@ def run(options: argparse.Namespace) -> int:
     compressor = Compressor(scene, data, measure, Storage(options.level), options.seed, options.minutes, options.steps)
     if options.max_error is not None:
         candidate = compressor.smallest_within(options.max_error, most)
-    elif aimed is not None:
-        candidate = compressor.finest_within(options.target_bytes, aimed)
+    elif options.target_bytes is not None:
+        candidate = compressor.finest_within(options.target_bytes, most)
     else:
         candidate = compressor.at(Setting(most, books))
     options.output.parent.mkdir(parents=True, exist_ok=True)

@@ -71,13 +71,12 @@ KEPT = 1.0, 0.97
 MOST_VIEWS = 96
 # Bits of a splat's position and opacity, about.
 PLACE = 22.0
-# Rather than keep fewer splats than this share, a file takes smaller codebooks: other views may need what those that it
-# was trained on do not show. It has at least so many splats.
-SHARE, FEWEST_SPLATS = 0.97, 100
-# A file may be this much smaller than it is to be.
-SLACK = 0.01
-# Steps of a training, and how many times as many for a thinned scene.
-FEWEST_STEPS, USUAL_STEPS, THINNING = 20, 500, 3
+# Rather than keep fewer splats than this share, a file takes smaller codebooks. It has at least so many splats.
+SHARE, FEWEST_SPLATS = 0.8, 100
+# A file may be this much smaller than it is to be; so many estimates of what to store in it are tried.
+SLACK, ESTIMATES = 0.01, 5
+# Steps of a training, and how many times as many where fewer splats than this share take time to cover what all did.
+FEWEST_STEPS, USUAL_STEPS, THINNING, THINNED = 20, 500, 3, 0.97
 
 
 def setting_for(size: int, most: int, sh_degree: int) -> Setting:
@@ -97,8 +96,9 @@ def setting_for(size: int, most: int, sh_degree: int) -> Setting:
             break
     if room < min(FEWEST_SPLATS, most):
         raise ValueError(f"{size} bytes leave room for {max(room, 0)} of {most} splats beside codebooks: allow more")
+    codes, dim = sizes.get("shN", (0, 1))
     spare = max(0.0, 8 * size - fixed - most * (PLACE + bits))
-    more = min(spare / (dims["shN"] * ATTRIBUTES["shN"].code_bits), most / 8) if dims["shN"] else 0
+    more = min(spare / (dim * ATTRIBUTES["shN"].code_bits), codes, most / 8)
     return Setting(min(most, room), name, more=int(more))
 
 
@@ -123,7 +123,8 @@ class Compressor:
         storage: Level and precision.
         seed: Seed of all draws.
         minutes: What one training may take, about.
-        steps: Steps of a training, at least 4; None as many as the minutes allow, at most :data:`USUAL_STEPS`.
+        steps: Steps of a training, at least 4; None as many as the minutes allow, at most :data:`USUAL_STEPS`, or
+            :data:`THINNING` times as many.
     """
 
     def __init__(
@@ -139,7 +140,7 @@ class Compressor:
         self._scene, self._data, self._measure, self._storage, self._seed = scene, data, measure, storage, seed
         self._splats = detached(scene.decode())
         self._render = partial(render, antialiased=scene.antialiased)
-        self._steps = max(steps or self._affordable(60 * minutes), 4)
+        self._steps, self._affordable = steps, self._steps_in(60 * minutes)
         self._trained: dict[Setting, tuple[CompressedScene, Tensor]] = {}
         self.stopped = False
 
@@ -165,37 +166,30 @@ class Compressor:
         """Root mean square difference between its pictures and those of the original, for channels in [0, 1]."""
         return self._measure.error(candidate.scene.decode())
 
-    def finest_within(self, target: int, setting: Setting) -> Candidate:
-        """The best file of at most ``target`` bytes, near a setting.
+    def finest_within(self, target: int, splats: int) -> Candidate:
+        """The best file of at most ``target`` bytes and this many splats.
 
         Raises:
             ValueError: None was found.
         """
         best: Candidate | None = None
-        if setting.codebooks == "none":
-            best = self.at(replace(setting, step=0.0))
-            if len(best.data) <= target:
-                return best
-        for _ in range(4):
+        asked = float(target)
+        for _ in range(ESTIMATES):
+            setting = setting_for(int(asked), splats, self._scene.sh_degree)
+            if setting.codebooks == "none" and len((exact := self.at(replace(setting, step=0.0))).data) <= target:
+                return exact
             found = self._between(
                 setting, True, lambda each: len(each.data) <= target, lambda size: size >= (1 - SLACK) * target
             )
-            best = found or best
-            if found is not None and (setting.step or len(found.data) >= (1 - 2 * SLACK) * target):
-                return found
-            setting = self._nearer(setting, target, len(self.at(_turned(setting, float(found is None))).data))
-        if best is None or len(best.data) > target:
+            if found and (best is None or len(found.data) > len(best.data)):
+                best = found
+            if self.stopped or (found and (setting.step or len(found.data) >= (1 - 2 * SLACK) * target)):
+                break
+            # What the estimate made of its bytes.
+            asked *= (1 - SLACK / 2) * target / len(self.at(_turned(setting, float(found is None))).data)
+        if best is None:
             raise ValueError(f"no file of at most {target} bytes was found: allow more")
         return best
-
-    def _nearer(self, setting: Setting, target: int, size: int) -> Setting:
-        """A setting for ``target`` bytes instead of ``size``: with other codes of spherical harmonics, or splats."""
-        aim, dim = (1 - SLACK / 2) * target, attribute_dims(self._scene.sh_degree)["shN"]
-        if dim and setting.codebooks != "none":
-            more = setting.more + int(8 * (aim - size) / (dim * ATTRIBUTES["shN"].code_bits))
-            if -codebook_sizes(setting.codebooks)["shN"] // 2 <= more <= setting.splats / 8:
-                return replace(setting, more=more)
-        return replace(setting, splats=max(1, min(int(setting.splats * aim / size), len(self._scene))))
 
     def smallest_within(self, error: float, splats: int) -> Candidate:
         """The smallest file with this many splats and an error of at most ``error``.
@@ -211,7 +205,7 @@ class Compressor:
         if self._scene.sh_degree:
             settings.insert(0, Setting(splats, "none", STEPS[0]))
         found, first, end = [plain] if fits(plain) else [], -1, len(settings)
-        while end - first > 1:
+        while end - first > 1 and not self.stopped:
             middle = (first + end) // 2
             candidate = self._between(settings[middle], False, fits, lambda _: False)
             first, end = (first, middle) if candidate is None else (middle, end)
@@ -248,8 +242,7 @@ class Compressor:
         sizes = {} if setting.codebooks == "none" else dict(codebook_sizes(setting.codebooks))
         if "shN" in sizes:
             sizes["shN"] += setting.more
-        # Few splats take time to cover what many did.
-        steps = self._steps * (THINNING if setting.splats < SHARE * len(self._scene) else 1)
+        steps = max(4, self._steps or self.usual_steps(setting.splats))
         prune = steps // 4 if setting.splats < len(self._scene) else 0
         quantize = prune + 2 * (steps - prune) // 3 if sizes else steps
         phases = {"warmup_end": 0, "prune_end": prune, "quantize_end": quantize, "position_decay": max(1, prune)}
@@ -285,7 +278,12 @@ class Compressor:
                 chatter.setLevel(level)
         return replace(module.compressed().finite(), origin=self._scene.origin)
 
-    def _affordable(self, seconds: float) -> int:
+    def usual_steps(self, splats: int) -> int:
+        """How many steps a training of this many of the splats takes."""
+        usual = USUAL_STEPS * (THINNING if splats < THINNED * len(self._scene) else 1)
+        return max(FEWEST_STEPS, min(self._affordable, usual))
+
+    def _steps_in(self, seconds: float) -> int:
         """How many steps a time is enough for."""
         leaves = type(self._splats)(*(tensor.clone().requires_grad_() for tensor in self._splats))
         times = []
@@ -293,4 +291,4 @@ class Compressor:
             start = time.perf_counter()
             self._render(leaves, camera).image.sum().backward()  # type: ignore[no-untyped-call]
             times.append(time.perf_counter() - start)
-        return int(min(max(seconds / (2 * min(times)), FEWEST_STEPS), USUAL_STEPS))
+        return int(min(seconds / (2 * min(times)), 1e9))

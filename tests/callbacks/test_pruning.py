@@ -83,3 +83,12 @@ def test_it_acts_when_the_phase_starts_by_the_modules_budget(until: int, left: i
 def test_without_a_budget_or_below_it_nothing_happens(budget: int | None) -> None:
     raw = random_splats(20)
     assert torch.equal(selected(raw, SplatSelection(budget=budget)).means, raw.means)
+
+
+def test_what_no_view_shows_counts_by_its_size_and_opacity() -> None:
+    raw = random_splats(20)
+    raw.opacities[:10] = -3.0
+    raw.opacities[10:] = 3.0
+    hidden = raw.means[[0, 10]] = -1000 * raw.means[[0, 10]]
+    left = selected(raw, SplatSelection(budget=10)).means.tolist()
+    assert [mean in left for mean in hidden.tolist()] == [False, True]

@@ -73,12 +73,11 @@ def test_harmonics_with_a_step_are_on_a_basis(small: Compressor) -> None:
 def test_a_file_has_the_bytes_that_it_may_have(small: Compressor, setting: Setting) -> None:
     usual = len(small.at(setting).data)
     for target in (usual, usual - 200):
-        assert (1 - 3 * SLACK) * target <= len(small.finest_within(target, setting).data) <= target
+        assert (1 - 3 * SLACK) * target <= len(small.finest_within(target, 400).data) <= target
 
 
 def test_a_file_that_codes_cannot_make_small_enough_has_fewer_splats(small: Compressor) -> None:
-    setting = Setting(400, "0.5k")
-    found = small.finest_within(2 * len(small.at(setting).data) // 3, setting)
+    found = small.finest_within(2 * len(small.at(Setting(400, "0.5k")).data) // 3, 400)
     assert len(found.scene) < 400
 
 
@@ -95,7 +94,7 @@ def test_the_smallest_file_within_an_error(small: Compressor) -> None:
 def test_settings_for_bytes_go_from_a_basis_to_fewer_splats() -> None:
     found = [setting_for(size, 100_000, 3) for size in (2_000_000, 1_300_000, 800_000, 500_000, 100_000)]
     assert found[0].step > 0
-    assert [setting.codebooks for setting in found[1:]] == ["16k", "2k", "0.5k", "0.5k"]
+    assert [setting.codebooks for setting in found[1:]] == ["16k", "8k", "0.5k", "0.5k"]
     assert [setting.splats for setting in found[:2]] == [100_000, 100_000]
     assert found[4].splats < found[3].splats < 100_000
     with pytest.raises(ValueError, match="100 bytes leave room for 0 of 100000 splats"):
@@ -124,5 +123,5 @@ def test_minutes_limit_the_steps() -> None:
     scene = ball(300)
     splats, cameras = scene.decode(), cameras_around(scene.means, 3, 80, 60)
     data, measure = SceneDataModule(own_scene(splats, cameras)), Measure(splats, cameras)
-    steps = [Compressor(scene, data, measure, Storage(), minutes=minutes)._steps for minutes in (1e-9, 1e9)]
-    assert steps == [20, 500]
+    brief, long = (Compressor(scene, data, measure, Storage(), minutes=minutes) for minutes in (1e-9, 1e9))
+    assert [brief.usual_steps(300), long.usual_steps(300), long.usual_steps(200)] == [20, 500, 1500]
