@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 
 from nsvq_lightning.commands.arguments import positive, views_of
+from nsvq_lightning.compression.setting import Setting, setting_for
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
 from nsvq_lightning.splats.attributes import SIZES
@@ -72,9 +73,6 @@ def run(options: argparse.Namespace) -> int:
     if options.output.suffix.lower() != ".nsvq":
         wrong = f"{options.output}: the compressed scene is a .nsvq file; 'nsvq convert' writes other formats"
         raise argparse.ArgumentError(None, wrong)
-    from nsvq_lightning.commands.compressor import Compressor, Setting, setting_for
-    from nsvq_lightning.compression.viewpoints import Measure, decibels, own_scene
-    from nsvq_lightning.data.datamodule import SceneDataModule
     from nsvq_lightning.io.formats import read_scene
 
     scene = read_scene(options.input).finite()
@@ -85,6 +83,10 @@ def run(options: argparse.Namespace) -> int:
     # What is impossible is said before the scene is looked at.
     if options.target_bytes is not None:
         setting_for(options.target_bytes, most, scene.sh_degree)
+    from nsvq_lightning.commands.compressor import Compressor
+    from nsvq_lightning.compression.viewpoints import Measure, decibels, own_scene
+    from nsvq_lightning.data.datamodule import SceneDataModule
+
     splats = scene.decode()
     cameras, photos = views_of(options.input, splats, VIEWS, options.root)
     measure = Measure(splats, cameras, scene.antialiased)

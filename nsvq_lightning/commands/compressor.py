@@ -2,7 +2,7 @@
 
 import logging
 import math
-import time
+import timeit
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -15,39 +15,19 @@ from torch import Tensor
 from nsvq_lightning.callbacks import LearningRateDecay, PhaseSchedule, SplatBudget, standard
 from nsvq_lightning.compression.components import components
 from nsvq_lightning.compression.importance import contributions, most_contributing, row_weights
+from nsvq_lightning.compression.setting import STEPS, Setting, setting_for
 from nsvq_lightning.compression.viewpoints import Measure
 from nsvq_lightning.data.datamodule import SceneDataModule
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import decode, encode
 from nsvq_lightning.io.nsvq.header import frame, unframe
 from nsvq_lightning.io.nsvq.precision import Storage
-from nsvq_lightning.quantize import codebook_sizes
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.attributes import ATTRIBUTES, SIZES, attribute_dims, codebook_bits
+from nsvq_lightning.splats.attributes import SIZES, codebook_sizes
 from nsvq_lightning.splats.splats import Splats, detached
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.schedule import Phase
-
-
-@dataclass(frozen=True)
-class Setting:
-    """How a scene is compressed.
-
-    Attributes:
-        splats: How many are left.
-        codebooks: The paper's name of their sizes, or "none".
-        step: Of spherical harmonics on a basis (:func:`nsvq_lightning.compression.components.components`), without
-            codebooks; 0 stores them as the others.
-        kept: Share of these that are stored.
-        more: Codes of spherical harmonics beyond those of the size.
-    """
-
-    splats: int
-    codebooks: str
-    step: float = 0.0
-    kept: float = 1.0
-    more: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,43 +43,14 @@ class Candidate:
         return decode(*unframe(self.data))
 
 
-# Steps of spherical harmonics on a basis, and from how many bits a splat they are, without any codebooks.
-STEPS, ON_BASIS = (0.2, 1.6), 125
 # Shares of the trained splats that are stored: those that contribute least go where a file is too large.
 KEPT = 1.0, 0.97
 # Most views in which contributions are measured.
 MOST_VIEWS = 96
-# Bits of a splat's position and opacity, about.
-PLACE = 22.0
-# Rather than keep fewer splats than this share, a file takes smaller codebooks. It has at least so many splats.
-SHARE, FEWEST_SPLATS = 0.8, 100
 # A file may be this much smaller than it is to be; so many estimates of what to store in it are tried.
 SLACK, ESTIMATES = 0.01, 5
 # Steps of a training, and how many times as many where fewer splats than this share take time to cover what all did.
 FEWEST_STEPS, USUAL_STEPS, THINNING, THINNED = 20, 500, 3, 0.97
-
-
-def setting_for(size: int, most: int, sh_degree: int) -> Setting:
-    """The setting that ``size`` bytes have room for, about, with at most ``most`` splats.
-
-    Raises:
-        ValueError: There is none.
-    """
-    if 8 * size >= ON_BASIS * most:
-        return Setting(most, "none", STEPS[0] if sh_degree else 0.0)
-    dims = attribute_dims(sh_degree)
-    for name in SIZES:
-        sizes = {each: (codes, dims[each]) for each, codes in codebook_sizes(name).items() if dims[each]}
-        fixed, bits = codebook_bits(sizes)
-        room = int((8 * size - fixed) / (PLACE + bits))
-        if room >= SHARE * most:
-            break
-    if room < min(FEWEST_SPLATS, most):
-        raise ValueError(f"{size} bytes leave room for {max(room, 0)} of {most} splats beside codebooks: allow more")
-    codes, dim = sizes.get("shN", (0, 1))
-    spare = max(0.0, 8 * size - fixed - most * (PLACE + bits))
-    more = min(spare / (dim * ATTRIBUTES["shN"].code_bits), codes, most / 8)
-    return Setting(min(most, room), name, more=int(more))
 
 
 def _turned(setting: Setting, turn: float) -> Setting:
@@ -149,8 +100,7 @@ class Compressor:
         key = replace(setting, step=0.0, kept=1.0)
         if key not in self._trained:
             scene = self._train(setting)
-            views = self._data.scene
-            cameras = [views.cameras[index] for index in views.some_train(MOST_VIEWS)]
+            cameras = [self._data.scene.cameras[index] for index in self._data.scene.some_train(MOST_VIEWS)]
             weights = row_weights(contributions(scene.decode(), cameras, self._render)).sqrt()
             self._trained[key] = scene, weights
         scene, weights = self._trained[key]
@@ -286,9 +236,9 @@ class Compressor:
     def _steps_in(self, seconds: float) -> int:
         """How many steps a time is enough for."""
         leaves = type(self._splats)(*(tensor.clone().requires_grad_() for tensor in self._splats))
-        times = []
-        for camera in self._measure.cameras[:3]:
-            start = time.perf_counter()
+        camera = self._measure.cameras[0]
+
+        def step() -> None:
             self._render(leaves, camera).image.sum().backward()  # type: ignore[no-untyped-call]
-            times.append(time.perf_counter() - start)
-        return int(min(seconds / (2 * min(times)), 1e9))
+
+        return int(min(seconds / (2 * min(timeit.repeat(step, number=1, repeat=3))), 1e9))

@@ -8,34 +8,8 @@ from torch import Tensor, nn
 
 from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.quantize.codebook import Quantizer, as_quantizer, held_codes
-from nsvq_lightning.splats.attributes import ATTRIBUTES, QUANTIZABLE, SIZES, attribute_dims
+from nsvq_lightning.splats.attributes import QUANTIZED, codebook_sizes
 from nsvq_lightning.splats.splats import RawSplats, Splats
-
-_DIMS = attribute_dims(sh_degree=3)
-# The quantized attributes, those with most codes first, and their numbers of codes relative to that for scales (paper,
-# section 4). Positions and opacities are not vector quantized.
-QUANTIZED = {
-    name: ATTRIBUTES[name].code_share
-    for name in sorted(QUANTIZABLE, key=lambda name: (-ATTRIBUTES[name].code_share, _DIMS[name]))
-}
-
-
-def codebook_sizes(name: str) -> dict[str, int]:
-    """Number of codes for each attribute in one of the paper's settings.
-
-    Args:
-        name: ``"0.5k"``, ``"1k"``, ``"2k"``, ``"4k"``, ``"8k"``, ``"16k"``: codes for scales and rotations in units of
-            1024; colours and SH have a quarter as many.
-
-    Returns:
-        Attribute name to number of codes; ``codebook_sizes("16k")["shN"]`` is 4096.
-
-    Raises:
-        ValueError: The name is unknown.
-    """
-    if name not in SIZES:
-        raise ValueError(f"unknown codebook setting {name!r}; choose one of {', '.join(SIZES)}")
-    return {attribute: int(SIZES[name] * share) for attribute, share in QUANTIZED.items()}
 
 
 def build_quantizers(

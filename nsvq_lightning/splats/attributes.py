@@ -108,3 +108,30 @@ def listed(culprits: Mapping[str, int]) -> str:
 def dropped(mask: Any, culprits: Mapping[str, int]) -> str:
     """The warning about rows that are left out, from both results of :func:`finite_rows`."""
     return f"dropped {int((~mask).sum())} of {len(mask)} splats with non-finite values: {listed(culprits)}"
+
+
+_DIMS = attribute_dims(sh_degree=3)
+# The quantized attributes, those with most codes first, and their numbers of codes relative to that for scales (paper,
+# section 4). Positions and opacities are not vector quantized.
+QUANTIZED = {
+    name: ATTRIBUTES[name].code_share
+    for name in sorted(QUANTIZABLE, key=lambda name: (-ATTRIBUTES[name].code_share, _DIMS[name]))
+}
+
+
+def codebook_sizes(name: str) -> dict[str, int]:
+    """Number of codes for each attribute in one of the paper's settings.
+
+    Args:
+        name: ``"0.5k"``, ``"1k"``, ``"2k"``, ``"4k"``, ``"8k"``, ``"16k"``: codes for scales and rotations in units of
+            1024; colours and SH have a quarter as many.
+
+    Returns:
+        Attribute name to number of codes; ``codebook_sizes("16k")["shN"]`` is 4096.
+
+    Raises:
+        ValueError: The name is unknown.
+    """
+    if name not in SIZES:
+        raise ValueError(f"unknown codebook setting {name!r}; choose one of {', '.join(SIZES)}")
+    return {attribute: int(SIZES[name] * share) for attribute, share in QUANTIZED.items()}

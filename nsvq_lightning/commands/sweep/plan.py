@@ -12,7 +12,7 @@ from typing import Any
 
 from nsvq_lightning.commands import arguments as given
 from nsvq_lightning.commands.fit import SplatCLI
-from nsvq_lightning.quantize.attributes import codebook_sizes
+from nsvq_lightning.splats.attributes import codebook_sizes
 from nsvq_lightning.version import __version__
 
 # All settings of a ``nsvq fit``: what ``--print_config`` shows, as JSON values.
