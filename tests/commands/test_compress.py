@@ -65,20 +65,25 @@ def test_an_aim_is_met(aim: str, value: str, tmp_path: Path, capsys: pytest.Capt
         assert float(capsys.readouterr().out.rpartition("error ")[2].split()[0]) <= 0.2
 
 
+@pytest.mark.parametrize("aim", ["--codebooks=0.5k", "--target-bytes=26000", "--max-error=0.2"])
 def test_ctrl_c_keeps_what_was_reached(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    aim: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from nsvq_lightning.training.module import SplatModule
 
+    interruptions = []
+
     def interrupted(module: SplatModule, *_: object) -> None:
         if module.global_step == 5:
+            interruptions.append(module)
             raise KeyboardInterrupt
 
     monkeypatch.setattr(SplatModule, "on_train_batch_end", interrupted, raising=False)
-    write_ply(tmp_path / "scene.ply", ball(300))
+    write_ply(tmp_path / "scene.ply", ball(2000))
     output = tmp_path / "x.nsvq"
-    assert main(["compress", str(tmp_path / "scene.ply"), str(output), "--codebooks=0.5k", "--steps=50"]) == 130
-    assert len(read_nsvq(output)) == 300
+    assert main(["compress", str(tmp_path / "scene.ply"), str(output), aim, "--steps=50"]) == 130
+    assert len(read_nsvq(output)) == 2000
+    assert len(interruptions) == 1  # no other training begins
     assert "ended the training early" in capsys.readouterr().err
 
 
