@@ -30,7 +30,7 @@ STEPS, ON_BASIS = (0.2, 1.6), 125
 # Bits of a splat's position and opacity, about.
 PLACE = 22.0
 # Rather than keep fewer splats than this share, a file takes smaller codebooks. It has at least so many splats.
-SHARE, FEWEST_SPLATS = 0.8, 100
+SHARE, FEWEST_SPLATS = 0.7, 100
 
 
 def setting_for(size: int, most: int, sh_degree: int) -> Setting:
