@@ -138,7 +138,7 @@ class Compressor:
             # What the estimate made of its bytes.
             asked *= (1 - SLACK / 2) * target / len(self.at(_turned(setting, float(found is None))).data)
         if best is None:
-            raise ValueError(f"no file of at most {target} bytes was found: allow more{' time' * self.stopped}")
+            raise ValueError(f"found no file of {target} bytes: allow more {'time' if self.stopped else 'bytes'}")
         return best
 
     def smallest_within(self, error: float, splats: int) -> Candidate:
