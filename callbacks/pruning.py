@@ -66,8 +66,7 @@ class SplatSelection(SplatCallback):
     Without a splat, a pixel I changes by Δ = -α ∂I/∂α, exactly; splats with the least Σ Δ² over the pixels of the train
     views go (:func:`nsvq_lightning.compression.importance.sensitivity` estimates it, and it is moved towards what is
     typical of a splat's size and opacity). The rest of the phase fits the others to what is missing. Growth to twice
-    the budget, and this, is better than growth to the budget
-    (docs/recipe.md).
+    the budget, and this, is better than growth to the budget (docs/recipe.md).
 
     It works after any density control, and on a finished scene: ``--model.init_from=scene.ply
     --callbacks.density=null --callbacks.phases.warmup_end=0``.

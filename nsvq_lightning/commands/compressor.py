@@ -91,7 +91,7 @@ class Compressor:
         self._scene, self._data, self._measure, self._storage, self._seed = scene, data, measure, storage, seed
         self._splats = detached(scene.decode())
         self._render = partial(render, antialiased=scene.antialiased)
-        self._steps, self._affordable = steps, self._steps_in(60 * minutes)
+        self._steps, self._minutes = steps, minutes
         self._trained: dict[Setting, tuple[CompressedScene, Tensor]] = {}
         self.stopped = False
 
@@ -136,7 +136,7 @@ class Compressor:
             if self.stopped or (found and (setting.step or len(found.data) >= (1 - 2 * SLACK) * target)):
                 break
             # What the estimate made of its bytes.
-            asked *= (1 - SLACK / 2) * target / len(self.at(_turned(setting, float(found is None))).data)
+            asked *= (1 - SLACK / 2) * target / len((found or self.at(_turned(setting, 1.0))).data)
         if best is None:
             raise ValueError(f"found no file of {target} bytes: allow more {'time' if self.stopped else 'bytes'}")
         return best
@@ -233,12 +233,12 @@ class Compressor:
         usual = USUAL_STEPS * (THINNING if splats < THINNED * len(self._scene) else 1)
         return max(FEWEST_STEPS, min(self._affordable, usual))
 
-    def _steps_in(self, seconds: float) -> int:
-        """How many steps a time is enough for."""
+    @cached_property
+    def _affordable(self) -> int:
+        """How many steps the minutes are enough for."""
         leaves = type(self._splats)(*(tensor.clone().requires_grad_() for tensor in self._splats))
-        camera = self._measure.cameras[0]
 
         def step() -> None:
-            self._render(leaves, camera).image.sum().backward()  # type: ignore[no-untyped-call]
+            self._render(leaves, self._measure.cameras[0]).image.sum().backward()  # type: ignore[no-untyped-call]
 
-        return int(min(seconds / (2 * min(timeit.repeat(step, number=1, repeat=3))), 1e9))
+        return int(min(60 * self._minutes / (2 * min(timeit.repeat(step, number=1, repeat=3))), 1e9))
