@@ -1,12 +1,13 @@
-"""Write a scene file in another format; the suffixes select the formats.
+"""Write scene files in another format, joined, cleaned, thinned, turned and moved; the names select the formats.
 
 The codebooks of a .nsvq file are used as the palette of .sog, and to make .spz smaller. To make a .ply small, with
-codebooks fitted to it, use 'nsvq compress'.
+codebooks fitted to it, or to thin it and train what is left, use 'nsvq compress'.
 
 Examples:
   nsvq convert scene.nsvq scene.sog
   nsvq convert scene.ply scene.sog --palette 4096
-  nsvq convert scene.ply scene.spz --measure
+  nsvq convert scene.ply scene.glb --measure
+  nsvq convert house.ply garden.spz both.nsvq --crop -5 -5 -5 5 5 5
   nsvq convert scene.nsvq clean.nsvq --floaters --up z --data.root my/scene
 """
 
@@ -22,8 +23,18 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from nsvq_lightning.io import formats, spz
-from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, cropped, rotated, turn_up
+from nsvq_lightning.commands.compress import share_or_number
+from nsvq_lightning.io import formats, lod, spz
+from nsvq_lightning.io.compressed import (
+    UP_AXES,
+    CompressedScene,
+    cropped,
+    joined,
+    moved,
+    rotated,
+    turn_up,
+    with_degree,
+)
 from nsvq_lightning.io.describe import attribute_errors
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.sog import PALETTE_LIMIT
@@ -37,8 +48,8 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq convert`` takes."""
     add, suffixes = parser.add_argument, ", ".join(formats.FORMATS)
-    add("input", type=Path, metavar="SCENE", help=f"file to read: {suffixes}")
-    add("output", type=Path, metavar="OUT", help=f"file to write: {suffixes}")
+    add("inputs", nargs="+", type=Path, metavar="SCENE", help=f"files to read and join: {suffixes}")
+    add("output", type=Path, metavar="OUT", help="file to write, of one of these formats")
     help_ = "largest number of rows of the .sog palette for a scene without an SH codebook; "
     help_ += f"{PALETTE_LIMIT} by default, 4096 to 16384 make a smaller file"
     add("--palette", type=int, metavar="ROWS", help=help_)
@@ -52,10 +63,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--crop", nargs=6, type=float, metavar=corners, help=f"{help_} of the input")
     help_ = "remove splats that no photo of --data.root supports; takes minutes"
     add("--floaters", action="store_true", help=help_)
+    help_ = "keep so many splats, or this share of them: those that contribute most to its pictures"
+    add("--splats", type=share_or_number, metavar="N", help=help_)
+    help_ = "keep spherical harmonics up to this degree"
+    add("--sh-degree", type=int, choices=range(4), help=help_)
+    turn = parser.add_mutually_exclusive_group().add_argument
     help_ = "turn the scene so that up, as the cameras of --data.root hold it, is this axis"
-    add("--up", choices=UP_AXES, help=help_)
+    turn("--up", choices=UP_AXES, help=help_)
+    help_ = "turn, scale and move the scene: the upper three rows of a matrix, from old to new coordinates"
+    turn("--matrix", nargs=12, type=float, metavar=("A", *"BCDEFGHIJKL"), help=help_)
+    help_ = "move the scene so that the cameras of --data.root are where those of this scene folder are, by photo name"
+    turn("--align", type=Path, metavar="FOLDER", help=help_)
     add("--up-from", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where up is in the input, for --up")
-    help_ = "scene folder: for --floaters and --up, and for --measure instead of views from around the scene"
+    help_ = "scene folder: for --floaters, --up and --align; for --measure and --splats instead of the scene's pictures"
     add("--data.root", dest="root", type=Path, metavar="FOLDER", help=help_)
 
 
@@ -67,61 +87,78 @@ def run(options: argparse.Namespace) -> int:
         ValueError: A file cannot be understood, or nothing is left of the scene.
         OSError: A file cannot be read or written.
     """
+    moves = options.up or options.matrix or options.align
+    edits = moves or options.crop or options.floaters or options.splats or len(options.inputs) > 1
     wrong = {
         "--up-from says where up is: add --up to say what it is to become": options.up_from and not options.up,
         "--floaters asks the photos: add --data.root": options.floaters and not options.root,
+        "--align moves the cameras of a scene folder: add --data.root": options.align and not options.root,
         "--up needs to know where up is now: add --data.root or --up-from": options.up
         and not (options.up_from or options.root),
         "--data.root says where to measure: add --measure": options.root
-        and not (options.measure or options.floaters or options.up),
-        "--measure compares with the input as it is: convert without it first": options.measure
-        and (options.crop or options.floaters or options.up),
+        and not (options.measure or options.floaters or options.up or options.align or options.splats),
+        "--measure compares with the input as it is: convert without it first": options.measure and edits,
     }
     writer: dict[str, Any] = {}
-    for flag, name, suffix in (
-        ("--level", "level", ".nsvq"),
-        ("--palette", "palette", ".sog"),
-        ("--spz-version", "version", ".spz"),
-        ("--spz-axes", "axes", ".spz"),
+    for flag, name, suffixes in (
+        ("--level", "level", (".nsvq",)),
+        ("--palette", "palette", (".sog", lod.NAME)),
+        ("--spz-version", "version", (".spz",)),
+        ("--spz-axes", "axes", (".spz",)),
     ):
         if (value := getattr(options, name)) is not None:
-            fits = options.output.suffix.lower() == suffix
-            wrong[f"{flag} is an option of {suffix} files, but the output is {options.output}"] = not fits
+            fits = formats.suffix_of(options.output) in suffixes
+            wrong[f"{flag} is an option of {suffixes[0]} files, but the output is {options.output}"] = not fits
             writer |= {"storage": Storage(value)} if name == "level" else {name: value}
     for message, is_so in wrong.items():
         if is_so:
             raise argparse.ArgumentError(None, message)
     output: Path = options.output
-    if not output.parent.is_dir():  # now, not after the minutes that floaters take
+    # Now, not after the minutes that floaters take.
+    entry = formats.format_of(output)
+    if not output.parent.is_dir() and formats.suffix_of(output) != lod.NAME:
         raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
-    scene = _cleaned(formats.read_scene(options.input).finite(), options)
+    scene = _edited(joined([formats.read_scene(path).finite() for path in options.inputs]), options)
     size = formats.save(scene, output, **writer)
     # What reading the output back would say of it is known here.
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
     each = f", {size / len(scene):.1f} per splat" if len(scene) else ""
     sys.stdout.write(f"{output}: {len(scene):,} splats in {size:,} bytes{each}\n")
-    in_order = formats.FORMATS[output.suffix.lower()].in_order
-    if in_order is not None:  # the format is not exact
-        errors = attribute_errors(formats.read_scene(output), in_order(scene))
+    if entry.in_order is not None:  # the format is not exact
+        errors = attribute_errors(formats.read_scene(output), entry.in_order(scene))
         listed = ", ".join(f"{name} {error:.2g}{'°' * (name == 'rotation')}" for name, error in errors.items())
         sys.stdout.write(f"  root mean square errors: {listed}\n")
     if options.measure:
-        _measure(options.input, output, options.root)
+        _measure(options.inputs[0], output, options.root)
     return 0
 
 
-def _cleaned(scene: CompressedScene, options: argparse.Namespace) -> CompressedScene:
-    """The scene within the box, without floaters, turned, in this order."""
+def _edited(scene: CompressedScene, options: argparse.Namespace) -> CompressedScene:
+    """The scene within the box, without floaters, thinned, turned and moved, up to a degree, in this order."""
     before = len(scene)
     if options.crop is not None:
         scene = cropped(scene, np.array(options.crop[:3]), np.array(options.crop[3:]))
         if len(scene) == 0:
-            raise ValueError(f"no splat of {options.input} is in the box {' '.join(map(str, options.crop))}")
+            named = ", ".join(map(str, options.inputs))
+            raise ValueError(f"no splat of {named} is in the box {' '.join(map(str, options.crop))}")
         sys.stdout.write(f"crop: {before - len(scene):,} of {before:,} splats are outside\n")
     if options.floaters:
         scene = _without_floaters(scene, options.root)
+    if options.splats is not None:
+        asked = round(options.splats * (len(scene) if options.splats <= 1 else 1))
+        if asked < len(scene):
+            scene = _thinned(scene, max(1, asked), options)
     if options.up is not None:
         scene = rotated(scene, turn_up(_up(options), options.up))
+    if options.matrix is not None:
+        scene = moved(scene, np.array([*options.matrix, 0, 0, 0, 1]).reshape(4, 4))
+    if options.align is not None:
+        from nsvq_lightning.data.colmap import alignment
+        from nsvq_lightning.data.transforms import read_poses
+
+        scene = moved(scene, alignment(*(read_poses(folder) for folder in (options.root, options.align))))
+    if options.sh_degree is not None and options.sh_degree < scene.sh_degree:
+        scene = with_degree(scene, options.sh_degree)
     return scene.in_use() if len(scene) < before else scene
 
 
@@ -165,6 +202,19 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
         f"{psnr(torch.ones_like(removed)):.2f} dB before, {psnr(~removed):.2f} dB after\n"
     )
     return scene.take((~removed).numpy())
+
+
+def _thinned(scene: CompressedScene, count: int, options: argparse.Namespace) -> CompressedScene:
+    """The splats that contribute most to photos of --data.root, or to the scene's own pictures."""
+    from nsvq_lightning.commands.arguments import views_of
+    from nsvq_lightning.commands.compress import VIEWS
+    from nsvq_lightning.compression.importance import contributions, most_contributing, row_weights
+    from nsvq_lightning.rendering.rasterize import render
+
+    splats = scene.decode()
+    cameras, _ = views_of(options.inputs[0], splats, VIEWS, options.root)
+    found = contributions(splats, cameras, partial(render, antialiased=scene.antialiased))
+    return scene.take(most_contributing(row_weights(found), count).numpy())
 
 
 def _measure(source: Path, output: Path, root: Path | None) -> None:

@@ -186,6 +186,29 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
     )
 
 
+def alignment(model: ColmapModel, other: ColmapModel) -> NDArray[np.float64]:
+    """The similarity ``[4, 4]`` that takes the camera centres of a model nearest to those of another, by photo name.
+
+    Raises:
+        SceneError: They share fewer than three photos, or these lie on a line, and so do not say how it turns.
+    """
+    centres = [
+        {image.name: -image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in found.images}
+        for found in (model, other)
+    ]
+    shared = sorted(centres[0].keys() & centres[1].keys())
+    ours, theirs = (np.array([places[name] for name in shared]).reshape(-1, 3) for places in centres)
+    for places in (ours, theirs):
+        if len(shared) < 3 or np.linalg.matrix_rank(places - places.mean(0), 1e-6 * np.ptp(places)) < 2:
+            raise SceneError(
+                f"{len(shared)} photos of the same name are in both scenes: to align them takes three that were not "
+                "taken from one line"
+            )
+    matrix = np.eye(4)
+    matrix[:3] = import_pycolmap().estimate_sim3d(ours, theirs).matrix()
+    return matrix
+
+
 def _is_finite(values: NDArray[np.float64]) -> bool:
     return bool((np.abs(values) <= LARGEST).all())
 

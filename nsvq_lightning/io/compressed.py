@@ -1,7 +1,7 @@
 """A scene as files hold it, some of whose attributes are codes; it is turned and cropped without decoding these."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -230,6 +230,13 @@ def _check_codes(name: str, codes: NDArray[np.integer], codebook: NDArray[np.flo
         raise ValueError(f"codes[{name!r}] must be in 0..{rows - 1}, got {codes.min()}..{codes.max()}")
 
 
+def in_morton_order(scene: CompressedScene) -> CompressedScene:
+    """The splats in Morton order of their positions, in which many formats hold them: what is near follows."""
+    from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
+
+    return scene.take(spatial_order(scene.means))
+
+
 # Rotations that turn COLMAP's up, -y, to an axis; x stays.
 UP_AXES = {
     "y": np.diag([1.0, -1.0, -1.0]),
@@ -255,40 +262,129 @@ def turn_up(up: NDArray[np.float64], axis: str) -> NDArray[np.float64]:
     return np.asarray(UP_AXES[axis] @ first @ second)
 
 
-def rotated(scene: CompressedScene, rotation: NDArray[np.float64]) -> CompressedScene:
-    """The scene turned about the world's origin.
+# Half around z: right, down, front becomes left, up, front, the axes of glTF and USD.
+HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
-    Positions, rotations and spherical harmonics turn, the last two by the rows of their codebooks; numbers are rounded
-    once, to float32.
+
+def rotated(scene: CompressedScene, rotation: NDArray[np.float64]) -> CompressedScene:
+    """The scene turned about the world's origin by a rotation ``[3, 3]``, see :func:`moved`."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    return moved(scene, matrix)
+
+
+def moved(scene: CompressedScene, matrix: NDArray[np.float64]) -> CompressedScene:
+    """The scene turned, scaled and moved.
+
+    Positions, scales, rotations and spherical harmonics change, the last three by the rows of their codebooks; numbers
+    are rounded once, to float32.
 
     Args:
         scene: The scene.
-        rotation: ``[3, 3]``, of determinant 1.
+        matrix: From old to new world coordinates ``[4, 4]``: a rotation times a positive number, and a translation.
+
+    Raises:
+        ValueError: It stretches, mirrors or is not finite.
     """
     import torch
 
     from nsvq_lightning.rendering.sh import sh_rotation
 
-    matrix = sh_rotation(torch.from_numpy(rotation), scene.sh_degree).numpy()
+    linear, shift = matrix[:3, :3], matrix[:3, 3]
+    size = float(np.cbrt(np.linalg.det(linear)))
+    if not (
+        np.isfinite(matrix).all()
+        and size > 0
+        and np.allclose(linear @ linear.T, size**2 * np.eye(3), 0, 1e-5 * size**2)
+    ):
+        raise ValueError(
+            f"{linear.tolist()} is no rotation times a number: splats can be turned and scaled evenly only"
+        )
+    rotation = linear / size
+    harmonics = sh_rotation(torch.from_numpy(rotation), scene.sh_degree).numpy()
 
     def rows(tables: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
         found = dict(tables)
+        if "scales" in found and size != 1:
+            found["scales"] = (found["scales"] + np.log(size)).astype(np.float32)
         if "quats" in found:
             found["quats"] = turned(found["quats"], rotation)
         if "shN" in found:
-            wide = found["shN"].reshape(len(found["shN"]), len(matrix), 3).astype(np.float64)
-            found["shN"] = (matrix @ wide).reshape(found["shN"].shape).astype(np.float32)
+            wide = found["shN"].reshape(len(found["shN"]), len(harmonics), 3).astype(np.float64)
+            found["shN"] = (harmonics @ wide).reshape(found["shN"].shape).astype(np.float32)
         return found
 
-    x, y, z = (rotation @ np.array(scene.origin)).tolist()
+    has_origin = any(scene.origin)
+    means = scene.means.astype(np.float64) @ linear.T + (0 if has_origin else shift)
+    x, y, z = (linear @ np.array(scene.origin) + (shift if has_origin else 0)).tolist()
     return replace(
         scene,
-        means=(scene.means.astype(np.float64) @ rotation.T).astype(np.float32),
+        means=means.astype(np.float32),
         codebooks=rows(scene.codebooks),
         raw={**scene.raw, **rows({name: values for name, values in scene.raw.items() if name not in scene.bases})},
         bases=rows(scene.bases),
         origin=(x, y, z),
         stored_bytes=None,
+    )
+
+
+def with_degree(scene: CompressedScene, degree: int) -> CompressedScene:
+    """The scene with spherical harmonics up to a degree, 0 to 3: higher ones are left out, missing ones are 0."""
+    dims = splat.attribute_dims(scene.sh_degree)["shN"], splat.attribute_dims(degree)["shN"]
+
+    def rows(tables: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        found = dict(tables)
+        if "shN" in found:
+            found["shN"] = np.pad(found["shN"][:, : dims[1]], ((0, 0), (0, max(0, dims[1] - dims[0]))))
+        return found
+
+    if degree == 0 or "shN" in scene.bases:  # no codebook at degree 0, nor a basis of another width
+        values = scene.values("shN").reshape(len(scene), dims[0])
+        codes = {name: codes for name, codes in scene.codes.items() if name != "shN"}
+        codebooks = {name: scene.codebooks[name] for name in codes}
+        raw = rows({**scene.raw, "shN": values})
+        return replace(scene, codes=codes, codebooks=codebooks, raw=raw, bases={}, sh_degree=degree)
+    return replace(scene, codebooks=rows(scene.codebooks), raw=rows(scene.raw), sh_degree=degree)
+
+
+def joined(scenes: Sequence[CompressedScene]) -> CompressedScene:
+    """The splats of scenes, one after another, up to their highest degree; origin and settings are those of the first.
+
+    Where all have a codebook, that is the rows of all, and the codes count on.
+
+    Raises:
+        ValueError: Only some are to be rendered with anti-aliasing.
+    """
+    first = scenes[0]
+    if len(scenes) == 1:
+        return first
+    if len({scene.antialiased for scene in scenes}) > 1:
+        raise ValueError("some of the scenes were trained with anti-aliasing and some were not; they cannot be joined")
+    degree = max(scene.sh_degree for scene in scenes)
+    scenes = [scene if scene.sh_degree == degree else with_degree(scene, degree) for scene in scenes]
+    shared = [name for name in splat.QUANTIZABLE if all(name in scene.codes for scene in scenes)]
+    starts = {name: np.cumsum([0, *(len(scene.codebooks[name]) for scene in scenes)]) for name in shared}
+    shifts = [np.array(scene.origin) - np.array(first.origin) for scene in scenes]
+    means = [scene.means + shift for scene, shift in zip(scenes, shifts, strict=True)]
+    dims = splat.attribute_dims(degree)
+    return CompressedScene(
+        np.concatenate(means).astype(np.float32),
+        np.concatenate([scene.opacities for scene in scenes]),
+        codes={
+            name: np.concatenate(
+                [scene.codes[name] + start for scene, start in zip(scenes, starts[name], strict=False)]
+            )
+            for name in shared
+        },
+        codebooks={name: np.concatenate([scene.codebooks[name] for scene in scenes]) for name in shared},
+        raw={
+            name: np.concatenate([scene.values(name).reshape(len(scene), dims[name]) for scene in scenes])
+            for name in splat.QUANTIZABLE
+            if name not in shared
+        },
+        sh_degree=degree,
+        config=first.config,
+        origin=first.origin,
     )
 
 

@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from nsvq_lightning.io import ply, sog, splat, spz
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError, naming_file
-from nsvq_lightning.io.formats import FORMATS
-from nsvq_lightning.io.nsvq.header import MAGIC, read_header
+from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.formats import FORMATS, read_scene, suffix_of
 from nsvq_lightning.io.numbers import opacity_of
+from nsvq_lightning.io.ply import plain_ply_bytes
 from nsvq_lightning.splats.conventions import unit
 
 
@@ -43,7 +42,7 @@ def attribute_errors(read: CompressedScene, written: CompressedScene) -> dict[st
 
 
 def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Facts about a file, as JSON values; its first bytes name the format, except that ``.splat`` has none.
+    """Facts about a file, as JSON values; its first bytes name the format, where it has such.
 
     Raises:
         FormatError: The file is damaged, or not in a format of :data:`~nsvq_lightning.io.formats.FORMATS`.
@@ -51,61 +50,28 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     path = Path(path)
     with open(path, "rb") as file:
-        start = file.read(len(MAGIC))
-    total = path.stat().st_size
-    facts = _describe_nsvq(path, total) if start.startswith(MAGIC) else _describe_others(path, start, total)
-    plain_bytes = ply.plain_ply_bytes(facts["splats"], facts["sh_degree"])
+        start = file.read(8)
+    entry = FORMATS.get(suffix_of(path))
+    if entry is None or entry.magics:
+        entry = next((known for known in FORMATS.values() if start.startswith(known.magics)), None)
+    if entry is None:
+        raise FormatError(f"{path}: not a {', '.join(FORMATS)} file", "give the file of a scene")
+    if entry.describe is not None:
+        facts = entry.describe(path)
+    else:
+        scene, kind = read_scene(path), suffix_of(path).removeprefix(".")
+        streams = {"file": (kind, path.stat().st_size)}
+        facts = {"format": kind, "splats": len(scene), "sh_degree": scene.sh_degree, "streams": streams}
+    parts = [{"name": name, "encoding": kind, "bytes": size} for name, (kind, size) in facts["streams"].items()]
+    total = facts.get("bytes", path.stat().st_size)
+    plain_bytes = plain_ply_bytes(facts["splats"], facts["sh_degree"])
     # An empty .splat has no bytes.
+    ratio = plain_bytes / max(1, total)
     return {
         "file": str(path),
         **facts,
+        "streams": parts,
         "bytes": total,
         "plain_bytes": plain_bytes,
-        "ratio": plain_bytes / max(1, total),
+        "ratio": ratio,
     }
-
-
-def _describe_nsvq(path: Path, total: int) -> dict[str, Any]:
-    header = read_header(path)
-    streams = [{"name": s.name, "encoding": s.encoding, "bytes": s.length} for s in header.streams]
-    header_bytes = total - sum(stream.length for stream in header.streams)
-    return {
-        "format": f"nsvq, level {header.level}",
-        "splats": header.splats,
-        "sh_degree": header.sh_degree,
-        "origin": list(header.origin),
-        "attributes": [{**entry._asdict(), "bits": entry.bits} for entry in header.attributes],
-        "streams": [{"name": "header", "encoding": "json", "bytes": header_bytes}, *streams],
-        "config": header.config,
-        "metrics": header.metrics,
-    }
-
-
-def _describe_others(path: Path, start: bytes, total: int) -> dict[str, Any]:
-    suffix = path.suffix.lower()
-    if suffix in FORMATS.keys() - {".nsvq", ".ply", ".sog", ".spz", ".splat"}:
-        scene = FORMATS[suffix].read(path)
-        count, sh_degree, kind, encoding, sizes = len(scene), scene.sh_degree, suffix[1:], suffix[1:], {"file": total}
-    elif start.startswith(ply.PLY_MAGIC):
-        header = ply.read_ply_header(path)
-        with naming_file(path):
-            count, sh_degree = header.count, ply.splat_degree(header)
-        kind, encoding = f"ply, {'compressed' if header.packed else header.encoding}", "ply"
-        # The lengths of ascii numbers vary, so only the total is known.
-        sizes = ply.attribute_bytes(header) if header.encoding != "ascii" else {}
-        sizes = {"header": total - sum(sizes.values()), **sizes} if sizes else {"text": total}
-    elif start.startswith(sog.ZIP_MAGIC):
-        count, sh_degree, sizes = sog.read_sog_header(path)
-        kind, encoding, sizes = "sog, version 2", "webp", {**sizes, "zip": total - sum(sizes.values())}
-    elif start.startswith(spz.SPZ_MAGICS):
-        found, sizes = spz.read_spz_header(path)
-        count, sh_degree, encoding = found.count, found.sh_degree, "zstd" if found.version == 4 else "gzip"
-        kind = f"spz, version {found.version}, axes {found.axes or f'not stated, taken as {spz.DEFAULT_AXES.upper()}'}"
-    elif suffix == ".splat":
-        count, sh_degree, kind, encoding = splat.count_splats(path), 0, "splat", "splat"
-        sizes = {name: count * size for name, size in splat.SPLAT_LAYOUT.items()}
-    else:
-        raise FormatError(f"{path}: not a {', '.join(FORMATS)} file", "give the file of a scene")
-    around = {"header": "plain", sog.META: "json", "zip": "zip"}
-    streams = [{"name": s, "encoding": around.get(s, encoding), "bytes": size} for s, size in sizes.items()]
-    return {"format": kind, "splats": count, "sh_degree": sh_degree, "streams": streams}

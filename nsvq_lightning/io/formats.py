@@ -1,4 +1,4 @@
-"""Load, save and convert scenes; the file's suffix selects the format."""
+"""Load, save and describe scenes of any format: the end of the file's name selects it."""
 
 import logging
 import os
@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nsvq_lightning.io import ply, sog, splat, spz
-from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io import glb, lod, ply, sog, splat, spz, usda
+from nsvq_lightning.io.compressed import CompressedScene, in_morton_order
 from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_nsvq
+from nsvq_lightning.io.nsvq.header import MAGIC, describe_nsvq
 from nsvq_lightning.io.nsvq.precision import Storage
 
 if TYPE_CHECKING:
@@ -25,7 +26,10 @@ class Format:
     Attributes:
         description: A few words for error messages and help.
         read: Scene from a file; codebooks are kept where the format has them.
-        write: ``write(path, scene, **options) -> bytes written``.
+        write: ``write(path, scene, **options) -> bytes written``; None if it is only read.
+        describe: Facts about a file: ``format``, ``splats``, ``sh_degree``, ``streams`` (encoding and bytes of each
+            part by name), and what else there is to say. None reads the scene for them.
+        magics: First bytes of its files; none if only the name tells.
         native: Whether it is our own: it holds the origin that positions are relative to, and ``write`` has an option
             ``storage``, the level and precision.
         in_order: Gives the splats of a scene that a file holds, in file order, for comparison with what is read back;
@@ -34,7 +38,9 @@ class Format:
 
     description: str
     read: Callable[[Path], CompressedScene]
-    write: Callable[..., int]
+    write: Callable[..., int] | None
+    describe: Callable[[Path], dict[str, Any]] | None = None
+    magics: tuple[bytes, ...] = ()
     native: bool = False
     in_order: Callable[[CompressedScene], CompressedScene] | None = None
 
@@ -61,7 +67,8 @@ def load(path: str | os.PathLike[str]) -> "Splats":
 def read_scene(path: str | os.PathLike[str]) -> CompressedScene:
     """Read a scene of any supported format, keeping its codebooks; arguments and errors are those of :func:`load`."""
     path = Path(path)
-    return replace(_format_of(path, "read").read(path), stored_bytes=path.stat().st_size)
+    scene = format_of(path).read(path)
+    return replace(scene, stored_bytes=scene.stored_bytes or path.stat().st_size)
 
 
 def save(
@@ -80,19 +87,19 @@ def save(
             would decode to, so that all files of a run hold the same splats.
         options: For ``.sog``: ``palette`` (most rows of the palette for spherical harmonics without a codebook, default
             65536). For ``.spz``: ``version`` (3 or 4, default 3) and ``axes`` (``rdf``, those of ``.ply``
-            and the default, or ``rub``).
+            and the default, or ``rub``). For ``lod-meta.json``: ``coarser`` (scenes of the coarser levels).
 
     Returns:
-        Bytes of the file.
+        Bytes of the file, or of all files of a folder.
 
     Raises:
         ValueError: Unknown suffix, or one that is only read.
         TypeError: The format has no such option.
     """
     path = Path(path)
-    if path.name.lower().endswith(".compressed.ply"):
-        raise ValueError(f"cannot write {path}: compressed .ply files are only read; .sog and .spz are smaller")
-    entry = _format_of(path, "write")
+    entry = format_of(path)
+    if entry.write is None:
+        raise ValueError(f"cannot write {path}: {suffix_of(path)} is only read")
     if not isinstance(scene, CompressedScene):
         scene = CompressedScene.from_splats(scene)
     scene = scene.finite()
@@ -105,24 +112,67 @@ def save(
     return entry.write(path, scene, **options)
 
 
-def _format_of(path: Path, action: str) -> Format:
-    try:
-        return FORMATS[path.suffix.lower()]
-    except KeyError:
-        supported = ", ".join(f"{suffix} ({entry.description})" for suffix, entry in FORMATS.items())
-        raise ValueError(f"cannot {action} {path}: unknown suffix {path.suffix!r}; supported are {supported}") from None
+def suffix_of(path: str | os.PathLike[str]) -> str:
+    """The longest end of a file's name, in lower case, that is a key of :data:`FORMATS`; empty if none is."""
+    name = Path(path).name.lower()
+    return max((suffix for suffix in FORMATS if name.endswith(suffix)), key=len, default="")
 
 
-# Formats by suffix; a new format is one more entry.
+def format_of(path: str | os.PathLike[str]) -> Format:
+    """The format that the name of a file selects.
+
+    Raises:
+        ValueError: None has such a name.
+    """
+    if suffix := suffix_of(path):
+        return FORMATS[suffix]
+    supported = ", ".join(f"{suffix} ({entry.description})" for suffix, entry in FORMATS.items())
+    raise ValueError(f"{path}: unknown suffix {Path(path).suffix!r}; supported are {supported}")
+
+
+# Formats by the end of the file's name; a new format is one more entry.
 FORMATS: dict[str, Format] = {
-    ".ply": Format("3D Gaussian Splatting", ply.read_ply, ply.write_ply),
-    ".nsvq": Format("compressed scene of this package", read_nsvq, write_nsvq, native=True),
-    ".sog": Format("PlayCanvas, SuperSplat", sog.read_sog, sog.write_sog, in_order=sog.in_sog_order),
-    ".spz": Format("Niantic", spz.read_spz, spz.write_spz, in_order=spz.in_spz_order),
+    ".ply": Format("3D Gaussian Splatting", ply.read_ply, ply.write_ply, ply.describe_ply, (b"ply",)),
+    ".nsvq": Format("compressed scene of this package", read_nsvq, write_nsvq, describe_nsvq, (MAGIC,), native=True),
+    ".sog": Format(
+        "PlayCanvas, SuperSplat",
+        sog.read_sog,
+        sog.write_sog,
+        sog.describe_sog,
+        magics=(b"PK\x03\x04",),
+        in_order=in_morton_order,
+    ),
+    ".spz": Format(
+        "Niantic",
+        spz.read_spz,
+        spz.write_spz,
+        spz.describe_spz,
+        magics=(b"\x1f\x8b", b"NGSP"),
+        in_order=spz.in_spz_order,
+    ),
+    ".glb": Format("glTF, KHR_gaussian_splatting", glb.read_glb, glb.write_glb, glb.describe_glb, (b"glTF",)),
+    ".usda": Format("OpenUSD, for scenes of moderate size", usda.read_usda, usda.write_usda),
+    ".compressed.ply": Format(
+        "PlayCanvas, SuperSplat",
+        ply.read_ply,
+        ply.write_compressed_ply,
+        ply.describe_ply,
+        magics=(b"ply",),
+        in_order=in_morton_order,
+    ),
+    lod.NAME: Format(
+        "streamed SOG, a folder with levels of detail",
+        lod.read_lod,
+        lod.write_lod,
+        lod.describe_lod,
+        in_order=lod.in_lod_order,
+    ),
+    sog.META: Format("SOG as a folder", sog.read_sog, None, sog.describe_sog),
     ".splat": Format(
         "first viewers on the web, without spherical harmonics",
         splat.read_splat,
         splat.write_splat,
+        splat.describe_splat,
         in_order=lambda scene: scene,
     ),
 }

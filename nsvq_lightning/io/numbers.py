@@ -24,12 +24,16 @@ def finite_logits(logits: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(np.isinf(logits), np.copysign(np.float32(_OPAQUE), logits), logits)
 
 
+def logits_of(opacities: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    """Logits of opacities of any shape: finite in [0, 1], otherwise NaN."""
+    wide = opacities.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return finite_logits((np.log(wide) - np.log1p(-wide)).astype(np.float32))
+
+
 def logits_of_bytes(levels: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Finite logits of opacities given in 255ths."""
-    shares = np.arange(256) / 255
-    with np.errstate(divide="ignore"):
-        table = np.log(shares) - np.log1p(-shares)
-    return finite_logits(table.astype(np.float32))[levels]
+    return logits_of(np.arange(256) / 255)[levels]
 
 
 logger = logging.getLogger(__name__)

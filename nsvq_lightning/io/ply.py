@@ -6,19 +6,17 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import atomic_write
-from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.compressed import CompressedScene, in_morton_order
 from nsvq_lightning.io.errors import FormatError, naming_file
-from nsvq_lightning.io.numbers import finite_logits, logits_of_bytes
+from nsvq_lightning.io.numbers import finite_logits, logits_of_bytes, opacity_of
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
-from nsvq_lightning.splats.conventions import SH_C0, from_smallest_three, shN_degree
-
-PLY_MAGIC = b"ply"
+from nsvq_lightning.splats.conventions import SH_C0, from_smallest_three, shN_degree, smallest_three, unit
 
 
 @dataclass(frozen=True)
@@ -177,7 +175,8 @@ def splat_degree(header: PlyHeader) -> int:
 
 def _check_packed(header: PlyHeader) -> None:
     chunk, sh = header.others["chunk"], header.others.get("sh")
-    bounds = [f"{end}_{part}{axis}" for part in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
+    names = ["x", "y", "z", "scale_x", "scale_y", "scale_z", *("rgb" if "min_r" in chunk.properties else "")]
+    bounds = [f"{end}_{name}" for end in ("min", "max") for name in names]
     expected = [(header, dict.fromkeys(_PACKED, "u4")), (chunk, dict.fromkeys(bounds, "f4"))]
     if sh:
         expected.append((sh, dict.fromkeys(sh.properties, "u1")))
@@ -192,15 +191,29 @@ def _check_packed(header: PlyHeader) -> None:
         )
 
 
-def attribute_bytes(header: PlyHeader) -> dict[str, int]:
-    """Bytes of each attribute of the splats in a file that is not ascii; ``other`` for all other properties."""
+def describe_ply(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Facts about a file, see :class:`nsvq_lightning.io.formats.Format`.
+
+    Raises:
+        FormatError: The file is truncated, or not a ``.ply`` of Gaussian splats.
+    """
+    header, total = read_ply_header(path), os.path.getsize(path)
+    with naming_file(path):
+        sh_degree = splat_degree(header)
     names = {column: name for name, columns in splat_columns(3).items() for column in columns} | _PACKED
     sizes: dict[str, int] = {}
     for table in [header, *([header.others["sh"]] if header.packed and "sh" in header.others else [])]:
         for column in table.properties:
             name = names.get(column, "other")
             sizes[name] = sizes.get(name, 0) + table.count * table.dtype[column].itemsize
-    return sizes
+    streams = {"header": ("plain", total - sum(sizes.values()))} | {name: ("ply", size) for name, size in sizes.items()}
+    return {
+        "format": f"ply, {'compressed' if header.packed else header.encoding}",
+        "splats": header.count,
+        "sh_degree": sh_degree,
+        # The lengths of ascii numbers vary, so only the total is known.
+        "streams": {"text": ("ply", total)} if header.encoding == "ascii" else streams,
+    }
 
 
 def read_ply(path: str | os.PathLike[str]) -> CompressedScene:
@@ -349,15 +362,80 @@ def write_ply(path: str | os.PathLike[str], scene: CompressedScene) -> int:
         return file.tell()
 
 
+def write_compressed_ply(path: str | os.PathLike[str], scene: CompressedScene) -> int:
+    """Write splats as compressed ``.ply``, 16 bytes each and a byte for each SH coefficient, in Morton order.
+
+    Returns:
+        Bytes of the file.
+    """
+    scene = in_morton_order(scene)
+    starts = np.arange(0, len(scene), 256)
+    bounds: dict[str, NDArray[Any]] = {}
+
+    def shares(values: NDArray[np.float32], names: Sequence[str]) -> NDArray[np.float64]:
+        """Shares of the ways from the smallest to the largest values of 256 splats ``[N, 3]``."""
+        low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+        for end, values_of_end in (("min", low), ("max", high)):
+            bounds.update({f"{end}_{name}": values_of_end[:, axis] for axis, name in enumerate(names)})
+        low, high = (np.repeat(end, 256, axis=0)[: len(values)].astype(np.float64) for end in (low, high))
+        return (values - low) / np.where(high > low, high - low, 1)
+
+    largest, others = smallest_three(unit(scene.values("quats")))
+    colors = np.asarray(0.5 + SH_C0 * scene.values("sh0")[:, 0], np.float32)
+    words = {
+        "packed_position": _packed(shares(scene.means, "xyz"), 11, 10, 11),
+        "packed_rotation": _packed(others / math.sqrt(2) + 0.5, 10, 10, 10) | largest.astype(np.uint32) << 30,
+        "packed_scale": _packed(
+            shares(scene.values("scales").clip(-20, 20), ["scale_x", "scale_y", "scale_z"]), 11, 10, 11
+        ),
+        "packed_color": _packed(np.c_[shares(colors, "rgb"), opacity_of(scene.opacities)], 8, 8, 8, 8),
+    }
+    levels = np.clip(32 * scene.values("shN") + 128, 0, 255).astype(np.uint8)
+    sh = dict(
+        zip(
+            splat_columns(scene.sh_degree)["shN"],
+            levels.swapaxes(1, 2).reshape(len(scene), 3 * levels.shape[1]).T,
+            strict=True,
+        )
+    )
+    tables: list[tuple[str, int, str, dict[str, NDArray[Any]]]] = [
+        ("chunk", len(starts), "float", bounds),
+        ("vertex", len(scene), "uint", words),
+        ("sh", len(scene), "uchar", sh),
+    ]
+    if not sh:
+        tables.pop()
+    with atomic_write(path) as file:
+        file.write(f"ply\nformat binary_little_endian 1.0\n{_comments(scene.antialiased)}".encode())
+        for name, count, kind, columns in tables:
+            properties = "".join(f"property {kind} {column}\n" for column in columns)
+            file.write(f"element {name} {count}\n{properties}".encode())
+        file.write(b"end_header\n")
+        for _, _, kind, columns in tables:
+            file.write(np.stack(list(columns.values()), axis=1).astype("<" + _TYPES[kind]).tobytes())
+        return file.tell()
+
+
+def _packed(shares: NDArray[np.float64], *bits: int) -> NDArray[np.uint32]:
+    """Words ``[N]`` of shares ``[N, len(bits)]``, the last one in the lowest bits, as :func:`_parts` takes them."""
+    words = np.zeros(len(shares), np.uint32)
+    for share, size in zip(shares.T, bits, strict=True):
+        words = words << np.uint32(size) | np.rint(share.clip(0, 1) * ((1 << size) - 1)).astype(np.uint32)
+    return words
+
+
 def plain_ply_bytes(splats: int, sh_degree: int) -> int:
     """Size in bytes of the file that :func:`write_ply` makes: the reference for a compressed scene."""
     header = _header_text(splats, sh_degree)
     return len(header) + 4 * splats * header.count(b"property")
 
 
+def _comments(antialiased: bool) -> str:
+    return "".join(f"comment {key} {value}\n" for key, value in _MIP_COMMENTS.items()) if antialiased else ""
+
+
 def _header_text(count: int, sh_degree: int, antialiased: bool = False) -> bytes:
-    comments = "".join(f"comment {key} {value}\n" for key, value in _MIP_COMMENTS.items()) if antialiased else ""
     columns = splat_columns(sh_degree) | {"unused": _UNUSED}
     properties = "".join(f"property float {column}\n" for name in _ORDER for column in columns[name])
-    head = f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {count}\n{properties}end_header\n"
-    return head.encode("ascii")
+    head = f"ply\nformat binary_little_endian 1.0\n{_comments(antialiased)}element vertex {count}\n"
+    return f"{head}{properties}end_header\n".encode("ascii")

@@ -1,6 +1,6 @@
 """The ``.sog`` file of PlayCanvas, version 2: byte images that a web page can pass to the GPU unchanged.
 
-A zip archive of ``meta.json`` and lossless WebP pictures.
+A zip archive, or a folder, of ``meta.json`` and lossless WebP pictures.
 
 ==================  ===========================================================================================
 picture             texel
@@ -26,6 +26,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,14 +34,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import atomic_write
-from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.compressed import CompressedScene, in_morton_order
 from nsvq_lightning.io.errors import FEW_SPLATS, FormatError, check_room, naming_file
 from nsvq_lightning.io.numbers import logits_of_bytes, opacity_of
 from nsvq_lightning.io.scalar_kmeans import nearest_level, scalar_kmeans
 from nsvq_lightning.splats.conventions import from_smallest_three, sh_coefficients, smallest_three, unit
 
 META = "meta.json"
-ZIP_MAGIC = b"PK\x03\x04"
 # Number of rows that a 16-bit label can address.
 PALETTE_LIMIT = 1 << 16
 _ROWS_A_LINE = 64
@@ -54,18 +54,76 @@ def picture_shape(count: int) -> tuple[int, int]:
     return max(4, 4 * math.ceil(count / width / 4)), width
 
 
-def _write_archive(
-    path: str | os.PathLike[str], meta: Mapping[str, Any], pictures: Mapping[str, NDArray[np.uint8]]
-) -> int:
-    """Write ``meta.json`` and pictures ``[H, W, 4]`` by name; returns the bytes of the file."""
+def sog_contents(scene: CompressedScene, palette: int = PALETTE_LIMIT) -> dict[str, bytes]:
+    """The files of an archive or folder by name, ``meta.json`` first; splats keep their order.
+
+    A codebook of the spherical harmonics becomes the palette and its codes the labels, renumbered in order of first
+    use. A scene without one, or with more rows in use than a label can address, gets a palette of means of similar
+    rows, in which opaque and large splats count more; it is exact if there are no more distinct rows than it may have.
+
+    Args:
+        scene: The scene.
+        palette: Largest number of rows of a palette that must be found: fewer make a smaller file, with less exact
+            view-dependent colours.
+
+    Raises:
+        ValueError: The palette has no rows or more than 65536.
+    """
     from PIL import Image
 
+    if not 1 <= palette <= PALETTE_LIMIT:
+        raise ValueError(f"palette must be in 1..{PALETTE_LIMIT}, got {palette}")
+    count = len(scene)
+    low, high, means = _packed_means(scene.means)
+    scales, scale_levels = _leveled(scene, "scales")
+    colors, color_levels = _leveled(scene, "sh0")
+    opacities = np.rint(255 * opacity_of(scene.opacities)).astype(np.uint8)
+    texels = {
+        "means_l.webp": low,
+        "means_u.webp": high,
+        "quats.webp": scene.spread("quats", lambda rows, _: _packed_quats(rows)),
+        "scales.webp": scales,
+        "sh0.webp": np.concatenate([colors, opacities[:, None]], axis=1),
+    }
+    meta: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": "nsvq-lightning"},
+        "count": count,
+        # The second is how it was said before; readers know one of them.
+        **({"model": "antialiased", "antialias": True} if scene.antialiased else {}),
+        "means": {**means, "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"codebook": scale_levels, "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": color_levels, "files": ["sh0.webp"]},
+    }
+    pictures = {name: _picture(values, picture_shape(count)) for name, values in texels.items()}
+    if scene.sh_degree:
+        meta["shN"], sh_pictures = _packed_sh(*_palette(scene, palette), scene.sh_degree)
+        pictures |= sh_pictures
     contents = {META: json.dumps(meta, separators=(",", ":"), allow_nan=False).encode()}
-    for name, texels in pictures.items():
+    for name, picture in pictures.items():
         buffer = io.BytesIO()
         # exact=True: otherwise colours under alpha 0 are changed.
-        Image.fromarray(texels, "RGBA").save(buffer, "WEBP", lossless=True, exact=True, quality=75, method=3)
+        Image.fromarray(picture, "RGBA").save(buffer, "WEBP", lossless=True, exact=True, quality=75, method=3)
         contents[name] = buffer.getvalue()
+    return contents
+
+
+def write_sog(path: str | os.PathLike[str], scene: CompressedScene, *, palette: int = PALETTE_LIMIT) -> int:
+    """Write a scene as ``.sog``, in Morton order.
+
+    Args:
+        path: File to write, replaced atomically.
+        scene: The scene.
+        palette: See :func:`sog_contents`.
+
+    Returns:
+        Bytes of the file.
+
+    Raises:
+        ValueError: The palette has no rows or more than 65536.
+    """
+    contents = sog_contents(in_morton_order(scene), palette)
     with atomic_write(path) as file:
         with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
             for name, data in contents.items():
@@ -204,66 +262,6 @@ class _Archive:
         return palette, labels
 
 
-def in_sog_order(scene: CompressedScene) -> CompressedScene:
-    """The splats that a file holds, in its order: Morton order of the positions."""
-    from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
-
-    return scene.take(spatial_order(scene.means))
-
-
-def write_sog(path: str | os.PathLike[str], scene: CompressedScene, *, palette: int = PALETTE_LIMIT) -> int:
-    """Write a scene as ``.sog``.
-
-    A codebook of the spherical harmonics becomes the palette and its codes the labels, renumbered in order of first
-    use. A scene without one, or with more rows in use than a label can address, gets a palette of means of similar
-    rows, in which opaque and large splats count more; it is exact if there are no more distinct rows than it may have.
-    Splats with a non-finite value are left out with a warning.
-
-    Args:
-        path: File to write, replaced atomically.
-        scene: The scene.
-        palette: Largest number of rows of a palette that must be found: fewer make a smaller file, with less exact
-            view-dependent colours.
-
-    Returns:
-        Bytes of the file.
-
-    Raises:
-        ValueError: The palette has no rows or more than 65536.
-    """
-    if not 1 <= palette <= PALETTE_LIMIT:
-        raise ValueError(f"palette must be in 1..{PALETTE_LIMIT}, got {palette}")
-    scene = in_sog_order(scene)
-    count = len(scene)
-    low, high, means = _packed_means(scene.means)
-    scales, scale_levels = _leveled(scene, "scales")
-    colors, color_levels = _leveled(scene, "sh0")
-    opacities = np.rint(255 * opacity_of(scene.opacities)).astype(np.uint8)
-    texels = {
-        "means_l.webp": low,
-        "means_u.webp": high,
-        "quats.webp": scene.spread("quats", lambda rows, _: _packed_quats(rows)),
-        "scales.webp": scales,
-        "sh0.webp": np.concatenate([colors, opacities[:, None]], axis=1),
-    }
-    meta: dict[str, Any] = {
-        "version": 2,
-        "asset": {"generator": "nsvq-lightning"},
-        "count": count,
-        # The second is how it was said before; readers know one of them.
-        **({"model": "antialiased", "antialias": True} if scene.antialiased else {}),
-        "means": {**means, "files": ["means_l.webp", "means_u.webp"]},
-        "scales": {"codebook": scale_levels, "files": ["scales.webp"]},
-        "quats": {"files": ["quats.webp"]},
-        "sh0": {"codebook": color_levels, "files": ["sh0.webp"]},
-    }
-    pictures = {name: _picture(values, picture_shape(count)) for name, values in texels.items()}
-    if scene.sh_degree:
-        meta["shN"], sh_pictures = _packed_sh(*_palette(scene, palette), scene.sh_degree)
-        pictures |= sh_pictures
-    return _write_archive(path, meta, pictures)
-
-
 def _palette(scene: CompressedScene, most: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Palette of spherical harmonics ``[K, D]`` in order of first use, and the row of each splat ``[N]``."""
     from nsvq_lightning.io.palette import find_palette, in_order_of_use  # imports Numba, which readers do without
@@ -354,14 +352,27 @@ def _picture(texels: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.ui
     return picture.reshape(*shape, 4)
 
 
+def _archived(path: Path) -> bytes:
+    """The zip archive; of a folder, whose ``meta.json`` is given, one with the pictures in it."""
+    if path.suffix.lower() != ".json":
+        return path.read_bytes()
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.write(path, META)
+        for picture in sorted(path.parent.glob("*.webp")):
+            archive.write(picture, picture.name)
+    return buffer.getvalue()
+
+
 def read_sog(path: str | os.PathLike[str]) -> CompressedScene:
-    """Read a ``.sog`` file; its palette becomes the codebook of the spherical harmonics.
+    """Read a ``.sog`` file or a ``meta.json`` in its folder; the palette becomes the codebook of the harmonics.
 
     Raises:
         FormatError: The file is truncated, altered, of another version, or not a ``.sog`` file.
     """
     with naming_file(path):
-        archive = _Archive(Path(path).read_bytes())
+        data = _archived(Path(path))
+        archive = _Archive(data)
         colors = archive.texels("sh0")
         raw = {"quats": archive.quats(), "scales": archive.values("scales", archive.texels("scales"))}
         raw["sh0"] = archive.values("sh0", colors)
@@ -373,15 +384,24 @@ def read_sog(path: str | os.PathLike[str]) -> CompressedScene:
         antialiased = archive.meta.get("model") == "antialiased" or archive.meta.get("antialias") is True
         config = {"antialiased": True} if antialiased else {}
         opacities = logits_of_bytes(colors[:, 3])
-        return CompressedScene(archive.means(), opacities, codes, codebooks, raw, archive.sh_degree, config)
+        scene = CompressedScene(archive.means(), opacities, codes, codebooks, raw, archive.sh_degree, config)
+        return replace(scene, stored_bytes=len(data))
 
 
-def read_sog_header(path: str | os.PathLike[str]) -> tuple[int, int, dict[str, int]]:
-    """Number of splats, SH degree, and size in bytes of each entry of a ``.sog`` archive, by name.
+def describe_sog(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Facts about a file, see :class:`nsvq_lightning.io.formats.Format`.
 
     Raises:
         FormatError: The file is truncated, of another version, or not a ``.sog`` file.
     """
+    path = Path(path)
     with naming_file(path):
-        archive = _Archive(Path(path).read_bytes())
-    return archive.count, archive.sh_degree, archive.sizes
+        data = _archived(path)
+        archive = _Archive(data)
+    streams = {name: ("json" if name == META else "webp", size) for name, size in archive.sizes.items()}
+    total = sum(archive.sizes.values())
+    if path.suffix.lower() != ".json":
+        streams["zip"] = "zip", len(data) - total
+        total = len(data)
+    facts = {"format": "sog, version 2", "splats": archive.count, "sh_degree": archive.sh_degree}
+    return {**facts, "streams": streams, "bytes": total}

@@ -13,6 +13,7 @@ offset     bytes  content
 import logging
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +27,6 @@ from nsvq_lightning.splats.conventions import SH_C0, unit
 logger = logging.getLogger(__name__)
 
 _RECORD = np.dtype([("means", "<f4", 3), ("lengths", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
-# Bytes of each part of a splat.
-SPLAT_LAYOUT = {name: _RECORD[name].itemsize for name in _RECORD.names or ()}
 
 
 def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:
@@ -76,7 +75,7 @@ def read_splat(path: str | os.PathLike[str]) -> CompressedScene:
     Raises:
         FormatError: The file does not consist of whole splats.
     """
-    count_splats(path)
+    describe_splat(path)
     records = np.frombuffer(Path(path).read_bytes(), _RECORD)
     colors = records["colors"]
     raw = {
@@ -88,8 +87,8 @@ def read_splat(path: str | os.PathLike[str]) -> CompressedScene:
     return CompressedScene(records["means"].astype(np.float32), logits_of_bytes(colors[:, 3]), raw=raw, sh_degree=0)
 
 
-def count_splats(path: str | os.PathLike[str]) -> int:
-    """Number of splats of a ``.splat`` file, which has no header.
+def describe_splat(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Facts about a file, which has no header, see :class:`nsvq_lightning.io.formats.Format`.
 
     Raises:
         FormatError: The file does not consist of whole splats.
@@ -101,4 +100,6 @@ def count_splats(path: str | os.PathLike[str]) -> int:
                 f"truncated, or not a .splat file: of {size} bytes the last {size % _RECORD.itemsize} are not "
                 f"a whole splat of {_RECORD.itemsize}"
             )
-    return size // _RECORD.itemsize
+    count = size // _RECORD.itemsize
+    streams = {name: ("splat", count * _RECORD[name].itemsize) for name in _RECORD.names or ()}
+    return {"format": "splat", "splats": count, "sh_degree": 0, "streams": streams}

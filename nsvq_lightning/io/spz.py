@@ -43,7 +43,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import atomic_write
-from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, rotated
+from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, in_morton_order, rotated
 from nsvq_lightning.io.errors import FormatError, check_room, naming_file
 from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, opacity_of
 from nsvq_lightning.splats import conventions
@@ -51,8 +51,6 @@ from nsvq_lightning.splats import conventions
 logger = logging.getLogger(__name__)
 
 _MAGIC = b"NGSP"
-# First bytes: those of gzip up to version 3, those of the plain header from version 4 on.
-SPZ_MAGICS = (b"\x1f\x8b", _MAGIC)
 
 
 @dataclass(frozen=True)
@@ -143,6 +141,20 @@ def read_spz_header(path: str | os.PathLike[str]) -> tuple[SpzHeader, dict[str, 
             return _unzip(data)[0], {"all": len(data)}
         header, lengths = _table(data)
     return header, {"header": len(data) - sum(lengths.values()), **lengths}
+
+
+def describe_spz(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Facts about a file, see :class:`nsvq_lightning.io.formats.Format`; errors as of :func:`read_spz_header`."""
+    header, sizes = read_spz_header(path)
+    axes = header.axes or f"not stated, taken as {DEFAULT_AXES.upper()}"
+    encoding = "zstd" if header.version == 4 else "gzip"
+    streams = {name: ("plain" if name == "header" else encoding, size) for name, size in sizes.items()}
+    return {
+        "format": f"spz, version {header.version}, axes {axes}",
+        "splats": header.count,
+        "sh_degree": header.sh_degree,
+        "streams": streams,
+    }
 
 
 def _unpack(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
@@ -290,9 +302,7 @@ def in_spz_order(scene: CompressedScene) -> CompressedScene:
 
     The codes of the spherical harmonics come first: in both versions, equal rows compress best when close together.
     """
-    from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
-
-    scene = scene.take(spatial_order(scene.means))
+    scene = in_morton_order(scene)
     codes = [scene.codes[name] for name in ("quats", "scales", "sh0", "shN") if name in scene.codes]  # shN sorts first
     return scene.take(np.lexsort([np.arange(len(scene)), *codes]))
 

@@ -2,20 +2,24 @@ from __future__ import annotations
 
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from compressed_scenes import arrays_of
-from viewer_scenes import coded_scene, nearest_in, needs_zstd
+from viewer_scenes import WRITTEN, coded_scene, nearest_in, needs_zstd, plain_scene
 
 from nsvq_lightning.commands.main import main as nsvq
+from nsvq_lightning.data.colmap import find_model, import_pycolmap
 from nsvq_lightning.data.scene import load_scene
-from nsvq_lightning.io import FORMATS, CompressedScene, read_scene, save
+from nsvq_lightning.io import CompressedScene, read_scene, save
+from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.spz import read_spz_header
 from nsvq_lightning.rendering.camera import up_of
 from nsvq_lightning.splats.splats import Splats
+from tests.support.splat_scenes import ball
 
 
 def main(arguments: list[str]) -> int:
@@ -33,12 +37,12 @@ def exported(scene: CompressedScene, folder: Path, storage: Storage, *formats: s
 def test_every_readable_format_becomes_every_writable_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = coded_scene(30, 1)
     (tmp_path / "new").mkdir()
-    for source in FORMATS:
+    for source in WRITTEN:
         save(scene, tmp_path / f"a{source}")
-        for target in FORMATS:
+        for target in WRITTEN:
             output = tmp_path / "new" / f"b{target}"
             assert main([str(tmp_path / f"a{source}"), str(output)]) == 0
-            assert f"30 splats in {output.stat().st_size:,} bytes" in capsys.readouterr().out
+            assert f"30 splats in {describe(output)['bytes']:,} bytes" in capsys.readouterr().out
             nearest_in(arrays_of(read_scene(output)), arrays_of(scene))
 
 
@@ -122,6 +126,12 @@ def test_measuring_says_how_the_pictures_differ(tmp_path: Path, capsys: pytest.C
         ("a.nsvq b.ply --up-from 0 0 1", "--up-from says where up is: add --up", 2),
         ("a.nsvq b.ply --floaters", "--floaters asks the photos: add --data.root", 2),
         ("a.nsvq b.ply --crop 1 1 1 2 2 2 --measure", "--measure compares with the input as it is", 2),
+        ("a.nsvq a.nsvq b.ply --measure", "--measure compares with the input as it is", 2),
+        ("a.nsvq b.ply --align x", "--align moves the cameras of a scene folder: add --data.root", 2),
+        ("a.nsvq b.ply --up y --matrix 1 0 0 0 0 1 0 0 0 0 1 0", "not allowed with argument", 2),
+        ("a.nsvq b.ply --matrix 1 0 0 0 0 2 0 0 0 0 1 0", "splats can be turned and scaled evenly only", 1),
+        ("a.nsvq b.ply --splats 0", "expected a number of splats, or a share such as 25%", 2),
+        ("a.nsvq none/meta.json", "the folder none does not exist", 1),
     ],
 )
 def test_what_cannot_be_is_told_and_writes_nothing(
@@ -181,3 +191,55 @@ def test_floaters_ask_the_photos(demo_scene: Path, tmp_path: Path, capsys: pytes
     assert found is not None
     assert len(read_scene(tmp_path / "b.ply")) == 500 - int(found[1])
     assert float(found[3]) >= float(found[2])
+
+
+def test_scenes_are_joined_moved_and_lose_bands(tmp_path: Path) -> None:
+    small, large = coded_scene(20, 1), plain_scene(30, 2)
+    save(small, tmp_path / "a.nsvq", Storage("paper"))
+    save(large, tmp_path / "b.ply")
+    matrix = ["0", "-2", "0", "1", "2", "0", "0", "2", "0", "0", "2", "3"]
+    files = [str(tmp_path / name) for name in ("a.nsvq", "b.ply", "c.ply")]
+    assert main([*files, "--matrix", *matrix, "--sh-degree", "1"]) == 0
+    both, parts = read_scene(tmp_path / "c.ply"), [arrays_of(small), arrays_of(large)]
+    x, y, z = np.concatenate([part.means for part in parts]).T
+    np.testing.assert_allclose(both.means, np.stack([1 - 2 * y, 2 + 2 * x, 3 + 2 * z], 1), rtol=1e-5, atol=1e-5)
+    scales = np.concatenate([part.scales for part in parts])
+    np.testing.assert_allclose(both.values("scales"), scales + np.log(2), rtol=1e-5, atol=1e-5)
+    assert (both.sh_degree, both.values("shN").shape) == (1, (50, 3, 3))
+
+
+def test_scenes_with_codebooks_keep_them_when_joined(tmp_path: Path) -> None:
+    paths = [tmp_path / f"{rows}.nsvq" for rows in (20, 12)]
+    for rows, path in zip((20, 12), paths, strict=True):
+        save(coded_scene(rows, 2, rows), path, Storage("paper"))
+    assert main([*map(str, paths), str(tmp_path / "c.nsvq"), "--level", "paper"]) == 0
+    parts, both = [read_scene(path) for path in paths], read_scene(tmp_path / "c.nsvq")
+    assert set(both.codes) == {"scales", "sh0", "shN"}
+    for name in ("means", "scales", "sh0", "shN"):
+        np.testing.assert_array_equal(both.values(name), np.concatenate([part.values(name) for part in parts]))
+
+
+def test_a_moved_scene_is_aligned_with_the_cameras_of_another(demo_scene: Path, tmp_path: Path) -> None:
+    """Oracle: cameras and splats moved by the same similarity, the cameras by pycolmap."""
+    pycolmap = import_pycolmap()
+    matrix = np.array([[0.0, -2, 0, 5], [2, 0, 0, -1], [0, 0, 2, 3]])
+    there = pycolmap.Reconstruction(str(find_model(demo_scene)["cameras"].parent))
+    there.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(matrix[:, :3] / 2), matrix[:, 3]))
+    (tmp_path / "other" / "sparse").mkdir(parents=True)
+    there.write(str(tmp_path / "other" / "sparse"))
+    scene = plain_scene(20, 1)
+    save(scene, tmp_path / "a.ply")
+    align = ["--data.root", str(demo_scene), "--align", str(tmp_path / "other")]
+    assert main([str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), *align]) == 0
+    expected = scene.means @ matrix[:, :3].T + matrix[:, 3]
+    np.testing.assert_allclose(read_scene(tmp_path / "b.ply").means, expected, atol=1e-4)
+
+
+def test_thinning_keeps_what_shows(tmp_path: Path) -> None:
+    scene = ball(400, 1)
+    hidden = replace(scene, opacities=np.where(np.arange(400) < 300, scene.opacities, np.float32(-9)))
+    save(hidden, tmp_path / "a.ply")
+    assert main([str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), "--splats", "50%"]) == 0
+    kept = read_scene(tmp_path / "b.ply")
+    assert len(kept) == 200
+    assert kept.opacities.min() > -8

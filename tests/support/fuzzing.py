@@ -211,7 +211,7 @@ def _read_scene(path: Path) -> object:
     with suppress(FormatError):
         describe(path)
     scene = read_scene(path)
-    finite = {".ply": (), ".nsvq": (), ".splat": ("opacities", "sh0")}
+    finite = {".ply": (), ".nsvq": (), ".glb": (), ".usda": (), ".splat": ("opacities", "sh0")}
     values = {name: scene.values(name) for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
     for name in finite.get(path.suffix, ("quats", "scales", "opacities", "sh0", "shN")):
         assert np.isfinite(values[name]).all(), name
@@ -365,6 +365,10 @@ def targets() -> dict[str, Target]:
         "spz": Target(partial(_build_viewer, suffix=".spz"), _read_scene, (FormatError,), _mend_spz),
         "spz4": Target(partial(_build_viewer, suffix=".spz", version=4), _read_scene, (FormatError,)),
         "sog": Target(partial(_build_viewer, suffix=".sog"), _read_scene, (FormatError,), _mend_sog),
+        "compressed-ply": Target(partial(_build_viewer, suffix=".compressed.ply"), _read_scene, (FormatError,)),
+        "glb": Target(partial(_build_viewer, suffix=".glb"), _read_scene, (FormatError,)),
+        "usda": Target(partial(_build_viewer, suffix=".usda"), _read_scene, (FormatError,)),
+        "lod": Target(partial(_build_viewer, suffix="lod-meta.json"), _read_scene, (FormatError,)),
         "splat": Target(partial(_build_viewer, suffix=".splat"), _read_scene, (FormatError,)),
         "colmap-bin": Target(partial(_build_colmap, suffix=".bin"), _read_colmap, (SceneError,)),
         "colmap-txt": Target(partial(_build_colmap, suffix=".txt"), _read_colmap, (SceneError,)),

@@ -11,8 +11,10 @@ import pytest
 from compressed_scenes import scene_of
 from numpy.typing import NDArray
 
-from nsvq_lightning.io import CompressedScene
+from nsvq_lightning.io import FORMATS, CompressedScene
 
+WRITTEN = [suffix for suffix, entry in FORMATS.items() if entry.write is not None]
+"""Formats that are written; all are read."""
 HAS_ZSTD = any(find_spec(parent) and find_spec(f"{parent}.zstd") for parent in ("compression", "backports"))
 needs_zstd = pytest.mark.skipif(not HAS_ZSTD, reason="no Zstandard: pip install 'nsvq-lightning[spz]'")
 

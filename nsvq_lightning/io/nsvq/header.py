@@ -250,3 +250,19 @@ def read_frame(path: str | os.PathLike[str]) -> tuple[Header, dict[str, memoryvi
 def read_header(path: str | os.PathLike[str]) -> Header:
     """Header of a ``.nsvq`` file, after verifying the checksum of the whole file."""
     return read_frame(path)[0]
+
+
+def describe_nsvq(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Facts about a file, see :class:`nsvq_lightning.io.formats.Format`; errors are those of :func:`read_header`."""
+    header, total = read_header(path), os.path.getsize(path)
+    header_bytes = total - sum(stream.length for stream in header.streams)
+    return {
+        "format": f"nsvq, level {header.level}",
+        "splats": header.splats,
+        "sh_degree": header.sh_degree,
+        "origin": list(header.origin),
+        "attributes": [{**entry._asdict(), "bits": entry.bits} for entry in header.attributes],
+        "streams": {"header": ("json", header_bytes)} | {s.name: (s.encoding, s.length) for s in header.streams},
+        "config": header.config,
+        "metrics": header.metrics,
+    }

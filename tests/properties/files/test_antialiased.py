@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 from compressed_scenes import scene as coded
+from viewer_scenes import WRITTEN
 
-from nsvq_lightning.io.formats import FORMATS, read_scene, save
+from nsvq_lightning.io.formats import read_scene, save
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("suffix", WRITTEN)
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_files_keep_it_or_warn(
     suffix: str, antialiased: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture

@@ -25,6 +25,10 @@ CASES = {
     "spz": 100,
     "spz4": 100,
     "sog": 100,
+    "compressed-ply": 60,
+    "glb": 100,
+    "usda": 60,
+    "lod": 60,
     "splat": 50,
     "colmap-bin": 60,
     "colmap-txt": 50,
@@ -33,7 +37,7 @@ CASES = {
     "checkpoint": 60,
 }
 """Cases in a quick test; in a slow one three times as many."""
-ALIKE = ("spz4", "splat", "colmap-txt")
+ALIKE = ("spz4", "splat", "compressed-ply", "colmap-txt")
 """Kinds whose reader is mostly that of another: slow tests only."""
 KINDS = [pytest.param(kind, marks=[pytest.mark.slow] if kind in ALIKE else []) for kind in CASES]
 

@@ -10,9 +10,10 @@ import pytest
 from compressed_scenes import arrays_of
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from viewer_scenes import WRITTEN
 
 from nsvq_lightning.io import CompressedScene, read_nsvq, write_nsvq
-from nsvq_lightning.io.formats import FORMATS, read_scene, save
+from nsvq_lightning.io.formats import read_scene, save
 from nsvq_lightning.io.nsvq.precision import Precision, Storage
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims
 
@@ -81,7 +82,7 @@ def test_compact_keeps_every_splat_where_it_promises(tmp_path: Path) -> None:
         assert (distance > 1.07 * bound + rounding).sum() <= np.ceil(len(scene) / 1000), f"seed {seed}"
 
 
-@pytest.mark.parametrize("suffix", sorted(FORMATS))
+@pytest.mark.parametrize("suffix", sorted(WRITTEN))
 def test_the_same_scene_gives_the_same_bytes_and_all_its_splats(suffix: str, tmp_path: Path) -> None:
     first, second = tmp_path / f"first{suffix}", tmp_path / f"second{suffix}"
     for seed in range(CASES):

@@ -107,6 +107,29 @@ def test_others_read_what_was_meant(
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
+@pytest.mark.parametrize("degree", range(4))
+def test_others_read_our_compressed_ply(tmp_path: Path, degree: int, program: str) -> None:
+    save(plain_scene(COUNT + 256, degree), tmp_path / "x.compressed.ply")
+    ours = arrays_of(read_scene(tmp_path / "x.compressed.ply"))
+    assert_same(as_read(program, tmp_path / "x.compressed.ply"), ours, opacity=1.1e-3)
+
+
+@pytest.mark.viewers
+@pytest.mark.parametrize("degree", [0, 3])
+def test_splat_transform_reads_our_streamed_sog_and_we_its_glb(tmp_path: Path, degree: int) -> None:
+    scene = plain_scene(COUNT, degree)
+    save(scene, tmp_path / "lod-meta.json")
+    ours = arrays_of(read_scene(tmp_path / "lod-meta.json"))
+    theirs = read_table(convert("splat-transform", tmp_path / "lod-meta.json", tmp_path / "read.csv"))
+    order = nearest_in(theirs, ours)
+    for name, values in vars(ours).items():
+        np.testing.assert_allclose(getattr(theirs, name), values[order], atol=2e-5, err_msg=name)
+    save(scene, tmp_path / "x.ply")
+    glb = convert("splat-transform", tmp_path / "x.ply", tmp_path / "x.glb")
+    assert_same(arrays_of(read_scene(glb)), arrays_of(scene), opacity=5e-5)
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
 def test_others_read_the_ply_of_a_compressed_scene(tmp_path: Path, program: str) -> None:
     save(coded_scene(COUNT), tmp_path / "x.nsvq")
     scene = read_scene(tmp_path / "x.nsvq")

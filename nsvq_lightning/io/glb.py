@@ -1,0 +1,221 @@
+"""glTF 2.0 in one file (``.glb``) with the extension KHR_gaussian_splatting, for exchange: 240 bytes a splat.
+
+Splats are the points of a mesh primitive. Its attributes are ``POSITION``, ``COLOR_0`` for readers without the
+extension, and those of the extension: ``ROTATION`` (xyzw), ``SCALE`` (lengths), ``OPACITY``, and a vector of three
+colours for each spherical harmonic. glTF has y up: our right, down, front turned half around z.
+"""
+
+import json
+import os
+import struct
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.compressed import HALF_TURN, CompressedScene, joined, moved, rotated
+from nsvq_lightning.io.errors import FormatError, check_room, naming_file
+from nsvq_lightning.io.numbers import logits_of, opacity_of
+from nsvq_lightning.splats.conventions import SH_C0, sh_coefficients, unit
+
+EXTENSION = "KHR_gaussian_splatting"
+# Magic, version, length of the file; then, of each chunk, length and type.
+_HEAD, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+_MOST_JSON = 1 << 26
+_FLOAT, _BYTE, _ARRAY_BUFFER = 5126, 5121, 34962
+_COMPONENTS = {5120: "i1", _BYTE: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+
+
+def _harmonic(number: int) -> str:
+    """Name of a coefficient, counted over all degrees from 0."""
+    degree = int(number**0.5)
+    return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{number - degree * degree}"
+
+
+def write_glb(path: str | os.PathLike[str], scene: CompressedScene) -> int:
+    """Write a scene as ``.glb``, in float32.
+
+    Returns:
+        Bytes of the file.
+    """
+    scene = rotated(scene, HALF_TURN)
+    opacities, sh0 = opacity_of(scene.opacities), scene.values("sh0")[:, 0]
+    # The fallback is linear light; what the splats have is meant for display.
+    shown = np.clip(0.5 + SH_C0 * sh0.astype(np.float64), 0, 1)
+    linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    arrays: dict[str, NDArray[Any]] = {
+        "POSITION": scene.means,
+        "COLOR_0": np.rint(255 * np.c_[linear, opacities]).astype(np.uint8),
+        f"{EXTENSION}:ROTATION": unit(scene.values("quats"))[:, [1, 2, 3, 0]].astype(np.float32),
+        f"{EXTENSION}:SCALE": np.exp(scene.values("scales")),
+        f"{EXTENSION}:OPACITY": opacities.astype(np.float32)[:, None],
+        _harmonic(0): sh0,
+    }
+    shN = scene.values("shN")
+    arrays |= {_harmonic(number + 1): shN[:, number] for number in range(sh_coefficients(scene.sh_degree))}
+    kinds = {width: name for name, width in _WIDTHS.items()}
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    end = 0
+    for values in arrays.values():
+        views.append({"buffer": 0, "byteOffset": end, "byteLength": values.nbytes, "target": _ARRAY_BUFFER})
+        accessor = {"bufferView": len(accessors), "count": len(scene), "type": kinds[values.shape[1]]}
+        is_byte = values.dtype == np.uint8
+        accessors.append(accessor | {"componentType": _BYTE if is_byte else _FLOAT, "normalized": is_byte})
+        end += values.nbytes
+    if len(scene):
+        accessors[0] |= {"min": scene.means.min(0).tolist(), "max": scene.means.max(0).tolist()}
+    about = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    about |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
+    attributes = {name: number for number, name in enumerate(arrays)}
+    primitive = {"mode": 0, "attributes": attributes, "extensions": {EXTENSION: about}}
+    asset: dict[str, Any] = {"version": "2.0", "generator": "nsvq-lightning"}
+    if scene.antialiased:
+        asset["extras"] = {"antialiased": True}
+    document = {
+        "asset": asset,
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": end}],
+    }
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    total = _HEAD.size + 2 * _CHUNK.size + len(text) + end
+    with atomic_write(path) as file:
+        file.write(_HEAD.pack(b"glTF", 2, total) + _CHUNK.pack(len(text), b"JSON") + text + _CHUNK.pack(end, b"BIN\0"))
+        for values in arrays.values():
+            file.write(np.ascontiguousarray(values).data)
+    return total
+
+
+def read_glb(path: str | os.PathLike[str]) -> CompressedScene:
+    """Read all splats of the scene of a ``.glb`` file, where its nodes put them.
+
+    Raises:
+        FormatError: The file is truncated, altered, no ``.glb`` file, or holds no Gaussian splats that are read:
+            numbers in sparse accessors or other files, compressed ones, and nodes that stretch splats unevenly are not.
+    """
+    with naming_file(path):
+        document, data = _parsed(Path(path).read_bytes())
+        try:
+            parts, count = [], 0
+            for primitive, matrix in _primitives(document):
+                parts.append(moved(_splats(document, data, primitive), matrix))
+                count += len(parts[-1])
+                check_room("splats", count, len(data))  # primitives may share their numbers
+            if not parts:
+                raise FormatError("no primitive has the extension KHR_gaussian_splatting", "give a file of splats")
+            scene = rotated(joined(parts), HALF_TURN)
+            extras = document["asset"].get("extras")
+        except (KeyError, TypeError, IndexError, AttributeError, ValueError, RecursionError) as error:
+            if isinstance(error, FormatError):
+                raise
+            raise FormatError(f"damaged, or of a kind that is not read: {error!r}") from None
+    antialiased = isinstance(extras, dict) and extras.get("antialiased") is True
+    return replace(scene, config={"antialiased": True}) if antialiased else scene
+
+
+def _parsed(data: bytes) -> tuple[dict[str, Any], memoryview]:
+    """JSON and binary chunk."""
+    if len(data) < _HEAD.size + _CHUNK.size or data[:4] != b"glTF":
+        raise FormatError("not a .glb file: it does not start with a whole header 'glTF'")
+    _, version, total = _HEAD.unpack_from(data)
+    length, kind = _CHUNK.unpack_from(data, _HEAD.size)
+    start = _HEAD.size + _CHUNK.size
+    if version != 2 or total > len(data) or kind != b"JSON" or start + length > len(data) or length > _MOST_JSON:
+        raise FormatError(f"truncated or damaged: version {version}, {total} of {len(data)} bytes, a chunk of {length}")
+    try:
+        document = json.loads(data[start : start + length])
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"damaged: the first chunk is not JSON ({error})") from None
+    if not isinstance(document, dict):
+        raise FormatError("damaged: the first chunk is not a JSON object")
+    return document, memoryview(data)[start + length + _CHUNK.size :]
+
+
+def _primitives(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
+    """Those with splats, and the matrix ``[4, 4]`` of the node that each is in."""
+    nodes = document["nodes"]
+    stack = [(number, np.eye(4)) for number in reversed(document["scenes"][document.get("scene", 0)]["nodes"])]
+    steps = 0
+    while stack:
+        number, outer = stack.pop()
+        node, steps = nodes[number], steps + 1
+        if steps > len(nodes):
+            raise ValueError("a node is in two others")
+        matrix = outer @ _matrix(node)
+        stack += [(child, matrix) for child in reversed(node.get("children", ()))]
+        for primitive in document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
+            if EXTENSION in primitive.get("extensions", {}):
+                yield primitive, matrix
+
+
+def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
+    """What a node does to what is in it ``[4, 4]``."""
+    from scipy.spatial.transform import Rotation
+
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    matrix = np.eye(4)
+    turn = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1))).as_matrix()
+    matrix[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), np.float64)
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
+
+
+def _splats(document: dict[str, Any], data: memoryview, primitive: dict[str, Any]) -> CompressedScene:
+    """The splats of a primitive, in the axes of the file."""
+    names = primitive["attributes"]
+    if inner := primitive["extensions"][EXTENSION].get("extensions"):
+        raise FormatError(f"splats are compressed by {', '.join(inner)}, which is not read", "save them without it")
+
+    def values(name: str) -> NDArray[np.float32]:
+        return _accessor(document, data, names[name])
+
+    degree = max(degree for degree in range(4) if _harmonic((degree + 1) ** 2 - 1) in names)
+    higher = [values(_harmonic(number + 1)) for number in range(sh_coefficients(degree))]
+    means = values("POSITION")
+    raw = {
+        "quats": values(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
+        "scales": np.log(values(f"{EXTENSION}:SCALE").clip(np.finfo(np.float32).tiny)),
+        "sh0": values(_harmonic(0)),
+        "shN": np.concatenate([np.zeros((len(means), 0), np.float32), *higher], axis=1),
+    }
+    return CompressedScene(means, logits_of(values(f"{EXTENSION}:OPACITY")[:, 0]), raw=raw, sh_degree=degree)
+
+
+def _accessor(document: dict[str, Any], data: memoryview, number: int) -> NDArray[np.float32]:
+    """Rows ``[N, D]`` of an accessor."""
+    accessor = document["accessors"][number]
+    view = document["bufferViews"][accessor["bufferView"]]
+    if "sparse" in accessor or view.get("buffer", 0) or "uri" in document["buffers"][0]:
+        raise FormatError("numbers in sparse accessors or in other files are not read", "save it as a plain .glb")
+    dtype, width, count = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[accessor["type"]], accessor["count"]
+    start, stride = view.get("byteOffset", 0) + accessor.get("byteOffset", 0), view.get("byteStride")
+    row = width * dtype.itemsize
+    stride = row if stride is None else stride
+    if type(count) is not int or count < 0 or start < 0 or stride < row:
+        raise ValueError(f"accessor {number} is out of range")
+    if count and start + (count - 1) * stride + row > len(data):
+        raise FormatError(f"truncated: accessor {number} ends beyond the file")
+    rows = np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize)).astype(np.float32)
+    if dtype.kind != "f":  # normalized
+        rows = np.maximum(rows / np.float32(np.iinfo(dtype).max), np.float32(-1))
+    return rows
+
+
+def describe_glb(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Facts about a file, see :class:`nsvq_lightning.io.formats.Format`; errors are those of :func:`read_glb`."""
+    scene, total = read_glb(path), os.path.getsize(path)
+    streams = {"file": ("glTF", total)}
+    return {"format": f"glb, {EXTENSION}", "splats": len(scene), "sh_degree": scene.sh_degree, "streams": streams}

@@ -1,0 +1,212 @@
+"""Streamed SOG of PlayCanvas: a folder with levels of detail, which viewers load coarse first, then fine.
+
+``lod-meta.json`` has a tree of boxes. Each leaf says, for each level, which run of splats of which file lies in its
+box; level 0 is the finest. A file is a folder of SOG (:mod:`nsvq_lightning.io.sog`) with the runs of several leaves of
+one level, each in Morton order.
+"""
+
+import itertools
+import json
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nsvq_lightning.io.atomic import atomic_write, write_text
+from nsvq_lightning.io.compressed import CompressedScene, joined
+from nsvq_lightning.io.errors import FormatError, naming_file
+from nsvq_lightning.io.sog import META, PALETTE_LIMIT, describe_sog, read_sog, sog_contents
+from nsvq_lightning.splats.conventions import unit
+
+NAME = "lod-meta.json"
+# Most splats of the finest level in a leaf, and of any level in a file.
+LEAF, FILE = 1 << 14, 1 << 17
+# The box of a splat ends where its density is that of so many standard deviations.
+_REACH = 3.0
+
+# Splats of each level.
+_Rows = list[NDArray[np.intp]]
+_Node = dict[str, Any]
+
+
+def write_lod(
+    path: str | os.PathLike[str],
+    scene: CompressedScene,
+    *,
+    coarser: Sequence[CompressedScene] = (),
+    palette: int = PALETTE_LIMIT,
+) -> int:
+    """Write a scene as streamed SOG: ``lod-meta.json`` and, beside it, the folders that it names.
+
+    Folders are named after their content, and the index is replaced last: a failed write leaves the old scene whole.
+    Folders that only the old index names are removed.
+
+    Args:
+        path: The ``lod-meta.json``.
+        scene: The finest level.
+        coarser: Coarser levels of the same scene, finest first.
+        palette: See :func:`nsvq_lightning.io.sog.sog_contents`.
+
+    Returns:
+        Bytes of all files.
+
+    Raises:
+        ValueError: A level is not coarser than the one before it.
+    """
+    levels, target = [scene, *(level.finite() for level in coarser)], Path(path)
+    counts = [len(level) for level in levels]
+    if any(a <= b for a, b in itertools.pairwise(counts)):
+        raise ValueError(f"each level must have fewer splats than the one before it, got {counts}")
+    tree, leaves = _tree(levels)
+    old: list[str] = []
+    with suppress(FileNotFoundError, FormatError):
+        old = _index(target)["filenames"]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    names: list[str] = []
+    total = 0
+    for level, splats in enumerate(levels):
+        for number, runs in enumerate(_files([rows[level] for rows, _ in leaves])):
+            contents = sog_contents(splats.take(np.concatenate([leaves[leaf][0][level] for leaf in runs])), palette)
+            # Those of two indices in one folder differ.
+            folder = (
+                f"{target.name[: -len(NAME)]}{level}_{number}_{sha256(b''.join(contents.values())).hexdigest()[:8]}"
+            )
+            (target.parent / folder).mkdir(exist_ok=True)
+            for name, data in contents.items():
+                with atomic_write(target.parent / folder / name) as file:
+                    total += file.write(data)
+            offset = 0
+            for leaf in runs:
+                rows, node = leaves[leaf]
+                node["lods"][str(level)] = {"file": len(names), "offset": offset, "count": len(rows[level])}
+                offset += len(rows[level])
+            names.append(f"{folder}/{META}")
+    about = {"version": 1, "asset": {"generator": "nsvq-lightning"}, "count": sum(counts), "counts": counts}
+    index = json.dumps(about | {"lodLevels": len(levels), "filenames": names, "tree": tree}, separators=(",", ":"))
+    write_text(target, index)
+    for folder in {name.partition("/")[0] for name in old} - {name.partition("/")[0] for name in names}:
+        shutil.rmtree(target.parent / folder, ignore_errors=True)
+    return total + len(index)
+
+
+def in_lod_order(scene: CompressedScene) -> CompressedScene:
+    """The splats in the order of a file's finest level: leaf by leaf, in Morton order in each."""
+    _, leaves = _tree([scene])
+    return scene.take(np.concatenate([rows[0] for rows, _ in leaves]))
+
+
+def _tree(levels: Sequence[CompressedScene]) -> tuple[_Node, list[tuple[_Rows, _Node]]]:
+    """The root, and in their order the leaves with the splats of each level in them."""
+    from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
+
+    boxes = [_boxes(level) for level in levels]
+    leaves: list[tuple[_Rows, _Node]] = []
+
+    def node(rows: _Rows) -> _Node:
+        lows, highs = ([box[some] for box, some in zip(ends, rows, strict=True)] for ends in zip(*boxes, strict=True))
+        low, high = np.concatenate(lows).min(0, initial=np.inf), np.concatenate(highs).max(0, initial=-np.inf)
+        bound = {name: [float(f"{x:.7g}") for x in end] for name, end in (("min", low), ("max", high))}
+        positions = [level.means[some] for level, some in zip(levels, rows, strict=True)]
+        axis = int(positions[0].std(0).argmax()) if len(rows[0]) else 0
+        middle = np.median(positions[0][:, axis]) if len(rows[0]) else 0.0
+        below = [points[:, axis] < middle for points in positions]
+        if len(rows[0]) > LEAF and below[0].any():
+            halves = [[some[side ^ upper] for some, side in zip(rows, below, strict=True)] for upper in (False, True)]
+            return {"bound": bound, "children": [node(half) for half in halves]}
+        leaf: _Node = {"bound": bound, "lods": {}}
+        leaves.append(([some[spatial_order(p)] for some, p in zip(rows, positions, strict=True)], leaf))
+        return leaf
+
+    return node([np.arange(len(level)) for level in levels]), leaves
+
+
+def _boxes(scene: CompressedScene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Smallest and largest coordinates ``[N, 3]`` of the ellipsoid of each splat."""
+    from scipy.spatial.transform import Rotation
+
+    axes = Rotation.from_quat(unit(scene.values("quats"))[:, [1, 2, 3, 0]]).as_matrix() if len(scene) else np.eye(3)
+    lengths = np.exp(scene.values("scales").astype(np.float64))
+    reach = _REACH * np.sqrt(np.square(axes * lengths[:, None, :]).sum(2))
+    return scene.means - reach, scene.means + reach
+
+
+def _files(runs: _Rows) -> Iterator[list[int]]:
+    """Which leaves, of those that have any splats, share a file."""
+    some: list[int] = []
+    count = 0
+    for leaf, rows in enumerate(runs):
+        if some and count + len(rows) > FILE:
+            yield some
+            some, count = [], 0
+        if len(rows):
+            some.append(leaf)
+            count += len(rows)
+    yield some or [0]
+
+
+# Of an index; one of 100 million splats has a fifth of it.
+_MOST_BYTES = 1 << 26
+
+
+def _index(path: Path) -> dict[str, Any]:
+    """The checked content of ``lod-meta.json``."""
+    with naming_file(path):
+        if path.stat().st_size > _MOST_BYTES:
+            raise FormatError(f"damaged: an index cannot have {path.stat().st_size} bytes")
+        try:
+            index = json.loads(path.read_bytes())
+            names, nodes = [PurePosixPath(name) for name in index["filenames"]], [index["tree"]]
+            finest: dict[int, None] = {}
+            while nodes:
+                node = nodes.pop()
+                nodes += reversed(node.get("children", ()))
+                if "0" in node.get("lods", {}):
+                    finest[range(len(names))[node["lods"]["0"]["file"]]] = None
+        except (ValueError, RecursionError, KeyError, TypeError, IndexError, AttributeError) as error:
+            raise FormatError(f"damaged: not the index of a streamed SOG ({error!r})") from None
+        if strange := [str(name) for name in names if len(name.parts) != 2 or ".." in name.parts or name.name != META]:
+            raise FormatError(f"damaged: {strange[0][:80]!r} is no FOLDER/{META} beside it")
+        if not finest:
+            raise FormatError("damaged: no leaf has splats of level 0")
+        if absent := [str(name) for name in names if not (path.parent / name).is_file()]:
+            raise FormatError(f"incomplete: {absent[0]} is missing", "copy the whole folder again")
+        if index.get("version") != 1:
+            raise FormatError(f"version {str(index.get('version'))[:40]} of the format; this release reads version 1")
+    return {**index, "finest": list(finest)}
+
+
+def read_lod(path: str | os.PathLike[str]) -> CompressedScene:
+    """Read the finest level of a streamed SOG.
+
+    Raises:
+        FormatError: A file is truncated, altered or of another version.
+        OSError: A file cannot be read.
+    """
+    path = Path(path)
+    index = _index(path)
+    parts = [read_sog(path.parent / index["filenames"][number]) for number in index["finest"]]
+    return replace(joined(parts), stored_bytes=sum(part.stored_bytes or 0 for part in parts))
+
+
+def describe_lod(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Facts about the files, see :class:`nsvq_lightning.io.formats.Format`; errors are those of :func:`read_lod`."""
+    path = Path(path)
+    index = _index(path)
+    found = [describe_sog(path.parent / name) for name in index["filenames"]]
+    streams = {META: ("json", path.stat().st_size)}
+    streams |= {name: ("sog", facts["bytes"]) for name, facts in zip(index["filenames"], found, strict=True)}
+    finest = [found[number] for number in index["finest"]]
+    return {
+        "format": f"streamed sog, {index.get('lodLevels', 1)} levels",
+        "splats": sum(facts["splats"] for facts in finest),
+        "sh_degree": max((facts["sh_degree"] for facts in finest), default=0),
+        "streams": streams,
+        "bytes": sum(size for _, size in streams.values()),
+    }

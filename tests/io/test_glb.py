@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from compressed_scenes import arrays_of
+from numpy.typing import NDArray
+from viewer_scenes import angles, plain_scene, sigmoid
+
+from nsvq_lightning.io import FormatError, read_scene, save
+
+NAME = "KHR_gaussian_splatting"
+# By the text of the extension: coefficients of degree l, in the order m = -l...l, turn half around z by (-1)^m.
+SIGNS = [-1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1]
+
+
+def parts(path: Path) -> tuple[dict[str, Any], bytes]:
+    data = path.read_bytes()
+    magic, version, total, length, kind = struct.unpack_from("<4sIII4s", data)
+    assert (magic, version, total, kind, length % 4) == (b"glTF", 2, len(data), b"JSON", 0)
+    size, kind = struct.unpack_from("<I4s", data, 20 + length)
+    assert (kind, size) == (b"BIN\0", len(data) - 28 - length)
+    return json.loads(data[20 : 20 + length]), data[28 + length :]
+
+
+def attribute(document: dict[str, Any], data: bytes, name: str) -> NDArray[np.float32]:
+    accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"][name]]
+    view, width = document["bufferViews"][accessor["bufferView"]], {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+    dtype = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+    return np.frombuffer(data, dtype, width * accessor["count"], view["byteOffset"]).reshape(-1, width)
+
+
+def write(path: Path, document: dict[str, Any], data: bytes) -> Path:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    return path
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_it_holds_what_the_extension_says(tmp_path: Path, degree: int) -> None:
+    """Oracle: the text of the extension."""
+    scene = plain_scene(50, degree)
+    plain = arrays_of(scene)
+    save(scene, tmp_path / "x.glb")
+    document, data = parts(tmp_path / "x.glb")
+    primitive = document["meshes"][0]["primitives"][0]
+    assert primitive["mode"] == 0
+    assert primitive["extensions"][NAME]["kernel"] == "ellipse"
+    assert primitive["extensions"][NAME]["colorSpace"] == "srgb_rec709_display"
+    assert len(primitive["attributes"]) == 5 + (degree + 1) ** 2
+    means = attribute(document, data, "POSITION")
+    np.testing.assert_array_equal(means, plain.means * np.float32([-1, -1, 1]))
+    assert document["accessors"][0]["max"] == pytest.approx(means.max(0).tolist())
+    np.testing.assert_allclose(attribute(document, data, f"{NAME}:SCALE"), np.exp(plain.scales), rtol=1e-6)
+    opacities = attribute(document, data, f"{NAME}:OPACITY")[:, 0]
+    np.testing.assert_allclose(opacities, sigmoid(plain.opacities), atol=1e-7)
+    np.testing.assert_array_equal(attribute(document, data, f"{NAME}:SH_DEGREE_0_COEF_0"), plain.sh0[:, 0])
+    names = [f"{NAME}:SH_DEGREE_{band}_COEF_{n}" for band in range(1, degree + 1) for n in range(2 * band + 1)]
+    for number, name in enumerate(names):
+        expected = SIGNS[number] * plain.shN[:, number]
+        np.testing.assert_allclose(attribute(document, data, name), expected, atol=1e-6)
+
+
+def test_covariances_are_turned_half_around_z(tmp_path: Path) -> None:
+    """Oracle: R diag(s²) Rᵀ by scipy."""
+    from scipy.spatial.transform import Rotation
+
+    scene = plain_scene(50, 0)
+    save(scene, tmp_path / "x.glb")
+    document, data = parts(tmp_path / "x.glb")
+
+    def covariances(quats: NDArray[Any], scales: NDArray[Any]) -> NDArray[np.float64]:
+        axes = Rotation.from_quat(quats).as_matrix() * scales[:, None, :].astype(np.float64)
+        return axes @ axes.transpose(0, 2, 1)
+
+    theirs = (attribute(document, data, f"{NAME}:{name}") for name in ("ROTATION", "SCALE"))
+    plain, turn = arrays_of(scene), np.diag([-1.0, -1, 1])
+    expected = turn @ covariances(plain.quats[:, [1, 2, 3, 0]], np.exp(plain.scales)) @ turn
+    np.testing.assert_allclose(covariances(*theirs), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_nodes_put_splats_in_their_place_and_small_numbers_are_read(tmp_path: Path) -> None:
+    scene = plain_scene(20, 1)
+    save(scene, tmp_path / "x.glb")
+    document, data = parts(tmp_path / "x.glb")
+    document["nodes"] = [
+        {"children": [1, 2], "translation": [1, 2, 3]},
+        {"mesh": 0, "scale": [2, 2, 2]},
+        {"mesh": 0, "matrix": [0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]},
+    ]
+    names = document["meshes"][0]["primitives"][0]["attributes"]
+    opacity = np.rint(255 * attribute(document, data, f"{NAME}:OPACITY")).astype(np.uint8)
+    rotation = np.rint(32767 * attribute(document, data, f"{NAME}:ROTATION")).astype("<i2")
+    for name, values, kind in ((f"{NAME}:OPACITY", opacity, 5121), (f"{NAME}:ROTATION", rotation, 5122)):
+        view = document["bufferViews"][document["accessors"][names[name]]["bufferView"]]
+        view["byteOffset"], view["byteLength"] = len(data), values.nbytes
+        document["accessors"][names[name]] |= {"componentType": kind, "normalized": True}
+        data += values.tobytes()
+    document["buffers"][0]["byteLength"] = len(data)
+    back, plain = read_scene(write(tmp_path / "y.glb", document, data)), arrays_of(scene)
+    x, y, z = (plain.means * [-1, -1, 1]).T
+    doubled, turned = np.stack([2 * x, 2 * y, 2 * z], 1), np.stack([-y, x, z], 1)
+    expected = np.concatenate([doubled, turned]) + np.array([1, 2, 3])
+    np.testing.assert_allclose(back.means * [-1, -1, 1], expected, atol=1e-5)
+    np.testing.assert_allclose(back.values("scales")[:20], plain.scales + np.log(2), atol=1e-5)
+    assert np.degrees(angles(back.values("quats")[:20], plain.quats)).max() < 0.01
+    assert np.abs(sigmoid(back.opacities)[:20] - sigmoid(plain.opacities)).max() < 0.5 / 255 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d["meshes"][0]["primitives"][0].pop("extensions"), "no primitive has the extension"),
+        (lambda d: d["nodes"][0].update(scale=[1, 2, 1]), "turned and scaled evenly only"),
+        (lambda d: d["nodes"][0].update(children=[0]), "a node is in two others"),
+        (lambda d: d["accessors"][2].update(sparse={}), "sparse accessors or in other files are not read"),
+        (lambda d: d["accessors"][2].update(count=1 << 40), "accessor 2 ends beyond the file"),
+        (lambda d: d["meshes"][0]["primitives"][0]["extensions"][NAME].update(extensions={"spz": {}}), "compressed by"),
+        (lambda d: d["scenes"][0].update(nodes=[0] * 9000), "a node is in two others"),
+    ],
+)
+def test_what_is_not_read_is_said(tmp_path: Path, change: Any, message: str) -> None:
+    save(plain_scene(20, 0), tmp_path / "x.glb")
+    document, data = parts(tmp_path / "x.glb")
+    change(document)
+    with pytest.raises(FormatError, match=message):
+        read_scene(write(tmp_path / "y.glb", document, data))

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from compressed_scenes import arrays_of
+from viewer_scenes import coded_scene, nearest_in, plain_scene
+
+from nsvq_lightning.io import FormatError, lod, read_scene, save
+from nsvq_lightning.io.describe import describe
+
+
+def leaves(node: dict[str, Any]) -> list[dict[str, Any]]:
+    return [leaf for child in node["children"] for leaf in leaves(child)] if "children" in node else [node]
+
+
+@pytest.fixture
+def small_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lod, "LEAF", 100)
+    monkeypatch.setattr(lod, "FILE", 300)
+
+
+@pytest.mark.usefixtures("small_leaves")
+@pytest.mark.parametrize("make", [plain_scene, coded_scene])
+def test_each_level_has_all_its_splats_in_the_boxes_of_its_leaves(tmp_path: Path, make: Any) -> None:
+    levels = [make(1000, 1), make(260, 1), plain_scene(30, 1)]
+    path = tmp_path / "new" / "lod-meta.json"
+    size = save(levels[0], path, coarser=levels[1:])
+    assert size == sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
+    index = json.loads(path.read_text())
+    assert (index["version"], index["count"], index["counts"], index["lodLevels"]) == (1, 1290, [1000, 260, 30], 3)
+    found = leaves(index["tree"])
+    assert len(found) >= 10
+    for number, level in enumerate(levels):
+        held = []
+        for leaf in found:
+            if (run := leaf["lods"].get(str(number))) is None:
+                continue
+            part = read_scene(path.parent / index["filenames"][run["file"]])
+            assert len(part) <= 300
+            means = part.means[run["offset"] : run["offset"] + run["count"]]
+            assert (means >= leaf["bound"]["min"]).all()
+            assert (means <= leaf["bound"]["max"]).all()
+            held.append(means)
+        expected, means = level.means, np.concatenate(held)
+        assert len(means) == len(expected)
+        assert len({int(np.abs(expected - row).sum(1).argmin()) for row in means}) == len(expected)
+    nearest_in(arrays_of(read_scene(path)), arrays_of(levels[0]))
+    facts = describe(path)
+    assert (facts["splats"], facts["format"], facts["bytes"]) == (1000, "streamed sog, 3 levels", size)
+
+
+def test_levels_become_coarser(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"fewer splats than the one before it, got \[20, 20\]"):
+        save(plain_scene(20, 1), tmp_path / "lod-meta.json", coarser=[plain_scene(20, 1)])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failed_write_leaves_the_old_scene_and_a_new_one_its_own_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "lod-meta.json"
+    save(plain_scene(20, 1), path, coarser=[plain_scene(7, 1)])
+    (tmp_path / "mine").mkdir()
+    before = read_scene(path)
+
+    def full(*_: object) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr(lod, "write_text", full)
+    with pytest.raises(OSError, match="no space"):
+        save(plain_scene(30, 1), path)
+    np.testing.assert_array_equal(read_scene(path).means, before.means)
+    monkeypatch.undo()
+    save(plain_scene(30, 1), path)
+    assert len(read_scene(path)) == 30
+    assert len(list(tmp_path.iterdir())) == 3  # the index, its one folder, and mine
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda index: index["filenames"].__setitem__(0, "../meta.json"), "is no FOLDER/meta.json beside it"),
+        (lambda index: index["filenames"].__setitem__(0, "/etc/meta.json"), "is no FOLDER/meta.json beside it"),
+        (lambda index: index["filenames"].__setitem__(0, "gone/meta.json"), "incomplete: gone/meta.json is missing"),
+        (lambda index: index.update(version=2), "version 2 of the format"),
+        (lambda index: index["tree"]["lods"].clear(), "no leaf has splats of level 0"),
+        (lambda index: index["tree"]["lods"]["0"].update(file=9), "not the index of a streamed SOG"),
+        (lambda index: index.pop("tree"), "not the index of a streamed SOG"),
+    ],
+)
+def test_a_damaged_index_is_told(tmp_path: Path, change: Any, message: str) -> None:
+    path = tmp_path / "lod-meta.json"
+    save(plain_scene(20, 1), path)
+    index = json.loads(path.read_text())
+    change(index)
+    path.write_text(json.dumps(index))
+    for read in (read_scene, describe):
+        with pytest.raises(FormatError, match=message):
+            read(path)
