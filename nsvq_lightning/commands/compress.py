@@ -7,6 +7,7 @@ Examples:
   nsvq compress scene.ply scene.nsvq
   nsvq compress scene.ply scene.nsvq --target-bytes 2000000 --splats 50%
   nsvq compress scene.ply scene.nsvq --max-error 0.01 --data.root photos
+  nsvq compress scene.ply www/lod-meta.json --levels 4
 """
 
 import argparse
@@ -17,6 +18,7 @@ from pathlib import Path
 from nsvq_lightning.commands.arguments import positive, views_of
 from nsvq_lightning.compression.setting import Setting, setting_for
 from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.lod import NAME
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
 from nsvq_lightning.splats.attributes import SIZES
 
@@ -34,7 +36,7 @@ def share_or_number(text: str) -> float:
     return value
 
 
-DEFAULT_SIZE, MINUTES = "16k", 4.0
+DEFAULT_SIZE, MINUTES, LOD_LEVELS = "16k", 4.0, 3
 # Number of own pictures.
 VIEWS = 96
 
@@ -43,12 +45,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq compress`` takes."""
     add, aim = parser.add_argument, parser.add_mutually_exclusive_group().add_argument
     add("input", type=Path, metavar="SCENE", help="splat file: .ply, .nsvq, .sog, .spz or .splat")
-    add("output", type=Path, metavar="OUT.nsvq", help="file to write")
+    add("output", type=Path, metavar="OUT.nsvq", help=f"file to write; {NAME} for a streamed SOG")
     aim("--codebooks", choices=(*SIZES, "none"), help=f"codebook sizes; {DEFAULT_SIZE} by default")
     aim("--max-error", type=positive(float), metavar="E", help="the smallest file with an error of at most E")
     aim("--target-bytes", type=positive(int), metavar="B", help="the best file of at most B bytes")
     help_ = "how many splats are left, or which share of them; all by default"
     add("--splats", type=share_or_number, metavar="N", help=help_)
+    help_ = f"levels of detail of {NAME}, each with a quarter of the splats of the one before; {LOD_LEVELS} by default"
+    aim("--levels", type=positive(int), metavar="N", help=help_)
     add("--level", choices=LEVELS, default=DEFAULT_LEVEL, help=f"{DEFAULT_LEVEL} by default")
     add("--seed", type=int, default=0, help="seed of all draws")
     help_ = "scene folder with the photos: splats and codebooks are fitted to its train photos"
@@ -70,10 +74,19 @@ def run(options: argparse.Namespace) -> int:
         ValueError: The scene cannot be used, or a limit cannot be met.
         OSError: A file cannot be read or written.
     """
-    if options.output.suffix.lower() != ".nsvq":
-        wrong = f"{options.output}: the compressed scene is a .nsvq file; 'nsvq convert' writes other formats"
+    from nsvq_lightning.io.formats import read_scene, save, suffix_of
+
+    streamed = suffix_of(options.output) == NAME
+    aims = options.codebooks or options.max_error or options.target_bytes
+    wrong = ""
+    if suffix_of(options.output) not in (".nsvq", NAME):
+        wrong = f"{options.output}: the result is a .nsvq file or {NAME}; 'nsvq convert' writes other formats"
+    elif streamed and aims:
+        wrong = f"{NAME} has levels of detail (--levels), no codebooks and no limits"
+    elif options.levels and not streamed:
+        wrong = f"--levels is for {NAME}, but the output is {options.output}"
+    if wrong:
         raise argparse.ArgumentError(None, wrong)
-    from nsvq_lightning.io.formats import read_scene
 
     scene = read_scene(options.input).finite()
     if len(scene) == 0:
@@ -92,6 +105,15 @@ def run(options: argparse.Namespace) -> int:
     measure = Measure(splats, cameras, scene.antialiased)
     data = SceneDataModule(photos or own_scene(splats, cameras, scene.antialiased), options.seed)
     compressor = Compressor(scene, data, measure, Storage(options.level), options.seed, options.minutes, options.steps)
+    if streamed:
+        thinner = [Setting(max(1, most // 4**level), "none") for level in range(1, options.levels or LOD_LEVELS)]
+        finest = scene if most == len(scene) else compressor.at(Setting(most, "none")).scene
+        levels = [finest, *(compressor.at(setting).scene for setting in thinner)]
+        size = save(levels[0], options.output, coarser=levels[1:])
+        sys.stdout.write(
+            f"{options.output}: levels of {', '.join(f'{len(x):,}' for x in levels)} splats, {size:,} bytes\n"
+        )
+        return 130 if compressor.stopped else 0
     if options.max_error is not None:
         candidate = compressor.smallest_within(options.max_error, most)
     elif options.target_bytes is not None:

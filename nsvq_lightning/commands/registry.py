@@ -23,6 +23,8 @@ COMMANDS = {
     "info": Command("describe a scene file of any format", "nsvq_lightning.commands.info"),
     "convert": Command("write a scene file in another format", "nsvq_lightning.commands.convert"),
     "compress": Command("make an existing splat file small", "nsvq_lightning.commands.compress"),
+    "split": Command("cut a scene folder into parts to train one by one", "nsvq_lightning.commands.split"),
+    "merge": Command("join the trained parts of a scene", "nsvq_lightning.commands.merge"),
     "view": Command("look at a scene in the browser, also while it trains", "nsvq_lightning.commands.view"),
     "render": Command("render pictures or a video along a path of cameras", "nsvq_lightning.commands.render"),
     "sweep": Command("train many runs and compare them", "nsvq_lightning.commands.sweep.run"),

@@ -200,7 +200,7 @@ def describe_lod(path: str | os.PathLike[str]) -> dict[str, Any]:
     path = Path(path)
     index = _index(path)
     found = [describe_sog(path.parent / name) for name in index["filenames"]]
-    streams = {META: ("json", path.stat().st_size)}
+    streams = {NAME: ("json", path.stat().st_size)}
     streams |= {name: ("sog", facts["bytes"]) for name, facts in zip(index["filenames"], found, strict=True)}
     finest = [found[number] for number in index["finest"]]
     return {

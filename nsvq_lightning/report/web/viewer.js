@@ -43,28 +43,41 @@ function activate(splats) {
   return splats;
 }
 
+/** The places of the largest to the smallest of the first `count` values, which are changed: two passes of 16 bits. */
+function descending(values, count) {
+  const keys = new Uint32Array(values.buffer), byLow = new Uint32Array(count), order = new Uint32Array(count);
+  const low = new Uint32Array(65537), high = new Uint32Array(65537);
+  for (let i = 0; i < count; i++) {
+    keys[i] ^= keys[i] >>> 31 ? 0xffffffff : 0x80000000; // unsigned integers in the order of the numbers
+    low[(keys[i] & 0xffff) + 1]++;
+    high[(keys[i] >>> 16) + 1]++;
+  }
+  for (let k = 0; k < 65536; k++) {
+    low[k + 1] += low[k];
+    high[k + 1] += high[k];
+  }
+  for (let i = 0; i < count; i++) byLow[low[keys[i] & 0xffff]++] = i;
+  for (let i = 0; i < count; i++) order[count - 1 - high[keys[byLow[i]] >>> 16]++] = byLow[i];
+  return order;
+}
+
 /**
- * A function that sorts splats from far to near along a direction; the rest of the texture's rows is filled with the
- * index after the last splat, which is a transparent one.
+ * A function that sorts splats from far to near along a direction: all, or the share of them that shows most. The rest of
+ * the texture's last row is filled with the index after the last splat, which is a transparent one.
  */
-function makeSorter(means) {
-  const count = means.length / 3;
-  const depths = new Float32Array(count), keys = new Uint32Array(depths.buffer), byLow = new Uint32Array(count);
-  return ([x, y, z]) => {
-    const low = new Uint32Array(65537), high = new Uint32Array(65537), order = new Uint32Array(rowsFor(count) * ROW);
-    for (let i = 0, m = 0; i < count; i++, m += 3) {
-      depths[i] = x * means[m] + y * means[m + 1] + z * means[m + 2];
-      keys[i] ^= keys[i] >>> 31 ? 0xffffffff : 0x80000000; // unsigned integers in the order of the numbers
-      low[(keys[i] & 0xffff) + 1]++;
-      high[(keys[i] >>> 16) + 1]++;
-    }
-    for (let k = 0; k < 65536; k++) {
-      low[k + 1] += low[k];
-      high[k + 1] += high[k];
-    }
-    for (let i = 0; i < count; i++) byLow[low[keys[i] & 0xffff]++] = i;
-    for (let i = 0; i < count; i++) order[count - 1 - high[keys[byLow[i]] >>> 16]++] = byLow[i];
-    return order.fill(count, count);
+function makeSorter({ count, means, opacities, scales }) {
+  const numbers = new Float32Array(count);
+  for (let i = 0; i < count; i++) {
+    const [a, b, c] = scales.subarray(3 * i, 3 * i + 3);
+    numbers[i] = opacities[i] * Math.max(a * b, b * c, c * a);
+  }
+  const ranked = descending(numbers, count), places = new Float32Array(3 * count);
+  for (let i = 0; i < count; i++) for (let k = 0; k < 3; k++) places[3 * i + k] = means[3 * ranked[i] + k];
+  return ([x, y, z], share) => {
+    const some = Math.ceil(count * share), order = new Uint32Array(rowsFor(some) * ROW);
+    for (let i = 0, m = 0; i < some; i++, m += 3) numbers[i] = x * places[m] + y * places[m + 1] + z * places[m + 2];
+    descending(numbers, some).forEach((place, i) => (order[i] = ranked[place]));
+    return order.fill(count, some);
   };
 }
 
@@ -74,11 +87,11 @@ function serve() {
   onmessage = async ({ data }) => {
     try {
       if (sort) {
-        const order = sort(data);
+        const order = sort(...data);
         postMessage({ result: order }, [order.buffer]);
       } else {
         const splats = activate(await nsvq.decode(data));
-        sort = makeSorter(splats.means.slice());
+        sort = makeSorter(splats);
         postMessage({ result: splats }, [...new Set(Object.values(splats).map((part) => part.buffer).filter(Boolean))]);
       }
     } catch (error) {
@@ -88,10 +101,10 @@ function serve() {
   postMessage({ result: null });
 }
 
-/** `{decode(buffer), sort(direction), end()}`, promises but the last: in a worker, or here where the browser allows none. */
+/** `{decode(buffer), sort(direction, share), end()}`, promises but the last: in a worker, or here where the browser allows none. */
 async function startEngine(decoderSource) {
   try {
-    const source = [`"use strict"; const ROW = ${ROW};`, decoderSource, rowsFor, activate, makeSorter, `(${serve})();`].join("\n");
+    const source = [`"use strict"; const ROW = ${ROW};`, decoderSource, rowsFor, activate, descending, makeSorter, `(${serve})();`].join("\n");
     const worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
     const waiting = [];
     const reply = () => new Promise((resolve, reject) => waiting.push({ resolve, reject }));
@@ -108,15 +121,15 @@ async function startEngine(decoderSource) {
       return reply();
     };
     const end = () => worker.terminate();
-    return { decode: (buffer) => ask(buffer, [buffer]), sort: (direction) => ask(direction), end };
+    return { decode: (buffer) => ask(buffer, [buffer]), sort: (...what) => ask(what), end };
   } catch {
     let sort;
     const decode = async (buffer) => {
       const splats = activate(await nsvq.decode(buffer));
-      sort = makeSorter(splats.means);
+      sort = makeSorter(splats);
       return splats;
     };
-    return { decode, sort: async (direction) => sort(direction), end: () => {} };
+    return { decode, sort: async (...what) => sort(...what), end: () => {} };
   }
 }
 
@@ -244,7 +257,6 @@ class Renderer {
     this.gl = gl;
     this.canvas = canvas;
     this.made = [];
-    this.count = splats.count;
     this.rows = rowsFor(splats.count);
     if (this.rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
       throw new Error(`This device cannot show more than ${gl.getParameter(gl.MAX_TEXTURE_SIZE) * ROW} splats.`);
@@ -348,11 +360,12 @@ class Renderer {
     return { program, at };
   }
 
-  /** Splats from far to near. */
+  /** Splats from far to near, all or some of them: whole rows. */
   setOrder(order) {
     const gl = this.gl;
+    this.drawn = order.length;
     gl.activeTexture(gl.TEXTURE4);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, this.rows, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, order.length / ROW, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
   }
 
   /** Draw what a camera (`view` below) sees over `background`, with `share` of the canvas's resolution. */
@@ -385,7 +398,7 @@ class Renderer {
     gl.uniform2f(this.splat.at.size, ...size);
     gl.uniform4f(this.splat.at.lens, fx * sx, fy * sy, cx * sx, cy * sy);
     gl.enable(gl.BLEND);
-    gl.drawElementsInstanced(gl.TRIANGLES, 6 * GROUP, gl.UNSIGNED_SHORT, 0, Math.ceil(this.count / GROUP));
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * GROUP, gl.UNSIGNED_SHORT, 0, this.drawn / GROUP);
     gl.disable(gl.BLEND);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, width, height);
@@ -580,6 +593,7 @@ async function main() {
   const backgrounds = [scene.background, [0, 0, 0], [1, 1, 1], [0.5, 0.5, 0.5]];
   const keys = new Set(), keyframes = [], waiting = [];
   let background = 0, current = 0, scheduled = false, sorting = false, sorted = null, last = 0, touched = 0, share = 1;
+  let portion = 1, sortedPortion = 1;
 
   // ---- frames, only when something changed
 
@@ -603,25 +617,29 @@ async function main() {
     const elapsed = last && now - last;
     if (keys.size) fly(Math.min(elapsed, 200) / 1000);
     const moving = now - touched < 250;
-    // A slow device shows fewer pixels while the view moves.
-    if (elapsed > 60) share = Math.max(0.3, share * Math.max(0.5, Math.sqrt(40 / elapsed)));
+    // A slow device shows fewer pixels while the view moves, then fewer splats, and takes up more in the other order.
+    if (elapsed > 60) {
+      if (share === 0.3) portion = Math.max(0.1, portion * Math.max(0.5, 40 / elapsed));
+      share = Math.max(0.3, share * Math.max(0.5, Math.sqrt(40 / elapsed)));
+    } else if (elapsed && portion < 1) portion = Math.min(1, portion * 1.02);
     else if (elapsed) share = Math.min(1, share * 1.02);
     last = moving ? now : 0;
     const direction = view.axes[2];
-    const stale = !sorted || sorted.some((x, k) => x !== direction[k]);
-    if (stale && !sorting) sort(direction);
+    const stale = !sorted || sorted.some((x, k) => x !== direction[k]) || (!moving && sortedPortion < 1);
+    if (stale && !sorting) sort(direction, moving ? portion : 1);
     if (sorted) draw(moving ? share : 1);
     if (moving) schedule();
     else if (!stale) waiting.splice(0).forEach((resolve) => resolve());
   }
 
-  function sort(direction) {
+  function sort(direction, part) {
     const asked = engine;
     sorting = true;
-    engine.sort(direction).then((order) => {
+    engine.sort(direction, part).then((order) => {
       if (asked !== engine) return; // the scene is another one now
       sorting = false;
       sorted = direction;
+      sortedPortion = part;
       renderer.setOrder(order);
       schedule();
     }, fail);

@@ -84,10 +84,11 @@ def test_compact_keeps_every_splat_where_it_promises(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", sorted(WRITTEN))
 def test_the_same_scene_gives_the_same_bytes_and_all_its_splats(suffix: str, tmp_path: Path) -> None:
-    first, second = tmp_path / f"first{suffix}", tmp_path / f"second{suffix}"
+    first, second = (tmp_path / folder / f"x{suffix}" for folder in "ab")
     for seed in range(CASES):
         scene = any_scene(seed)
         for path in (first, second):
+            path.parent.mkdir(exist_ok=True)
             save(scene, path)
         assert first.read_bytes() == second.read_bytes(), f"seed {seed}"
         back = read_scene(first)

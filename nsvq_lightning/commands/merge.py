@@ -1,0 +1,84 @@
+"""Join the trained parts of 'nsvq split' to one scene file, and test it on the photos of the whole.
+
+Examples:
+  nsvq merge parts -o scene.nsvq
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from nsvq_lightning.commands.split import RUN
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what ``nsvq merge`` takes."""
+    parser.add_argument("parts", type=Path, metavar="PARTS", help="folder that 'nsvq split' has made")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="file to write, of any format")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Join what lies in the core of each part.
+
+    Raises:
+        ValueError: The folder has no parts, a part is not trained yet, or nothing is left of it.
+        OSError: A file cannot be read or written.
+    """
+    import torch
+
+    from nsvq_lightning.data.blocks import BLOCK, Block, near_seams, points_in_front, shown
+    from nsvq_lightning.data.scene import View, load_scene
+    from nsvq_lightning.io.compressed import joined
+    from nsvq_lightning.io.formats import format_of, read_scene, save
+    from nsvq_lightning.rendering.rasterize import render
+    from nsvq_lightning.report.files import evaluate
+
+    format_of(options.output)
+    folders = sorted(
+        (path.parent for path in options.parts.glob(f"*/{BLOCK}")), key=lambda path: (len(path.name), path)
+    )
+    if not folders:
+        raise ValueError(f"{options.parts} has no parts: make them with 'nsvq split'")
+    blocks = [Block.read(folder) for folder in folders]
+    files = [folder / RUN / "scene.nsvq" for folder in folders]
+    if missing := [file for file in files if not file.is_file()]:
+        raise ValueError(
+            f"{len(missing)} of {len(files)} parts are not trained yet, first {missing[0]}: run their fits"
+        )
+    parts = []
+    for folder, block, file in zip(folders, blocks, files, strict=True):
+        whole = read_scene(file)
+        part = whole.take(block.contains(whole.means + np.array(whole.origin))).in_use()
+        sys.stdout.write(f"{folder}: {len(part):,} of {len(whole):,} splats are in its core\n")
+        parts.append(part)
+    scene = joined(parts)
+    size = save(scene, options.output)
+    sys.stdout.write(f"{options.output}: {len(scene):,} splats in {size:,} bytes\n")
+    photos, splats = load_scene(blocks[0].scene), scene.decode()
+    points = photos.points.double().numpy()
+    seams = near_seams(points, blocks)
+
+    def views(keep: bool | None) -> Iterator[View]:
+        """The test views; with ``keep``, only their pixels at the seams, or only those elsewhere."""
+        for index in photos.test:
+            view = photos.view(index)
+            at_seam = torch.from_numpy(shown(points_in_front(points, view.camera), seams, view.camera))
+            if keep is not None:
+                mask = at_seam if keep else ~at_seam
+                view = replace(view, mask=mask if view.mask is None else mask & view.mask)
+            if view.mask is None or view.mask.any():
+                yield view
+
+    look = partial(render, splats, antialiased=scene.antialiased)
+    whole_psnr, there, elsewhere = (
+        evaluate(lambda camera: look(camera).image, views(keep), torch.device("cpu"))[0] for keep in (None, True, False)
+    )
+    sys.stdout.write(
+        f"  test photos of {photos.root}: {whole_psnr:.2f} dB; at seams {there:.2f}, elsewhere {elsewhere:.2f} dB\n"
+    )
+    return 0

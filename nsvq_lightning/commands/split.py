@@ -1,0 +1,58 @@
+"""Cut a scene folder into parts that are trained one by one, on as many machines as there are, and then merged.
+
+Each part is a scene folder of its own, with the photos and points that show it. The commands that train the parts go to
+standard output, a line each; options of 'nsvq fit' may follow and are in them.
+
+Examples:
+  nsvq split photos parts --blocks 4
+  nsvq split photos parts --blocks 4 --config best | xargs -P 2 -I{} sh -c {}
+  nsvq merge parts -o scene.nsvq
+"""
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+
+from nsvq_lightning.commands.arguments import positive
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what ``nsvq split`` takes; what it does not know are options of ``nsvq fit``."""
+    parser.usage = "nsvq split SCENE OUT [--blocks N] [options of nsvq fit]"
+    parser.allow_abbrev = False
+    parser.set_defaults(further=[])
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
+    parser.add_argument("output", type=Path, metavar="OUT", help="new folder, with a folder for each part")
+    parser.add_argument("--blocks", type=positive(int), default=4, metavar="N", help="number of parts; 4 by default")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Write the parts, and print the commands that train them.
+
+    Raises:
+        argparse.ArgumentError: There is an argument that is no option.
+        ValueError: The scene cannot be used or has too little to see for so many parts.
+        OSError: The output exists, or a file cannot be read or written.
+    """
+    if options.further and not options.further[0].startswith("-"):
+        raise argparse.ArgumentError(None, f"unknown argument {options.further[0]!r}")
+    from nsvq_lightning.data.blocks import cut, write_blocks
+    from nsvq_lightning.data.scene import load_scene
+
+    if options.output.exists():
+        raise FileExistsError(f"{options.output} exists: remove it, or give another folder")
+    scene = load_scene(options.scene, cache_bytes=0)
+    blocks = cut(scene, options.blocks)
+    folders = [options.output / str(number) for number in range(1, len(blocks) + 1)]
+    for folder in folders:
+        folder.mkdir(parents=True)
+    for folder, (train, test) in zip(folders, write_blocks(scene, blocks, folders), strict=True):
+        sys.stderr.write(f"{folder}: {train} train and {test} test photos\n")
+        where = [f"--data.root={folder.resolve()}", f"--trainer.run_folder={folder.resolve() / RUN}"]
+        sys.stdout.write(shlex.join(["nsvq", "fit", *where, *options.further]) + "\n")
+    return 0
+
+
+# Folder of a part's run.
+RUN = "run"

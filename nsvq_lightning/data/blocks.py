@@ -1,0 +1,265 @@
+"""Large scenes in parts: each part is a scene of its own, with what its photos show of it and nothing else.
+
+The ground is cut where the photos show as much on one side as on the other. A part's core has no gaps to the others,
+and its surroundings are trained with it, so that seams lie within what both sides know. Photos are cropped to the part,
+and masks leave out what is in front of it or behind: no splat is spent on that, and no memory.
+"""
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from nsvq_lightning.data.colmap import SceneError
+from nsvq_lightning.data.scene import Scene
+from nsvq_lightning.io.atomic import atomic_path, atomic_write, write_text
+from nsvq_lightning.io.compressed import turn_up
+from nsvq_lightning.rendering.camera import Camera, up_of
+
+BLOCK = "block.json"
+# Where a part without a neighbour ends.
+_FAR = 1e30
+# Widths of a photo in cells; in each, the points that are in front tell what it shows.
+CELLS = 50
+# Points up to so many times as far as the nearest one in the cell count as in front, too.
+FRONT = 1.05
+# Surroundings of a core beyond each seam, as a share of what photos show of the part.
+OVERLAP = 0.15
+# A photo belongs to a part if it shows it in this share of its cells.
+LEAST_SHOWN = 0.02
+
+
+@dataclass(frozen=True)
+class Block:
+    """A part of a scene: a box on its ground, without end where there is no neighbour.
+
+    Attributes:
+        axes: Directions in the world ``[2][3]`` of the two coordinates on the ground, of length 1.
+        core: Where it begins and ends on both ``[2][2]``.
+        around: The same with the surroundings that are trained with it.
+        scene: Folder of the whole scene.
+    """
+
+    axes: Sequence[Sequence[float]]
+    core: Sequence[Sequence[float]]
+    around: Sequence[Sequence[float]]
+    scene: str
+
+    def contains(self, points: NDArray[np.floating[Any]], share: float = 0.0) -> NDArray[np.bool_]:
+        """Which points ``[N, 3]`` are in its core, or up to a share of the way to the end of its surroundings.
+
+        Cores have no point in common, and each point is in one.
+        """
+        ground = points.astype(np.float64) @ np.array(self.axes).T
+        low, high = (1 - share) * np.array(self.core) + share * np.array(self.around)
+        inside: NDArray[np.bool_] = ((ground >= low) & (ground < high)).all(1)
+        return inside
+
+    @classmethod
+    def read(cls, folder: Path) -> "Block":
+        """The part in a folder.
+
+        Raises:
+            SceneError: The folder has none, or it is damaged.
+        """
+        try:
+            return cls(**json.loads((folder / BLOCK).read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError) as error:
+            raise SceneError(f"{folder} is no part of a scene ({error}): make it anew with 'nsvq split'") from None
+
+
+# Rows of points, and the cell of a picture that each is in.
+_Front = tuple[NDArray[np.intp], NDArray[np.intp]]
+
+
+def points_in_front(points: NDArray[np.float64], camera: Camera) -> _Front:
+    """Rows of the points ``[P, 3]`` that no nearer ones hide from a camera, and the cell of its picture of each.
+
+    Cells are numbered row by row.
+    """
+    view = camera.viewmat.double().numpy()
+    x, y, z = (points @ view[:3, :3].T + view[:3, 3]).T
+    fx, fy, cx, cy = camera.intrinsics
+    columns, rows, size = _cells(camera)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        column, row = np.floor((fx * x / z + cx) / size), np.floor((fy * y / z + cy) / size)
+    seen = np.flatnonzero((z > 0) & (column >= 0) & (column < columns) & (row >= 0) & (row < rows))
+    cells = (row[seen] * columns + column[seen]).astype(np.intp)
+    nearest = np.full(columns * rows, np.inf)
+    np.minimum.at(nearest, cells, z[seen])
+    front = z[seen] <= FRONT * nearest[cells]
+    return seen[front], cells[front]
+
+
+def _cells(camera: Camera) -> tuple[int, int, int]:
+    """Columns and rows of the cells of a picture, and their side in pixels."""
+    size = max(4, camera.width // CELLS)
+    return math.ceil(camera.width / size), math.ceil(camera.height / size), size
+
+
+def cut(scene: Scene, count: int) -> list[Block]:
+    """Parts of a scene, of which photos show about the same amount.
+
+    Raises:
+        SceneError: Photos show too few points for so many parts.
+    """
+    points = scene.points.double().numpy()
+    shown = np.zeros(len(points))
+    for index in scene.train:
+        rows, cells = points_in_front(points, scene.cameras[index])
+        shown[rows] += 1 / np.bincount(cells)[cells]  # a cell is shared by its points
+    level = np.linalg.inv(turn_up(up_of(scene.cameras), "minus-y"))
+    axes = level.T[[0, 2]]
+    ground = points @ axes.T
+    root = str(scene.root.resolve())
+
+    def parts(
+        some: NDArray[np.bool_], core: NDArray[np.float64], around: NDArray[np.float64], number: int
+    ) -> list[Block]:
+        places, weights = ground[some], shown[some]
+        if np.count_nonzero(weights) < 4 * number:
+            raise SceneError(f"the photos show too few points of {scene.root} for {count} parts: ask for fewer")
+        if number == 1:
+            return [Block(axes.tolist(), core.tolist(), around.tolist(), root)]
+        spread = [np.subtract(*_quantiles(column, weights, (0.95, 0.05))) for column in places.T]
+        axis, first = int(np.argmax(spread)), number // 2
+        shares = np.array([first - OVERLAP, first, first + OVERLAP]) / number
+        lower, seam, upper = _quantiles(places[:, axis], weights, shares)
+        found = []
+        for below, end in ((True, upper), (False, lower)):
+            side = some & ((ground[:, axis] < seam) == below)
+            inner, outer = core.copy(), around.copy()
+            inner[int(below), axis], outer[int(below), axis] = seam, end
+            found += parts(side, inner, outer, first if below else number - first)
+        return found
+
+    everywhere = np.array([[-_FAR] * 2, [_FAR] * 2])
+    return parts(np.ones(len(points), bool), everywhere, everywhere, count)
+
+
+def _quantiles(
+    values: NDArray[np.float64], weights: NDArray[np.float64], shares: Sequence[float] | NDArray[np.float64]
+) -> NDArray[np.float64]:
+    order = values.argsort()
+    sums = weights[order].cumsum()
+    found: NDArray[np.float64] = values[order][np.searchsorted(sums, np.array(shares) * sums[-1])]
+    return found
+
+
+# What of the surroundings counts as at the seam.
+_SEAM = 0.3
+
+
+def near_seams(points: NDArray[np.float64], blocks: Sequence[Block]) -> NDArray[np.bool_]:
+    """Which points ``[P, 3]`` lie where two parts meet."""
+    return np.asarray(sum(block.contains(points, _SEAM).astype(int) for block in blocks) > 1)
+
+
+def write_blocks(scene: Scene, blocks: Sequence[Block], folders: Sequence[Path]) -> list[tuple[int, int]]:
+    """Write each part as a scene folder: cropped photos, masks, points, and a ``transforms.json`` with the cameras.
+
+    Test photos stay test photos. ``block.json`` is written last.
+
+    Returns:
+        Number of train and of test photos of each part.
+
+    Raises:
+        SceneError: A photo cannot be decoded, or a part is in no train or no test photo.
+        OSError: A file cannot be written.
+    """
+    points = scene.points.double().numpy()
+    inside = [block.contains(points, 1.0) for block in blocks]
+    frames: list[dict[str, list[dict[str, Any]]]] = [{"train": [], "test": []} for _ in blocks]
+    for index in range(len(scene)):
+        camera, picture = scene.cameras[index], None
+        front = points_in_front(points, camera)
+        for number, folder in enumerate(folders):
+            mask = shown(front, inside[number], camera)
+            if mask.mean() < LEAST_SHOWN:
+                continue
+            picture = scene.images[index] if picture is None else picture
+            if picture.mask is not None:
+                mask &= picture.mask.numpy()
+            if not mask.any():
+                continue
+            entry = _write_photo(folder, index, picture.image.numpy(), mask, camera)
+            frames[number]["test" if index in scene.test else "train"].append(entry)
+    for block, folder, some, found in zip(blocks, folders, inside, frames, strict=True):
+        if not found["train"] or not found["test"]:
+            raise SceneError(
+                f"a part is in {len(found['train'])} train and {len(found['test'])} test photos: ask for fewer parts"
+            )
+        _write_points(folder / "points.ply", points[some], scene.colors.numpy()[some])
+        model = {
+            "camera_model": "PINHOLE",
+            "ply_file_path": "points.ply",
+            "frames": [*found["train"], *found["test"]],
+            **{f"{split}_filenames": [frame["file_path"] for frame in found[split]] for split in found},
+        }
+        write_text(folder / "transforms.json", json.dumps(model, indent=1))
+        write_text(folder / BLOCK, json.dumps(asdict(block), indent=1))
+    return [(len(found["train"]), len(found["test"])) for found in frames]
+
+
+def shown(front: _Front, inside: NDArray[np.bool_], camera: Camera) -> NDArray[np.bool_]:
+    """Pixels ``[H, W]`` of a picture that show some points.
+
+    Args:
+        front: See :func:`points_in_front`.
+        inside: Which of all points ``[P]``.
+        camera: Camera of the picture.
+    """
+    (points, cells), (columns, rows, size) = front, _cells(camera)
+    counts = np.bincount(cells, minlength=columns * rows)
+    here = np.bincount(cells[inside[points]], minlength=columns * rows) > 0
+    if not here.any():
+        return np.zeros((camera.height, camera.width), bool)
+    # A cell without points shows what the nearest one with points does.
+    nearest = distance_transform_edt(counts.reshape(rows, columns) == 0, return_distances=False, return_indices=True)
+    grid = cv2.dilate(here.reshape(rows, columns)[tuple(nearest)].astype(np.uint8), np.ones((3, 3), np.uint8))
+    return np.kron(grid, np.ones((size, size), np.uint8))[: camera.height, : camera.width].astype(bool)
+
+
+def _write_photo(
+    folder: Path, index: int, image: NDArray[np.uint8], mask: NDArray[np.bool_], camera: Camera
+) -> dict[str, Any]:
+    """Write what a photo shows of a part, and its mask; returns its frame in ``transforms.json``."""
+    top, bottom = np.flatnonzero(mask.any(1))[[0, -1]]
+    left, right = np.flatnonzero(mask.any(0))[[0, -1]]
+    box = slice(top, bottom + 1), slice(left, right + 1)
+    names = {"file_path": f"images/{index:05}.png", "mask_path": f"masks/{index:05}.png"}
+    for name, pixels in zip(names.values(), (image[box][..., ::-1], 255 * mask[box].astype(np.uint8)), strict=True):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(cv2.imencode(".png", np.ascontiguousarray(pixels))[1].tobytes())
+    fx, fy, cx, cy = camera.intrinsics
+    height, width = mask[box].shape
+    # The file has the inverse, y up, z backward.
+    pose = np.linalg.inv(camera.viewmat.double().numpy()) * np.array([1, -1, -1, 1])
+    lens = {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx - float(left), "cy": cy - float(top)}
+    return names | lens | {"transform_matrix": pose.tolist()}
+
+
+def _write_points(path: str | os.PathLike[str], points: NDArray[np.float64], colors: NDArray[np.float32]) -> None:
+    rows = np.empty(len(points), [(axis, "<f4") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")])
+    for axis, name in enumerate("xyz"):
+        rows[name] = points[:, axis]
+    for channel, name in enumerate(("red", "green", "blue")):
+        rows[name] = np.rint(255 * colors[:, channel])
+    properties = "".join(
+        f"property {'float' if len(name) == 1 else 'uchar'} {name}\n" for name in rows.dtype.names or ()
+    )
+    with atomic_write(path) as file:
+        file.write(
+            f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n".encode()
+        )
+        file.write(rows.tobytes())
