@@ -1,0 +1,57 @@
+"""``nsvq split`` and ``nsvq merge``."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nsvq_lightning.commands.main import main
+from nsvq_lightning.data.scene import load_scene
+from nsvq_lightning.io import read_scene, save
+from nsvq_lightning.splats.splats import Splats
+
+
+def test_parts_are_trained_by_fit_and_merged(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parts = tmp_path / "parts"
+    short = ["--config", "demo", "--trainer.max_steps=16", "--data.factor=4"]
+    assert main(["split", str(demo_scene), str(parts), "--blocks", "2", *short]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2
+    assert main(["merge", str(parts), "-o", str(tmp_path / "x.nsvq")]) == 1
+    assert re.search(r"2 of 2 parts are not trained yet, first .*1.run.scene\.nsvq: run", capsys.readouterr().err)
+    for line in lines:
+        assert main(shlex.split(line)[1:]) == 0
+    capsys.readouterr()
+    assert main(["merge", str(parts), "-o", str(tmp_path / "x.nsvq")]) == 0
+    said = capsys.readouterr().out
+    kept = [int(n.replace(",", "")) for n in re.findall(r"([\d,]+) of [\d,]+ splats are in its core", said)]
+    assert len(kept) == 2
+    assert sum(kept) == len(read_scene(tmp_path / "x.nsvq"))
+    assert re.search(r"test photos of .*: \d+\.\d\d dB; at seams \d+\.\d\d, elsewhere \d+\.\d\d dB", said)
+    assert main(["split", str(demo_scene), str(parts)]) == 1
+    assert "exists: remove it, or give another folder" in capsys.readouterr().err
+
+
+def test_the_whole_is_what_lies_in_the_cores(demo_scene: Path, tmp_path: Path) -> None:
+    """Each part holds all points; the merged scene has each once."""
+    assert main(["split", str(demo_scene), str(tmp_path / "parts"), "--blocks", "3"]) == 0
+    scene = load_scene(demo_scene)
+    splats = Splats.from_points(scene.points, scene.colors, 0)
+    for number in "123":
+        (tmp_path / "parts" / number / "run").mkdir()
+        save(splats, tmp_path / "parts" / number / "run" / "scene.nsvq")
+    assert main(["merge", str(tmp_path / "parts"), "-o", str(tmp_path / "x.ply")]) == 0
+    means = read_scene(tmp_path / "parts" / "1" / "run" / "scene.nsvq").means
+    merged = read_scene(tmp_path / "x.ply").means
+    assert sorted(map(tuple, merged.tolist())) == sorted(map(tuple, np.asarray(means).tolist()))
+
+
+def test_a_folder_without_parts_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["merge", str(tmp_path), "-o", str(tmp_path / "x.nsvq")]) == 1
+    assert "has no parts: make them with 'nsvq split'" in capsys.readouterr().err
