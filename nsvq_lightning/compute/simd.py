@@ -22,6 +22,8 @@ from numba.core import cgutils
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
+from nsvq_lightning.compute.jit import inline
+
 WIDTH = 16
 
 _f32, _i1, _i8, _i16, _i32, _i64 = ir.FloatType(), *(ir.IntType(bits) for bits in (1, 8, 16, 32, 64))
@@ -248,18 +250,17 @@ def fnma(context, builder, sig, values):
     return _fused(builder, builder.fneg(x), y, z)
 
 
-@_function(Lanes, 2)
-def vmin(context, builder, sig, values):
-    """The smaller of two; the second one where the first is NaN."""
-    x, y = _spread(context, builder, sig.args, values)
-    return builder.select(builder.fcmp_ordered("<", x, y), x, y)
+def _choice(name: str, symbol: str, doc: str) -> Any:
+    def emit(context, builder, sig, values):
+        x, y = _spread(context, builder, sig.args, values)
+        return builder.select(builder.fcmp_ordered(symbol, x, y), x, y)
+
+    emit.__name__, emit.__doc__ = name, doc
+    return _function(Lanes, 2)(emit)
 
 
-@_function(Lanes, 2)
-def vmax(context, builder, sig, values):
-    """The larger of two; the second one where the first is NaN."""
-    x, y = _spread(context, builder, sig.args, values)
-    return builder.select(builder.fcmp_ordered(">", x, y), x, y)
+vmin = _choice("vmin", "<", "The smaller of two; the second one where the first is NaN.")
+vmax = _choice("vmax", ">", "The larger of two; the second one where the first is NaN.")
 
 
 def _unary(name: str, doc: str) -> Any:
@@ -285,28 +286,22 @@ def select(context, builder, sig, values):
 @_function(Lanes, 1)
 def exp2(context, builder, sig, values):
     """2**x for |x| < 126, relative error 2e-7; no check outside."""
-    return _exp2(builder, values[0])
-
-
-@_function(Lanes, 1)
-def exp2_clamped(context, builder, sig, values):
-    """2**x with x limited to [-125, 125]: never 0, never infinite; NaN becomes 2**-125."""
-    low, high, x = _constant(-125.0), _constant(125.0), values[0]
-    x = builder.select(builder.fcmp_ordered(">", x, low), x, low)
-    return _exp2(builder, builder.select(builder.fcmp_ordered("<", x, high), x, high))
-
-
-def _exp2(builder: Any, x: Any) -> Any:
     # Adding 1.5·2^23 rounds to an integer in the low bits of the sum, ready to become an exponent.
     magic = _constant(12582912.0)
-    shifted = builder.fadd(x, magic)
-    fraction = builder.fsub(x, builder.fsub(shifted, magic))
+    shifted = builder.fadd(values[0], magic)
+    fraction = builder.fsub(values[0], builder.fsub(shifted, magic))
     # Minimax polynomial of 2**f on [-1/2, 1/2].
     power = _polynomial(
         builder, fraction, (1.32764715e-3, 9.67554133e-3, 5.55071327e-2, 2.40221197e-1, 6.93146967e-1, 1.00000007)
     )
     exponent = builder.shl(builder.bitcast(shifted, _VI), _integers(23))
     return builder.bitcast(builder.add(builder.bitcast(power, _VI), exponent), _VF)
+
+
+@inline
+def exp2_clamped(x):
+    """2**x with x limited to [-125, 125]: never 0, never infinite; NaN becomes 2**-125."""
+    return exp2(vmin(vmax(x, -125), 125))
 
 
 @_function(Lanes, 1)
@@ -334,12 +329,6 @@ def log2(context, builder, sig, values):
 def mask_bits(context, builder, sig, values):
     """The mask as an integer, lane 0 in the lowest bit."""
     return builder.zext(builder.bitcast(values[0], _i16), _i64)
-
-
-@_function(types.boolean, 1)
-def any_lane(context, builder, sig, values):
-    """Whether any lane is set."""
-    return builder.icmp_unsigned("!=", builder.bitcast(values[0], _i16), _i16(0))
 
 
 @_function(types.int64, 1)
@@ -386,8 +375,7 @@ def lane_min(context, builder, sig, values):
 def lane_sums(context, builder, sig, values):
     """``lane_sums((v0, v1, …))``: lane i of the result is the sum of the lanes of vector i, 0 beyond the last."""
     vectors = list(cgutils.unpack_tuple(builder, values[0], len(sig.args[0])))
-    vectors += [None] * (WIDTH - len(vectors))
-    zero = _constant(0.0)
+    vectors += [_constant(0.0)] * (WIDTH - len(vectors))
     for step in (1, 2, 4, 8):
         # Lanes with this bit now belong to the second of two vectors; each lane adds its partner's half sum.
         second_half = [bool(lane & step) for lane in range(WIDTH)]
@@ -395,10 +383,6 @@ def lane_sums(context, builder, sig, values):
         moved = [(lane ^ step) + WIDTH * of_second for lane, of_second in enumerate(second_half)]
         merged = []
         for first, second in zip(vectors[0::2], vectors[1::2], strict=True):
-            if first is None:
-                merged.append(None)
-                continue
-            second = zero if second is None else second
             own, other = builder.select(kept, second, first), _shuffle(builder, first, second, moved)
             merged.append(builder.fadd(own, other, flags=_CONTRACT))
         vectors = merged
@@ -470,19 +454,17 @@ def _gatherer(columns: int) -> Any:
             for column in range(columns):
                 element = builder.load(builder.gep(address, [_i64(column)]))
                 vectors[column] = builder.insert_element(vectors[column], element, _i32(lane))
-        if columns == 1:
-            return vectors[0]
         return context.make_tuple(builder, sig.return_type, vectors)
 
     emit.__name__ = f"gather_rows{columns}"
     emit.__doc__ = f"``gather_rows{columns}(array, indices, start)``: 16 chosen rows of {columns} floats as vectors."
-    return _function(Lanes if columns == 1 else types.UniTuple(Lanes, columns), 3)(emit)
+    return _function(types.UniTuple(Lanes, columns), 3)(emit)
 
 
 def _scatterer(columns: int) -> Any:
     def emit(context, builder, sig, values):
         array, indices, start, rows = values
-        vectors = [rows] if columns == 1 else cgutils.unpack_tuple(builder, rows, columns)
+        vectors = cgutils.unpack_tuple(builder, rows, columns)
         for lane in range(WIDTH):
             address = _row_address(context, builder, sig, array, indices, start, lane, _i64(columns))
             for column in range(columns):
@@ -501,30 +483,11 @@ gather_rows1, gather_rows3, gather_rows4 = (_gatherer(columns) for columns in (1
 scatter_rows1, scatter_rows3, scatter_rows4 = (_scatterer(columns) for columns in (1, 3, 4))
 
 
-def _split_columns(builder: Any, parts: Sequence[Any], columns: int) -> list[Any]:
-    """Turn vectors of consecutive memory, element (row, column) at row·columns + column, into one vector per column."""
-    flat = [(part, lane) for part in range(columns) for lane in range(WIDTH)]
-    result = []
-    for column in range(columns):
-        source = [flat[row * columns + column] for row in range(WIDTH)]
-        value = parts[0]
-        lanes = [lane if part == 0 else 0 for part, lane in source]
-        value = _shuffle(builder, value, value, lanes)
-        for part in range(1, columns):
-            lanes = [WIDTH + lane if at == part else row for row, (at, lane) in enumerate(source)]
-            value = _shuffle(builder, value, parts[part], lanes)
-        result.append(value)
-    return result
-
-
 def _row_loader(columns: int) -> Any:
     def emit(context, builder, sig, values):
-        array, offset = values
-        parts = [
-            _read(builder, _address(context, builder, sig.args[0], array, builder.add(offset, _i64(WIDTH * part))))
-            for part in range(columns)
-        ]
-        return context.make_tuple(builder, sig.return_type, _split_columns(builder, parts, columns))
+        rows = _read(builder, _address(context, builder, sig.args[0], *values), WIDTH * columns)
+        vectors = [_shuffle(builder, rows, rows, range(column, WIDTH * columns, columns)) for column in range(columns)]
+        return context.make_tuple(builder, sig.return_type, vectors)
 
     emit.__name__ = f"load_rows{columns}"
     emit.__doc__ = (
@@ -541,58 +504,45 @@ def _line(context: Any, builder: Any, sig: Any, image: Any, offset: Any, stride:
     return _address(context, builder, sig.args[0], image, builder.add(offset, builder.mul(_i64(row), stride)))
 
 
-@_function(types.UniTuple(Lanes, 3), 3)
-def load_rgb_block(context, builder, sig, values):
-    """``load_rgb_block(image, offset, stride)``: a 4x4 block of an interleaved RGB image as three vectors.
-
-    ``offset`` is the element of the block's first pixel, ``stride`` the floats between the starts of two image rows.
-    """
-    image, offset, stride = values
-    rows = []
-    for row in range(4):
-        address = _line(context, builder, sig, image, offset, stride, row)
-        first = _read(builder, address, 8)
-        last = _read(builder, builder.gep(address, [_i64(8)]), 4)
-        last = _shuffle(builder, last, last, [0, 1, 2, 3, 0, 0, 0, 0])
-        rows.append(_shuffle(builder, first, last, list(range(WIDTH))))
-    upper, lower = (_shuffle(builder, rows[k], rows[k + 1], list(range(32))) for k in (0, 2))
-    channels = [
-        _shuffle(builder, upper, lower, [16 * row + 3 * column + channel for row in range(4) for column in range(4)])
-        for channel in range(3)
-    ]
-    return context.make_tuple(builder, sig.return_type, channels)
+def _joined(builder: Any, parts: Sequence[Any]) -> Any:
+    """The lanes of two or four vectors of one width, one after the other."""
+    while len(parts) > 1:
+        pairs = zip(parts[0::2], parts[1::2], strict=True)
+        parts = [_shuffle(builder, *pair, range(2 * pair[0].type.count)) for pair in pairs]
+    return parts[0]
 
 
-@_function(types.void, 6)
-def store_rgb_block(context, builder, sig, values):
-    """``store_rgb_block(image, offset, stride, r, g, b)``: the inverse of :func:`load_rgb_block`."""
-    image, offset, stride, r, g, b = values
-    undefined = ir.Constant(_VF, ir.Undefined)
-    red_green = _shuffle(builder, r, g, list(range(32)))
-    blue = _shuffle(builder, b, undefined, list(range(32)))
-    for row in range(4):
-        order = [16 * channel + 4 * row + column for column in range(4) for channel in range(3)]
-        pixels = _shuffle(builder, red_green, blue, order)
-        address = _line(context, builder, sig, image, offset, stride, row)
-        _write(builder, address, _shuffle(builder, pixels, pixels, list(range(8))))
-        _write(builder, builder.gep(address, [_i64(8)]), _shuffle(builder, pixels, pixels, list(range(8, 12))))
-    return context.get_dummy_value()
+def _block_loader(channels: int) -> Any:
+    def emit(context, builder, sig, values):
+        lines = [_line(context, builder, sig, *values, row) for row in range(4)]
+        block = _joined(builder, [_read(builder, line, 4 * channels) for line in lines])
+        planes = [
+            _shuffle(builder, block, block, range(first, WIDTH * channels, channels)) for first in range(channels)
+        ]
+        return context.make_tuple(builder, sig.return_type, planes)
+
+    emit.__name__ = f"load_block{channels}"
+    emit.__doc__ = (
+        f"``load_block{channels}(image, offset, stride)``: a 4x4 block of an image with {channels} channels.\n\n"
+        "``offset`` is the element of its first pixel, ``stride`` the floats between the starts of two image rows."
+    )
+    return _function(types.UniTuple(Lanes, channels), 3)(emit)
 
 
-@_function(Lanes, 3)
-def load_block(context, builder, sig, values):
-    """``load_block(image, offset, stride)``: a 4x4 block of a single-channel image as one vector."""
-    image, offset, stride = values
-    rows = [_read(builder, _line(context, builder, sig, image, offset, stride, row), 4) for row in range(4)]
-    upper, lower = (_shuffle(builder, rows[k], rows[k + 1], list(range(8))) for k in (0, 2))
-    return _shuffle(builder, upper, lower, list(range(WIDTH)))
+def _block_storer(channels: int) -> Any:
+    def emit(context, builder, sig, values):
+        *place, planes = values
+        planes = cgutils.unpack_tuple(builder, planes, channels)
+        block = _joined(builder, [*planes, planes[0]])
+        for row in range(4):
+            order = [16 * channel + 4 * row + column for column in range(4) for channel in range(channels)]
+            _write(builder, _line(context, builder, sig, *place, row), _shuffle(builder, block, block, order))
+        return context.get_dummy_value()
+
+    emit.__name__ = f"store_block{channels}"
+    emit.__doc__ = f"``store_block{channels}(image, offset, stride, planes)``: the inverse of ``load_block{channels}``."
+    return _function(types.void, 4)(emit)
 
 
-@_function(types.void, 4)
-def store_block(context, builder, sig, values):
-    """``store_block(image, offset, stride, lanes)``: the inverse of :func:`load_block`."""
-    image, offset, stride, lanes = values
-    for row in range(4):
-        address = _line(context, builder, sig, image, offset, stride, row)
-        _write(builder, address, _shuffle(builder, lanes, lanes, list(range(4 * row, 4 * row + 4))))
-    return context.get_dummy_value()
+load_block1, load_block3 = _block_loader(1), _block_loader(3)
+store_block1, store_block3 = _block_storer(1), _block_storer(3)

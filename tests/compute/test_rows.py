@@ -2,22 +2,20 @@ import pytest
 import torch
 
 from nsvq_lightning.compute import rows as rows_module
-from nsvq_lightning.compute.rows import gather_rows, spread_rows, take_rows
+from nsvq_lightning.compute.rows import put_rows, take_rows
 from nsvq_lightning.random import generator
 
 
-@pytest.mark.parametrize("threads", [1, 2, 5])
 @pytest.mark.parametrize("shape", [(9,), (9, 3), (9, 15, 3)])
 @pytest.mark.parametrize("chosen", [[], [0], [8], [2, 3, 7], list(range(9))])
-def test_rows_out_of_a_table_and_back_over_old_memory(
-    threads: int, shape: tuple[int, ...], chosen: list[int], monkeypatch: pytest.MonkeyPatch
+def test_rows_go_back_into_a_table_over_old_memory(
+    shape: tuple[int, ...], chosen: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rows_module, "thread_count", lambda: threads)
     monkeypatch.setattr(rows_module, "recycled", lambda shape: torch.full(shape, torch.nan))
     table, rows = torch.randn(shape, generator=generator(0)), torch.tensor(chosen, dtype=torch.int64)
-    values = gather_rows(table, rows)
-    assert torch.equal(values, table[rows])
-    assert torch.equal(spread_rows(values, rows, 9), torch.zeros(shape).index_copy_(0, rows, values))
+    expected = torch.zeros(shape)
+    expected[rows] = table[rows]
+    assert torch.equal(put_rows(table[rows], rows, 9), expected)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -100,7 +100,7 @@ def test_masks() -> None:
         simd.store(out, 0, simd.select(low & ~(simd.load(a, 0) >= simd.load(a, 16)), simd.load(a, 0), simd.load(a, 16)))
         out[16] = simd.mask_bits(low)
         out[17] = simd.lowest_bit(simd.mask_bits(low))
-        out[18] = simd.any_lane(simd.load(a, 0) > simd.load(a, 0))
+        out[18] = simd.mask_bits(simd.load(a, 0) > simd.load(a, 0))
 
     rng = np.random.default_rng(1)
     a = rng.normal(size=32).astype(np.float32)
@@ -158,13 +158,13 @@ def test_sums(values: Array) -> None:
 
 def test_image_blocks() -> None:
     def kernel(image: Array, plane: Array, out: Array) -> None:
-        red, green, blue = simd.load_rgb_block(image, 3 * (2 * 9 + 1), 27)
+        red, green, blue = simd.load_block3(image, 3 * (2 * 9 + 1), 27)
         simd.store(out, 0, red)
         simd.store(out, 16, green)
         simd.store(out, 32, blue)
-        simd.store(out, 48, simd.load_block(plane, 2 * 9 + 1, 9))
-        simd.store_rgb_block(image, 3 * (1 * 9 + 4), 27, red, green, blue)
-        simd.store_block(plane, 1 * 9 + 4, 9, simd.load(out, 48))
+        simd.store(out, 48, simd.load_block1(plane, 2 * 9 + 1, 9)[0])
+        simd.store_block3(image, 3 * (1 * 9 + 4), 27, (red, green, blue))
+        simd.store_block1(plane, 1 * 9 + 4, 9, (simd.load(out, 48),))
 
     rng = np.random.default_rng(3)
     image, plane = rng.normal(size=(8, 9, 3)).astype(np.float32), rng.normal(size=(8, 9)).astype(np.float32)

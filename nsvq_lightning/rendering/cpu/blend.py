@@ -162,7 +162,7 @@ def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
         left, sums = blend_one(batch, r1, a1, t1, t2, left, sums)
         left, sums = blend_one(batch, r2, a2, t2, t3, left, sums)
         left, sums = blend_one(batch, r3, a3, t3, t4, left, sums)
-        if drop_closed and not simd.any_lane(t4 >= TRANSMITTANCE_MIN):
+        if drop_closed and simd.mask_bits(t4 >= TRANSMITTANCE_MIN) == 0:
             for j in range(j3 + 1, count):
                 simd.put(touched, first + j, simd.get(touched, first + j) & ~bit)
             bit = 0
@@ -190,9 +190,9 @@ def write_block(block, corner, size, background, state, planes):
     blue = simd.fma(t, simd.load_one(background, 2), simd.load(state, B_SUM + o))
     if x0 + BLOCK_SIDE <= width and y0 + BLOCK_SIDE <= height:
         pixel = y0 * width + x0
-        simd.store_rgb_block(image, 3 * pixel, 3 * width, red, green, blue)
-        simd.store_block(transmittance, pixel, width, t)
-        simd.store_block(depth, pixel, width, simd.load(state, Z_SUM + o))
+        simd.store_block3(image, 3 * pixel, 3 * width, (red, green, blue))
+        simd.store_block1(transmittance, pixel, width, (t,))
+        simd.store_block1(depth, pixel, width, (simd.load(state, Z_SUM + o),))
         return
     simd.store(state, T_LEFT + o, t)
     simd.store(state, R_SUM + o, red)
@@ -226,7 +226,7 @@ def blend_tile(records, entries, begin, end, corner, size, background, grid, tou
         simd.store(state, T_LEFT + 16 * block, simd.select(inside, 1, 0))
         for plane in range(2, 6):
             simd.store(state, 256 * plane + 16 * block, 0)
-        if simd.any_lane(inside):
+        if simd.mask_bits(inside) != 0:
             alive |= 1 << block
     batch = state[6 * 256 :]
     # A record without effect, which fills up the last group of four.
@@ -318,17 +318,18 @@ def start_block(block, corner, size, planes, gradients, pixel_weights, wanted, g
     simd.store(state, s + BACK_Y, simd.load(grid, 256 + 16 * block))
     if x0 + BLOCK_SIDE <= width and y0 + BLOCK_SIDE <= height:
         pixel = y0 * width + x0
-        red, green, blue = simd.load_rgb_block(g_image, 3 * pixel, 3 * width)
-        r, g, b = simd.load_rgb_block(image, 3 * pixel, 3 * width)
+        red, green, blue = simd.load_block3(g_image, 3 * pixel, 3 * width)
+        r, g, b = simd.load_block3(image, 3 * pixel, 3 * width)
         rest = simd.fma(red, r, simd.fma(green, g, blue * b))
         if with_alpha:
-            rest = simd.fnma(simd.load_block(g_alpha, pixel, width), simd.load_block(transmittance, pixel, width), rest)
+            kept = simd.load_block1(transmittance, pixel, width)[0]
+            rest = simd.fnma(simd.load_block1(g_alpha, pixel, width)[0], kept, rest)
         if with_depth:
-            far = simd.load_block(g_depth, pixel, width)
+            far = simd.load_block1(g_depth, pixel, width)[0]
             simd.store(state, s + BACK_DEPTH, far)
-            rest = simd.fma(far, simd.load_block(depth, pixel, width), rest)
+            rest = simd.fma(far, simd.load_block1(depth, pixel, width)[0], rest)
         if with_absgrad:
-            simd.store(state, s + BACK_WEIGHT, simd.load_block(pixel_weights, pixel, width))
+            simd.store(state, s + BACK_WEIGHT, simd.load_block1(pixel_weights, pixel, width)[0])
         simd.store(state, s + BACK_T, 1)
         simd.store(state, s + BACK_REST, rest)
         simd.store(state, s + BACK_RED, red)

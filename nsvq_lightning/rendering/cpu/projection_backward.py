@@ -153,9 +153,9 @@ def project_backward(
             simd.scatter_rows3(g_means, ids, start, (g_mean[0] + gx, g_mean[1] + gy, g_mean[2] + gz))
             simd.scatter_rows4(g_quats, ids, start, g_quat)
             simd.scatter_rows3(g_scales, ids, start, g_scale)
-            logit = simd.gather_rows1(logits, ids, start)
+            logit = simd.gather_rows1(logits, ids, start)[0]
             transparent = 1 / (1 + simd.exp2_clamped(logit * rec.LOG2_E))
-            simd.scatter_rows1(g_logits, ids, start, total[rec.SUM_H] * transparent)
+            simd.scatter_rows1(g_logits, ids, start, (total[rec.SUM_H] * transparent,))
 
 
 @kernel
