@@ -9,7 +9,6 @@ from .density import DensityControl
 from .exposure import ExposureCompensation
 from .growth import BudgetedGrowth, SplatBudget
 from .outputs import ExportScene, LiveScene, RenderWriter
-from .precompile import CompileAhead
 from .progress import SplatProgressBar
 from .pruning import OpacityRegularization, SplatSelection
 from .quantization import (
@@ -33,7 +32,6 @@ __all__ = [
     "CodebookInit",
     "CodebookRefit",
     "CodebookReplacement",
-    "CompileAhead",
     "DensityControl",
     "ExportScene",
     "ExposureCompensation",

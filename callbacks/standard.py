@@ -7,7 +7,7 @@ from lightning.pytorch import Callback
 
 from nsvq_lightning.top_level import folder_of
 
-from . import checkpoint, growth, outputs, precompile, progress, pruning, quantization, report, schedule
+from . import checkpoint, growth, outputs, progress, pruning, quantization, report, schedule
 
 # Callback by name. Density control comes before the canonical form, which may act after the same iteration; codebooks
 # are placed, and codes replaced, before rate and distortion choose among them.
@@ -31,7 +31,6 @@ STANDARD: dict[str, type[Callback]] = {
     "export": outputs.ExportScene,
     "predictions": outputs.RenderWriter,
     "checkpoint": checkpoint.RunCheckpoint,
-    "kernels": precompile.CompileAhead,
     "progress": progress.SplatProgressBar,
 }
 

@@ -211,7 +211,7 @@ class Compressor:
                 phases=PhaseSchedule(total=steps, reference_total=None, min_finetune=1, **phases),
                 budget=SplatBudget(splats=setting.splats),
                 rate_decay=LearningRateDecay(start=prune),
-                **dict.fromkeys((*names, "checkpoint", "kernels")),
+                **dict.fromkeys((*names, "checkpoint")),
             )
             chatter = logging.getLogger("lightning.pytorch")
             level = chatter.level

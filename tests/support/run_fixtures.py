@@ -63,7 +63,7 @@ def recipe() -> Recipe:
             ),
             "density": DensityControl(grad_threshold=5e-6),
             "report": MetricReport(every=20),
-            **dict.fromkeys(("predictions", "checkpoint", "kernels", "progress")),
+            **dict.fromkeys(("predictions", "checkpoint", "progress")),
             **replaced,
         }
         given = dict.fromkeys(OPTIONAL) | PAPER["callbacks"] | chosen

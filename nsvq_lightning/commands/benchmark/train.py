@@ -94,7 +94,7 @@ class _Run(SplatCLI):
 
 
 # Callbacks of ``nsvq fit`` that write files or lines but train nothing; the benchmark measures by itself.
-WATCHING = ("report", "export", "predictions", "checkpoint", "kernels", "progress")
+WATCHING = ("report", "export", "predictions", "checkpoint", "progress")
 
 
 def _train(scope: Scope, threads: int, clock: StepClock, options: Sequence[str] = ()) -> dict[str, Tensor]:

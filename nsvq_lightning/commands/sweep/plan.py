@@ -145,6 +145,6 @@ def resolve(arguments: Sequence[str]) -> Settings:
     if settings["ckpt_path"] is not None:
         raise ValueError(f"a sweep has checkpoints of its own; leave ckpt_path={settings['ckpt_path']} out")
     trainer, callbacks = settings["trainer"], settings["callbacks"]
-    del trainer["default_root_dir"], trainer["run_folder"], callbacks["progress"], callbacks["kernels"]
+    del trainer["default_root_dir"], trainer["run_folder"], callbacks["progress"]
     trainer["logger"] = False
     return settings
