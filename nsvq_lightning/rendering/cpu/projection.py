@@ -199,28 +199,6 @@ def project_splats(threads, camera, means, quats, scales, logits, records, integ
 
 
 @kernel
-def find_visible(threads, camera, means, quats, scales, logits, found, runs, scratch):
-    """Find the rows of the visible splats; thread t writes them to ``found`` from ``runs[t, 0]`` to ``runs[t, 1]``."""
-    for thread in prange(threads):
-        first, last = rec.vector_range(logits.shape[0], thread, threads)
-        at = first
-        for start in range(first, last, 16):
-            count = min(16, last - start)
-            mean = load_means(means, start, count, scratch[thread])
-            bits = simd.mask_bits(view_depth(camera, mean) > NEAR) & ((1 << count) - 1)
-            if bits == 0:
-                continue
-            quat, scale, logit = load_shapes(quats, scales, logits, start, count, scratch[thread])
-            seen, _, _, _ = footprint(camera, mean, quat, scale, logit)
-            bits &= simd.mask_bits(seen)
-            while bits != 0:
-                simd.put(found, at, start + simd.lowest_bit(bits))
-                bits &= bits - 1
-                at += 1
-        runs[thread, 0], runs[thread, 1] = first, at
-
-
-@kernel
 def finish_records(threads, camera, means, colors, bands, runs, records, integers, listed, means2d, radii, scratch):
     """Join the runs of all threads into ``ids`` (ascending rows, padded by 16), number the slots and add the colours.
 

@@ -53,13 +53,18 @@ class _Frame:
         if work is not None:
             work.give_back()
 
-    def project(self, colors: tuple[Array, Array], bands: tuple[int, int], means2d: Array, radii: Array) -> None:
-        """Write the records; list the visible splats by row (``ids``) and, as places in it, by depth (``order``)."""
+    def find(self) -> tuple[Array, Array, Array]:
+        """Write the records of the visible splats; returns a run of rows, and the rows and slots, of each thread."""
         found = self.work.array("found", self.n, np.int32)
         counts, slots = (self.work.array(name, self.threads, np.int64) for name in ("counts", "slot_counts"))
         projection.project_splats(
             self.threads, self.camera, *self.geometry, self.records, self.integers, found, counts, slots, self.scratch
         )
+        return found, counts, slots
+
+    def project(self, colors: tuple[Array, Array], bands: tuple[int, int], means2d: Array, radii: Array) -> None:
+        """Write the records; list the visible splats by row (``ids``) and, as places in it, by depth (``order``)."""
+        found, counts, slots = self.find()
         self.count, self.slots = int(counts.sum()), int(slots.sum())
         self.ids = self.work.array("ids", self.count + 16, np.int32)
         keys = self.work.array("keys", self.count + 1, np.int32)
@@ -240,12 +245,11 @@ def visible(splats: SplatTensors, camera: Camera) -> Tensor:
         ValueError: The attributes do not fit together, or the image is too large.
         TypeError: An attribute is not float32.
     """
-    geometry = _flat((splats.means, splats.quats, splats.scales, splats.opacities))
-    threads = thread_count()
-    found, runs = np.empty(splats.means.shape[0], np.int64), np.empty((threads, 2), np.int64)
-    scratch = np.empty((threads, PROJECTION_SCRATCH), np.float32)
-    projection.find_visible(threads, rec.pack_camera(camera), *geometry, found, runs, scratch)
-    return torch.from_numpy(np.concatenate([found[first:last] for first, last in runs]))
+    frame = _Frame(splats, camera)
+    found, counts, _ = frame.find()
+    starts = (rec.vector_range.py_func(frame.n, thread, frame.threads)[0] for thread in range(frame.threads))
+    runs = [found[start : start + count] for start, count in zip(starts, counts, strict=True)]
+    return torch.from_numpy(np.concatenate(runs, dtype=np.int64))
 
 
 class _LightKept(torch.autograd.Function):
