@@ -56,14 +56,8 @@ class Densification(SplatCallback, ABC):
         """Ask the module for what the statistics need of the view ``batch``; returns whether the view counts."""
 
     @abstractmethod
-    def add(self, tables: Sequence[Tensor], render: Render, micro_batches: int) -> None:
-        """Add a rendered view to the tables ``[N]``, in place.
-
-        Args:
-            tables: In the order of :attr:`tables`.
-            render: The rendering, after its backward pass.
-            micro_batches: Views in a step of this process, by which the loss was divided.
-        """
+    def gradients(self, render: Render) -> Tensor | None:
+        """The gradients of a rendering after its backward pass as :func:`add_view` takes them; None if it has none."""
 
     @abstractmethod
     def act(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
@@ -149,6 +143,20 @@ class Densification(SplatCallback, ABC):
                 f"are left out from now on. List that callback after {type(self).__name__} to count all views"
             )
         return None
+
+    def add(self, tables: Sequence[Tensor], render: Render, micro_batches: int) -> None:
+        """Add a rendered view to the tables ``[N]``, in place.
+
+        Args:
+            tables: In the order of :attr:`tables`.
+            render: The rendering, after its backward pass.
+            micro_batches: Views in a step of this process, by which the loss was divided.
+        """
+        gradients = self.gradients(render)
+        if gradients is not None:
+            height, width = render.alpha.shape
+            # Each micro-batch is a separate view here.
+            add_view(tables, gradients, render.radii, width * micro_batches, height * micro_batches)
 
     def _observe(self, trainer: Trainer, module: SplatModule, render: Render | None) -> None:
         """Add one view (of each process) to the statistics; None, for a view without a loss, adds nothing."""
@@ -261,14 +269,9 @@ class DensityControl(Densification):
         schedule = module.schedule
         return schedule.phase_at(iteration) is Phase.WARMUP and iteration <= schedule.iteration(self.last)
 
-    def add(self, tables: Sequence[Tensor], render: Render, micro_batches: int) -> None:
-        """Add the norms of a view's screen-space gradients, and count it."""
-        if render.means2d.grad is None:
-            return
-        height, width = render.alpha.shape
-        # Gradient accumulation divides the loss by the number of micro-batches; each is a separate view here.
-        sums, views = tables
-        add_view(sums, views, render.means2d.grad, render.radii, width * micro_batches, height * micro_batches)
+    def gradients(self, render: Render) -> Tensor | None:
+        """The screen-space gradients."""
+        return render.means2d.grad
 
     def act(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Clone, split, prune and reset when due."""
@@ -323,27 +326,33 @@ class DensityControl(Densification):
         return self.prune(trainer, module, marked)
 
 
-def add_view(sums: Tensor, views: Tensor, grad: Tensor, radii: Tensor, width: int, height: int) -> None:
-    """Add a view's screen-space gradients to ``sums [N]`` and 1 to ``views [N]``, where a splat was seen.
-
-    A gradient is the norm in normalised device coordinates, in which an image is 2 wide and 2 high.
+def add_view(tables: Sequence[Tensor], gradients: Tensor, radii: Tensor, width: int, height: int) -> None:
+    """Add a view to the statistics ``[N]`` of the splats that it saw, in place.
 
     Args:
-        sums: Sum of the norms, changed in place.
-        views: Number of views, changed in place.
-        grad: Gradient of the loss ``[N, 2]`` by the centre in pixels.
+        tables: Sum over the views of the norm of the gradient in normalised device coordinates, in which an image is 2
+            wide and 2 high; number of views; and, if there is a third one, sum over the views of the edge weight,
+            divided by the mean of those in the view that are positive.
+        gradients: Gradient of the loss by the centre in pixels ``[N, 2]``; with a table of edge weights that of
+            ``Render.absgrad``: Σ |∂L/∂x|, Σ |∂L/∂y| per pixel, Σ weight · edge strength ``[N, 3]``.
         radii: Radius on the screen ``[N]`` in pixels, 0 for splats that were not seen.
         width: Image width in pixels.
         height: Image height in pixels.
     """
-    if kernels_for(grad) == "cpu":
+    factors = 0.5 * width, 0.5 * height
+    if kernels_for(gradients) == "cpu":
         from nsvq_lightning.rendering.cpu.statistics import add_view as add_view_cpu
 
-        add_view_cpu(sums, views, grad, radii, (0.5 * width, 0.5 * height))
+        add_view_cpu(tables, gradients, radii, factors)
         return
-    seen = (radii > 0).to(sums)
-    sums.add_(torch.hypot(grad[:, 0] * (0.5 * width), grad[:, 1] * (0.5 * height)) * seen)
+    sums, views, *weights = tables
+    seen = (radii > 0).to(gradients)
+    sums.add_(torch.hypot(gradients[:, 0] * factors[0], gradients[:, 1] * factors[1]) * seen)
     views.add_(seen)
+    for total in weights:
+        edges = gradients[:, 2].clamp_min(0)
+        mean = edges.sum() / (edges > 0).sum().clamp_min(1)
+        total.add_(edges / mean.clamp_min(torch.finfo(edges.dtype).tiny) * seen)
 
 
 def limit_growth(mask: Tensor, statistic: Tensor, added: Tensor, budget: int) -> Tensor:

@@ -10,7 +10,6 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
 
-from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.data.scene import View, detailed_pixels, edge_strength
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.random import draw_rows, generator
@@ -106,34 +105,6 @@ CHILD_LENGTH = 0.55
 CHILD_WIDTH = 0.893
 # Opacity of a child over that of its parent.
 CHILD_OPACITY = 0.6
-
-
-def add_absgrad(
-    gradients: Tensor, views: Tensor, weights: Tensor, absgrad: Tensor, radii: Tensor, width: int, height: int
-) -> None:
-    """Add the absolute gradients and edge weights of a view to the statistics ``[N]`` of what it saw, in place.
-
-    Args:
-        gradients: Sum over the views of the norm of the two absolute sums, in normalised device coordinates, in which
-            an image is 2 wide and 2 high.
-        views: Number of views.
-        weights: Sum over the views of the edge weight, divided by the mean of those in the view that are positive.
-        absgrad: Gradient of ``Render.absgrad``: Σ |∂L/∂x|, Σ |∂L/∂y| per pixel, Σ weight · edge strength ``[N, 3]``.
-        radii: Radius on the screen ``[N]``, 0 for splats that were not seen.
-        width: Image width in pixels.
-        height: Image height in pixels.
-    """
-    if kernels_for(absgrad) == "cpu":
-        from nsvq_lightning.rendering.cpu.statistics import add_absgrad as add_absgrad_cpu
-
-        add_absgrad_cpu(gradients, views, weights, absgrad, radii, (0.5 * width, 0.5 * height))
-        return
-    seen = (radii > 0).to(absgrad)
-    edges = absgrad[:, 2].clamp_min(0)
-    mean = edges.sum() / (edges > 0).sum().clamp_min(1)
-    gradients.add_(torch.hypot(absgrad[:, 0] * (0.5 * width), absgrad[:, 1] * (0.5 * height)) * seen)
-    views.add_(seen)
-    weights.add_(edges / mean.clamp_min(torch.finfo(edges.dtype).tiny) * seen)
 
 
 def split_longest(parents: RawSplats) -> RawSplats:
@@ -276,15 +247,9 @@ class BudgetedGrowth(Densification):
         module.pixel_weights = edge_strength(batch.image, batch.mask) if growing else None
         return growing
 
-    def add(self, tables: Sequence[Tensor], render: Render, micro_batches: int) -> None:
-        """Add a view's absolute gradients and edge weights, and count it."""
-        if render.absgrad is None or render.absgrad.grad is None:
-            return
-        height, width = render.alpha.shape
-        # Gradient accumulation divides the loss by the number of micro-batches; each is a separate view here.
-        size = width * micro_batches, height * micro_batches
-        gradients, views, edges = tables
-        add_absgrad(gradients, views, edges, render.absgrad.grad, render.radii, *size)
+    def gradients(self, render: Render) -> Tensor | None:
+        """The absolute gradients and edge weights."""
+        return None if render.absgrad is None else render.absgrad.grad
 
     def act(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Split, prune and reset when due."""

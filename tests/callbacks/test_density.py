@@ -27,7 +27,7 @@ def test_only_splats_that_were_seen_enter_the_statistic_in_device_coordinates(dt
     grad, start = torch.randn(57, 2, generator=draw).to(dtype), torch.rand(57, generator=draw).to(dtype)
     radii = torch.randint(0, 3, (57,), generator=draw, dtype=torch.int32)
     sums, views = start.clone(), torch.full((57,), 2.0, dtype=dtype)
-    add_view(sums, views, grad, radii, width=80, height=60)
+    add_view((sums, views), grad, radii, width=80, height=60)
     seen = radii > 0
     # A shift of one pixel is a shift of 2 / width; the gradient by it is width / 2 times larger.
     torch.testing.assert_close(sums, torch.where(seen, start + torch.hypot(grad[:, 0] * 40, grad[:, 1] * 30), start))

@@ -10,7 +10,8 @@ import torch
 from density_stage import Stage, make_splats
 
 from nsvq_lightning.callbacks import BudgetedGrowth
-from nsvq_lightning.callbacks.growth import add_absgrad, lowest_share, split_longest
+from nsvq_lightning.callbacks.density import add_view
+from nsvq_lightning.callbacks.growth import lowest_share, split_longest
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render
@@ -28,7 +29,7 @@ def test_a_view_adds_gradients_in_device_coordinates_and_edge_weights_of_mean_on
     absgrad = torch.tensor([[3e-6, 4e-6, 2.0], [1e-6, 0.0, 0.0], [5e-6, 0.0, 6.0], [1.0, 1.0, 0.0]], dtype=dtype)
     gradients, views, edges = tables(4, absgrad)
     radii = torch.tensor([3, 1, 9, 0], dtype=torch.int32)
-    add_absgrad(gradients, views, edges, absgrad, radii, width=800, height=600)
+    add_view((gradients, views, edges), absgrad, radii, width=800, height=600)
     assert gradients.tolist() == pytest.approx([1 + math.hypot(3e-6 * 400, 4e-6 * 300), 1 + 4e-4, 1 + 2e-3, 1.0])
     assert views.tolist() == [2.0, 2.0, 2.0, 1.0]
     assert edges.tolist() == pytest.approx([1.5, 1.0, 2.5, 1.0])  # the mean of the two that are positive is 4
@@ -40,8 +41,8 @@ def test_the_kernel_adds_what_plain_torch_adds(count: int) -> None:
     absgrad = torch.rand(count, 3, generator=draw) - torch.tensor([0.0, 0.0, 0.3])
     radii = torch.randint(0, 3, (count,), generator=draw, dtype=torch.int32)
     fast, exact = tables(count, absgrad), tables(count, absgrad.double())
-    add_absgrad(*fast, absgrad, radii, width=80, height=60)
-    add_absgrad(*exact, absgrad.double(), radii, width=80, height=60)
+    add_view(fast, absgrad, radii, width=80, height=60)
+    add_view(exact, absgrad.double(), radii, width=80, height=60)
     for ours, theirs in zip(fast, exact, strict=True):
         torch.testing.assert_close(ours.double(), theirs, rtol=1e-6, atol=1e-6)
 

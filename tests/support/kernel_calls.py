@@ -28,8 +28,8 @@ from guards import guarded
 from kernel_entries import entry_points, stand_in_for_a_gpu
 from splat_scenes import front_camera, random_splats, some_pixel_weights
 from torch import Tensor
+from warm import compile_kernels
 
-from nsvq_lightning.callbacks.precompile import compile_kernels
 from nsvq_lightning.io import formats
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, TrainedStraightThrough
@@ -58,8 +58,8 @@ def use_cpu() -> None:
     importlib.import_module("nsvq_lightning.quantize.kmeans").distinct_rows(x)
     statistics = importlib.import_module("nsvq_lightning.rendering.cpu.statistics")
     radii = torch.arange(70, dtype=torch.int32) % 3
-    statistics.add_view(*torch.zeros(2, 70), x[:, :2].contiguous(), radii, (2.0, 3.0))
-    statistics.add_absgrad(*torch.zeros(3, 70), x, radii, (2.0, 3.0))
+    statistics.add_view(tuple(torch.zeros(2, 70)), x[:, :2].contiguous(), radii, (2.0, 3.0))
+    statistics.add_view(tuple(torch.zeros(3, 70)), x, radii, (2.0, 3.0))
     with tempfile.TemporaryDirectory() as folder:
         formats.save(Splats.from_tensors(*random_splats(300)), Path(folder, "a.sog"))
 
