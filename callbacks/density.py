@@ -198,8 +198,7 @@ class DensityControl(Densification):
         grad_threshold: A splat is cloned or split where the norm of its screen-space gradient (in normalised device
             coordinates), averaged over the views that saw it, reaches this.
         dense_fraction: Splats up to this share of the extent are cloned, larger ones split.
-        children: Splats that a split leaves in place of its parent.
-        shrink: Children are smaller than their parent by this factor.
+        shrink: The two children of a split are smaller than their parent by this factor.
         min_opacity: Splats with a lower opacity are pruned.
         huge_fraction: Splats larger than this share of the extent are pruned.
         huge_after: Huge splats are pruned only after this iteration.
@@ -233,7 +232,6 @@ class DensityControl(Densification):
     every: int = 100
     grad_threshold: float = 2e-4
     dense_fraction: float = 0.01
-    children: int = 2
     shrink: float = 1.6
     min_opacity: float = 0.005
     huge_fraction: float = 0.1
@@ -251,7 +249,7 @@ class DensityControl(Densification):
     def __post_init__(self) -> None:
         self.check(
             {
-                "at least 1": ("start", "every", "reset_every", "children", "min_splats", "finite_every"),
+                "at least 1": ("start", "every", "reset_every", "min_splats", "finite_every"),
                 "at least 0": ("white_reset", "prune_every", "huge_after", "grad_threshold", "dense_fraction"),
                 "above 0": ("shrink", "huge_fraction"),
                 "between 0 and 1": ("min_opacity", "reset_opacity"),
@@ -303,13 +301,13 @@ class DensityControl(Densification):
         large = splats.scales.amax(1).exp() > self.dense_fraction * module.extent
         grown = statistic >= self.grad_threshold
         if self.max_splats is not None:
-            added = torch.where(large, self.children - 1, 1)
-            grown = limit_growth(grown, statistic, added, self.max_splats - len(splats))
+            ranks = torch.where(grown, statistic, -torch.inf)
+            grown &= most_contributing(ranks, max(0, self.max_splats - len(splats)))
         divided, before = grown & large, len(splats)
         clones, parents = (
             RawSplats(*(tensor.detach()[mask] for tensor in splats.raw())) for mask in (grown & ~large, divided)
         )
-        children = split(parents, self.children, self.shrink, generator(module.seed, iteration, "split"))
+        children = split(parents, self.shrink, generator(module.seed, iteration, "split"))
         new = (torch.cat(pair) for pair in zip(clones, children, strict=True))
         row_ops.append_rows(splats, optimizer, RawSplats(*new)._asdict())
         row_ops.keep_rows(splats, optimizer, torch.cat([~divided, divided.new_ones(len(splats) - before)]))
@@ -355,35 +353,15 @@ def add_view(tables: Sequence[Tensor], gradients: Tensor, radii: Tensor, width: 
         total.add_(edges / mean.clamp_min(torch.finfo(edges.dtype).tiny) * seen)
 
 
-def limit_growth(mask: Tensor, statistic: Tensor, added: Tensor, budget: int) -> Tensor:
-    """The splats of ``mask [N]`` with the largest statistic that together add at most ``budget``; in ties, the first.
-
-    Args:
-        mask: Splats that want to grow.
-        statistic: Mean screen-space gradient ``[N]``.
-        added: Splats that each would add ``[N]`` int64, not negative: 1 for a clone, children - 1 for a split.
-        budget: Splats that may be added.
-    """
-    candidates = mask.nonzero()[:, 0]
-    if int(added[candidates].sum()) <= budget:
-        return mask
-    order = statistic[candidates].argsort(descending=True, stable=True)
-    candidates = candidates[order]
-    limited = torch.zeros_like(mask)
-    limited[candidates[added[candidates].cumsum(0) <= budget]] = True
-    return limited
-
-
-def split(parents: RawSplats, children: int, shrink: float, generator: torch.Generator) -> RawSplats:
-    """Children ``[children · M, ...]`` of ``M`` parents: centres drawn from each parent's own Gaussian, axes shrunk.
+def split(parents: RawSplats, shrink: float, generator: torch.Generator) -> RawSplats:
+    """Two children for each of ``M`` parents ``[2 · M, ...]``: centres drawn from the parent's Gaussian, axes shrunk.
 
     Args:
         parents: Raw attributes of the parents; all first children come before all second ones.
-        children: Number for each parent.
         shrink: Children are smaller than their parent by this factor.
         generator: Source of the draws, on the CPU.
     """
-    repeated = RawSplats(*(t.repeat(children, *([1] * (t.dim() - 1))) for t in parents))
+    repeated = RawSplats(*(torch.cat([tensor, tensor]) for tensor in parents))
     draws = torch.randn(len(repeated.means), 3, generator=generator).to(parents.means)
     offsets = times_vectors(rotation_matrices(repeated.quats), repeated.scales.exp() * draws)
     return repeated._replace(means=repeated.means + offsets, scales=repeated.scales - math.log(shrink))

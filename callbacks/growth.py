@@ -10,6 +10,7 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
 
+from nsvq_lightning.compression.importance import most_contributing
 from nsvq_lightning.data.scene import View, detailed_pixels, edge_strength
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.random import draw_rows, generator
@@ -124,13 +125,6 @@ def split_longest(parents: RawSplats) -> RawSplats:
     child = parents._replace(scales=parents.scales + shrink, opacities=opacities)
     pair = (child._replace(means=parents.means + side * offsets) for side in (1, -1))
     return RawSplats(*(torch.cat(two) for two in zip(*pair, strict=True)))
-
-
-def lowest_share(opacities: Tensor, share: float) -> Tensor:
-    """Mask ``[N]`` of the ``share`` of the splats with the lowest opacity; ties go to the first."""
-    mask = torch.zeros_like(opacities, dtype=torch.bool)
-    mask[opacities.argsort(stable=True)[: int(share * opacities.shape[0])]] = True
-    return mask
 
 
 # Growth is idle if it adds at most this share of what it may add, or of what there is.
@@ -279,7 +273,8 @@ class BudgetedGrowth(Densification):
             self.reset_opacities(trainer, module, self.reset_opacity)
             distributed.check_replicas(trainer, "the opacity reset")
         if iteration in (reset + schedule.interval(self.recovery) for reset in resets[: self.recoveries]):
-            self.prune(trainer, module, lowest_share(module.splats.opacities, self.recovery_share))
+            transparency = -module.splats.opacities
+            self.prune(trainer, module, most_contributing(transparency, int(self.recovery_share * len(transparency))))
 
     @torch.no_grad()
     def _grow(self, trainer: Trainer, module: SplatModule, iteration: int) -> tuple[int, int]:

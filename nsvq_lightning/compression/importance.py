@@ -46,11 +46,11 @@ def contributions(
 
 
 def most_contributing(contribution: Tensor, count: int) -> Tensor:
-    """Mask ``[N]`` of the ``count`` splats that contribute most; ties go to the first.
+    """Mask ``[N]`` of the ``count`` splats that contribute most, or have most of anything else; ties go to the first.
 
     Args:
         contribution: Contribution ``[N]``.
-        count: Number of splats, at most N.
+        count: Number of splats, not negative; all if there are no more.
     """
     mask = torch.zeros_like(contribution, dtype=torch.bool)
     mask[contribution.argsort(descending=True, stable=True)[:count]] = True

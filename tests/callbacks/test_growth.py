@@ -11,7 +11,7 @@ from density_stage import Stage, make_splats
 
 from nsvq_lightning.callbacks import BudgetedGrowth
 from nsvq_lightning.callbacks.density import add_view
-from nsvq_lightning.callbacks.growth import lowest_share, split_longest
+from nsvq_lightning.callbacks.growth import split_longest
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render
@@ -71,12 +71,6 @@ def test_children_lie_on_the_longest_axis_of_their_parent() -> None:
         torch.testing.assert_close(children.opacities[child].sigmoid(), 0.6 * parents.opacities.sigmoid())
         for name in ("quats", "sh0", "shN"):
             assert torch.equal(getattr(children, name)[child], getattr(parents, name))
-
-
-def test_the_lowest_share_is_counted_and_ties_go_to_the_first() -> None:
-    logits = torch.tensor([0.0, -2.0, 3.0, -2.0, -2.0])
-    assert lowest_share(logits, 0.4).tolist() == [False, True, False, True, False]
-    assert not lowest_share(logits, 0.1).any()
 
 
 WIDTH, HEIGHT = 40, 20
