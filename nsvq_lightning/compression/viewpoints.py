@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nsvq_lightning.data.images import ImageStore, Picture
 from nsvq_lightning.data.scene import Scene
-from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.camera import Camera, view_towards
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import SplatTensors
@@ -28,17 +28,10 @@ def look_at(target: NDArray[np.float64], eye: NDArray[np.float64], width: int, h
         height: Pixels.
         angle: Horizontal field of view, radians.
     """
-    forward = target - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(np.array([0.0, 1.0, 0.0]), forward)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    view = np.eye(4)
-    view[:3, :3] = rotation
-    view[:3, 3] = -rotation @ eye
+    view = view_towards(target, eye, np.array([0.0, -1.0, 0.0]))
     focal = 0.5 * width / math.tan(angle / 2)
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
-    return Camera(intrinsics, torch.from_numpy(view.astype(np.float32)), width, height)
+    return Camera(intrinsics, view, width, height)
 
 
 def middle_of(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:

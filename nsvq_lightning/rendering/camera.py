@@ -217,12 +217,16 @@ def orbit(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     path = []
     for angle in angles:
         eye = middle + height * up + radius * (math.cos(angle) * across + math.sin(angle) * ahead)
-        forward = (middle - eye) / (np.linalg.norm(middle - eye) or 1.0)
-        right = np.cross(forward, up)
-        right /= np.linalg.norm(right) or 1.0
-        matrix = np.stack([right, np.cross(forward, right), forward], axis=1)
-        path.append(_camera(_view(matrix, eye), lens, cameras[0].width, cameras[0].height))
+        path.append(_camera(view_towards(middle, eye, up), lens, cameras[0].width, cameras[0].height))
     return path
+
+
+def view_towards(target: NDArray[np.float64], eye: NDArray[np.float64], up: NDArray[np.float64]) -> Tensor:
+    """World to camera ``[4, 4]`` float32: from ``eye [3]`` a camera looks at ``target [3]``, with ``up [3]`` above."""
+    forward = (target - eye) / (np.linalg.norm(target - eye) or 1.0)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right) or 1.0
+    return _view(np.stack([right, np.cross(forward, right), forward], axis=1), eye)
 
 
 def read_camera_path(path: Path, width: int | None = None, height: int | None = None) -> tuple[list[Camera], float]:

@@ -59,23 +59,30 @@ def times_vectors(matrices: Tensor, vectors: Tensor) -> Tensor:
     return (matrices * vectors[:, None]).sum(2)
 
 
+def image_axes(
+    means: Tensor, quats: Tensor, scales: Tensor, camera: Camera
+) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:
+    """View-space x, y, z ``[N]`` of splats, and their axes along x and along y of the image ``[N, 3]``, pixels."""
+    viewmat = camera.viewmat.to(means)
+    fx, fy, _, _ = camera.intrinsics
+    x, y, z = (times_vectors(viewmat[:3, :3], means) + viewmat[:3, 3]).unbind(1)
+    low_x, high_x, low_y, high_y = camera.slope_limits
+    slope_x, slope_y = (x / z).clamp(low_x, high_x), (y / z).clamp(low_y, high_y)
+    right, down, forward = viewmat[:3, :3]
+    across = (right - slope_x[:, None] * forward) * (fx / z)[:, None]
+    along = (down - slope_y[:, None] * forward) * (fy / z)[:, None]
+    axes = rotation_matrices(quats) * scales.exp()[:, None, :]
+    return (x, y, z), (across[:, :, None] * axes).sum(1), (along[:, :, None] * axes).sum(1)
+
+
 def project(splats: SplatTensors, camera: Camera) -> Projection:
     """Project splats through the local affine approximation of the camera (EWA splatting).
 
     The determinant uses Lagrange's identity, |u|²|v|² - (u·v)² = |u × v|²: the naive difference loses every digit for
     splats of thousands of pixels. The determinant of a huge splat is taken in units of its size, or it would overflow.
     """
-    means = splats.means
-    viewmat = camera.viewmat.to(means)
     fx, fy, cx, cy = camera.intrinsics
-    rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
-    x, y, z = (means @ rotation.T + translation).unbind(-1)
-    low_x, high_x, low_y, high_y = camera.slope_limits
-    slope_x, slope_y = (x / z).clamp(low_x, high_x), (y / z).clamp(low_y, high_y)
-    zero = torch.zeros_like(z)
-    jacobian = torch.stack([fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], -1).view(-1, 2, 3)
-    axes = rotation_matrices(splats.quats) * splats.scales.exp()[:, None, :]
-    u, v = (jacobian @ rotation @ axes).unbind(1)
+    (x, y, z), u, v = image_axes(splats.means, splats.quats, splats.scales, camera)
     xx, xy, yy = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
     size = (xx + yy).detach()
     unit = torch.where(size > constants.HUGE_FOOTPRINT, 1 / size, torch.ones_like(size))
@@ -107,17 +114,7 @@ def light_kept(splats: SplatTensors, camera: Camera, rows: Tensor) -> Tensor:
     √(det Σ / det(Σ + blur·I)) with Σ the projected covariance, differentiable in means, quaternions and log-scales.
     """
     means, quats, scales = (take_rows(getattr(splats, name), rows) for name in ("means", "quats", "scales"))
-    viewmat = camera.viewmat.to(means)
-    fx, fy, _, _ = camera.intrinsics
-    rotation = viewmat[:3, :3]
-    x, y, z = (times_vectors(rotation, means) + viewmat[:3, 3]).unbind(1)
-    low_x, high_x, low_y, high_y = camera.slope_limits
-    slope_x, slope_y = (x / z).clamp(low_x, high_x), (y / z).clamp(low_y, high_y)
-    right, down, forward = rotation
-    across = (right - slope_x[:, None] * forward) * (fx / z)[:, None]
-    along = (down - slope_y[:, None] * forward) * (fy / z)[:, None]
-    axes = rotation_matrices(quats) * scales.exp()[:, None, :]
-    u, v = (across[:, :, None] * axes).sum(1), (along[:, :, None] * axes).sum(1)
+    _, u, v = image_axes(means, quats, scales, camera)
     # The blur does not matter to splats so large that squares of their area would overflow.
     counts = (u.square().sum(1) + v.square().sum(1)).detach() < constants.HUGE_FOOTPRINT
     u, v = torch.where(counts[:, None], u, 0.0), torch.where(counts[:, None], v, 0.0)

@@ -43,10 +43,7 @@ class _Frame:
         self.records = self.work.array("records", rec.RECORD * self.n)
         self.integers = self.records.view(np.int32)
         self.scratch = self.work.rows("projection", self.threads, PROJECTION_SCRATCH)
-        self.count = self.slots = 0
-        nothing = np.empty(0, np.int32)
-        self.ids = self.order = self.boxes = self.entries = nothing
-        self.offsets = self.touched = self.ends = self.sums = nothing
+        self.sums = np.empty(0, np.float32)
 
     def __del__(self) -> None:
         work = getattr(self, "work", None)
@@ -96,6 +93,8 @@ class _Frame:
             )
         self.entries = self.work.array("entries", total, np.int32)
         binning.fill_tiles(*listed, self.ids, self.entries)
+        self.touched = self.work.array("touched", total + blending.BATCH, np.uint16)
+        self.ends = self.work.array("ends", self.tiles, np.int64)
 
 
 _GRID = blending.pixel_grid()
@@ -169,14 +168,11 @@ class _Blend(torch.autograd.Function):
         shape = frame.size[::-1]
         image, transmittance, depth, alpha = (recycled((*shape, *last)) for last in ((3,), (), (), ()))
         frame.bin()
-        work = frame.work
-        frame.touched = work.array("touched", frame.entries.size + blending.BATCH, np.uint16)
-        frame.ends = work.array("ends", frame.tiles, np.int64)
         behind = flat_checked("background", background.contiguous(), (3,))
         blending.blend(
             frame.threads, frame.records, frame.entries, frame.offsets, frame.group_columns, frame.size, behind, _GRID,
             frame.touched, frame.ends, (flat(image), flat(transmittance), flat(depth)),
-            work.rows("blend", frame.threads, blending.FORWARD_SCRATCH), (is_on("blocks"), is_on("saturated")),
+            frame.work.rows("blend", frame.threads, blending.FORWARD_SCRATCH), (is_on("blocks"), is_on("saturated")),
             np.zeros(1, np.int64),
         )  # fmt: skip
         ctx.frame = frame
