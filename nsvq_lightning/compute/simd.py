@@ -351,24 +351,24 @@ def column_bits(context, builder, sig, values):
 # --------------------------------------------------------------------------------------------------
 
 
+def _folded(builder: Any, value: Any, combine: Callable[[Any, Any], Any]) -> Any:
+    """The 16 lanes combined to a scalar, always in the same order."""
+    for step in (8, 4, 2, 1):
+        rotated = _shuffle(builder, value, value, [(lane + step) % WIDTH for lane in range(WIDTH)])
+        value = combine(value, rotated)
+    return builder.extract_element(value, _i32(0))
+
+
 @_function(types.float32, 1)
 def lane_sum(context, builder, sig, values):
     """Sum of the 16 lanes, always in the same order."""
-    total = values[0]
-    for step in (8, 4, 2, 1):
-        rotated = _shuffle(builder, total, total, [(lane + step) % WIDTH for lane in range(WIDTH)])
-        total = builder.fadd(total, rotated, flags=_CONTRACT)
-    return builder.extract_element(total, _i32(0))
+    return _folded(builder, values[0], lambda x, y: builder.fadd(x, y, flags=_CONTRACT))
 
 
 @_function(types.float32, 1)
 def lane_min(context, builder, sig, values):
     """Smallest of the 16 lanes; a NaN lane may be passed over or returned."""
-    smallest = values[0]
-    for step in (8, 4, 2, 1):
-        other = _shuffle(builder, smallest, smallest, [(lane + step) % WIDTH for lane in range(WIDTH)])
-        smallest = builder.select(builder.fcmp_ordered("<", other, smallest), other, smallest)
-    return builder.extract_element(smallest, _i32(0))
+    return _folded(builder, values[0], lambda x, y: builder.select(builder.fcmp_ordered("<", y, x), y, x))
 
 
 @_function(Lanes, 1)

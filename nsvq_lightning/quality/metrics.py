@@ -31,12 +31,9 @@ def color_corrected(image: Tensor, photo: Tensor, mask: Tensor | None = None) ->
     counting = torch.ones_like(colors[:, 0], dtype=torch.bool) if mask is None else mask.reshape(-1)
     dark, bright = 0.5 / 255, 1 - 0.5 / 255  # beyond these, a pixel is clipped and says nothing about the map
     seen = counting[:, None] & (target >= dark) & (target <= bright)
+    first, second = torch.triu_indices(3, 3)  # each pair of channels once
     for _ in range(5):
-        red, green, blue = colors.unbind(1)
-        terms = torch.stack(
-            [red * red, red * green, red * blue, green * green, green * blue, blue * blue, red, green, blue], 1
-        )
-        terms = torch.cat([terms, torch.ones_like(terms[:, :1])], 1)
+        terms = torch.cat([colors[:, first] * colors[:, second], colors, torch.ones_like(colors[:, :1])], 1)
         unclipped = seen & (colors >= dark) & (colors <= bright)
         corrected = []
         for channel in range(3):

@@ -19,7 +19,7 @@ from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat_checke
 from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
 
 # The taps of the window, from the middle outwards.
-G0, G1, G2, G3, G4, G5 = (F(tap) for tap in ssim_window()[SSIM_RADIUS:].tolist())
+TAPS = tuple(F(tap) for tap in ssim_window()[SSIM_RADIUS:].tolist())
 C1, C2 = F(SSIM_C1), F(SSIM_C2)
 # Zeros beside every row, at least 3·radius floats, so that the horizontal blur needs no special case at the border.
 PAD = 16
@@ -62,12 +62,10 @@ def take_row(image, target, white, images, y, height, length, pitch):
 @inline
 def blur_along(row, o):
     """Eleven taps along a padded row of interleaved RGB (neighbouring pixels are 3 floats apart)."""
-    total = G0 * simd.load(row, o)
-    total = simd.fma(G1, simd.load(row, o - 3) + simd.load(row, o + 3), total)
-    total = simd.fma(G2, simd.load(row, o - 6) + simd.load(row, o + 6), total)
-    total = simd.fma(G3, simd.load(row, o - 9) + simd.load(row, o + 9), total)
-    total = simd.fma(G4, simd.load(row, o - 12) + simd.load(row, o + 12), total)
-    return simd.fma(G5, simd.load(row, o - 15) + simd.load(row, o + 15), total)
+    total = TAPS[0] * simd.load(row, o)
+    for k in range(1, SSIM_RADIUS + 1):
+        total = simd.fma(TAPS[k], simd.load(row, o - 3 * k) + simd.load(row, o + 3 * k), total)
+    return total
 
 
 @inline
@@ -92,12 +90,9 @@ def moments_of_row(images, y, length, pitch, moments):
         x = min(x_, length - 16)
         o = row_of(y, IMAGES, pitch) + x
         p, q = simd.load(images, o), simd.load(images, o + pitch)
-        sums = (G0 * p, G0 * q, G0 * simd.fma(p, p, q * q), G0 * (p * q))
-        sums = add_pair(images, y, 1, x, pitch, G1, sums)
-        sums = add_pair(images, y, 2, x, pitch, G2, sums)
-        sums = add_pair(images, y, 3, x, pitch, G3, sums)
-        sums = add_pair(images, y, 4, x, pitch, G4, sums)
-        sums = add_pair(images, y, 5, x, pitch, G5, sums)
+        sums = (TAPS[0] * p, TAPS[0] * q, TAPS[0] * simd.fma(p, p, q * q), TAPS[0] * (p * q))
+        for distance in range(1, SSIM_RADIUS + 1):
+            sums = add_pair(images, y, distance, x, pitch, TAPS[distance], sums)
         simd.store(moments, PAD + x, sums[0])
         simd.store(moments, pitch + PAD + x, sums[1])
         simd.store(moments, 2 * pitch + PAD + x, sums[2])
@@ -143,12 +138,10 @@ def pair_sum(ring, y, distance, o, pitch):
 def blur_across(ring, y, plane, x, pitch):
     """Eleven taps down the ring buffer, centred on row y, of one derivative plane."""
     o = plane * pitch + x
-    total = G0 * simd.load(ring, row_of(y, DERIVATIVES, pitch) + o)
-    total = simd.fma(G1, pair_sum(ring, y, 1, o, pitch), total)
-    total = simd.fma(G2, pair_sum(ring, y, 2, o, pitch), total)
-    total = simd.fma(G3, pair_sum(ring, y, 3, o, pitch), total)
-    total = simd.fma(G4, pair_sum(ring, y, 4, o, pitch), total)
-    return simd.fma(G5, pair_sum(ring, y, 5, o, pitch), total)
+    total = TAPS[0] * simd.load(ring, row_of(y, DERIVATIVES, pitch) + o)
+    for distance in range(1, SSIM_RADIUS + 1):
+        total = simd.fma(TAPS[distance], pair_sum(ring, y, distance, o, pitch), total)
+    return total
 
 
 @inline
