@@ -121,7 +121,7 @@ class SplatProgressBar(TQDMProgressBar):
         return bar
 
     def _text(self, trainer: Trainer, module: SplatModule) -> str:
-        parts = [f"{module.phase.name.lower()} {_rounded(len(module.splats))} splats"]
+        parts = [f"{module.phase.name.lower()} {Tqdm.format_sizeof(len(module.splats))} splats"]
         psnr = trainer.callback_metrics.get("train/psnr")
         if psnr is not None:
             past = float(psnr) if self._psnr is None else self._psnr
@@ -135,10 +135,3 @@ class SplatProgressBar(TQDMProgressBar):
         bar = self._train_progress_bar
         if bar is not None and not bar.disable:
             bar.set_postfix_str(line)  # the next refresh removes it
-
-
-def _rounded(count: int) -> str:
-    """A number in at most five characters."""
-    if count < 10_000:
-        return str(count)
-    return f"{count / 1000:.0f}k" if count < 1_000_000 else f"{count / 1e6:.2f}M"
