@@ -49,7 +49,8 @@ def clamped(image, row, column, height, length):
     return tl.where(raw < 0, 0.0, tl.where(raw > 1, 1.0, raw))
 
 
-G0, G1, G2, G3, G4, G5 = (tl.constexpr(tap) for tap in ssim_window()[SSIM_RADIUS:].tolist())
+# The taps of the window, from the middle outwards.
+TAPS, RADIUS = tl.constexpr(tuple(ssim_window()[SSIM_RADIUS:].tolist())), tl.constexpr(SSIM_RADIUS)
 C1, C2 = tl.constexpr(SSIM_C1), tl.constexpr(SSIM_C2)
 WHITE = tl.constexpr(255.0)
 
@@ -86,12 +87,9 @@ def moments_kernel(
     p, q = clamped(image, row, column, height, length), photo(target, row, column, height, length, BYTES)
     # Beyond the border both are 0.
     tl.store(sums + 2 * program, tl.sum(tl.sum(tl.abs(p - q), 1), 0))
-    blurred = (p * G0, q * G0, (p * p + q * q) * G0, p * q * G0)
-    blurred = add_moments(blurred, image, target, row, column, height, length, 1, G1, BYTES)
-    blurred = add_moments(blurred, image, target, row, column, height, length, 2, G2, BYTES)
-    blurred = add_moments(blurred, image, target, row, column, height, length, 3, G3, BYTES)
-    blurred = add_moments(blurred, image, target, row, column, height, length, 4, G4, BYTES)
-    blurred = add_moments(blurred, image, target, row, column, height, length, 5, G5, BYTES)
+    blurred = (p * TAPS[0], q * TAPS[0], (p * p + q * q) * TAPS[0], p * q * TAPS[0])
+    for k in tl.static_range(1, RADIUS + 1):
+        blurred = add_moments(blurred, image, target, row, column, height, length, k, TAPS[k], BYTES)
     inside = (row < height) & (column < length)
     size = tl.cast(height, tl.int64) * length
     at = moments + row.to(tl.int64) * length + column
@@ -104,24 +102,20 @@ def moments_kernel(
 @triton.jit
 def blur_down(plane, row, column, height, length):
     """Eleven taps down a plane."""
-    total = load_at(plane, row, column, height, length) * G0
-    total += (load_at(plane, row - 1, column, height, length) + load_at(plane, row + 1, column, height, length)) * G1
-    total += (load_at(plane, row - 2, column, height, length) + load_at(plane, row + 2, column, height, length)) * G2
-    total += (load_at(plane, row - 3, column, height, length) + load_at(plane, row + 3, column, height, length)) * G3
-    total += (load_at(plane, row - 4, column, height, length) + load_at(plane, row + 4, column, height, length)) * G4
-    total += (load_at(plane, row - 5, column, height, length) + load_at(plane, row + 5, column, height, length)) * G5
+    total = load_at(plane, row, column, height, length) * TAPS[0]
+    for k in tl.static_range(1, RADIUS + 1):
+        pair = load_at(plane, row - k, column, height, length) + load_at(plane, row + k, column, height, length)
+        total += pair * TAPS[k]
     return total
 
 
 @triton.jit
 def blur_along(plane, row, column, height, length):
     """Eleven taps along the rows of interleaved RGB: neighbouring pixels are 3 floats apart."""
-    total = load_at(plane, row, column, height, length) * G0
-    total += (load_at(plane, row, column - 3, height, length) + load_at(plane, row, column + 3, height, length)) * G1
-    total += (load_at(plane, row, column - 6, height, length) + load_at(plane, row, column + 6, height, length)) * G2
-    total += (load_at(plane, row, column - 9, height, length) + load_at(plane, row, column + 9, height, length)) * G3
-    total += (load_at(plane, row, column - 12, height, length) + load_at(plane, row, column + 12, height, length)) * G4
-    total += (load_at(plane, row, column - 15, height, length) + load_at(plane, row, column + 15, height, length)) * G5
+    total = load_at(plane, row, column, height, length) * TAPS[0]
+    for k in tl.static_range(1, RADIUS + 1):
+        pair = load_at(plane, row, column - 3 * k, height, length) + load_at(plane, row, column + 3 * k, height, length)
+        total += pair * TAPS[k]
     return total
 
 

@@ -73,26 +73,17 @@ def color(sh0, shN, row, base, x, y, z, mask, DEGREE: tl.constexpr):
     r, g, b = load3(sh0 + 3 * row, mask)
     r, g, b = r * C0 + 0.5, g * C0 + 0.5, b * C0 + 0.5
     if DEGREE > 0:
-        b0, b1, b2 = bands1(x, y, z)
-        r, g, b = add_band(shN, base, 0, b0, r, g, b, mask)
-        r, g, b = add_band(shN, base, 1, b1, r, g, b, mask)
-        r, g, b = add_band(shN, base, 2, b2, r, g, b, mask)
+        b1 = bands1(x, y, z)
+        for k in tl.static_range(3):
+            r, g, b = add_band(shN, base, k, b1[k], r, g, b, mask)
     if DEGREE > 1:
-        b0, b1, b2, b3, b4 = bands2(x, y, z)
-        r, g, b = add_band(shN, base, 3, b0, r, g, b, mask)
-        r, g, b = add_band(shN, base, 4, b1, r, g, b, mask)
-        r, g, b = add_band(shN, base, 5, b2, r, g, b, mask)
-        r, g, b = add_band(shN, base, 6, b3, r, g, b, mask)
-        r, g, b = add_band(shN, base, 7, b4, r, g, b, mask)
+        b2 = bands2(x, y, z)
+        for k in tl.static_range(5):
+            r, g, b = add_band(shN, base, 3 + k, b2[k], r, g, b, mask)
     if DEGREE > 2:
-        b0, b1, b2, b3, b4, b5, b6 = bands3(x, y, z)
-        r, g, b = add_band(shN, base, 8, b0, r, g, b, mask)
-        r, g, b = add_band(shN, base, 9, b1, r, g, b, mask)
-        r, g, b = add_band(shN, base, 10, b2, r, g, b, mask)
-        r, g, b = add_band(shN, base, 11, b3, r, g, b, mask)
-        r, g, b = add_band(shN, base, 12, b4, r, g, b, mask)
-        r, g, b = add_band(shN, base, 13, b5, r, g, b, mask)
-        r, g, b = add_band(shN, base, 14, b6, r, g, b, mask)
+        b3 = bands3(x, y, z)
+        for k in tl.static_range(7):
+            r, g, b = add_band(shN, base, 8 + k, b3[k], r, g, b, mask)
     return r, g, b
 
 
