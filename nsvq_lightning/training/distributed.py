@@ -3,14 +3,14 @@
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import torch
 import torch.distributed
 from lightning.pytorch import Trainer
 from lightning.pytorch.strategies import DDPStrategy, Strategy, StrategyRegistry
 from torch import Tensor, nn
-from torch.distributed import all_reduce, broadcast
+from torch.distributed import all_reduce
 
 from nsvq_lightning.compute.devices import to_device
 
@@ -21,7 +21,7 @@ def check_strategy(strategy: Strategy) -> None:
     Raises:
         ValueError: The strategy wraps the module in ``DistributedDataParallel``.
     """
-    if isinstance(strategy, DDPStrategy) and not getattr(strategy, "follows_replaced_parameters", False):
+    if isinstance(strategy, DDPStrategy) and not isinstance(strategy, ViewParallelStrategy):
         raise ValueError(
             "DistributedDataParallel binds gradient hooks to the parameters it finds at the start: after the first "
             "clone it crashes or silently stops averaging. Train with --trainer.strategy=view_parallel, or on one "
@@ -31,7 +31,9 @@ def check_strategy(strategy: Strategy) -> None:
 
 def follow_first(strategy: Strategy, module: nn.Module) -> None:
     """Copy the first process's parameters and buffers to the module on every process; row counts may differ before."""
-    module.load_state_dict(strategy.broadcast(module.state_dict()))
+    # What is pickled on a GPU would come back on the first process's.
+    own = {name: tensor.cpu() for name, tensor in module.state_dict().items()}
+    module.load_state_dict(strategy.broadcast(own))
 
 
 @torch.no_grad()
@@ -75,7 +77,7 @@ def check_replicas(trainer: Trainer, event: str) -> None:
 
 def from_first_process(trainer: Trainer, tensor: Tensor) -> Tensor:
     """The first process's value of a tensor, on every process; its shape may differ before."""
-    return tensor if trainer.world_size == 1 else trainer.strategy.broadcast(tensor).to(tensor.device)
+    return tensor if trainer.world_size == 1 else trainer.strategy.broadcast(tensor.cpu()).to(tensor.device)
 
 
 def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:
@@ -85,8 +87,6 @@ def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:
     reduced = trainer.strategy.reduce(tensor, reduce_op="sum")
     return cast(Tensor, reduced)
 
-
-T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
@@ -105,9 +105,6 @@ class ViewParallelStrategy(DDPStrategy):
 
     Arguments are those of ``DDPStrategy`` that do not concern the wrapper, such as ``process_group_backend``.
     """
-
-    follows_replaced_parameters = True
-    """What :func:`check_strategy` requires of a strategy for several processes."""
 
     _accumulates = False
     _failed: Tensor | None = None
@@ -150,21 +147,11 @@ class ViewParallelStrategy(DDPStrategy):
             else:
                 gradient = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
                 parameter.grad = gradient.contiguous()
-        parts = [self._trained_part(parameter) for parameter in parameters if parameter.grad is not None]
-        sums = [part.contiguous() for part in parts]
-        for work in [all_reduce(total, async_op=True) for total in sums]:
+        gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+        for work in [all_reduce(gradient, async_op=True) for gradient in gradients]:
             work.wait()
-        for part, total in zip(parts, sums, strict=True):
-            torch.div(total, self.world_size, out=part)  # not every backend has an average
-
-    def _trained_part(self, parameter: Tensor) -> Tensor:
-        """Its gradient without the SH coefficients above the active degree, which is 0 on every process."""
-        assert parameter.grad is not None
-        splats = getattr(self.lightning_module, "splats", None)
-        if splats is None or parameter is not getattr(splats, "shN", None):
-            return parameter.grad
-        degree = getattr(self.lightning_module, "active_sh_degree", 3)
-        return parameter.grad[:, : (degree + 1) ** 2 - 1]
+        for gradient in gradients:
+            gradient.div_(self.world_size)  # not every backend has an average
 
     def reduce(self, tensor: Any, group: Any | None = None, reduce_op: Any = "mean") -> Any:
         """Reduce a tensor; a sum without the barrier that Lightning puts before each reduction."""
@@ -172,21 +159,6 @@ class ViewParallelStrategy(DDPStrategy):
             all_reduce(tensor)
             return tensor
         return super().reduce(tensor, group, reduce_op)
-
-    def broadcast(self, obj: T, src: int = 0) -> T:
-        """Send an object of one process to all; tensors and dictionaries of them directly, all else pickled."""
-        if isinstance(obj, Tensor):
-            return cast(T, self.broadcast({"": obj}, src)[""])
-        if not isinstance(obj, dict) or not obj or not all(isinstance(value, Tensor) for value in obj.values()):
-            return super().broadcast(obj, src)
-        own = cast("dict[str, Tensor]", obj)
-        kinds = super().broadcast({name: (list(value.shape), value.dtype) for name, value in own.items()}, src)
-        received = {}
-        for name, (shape, dtype) in kinds.items():
-            sent = own[name].detach() if self.global_rank == src else torch.empty(shape, dtype=dtype)
-            received[name] = sent.to(self.root_device).contiguous().clone()
-            broadcast(received[name], src)
-        return cast(T, received)
 
 
 StrategyRegistry.register(

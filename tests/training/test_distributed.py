@@ -110,52 +110,10 @@ def test_accumulated_gradients_travel_once_and_remember_a_loss_that_was_not_fini
     assert scene.first.grad is None
 
 
-class WithHarmonics(LightningModule):
-    """Splats of degree 2, of which degree 1 is rendered."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.splats = nn.Module()
-        self.splats.shN = nn.Parameter(torch.zeros(2, 8, 3))
-        self.active_sh_degree = 1
-
-
-def test_coefficients_that_are_not_rendered_are_not_sent(strategy: OfTwo, monkeypatch: pytest.MonkeyPatch) -> None:
-    module: Any = WithHarmonics()
-    strategy._lightning_module = module
-    module.splats.shN.grad = torch.zeros(2, 8, 3)
-    module.splats.shN.grad[:, :3] = 1.0
-    sent = meet(monkeypatch, [0.0, 1.0], torch.full((2, 3, 3), 3.0).tolist())
-    strategy.post_backward(LOSS)
-    assert [list(tensor.shape) for tensor in sent] == [[2], [2, 3, 3]]
-    assert torch.equal(module.splats.shN.grad[:, :3], torch.full((2, 3, 3), 2.0))
-    assert not module.splats.shN.grad[:, 3:].any()
-
-
 def test_sums_wait_for_nobody_first(strategy: OfTwo, monkeypatch: pytest.MonkeyPatch) -> None:
     meet(monkeypatch, [1.0, 2.0])
     monkeypatch.setattr(DDPStrategy, "reduce", lambda *_: pytest.fail("Lightning's reduction has a barrier"))
     assert strategy.reduce(torch.tensor([1.0, 1.0]), reduce_op="sum").tolist() == [2.0, 3.0]
-
-
-def test_tensors_are_sent_as_they_are(strategy: OfTwo, monkeypatch: pytest.MonkeyPatch) -> None:
-    pickled: list[Any] = []
-
-    def first_ones(self: DDPStrategy, obj: Any, src: int = 0) -> Any:
-        pickled.append(obj)
-        return {"b": ([1], torch.int64), "a": ([2, 3], torch.float32)} if isinstance(obj, dict) else obj
-
-    monkeypatch.setattr(DDPStrategy, "broadcast", first_ones)
-    monkeypatch.setattr(strategies, "broadcast", lambda tensor, src: tensor.fill_(7))
-    monkeypatch.setattr(OfTwo, "global_rank", 1, raising=False)
-    received = strategy.broadcast({"a": torch.zeros(5, 3), "b": torch.zeros(1, dtype=torch.int64)})
-    assert pickled == [{"a": ([5, 3], torch.float32), "b": ([1], torch.int64)}]
-    assert {name: (tensor.shape, tensor.dtype) for name, tensor in received.items()} == {
-        "a": ((2, 3), torch.float32),
-        "b": ((1,), torch.int64),
-    }
-    assert all(bool((tensor == 7).all()) for tensor in received.values())
-    assert strategy.broadcast("a name") == "a name"
 
 
 ROWS = torch.randn(40, 3, generator=generator(0))
