@@ -36,22 +36,15 @@ def continued_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> Sch
 
 def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str | None:
     """What to report on a run that continues from a checkpoint with this schedule; None if nothing changes."""
-    stored = Schedule(**checkpoint["schedule"])
-    if stored.total != schedule.total:
-        return (
-            f"the checkpoint is of a run of {stored.total} iterations, this one has {schedule.total}: phases, density "
-            "control and learning rates follow the new length; pass "
-            f"--trainer.max_steps={stored.total} to continue that run as it was"
-        )
-    own = asdict(schedule) | {"saved": stored.saved}
-    changed = {name: value for name, value in asdict(stored).items() if value != own[name]}
+    stored, own = checkpoint["schedule"], asdict(schedule)
+    changed = [name for name, value in stored.items() if value != own[name] and name != "saved"]
+    options = {name: f"--callbacks.phases.{name}" for name in changed} | {"total": "--trainer.max_steps"}
     if not changed:
         return None
     return (
-        f"the checkpoint is of a run with {', '.join(f'{name} = {value}' for name, value in changed.items())}, this "
-        f"one continues with {', '.join(f'{name} = {own[name]}' for name in changed)}; pass "
-        f"{' '.join(f'--callbacks.phases.{name}={value}' for name, value in changed.items())} to continue that run as "
-        "it was"
+        f"the checkpoint is of a run with {', '.join(f'{name} = {stored[name]}' for name in changed)}, this one "
+        f"continues with {', '.join(f'{name} = {own[name]}' for name in changed)}; pass "
+        f"{' '.join(f'{options[name]}={stored[name]}' for name in changed)} to continue that run as it was"
     )
 
 
@@ -118,13 +111,16 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         raise FileNotFoundError(f"{path}: no such checkpoint; {WAY_OUT}")
     if path.is_dir():
         raise FormatError(f"{path}: a folder, not a checkpoint", WAY_OUT)
-    if path.stat().st_size == 0:
-        raise FormatError(f"{path}: an empty file, not a checkpoint", WAY_OUT)
     try:
-        _check_sums(path)
+        with ZipFile(path) as archive:  # torch itself does not verify its checksums
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise FormatError(f"{path}: damaged, its part {damaged} is not what was written", WAY_OUT)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except (PermissionError, FormatError):
         raise
+    except BadZipFile as error:
+        raise FormatError(f"{path}: truncated, or not a checkpoint", WAY_OUT) from error
     except UnpicklingError as error:
         named = re.search(r"GLOBAL (\S+)", str(error))
         what = f"an object of {named[1]}" if named else "an object that is not plain data"
@@ -134,17 +130,6 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         raise FormatError(f"{path}: damaged, or not a checkpoint ({reason})", WAY_OUT) from error
     _check_contents(path, checkpoint)
     return checkpoint  # type: ignore[no-any-return]  # checked
-
-
-def _check_sums(path: Path) -> None:
-    """Verify the checksums of the zip archive that a checkpoint is; torch itself does not."""
-    try:
-        with ZipFile(path) as archive:
-            damaged = archive.testzip()
-    except BadZipFile as error:
-        raise FormatError(f"{path}: truncated, or not a checkpoint", WAY_OUT) from error
-    if damaged is not None:
-        raise FormatError(f"{path}: damaged, its part {damaged} is not what was written", WAY_OUT)
 
 
 def _check_contents(path: Path, checkpoint: Any) -> None:

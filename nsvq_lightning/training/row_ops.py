@@ -120,10 +120,7 @@ def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -
     state = optimizer.state.get(find_group(optimizer, name)["params"][0], {})
     for key in MOMENTS:
         if key in state:
-            if rows is None:
-                state[key].zero_()
-            else:
-                state[key][rows] = 0.0
+            state[key][slice(None) if rows is None else rows] = 0.0
 
 
 def trainable_rows(splats: Splats) -> tuple[Tensor, dict[str, int]]:
@@ -147,11 +144,7 @@ def finite_splats(splats: Splats, source: str) -> Splats:
     Raises:
         ValueError: No finite splat is left.
     """
-    kept = _finite_or_warn(
-        splats,
-        source,
-        lambda found: ValueError(f"{source} holds no finite splat ({found}); there is nothing to train"),
-    )
+    kept = _finite_or_warn(splats, source, ValueError, "there is nothing to train")
     return splats if bool(kept.all()) else Splats.from_tensors(*(tensor.detach()[kept] for tensor in splats.raw()))
 
 
@@ -164,23 +157,17 @@ def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> Tensor:
     Raises:
         FloatingPointError: No finite splat is left.
     """
-    kept = _finite_or_warn(
-        splats,
-        f"step {step}",
-        lambda found: FloatingPointError(
-            f"step {step}: all {len(splats)} splats are non-finite ({found}); lower the learning rates"
-        ),
-    )
+    kept = _finite_or_warn(splats, f"step {step}", FloatingPointError, "lower the learning rates")
     keep_rows(splats, optimizer, kept)
     return kept
 
 
-def _finite_or_warn(splats: Splats, where: str, none_left: Callable[[str], Exception]) -> Tensor:
+def _finite_or_warn(splats: Splats, where: str, error: type[Exception], advice: str) -> Tensor:
     """Mask ``[N]`` of :func:`trainable_rows`, with a warning about the others; raises if no splat is finite."""
     kept, culprits = trainable_rows(splats)
     if culprits:
         if not bool(kept.any()):
-            raise none_left(listed(culprits))
+            raise error(f"{where}: all {len(splats)} splats are non-finite ({listed(culprits)}); {advice}")
         log.warning("%s: %s", where, dropped(kept, culprits))
     return kept
 

@@ -6,7 +6,7 @@ import logging
 import os
 import platform
 import sys
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from itertools import count
 from pathlib import Path
 from typing import Any, TextIO
@@ -233,20 +233,10 @@ def _choose(trainer: Trainer) -> Path:
 log = logging.getLogger(__name__)
 
 
-class _Nothing:
-    """A context that does nothing; ``contextlib`` has slower ones."""
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-
 class _NoProfiler(PassThroughProfiler):
     """Lightning's default, without the generator that it makes for each of the hundred hooks and actions of a step."""
 
-    _nothing: Any = _Nothing()
+    _nothing: Any = nullcontext()
 
     def profile(self, action_name: str) -> Any:
         return self._nothing

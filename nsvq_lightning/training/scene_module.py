@@ -298,7 +298,7 @@ def first_splats(module: SceneModule) -> Splats:
         ValueError: There is neither a file nor a scene, or the file has another SH degree than the module.
         SceneError: A photo cannot be decoded.
     """
-    sh_degree, path, scene = module.splats.sh_degree, module.init_from, scene_of(module.trainer)
+    sh_degree, path = module.splats.sh_degree, module.init_from
     if path is not None:
         loaded = load(path)
         if loaded.sh_degree != sh_degree:
@@ -306,8 +306,7 @@ def first_splats(module: SceneModule) -> Splats:
                 f"{path} has SH degree {loaded.sh_degree}, the module has {sh_degree}; set sh_degree={loaded.sh_degree}"
             )
         return finite_splats(loaded, path)
-    if scene is None:
-        raise ValueError("no splats to start from: fit with a data module that has a scene, or set init_from")
+    scene = needed_scene(module.trainer, "no splats to start from", "set init_from")
     points, colors = scene.points, scene.colors
     if module.first_points is None:
         return Splats.from_points(points, colors, sh_degree)

@@ -223,7 +223,7 @@ def test_splats_of_a_file_that_are_not_finite_are_left_out(
     torch.testing.assert_close(means, torch.cat([start.means[:7], start.means[8:]]).detach(), atol=1e-6, rtol=0)
     assert "a.ply: dropped 1 of 30 splats with non-finite values: quats in 1 rows" in caplog.messages
     start.means.data.fill_(torch.inf)
-    with pytest.raises(ValueError, match=r"a\.ply holds no finite splat \(means in 30 rows"):
+    with pytest.raises(ValueError, match=r"a\.ply: all 30 splats are non-finite \(means in 30 rows"):
         fitted()
 
 

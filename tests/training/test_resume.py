@@ -62,7 +62,7 @@ def test_truncated_checkpoints_are_refused(part: float, tmp_path: Path) -> None:
     path = tmp_path / "a.ckpt"
     whole = write(path)
     path.write_bytes(whole[: int(part * len(whole))])
-    with pytest.raises(FormatError, match=rf"^{path}: (an empty file|truncated), .*; pass a checkpoint that nsvq fit"):
+    with pytest.raises(FormatError, match=rf"^{path}: truncated, .*; pass a checkpoint that nsvq fit"):
         read_checkpoint(path)
 
 

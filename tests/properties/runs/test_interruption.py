@@ -241,8 +241,9 @@ def test_a_run_continued_with_another_length_says_what_follows_from_it(
 ) -> None:
     path = Runner(run, recipe, "paper", max_steps=8).stopped(Broken, Trouble(3, fail))
     Runner(run, recipe, "paper", max_steps=9).continued(path)
-    (message,) = [message for message in caplog.messages if message.startswith("the checkpoint is of a run of 8 ")]
-    assert "this one has 9" in message
+    told = [message for message in caplog.messages if message.startswith("the checkpoint is of a run with total = 8")]
+    (message,) = told
+    assert "this one continues with total = 9" in message
     assert "pass --trainer.max_steps=8" in message
 
 
