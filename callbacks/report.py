@@ -4,7 +4,7 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -92,7 +92,7 @@ class MetricReport(WritingCallback):
         self.check({"at least 0": ("every",)})
         self._scene: CompressedScene | None = None
         self._paper_level: dict[str, Any] = {}
-        self._scores: list[files.ViewScore] = []
+        self._scores: list[dict[str, Any]] = []
         self._folder = Path()
         self._lpips: Metric | None = None
         self._lpips_reason: str | None = None
@@ -224,9 +224,10 @@ class MetricReport(WritingCallback):
         if self._lpips is not None:
             lpips = float(self._lpips(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]))
         corrected = apply_mask(eight_bit(color_corrected(image, photo, batch.mask)), batch.mask)
-        corrected_scores = float(psnr(corrected, photo, batch.mask)), float(ssim(corrected, photo, batch.mask))
-        scores = float(outputs["psnr"]), float(outputs["ssim"])
-        self._scores.append(files.ViewScore(batch.name, *scores, lpips, *corrected_scores))
+        score = {"name": batch.name, "psnr": float(outputs["psnr"]), "ssim": float(outputs["ssim"]), "lpips": lpips}
+        score["cc_psnr"] = float(psnr(corrected, photo, batch.mask))
+        score["cc_ssim"] = float(ssim(corrected, photo, batch.mask))
+        self._scores.append(score)
         if self.pictures:
             path = self._picture(trainer, batch.name)
             path.parent.mkdir(exist_ok=True)
@@ -246,12 +247,12 @@ class MetricReport(WritingCallback):
             folder = self._folder
             lpips: tuple[float | None, str | None] = (None, self._lpips_reason)
             if self._lpips is not None:
-                lpips = fmean(score.lpips for score in scores if score.lpips is not None), None
+                lpips = fmean(score["lpips"] for score in scores), None
             metrics = files.summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper_level)
             files.write_metrics(folder / "metrics.json", metrics)
-            files.write_csv(folder / "views.csv", [asdict(score) for score in scores])
-            paths = [self._picture(trainer, score.name) for score in scores]
-            views = [asdict(score) | {"picture": path.name} for score, path in zip(scores, paths, strict=True)]
+            files.write_csv(folder / "views.csv", scores)
+            paths = [self._picture(trainer, score["name"]) for score in scores]
+            views = [score | {"picture": path.name} for score, path in zip(scores, paths, strict=True)]
             written = page.write_page(folder, module.history, module.schedule, self._other_seconds(), metrics, views)
             log.info(f"report: {written}")
             if self.pictures:
@@ -259,10 +260,10 @@ class MetricReport(WritingCallback):
         self._scene, self._lpips = None, None
 
 
-def _gathered(trainer: Trainer, scores: list[files.ViewScore]) -> list[files.ViewScore]:
+def _gathered(trainer: Trainer, scores: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The scores of all processes, by name of the view."""
     if trainer.world_size > 1:
-        gathered: list[list[files.ViewScore]] = [[] for _ in range(trainer.world_size)]
+        gathered: list[list[dict[str, Any]]] = [[] for _ in range(trainer.world_size)]
         torch.distributed.all_gather_object(gathered, scores)
         scores = [score for part in gathered for score in part]
-    return sorted(scores, key=lambda score: score.name)
+    return sorted(scores, key=lambda score: score["name"])

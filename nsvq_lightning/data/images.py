@@ -162,19 +162,6 @@ def resized_mask(kept: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.b
     return np.asarray(cv2.resize(kept.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255, bool)
 
 
-def encode_png(rgb: NDArray[np.uint8]) -> bytes:
-    """A PNG file of RGB bytes ``[H, W, 3]``.
-
-    Raises:
-        OSError: The picture could not be encoded.
-    """
-    # Not imwrite, which on Windows fails on names outside the locale's character set.
-    encoded, data = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))
-    if not encoded:
-        raise OSError(f"cannot encode a picture of shape {list(rgb.shape)}")
-    return bytes(data)
-
-
 class Picture(NamedTuple):
     """A photo as it is compared with.
 

@@ -10,8 +10,7 @@ import subprocess
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from hashlib import sha256
 from itertools import cycle
@@ -27,7 +26,6 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nsvq_lightning.data.images import encode_png
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import atomic_path, atomic_write, write_text
 from nsvq_lightning.io.compressed import CompressedScene
@@ -39,21 +37,6 @@ from nsvq_lightning.quality.metrics import eight_bit, psnr
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.training.resume import ResumedModule
 from nsvq_lightning.training.schedule import Phase, Schedule
-
-
-@dataclass(frozen=True)
-class ViewScore:
-    """Quality of one view: PSNR in dB, SSIM, LPIPS where it was measured.
-
-    ``cc_psnr`` and ``cc_ssim`` are those after a colour correction to the photo, where that was measured.
-    """
-
-    name: str
-    psnr: float
-    ssim: float
-    lpips: float | None = None
-    cc_psnr: float | None = None
-    cc_ssim: float | None = None
 
 
 @torch.no_grad()
@@ -94,7 +77,7 @@ def evaluate(
 def summarize(
     path: Path,
     scene: CompressedScene,
-    scores: Sequence[ViewScore],
+    scores: Sequence[Mapping[str, Any]],
     lpips: tuple[float | None, str | None],
     module: ResumedModule,
     paper: Mapping[str, Any],
@@ -104,14 +87,14 @@ def summarize(
     Args:
         path: The file that was decoded.
         scene: The decoded scene.
-        scores: Score of each test view.
+        scores: Row of each test view in ``views.csv``: its name, ``psnr``, ``ssim``, ``cc_psnr`` and ``cc_ssim``.
         lpips: Mean LPIPS and None, or None and the reason.
         module: The module, for its history and schedule.
         paper: :func:`paper_level` of the scene that was stored.
     """
 
     def mean(name: str) -> float:
-        return float(sum(getattr(score, name) for score in scores)) / len(scores)
+        return float(sum(score[name] for score in scores)) / len(scores)
 
     file_bytes, header = path.stat().st_size, read_header(path)
     plain_bytes = plain_ply_bytes(len(scene), scene.sh_degree)
@@ -279,14 +262,10 @@ def as_bytes(image: Tensor) -> NDArray[np.uint8]:
 
 
 def write_png(path: Path, image: Tensor) -> None:
-    """Write an RGB image ``[H, W, 3]`` in [0, 1] as 8-bit PNG, atomically.
-
-    Raises:
-        OSError: The image could not be encoded.
-    """
-    data = encode_png(as_bytes(image))
+    """Write an RGB image ``[H, W, 3]`` in [0, 1] as 8-bit PNG, atomically."""
+    data = cv2.imencode(".png", cv2.cvtColor(as_bytes(image), cv2.COLOR_RGB2BGR))[1]
     with atomic_write(path) as file:
-        file.write(data)
+        file.write(data.tobytes())
 
 
 def log_pictures(loggers: Sequence[Logger], pictures: Sequence[Path], step: int) -> None:
@@ -355,17 +334,15 @@ def _h264(program: str, path: Path, width: int, height: int, fps: float) -> Iter
     command = [program, "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
     command += ["-r", str(fps), "-i", "-", "-c:v", "libx264", "-crf", "17", "-pix_fmt", "yuv420p"]  # 17: nearly no loss
     command += ["-movflags", "+faststart", str(path)]
-    broken = False
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         pipe = process.stdin
         assert pipe is not None
         try:
-            yield lambda rgb: pipe.write(np.ascontiguousarray(rgb).data)
-        except BrokenPipeError:  # what ffmpeg says is the cause
-            broken = True
+            with suppress(BrokenPipeError):  # what ffmpeg says is the cause
+                yield lambda rgb: pipe.write(np.ascontiguousarray(rgb).data)
         except BaseException:
             process.kill()
             raise
         _, said = process.communicate()
-    if broken or process.returncode:
+    if process.returncode:
         raise OSError(f"ffmpeg could not write the video: {said.decode(errors='replace').strip()}")

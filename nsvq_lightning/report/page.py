@@ -5,7 +5,6 @@ import platform
 from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.metadata import version
-from importlib.resources import files
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -17,6 +16,7 @@ from cv2.typing import MatLike
 
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.report.files import curve_figure, figure_png
+from nsvq_lightning.report.viewer import web_source
 from nsvq_lightning.training.schedule import Schedule
 from nsvq_lightning.version import __version__
 
@@ -46,7 +46,7 @@ def write_page(
     """
     title = escape(f"{folder.resolve().parent.name} / {folder.resolve().name}")
     refresh = "" if metrics else '<meta http-equiv="refresh" content="5">'
-    template = Template(files("nsvq_lightning.report").joinpath("web", "report.html").read_text(encoding="utf-8"))
+    template = Template(web_source("report.html"))
     preview, config = folder / "preview.png", folder / "config.yaml"
     sections: dict[str, str] = {}
     if metrics is None and preview.exists():
@@ -64,8 +64,8 @@ def write_page(
     packages = ", ".join(f"{name} {version(name)}" for name in ("torch", "lightning", "numba"))
     machine = f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads"
     versions = f"nsvq-lightning {__version__}, Python {platform.python_version()}, {packages}; {machine}"
-    facts = _progress(history, schedule) if metrics is None else _results(metrics)
-    figures = "".join(f"<div>{name}<b>{value}</b></div>" for name, value in facts.items())
+    facts = _facts(history, schedule, metrics).items()
+    figures = "".join(f"<div>{name}<b>{value}</b></div>" for name, value in facts)
     how = "measured on the decoded file" if metrics else "as a file written at that moment would decode to"
     viewer = ' <a href="viewer.html">viewer.html</a> beside this page shows the scene.'
     summary = f"<p>Quality on test views, {how}.{viewer if (folder / 'viewer.html').exists() else ''}</p>"
@@ -76,26 +76,19 @@ def write_page(
     return path
 
 
-def _progress(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> dict[str, str]:
-    """How far a run has come."""
-    last = history[-1]
+def _facts(
+    history: Sequence[Mapping[str, Any]], schedule: Schedule, metrics: Mapping[str, Any] | None
+) -> dict[str, str]:
+    """What a run has come to or, without ``metrics``, how far it has come."""
+    last = metrics or history[-1]
+    quality = {"test PSNR": _decibels(last["psnr"]), "SSIM": f"{last['ssim']:.4f}"}
+    if metrics is None:
+        place = {"iteration": f"{last['iteration']:,} of {schedule.total:,}", "phase": last["phase"]}
+        return {**place, **quality, "splats": f"{last['splats']:,}", "trained for": _duration(last["seconds"])}
+    if metrics["lpips"] is not None:
+        quality["LPIPS"] = f"{metrics['lpips']:.4f}"
     return {
-        "iteration": f"{last['iteration']:,} of {schedule.total:,}",
-        "phase": last["phase"],
-        "test PSNR": _decibels(last["psnr"]),
-        "SSIM": f"{last['ssim']:.4f}",
-        "splats": f"{last['splats']:,}",
-        "trained for": _duration(last["seconds"]),
-    }
-
-
-def _results(metrics: Mapping[str, Any]) -> dict[str, str]:
-    """What a run has come to."""
-    lpips = {} if metrics["lpips"] is None else {"LPIPS": f"{metrics['lpips']:.4f}"}
-    return {
-        "test PSNR": _decibels(metrics["psnr"]),
-        "SSIM": f"{metrics['ssim']:.4f}",
-        **lpips,
+        **quality,
         "file": f"{metrics['file_bytes'] / 1e6:.3f} MB",
         "smaller than .ply": f"{metrics['ratio']:.1f} x",
         "splats": f"{metrics['num_splats']:,}",

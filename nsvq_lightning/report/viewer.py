@@ -2,7 +2,6 @@
 
 import base64
 import json
-import math
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,7 @@ import torch
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.nsvq.header import read_header
-from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.camera import Camera, up_of
 
 # RGB of the backgrounds that have names.
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -34,9 +33,10 @@ def write_viewer(
     cameras: Mapping[str, Camera],
     title: str,
     background: Sequence[float] = (0.0, 0.0, 0.0),
-    up: Sequence[float] | None = None,
 ) -> int:
     """Write a page that holds a ``.nsvq`` file, its reader, a renderer and cameras; it loads nothing from elsewhere.
+
+    It orbits about the direction that is up for the cameras (:func:`nsvq_lightning.rendering.camera.up_of`).
 
     Args:
         path: HTML file to write, replaced atomically.
@@ -44,16 +44,15 @@ def write_viewer(
         cameras: At least one, by name; the page starts at the first. They have the coordinates of the file's positions.
         title: Name of the scene, plain text.
         background: RGB in [0, 1] behind the splats.
-        up: Direction in the world about which the page orbits; by default, the mean of the cameras' own.
 
     Returns:
         Bytes of the page.
 
     Raises:
         FormatError: ``scene_file`` is damaged or not a ``.nsvq`` file.
-        ValueError: There are no cameras, ``background`` is no colour, or ``up`` is no direction.
+        ValueError: There are no cameras, or ``background`` is no colour.
     """
-    page = viewer_page(cameras, title, background, up, scene_file)
+    page = viewer_page(cameras, title, background, scene_file)
     write_text(path, page)
     return len(page.encode())
 
@@ -62,7 +61,6 @@ def viewer_page(
     cameras: Mapping[str, Camera],
     title: str,
     background: Sequence[float] = (0.0, 0.0, 0.0),
-    up: Sequence[float] | None = None,
     scene_file: str | os.PathLike[str] | None = None,
     live: float = 0.0,
 ) -> str:
@@ -72,7 +70,6 @@ def viewer_page(
         cameras: See there.
         title: See there.
         background: See there.
-        up: See there.
         scene_file: The ``.nsvq`` file in the page; without one, it asks its server for ``scene.nsvq``.
         live: Seconds after which a page without a file asks its server for ``version`` again, to show a new one;
             0 for never.
@@ -81,31 +78,26 @@ def viewer_page(
         raise ValueError("a page needs at least one camera to start from, got none")
     if len(background) != 3 or not all(0 <= value <= 1 for value in background):
         raise ValueError(f"background must be three numbers from 0 to 1, got {list(background)}")
-    if up is None:  # the mean of where their upper edges point, or that of the first where they point everywhere
-        edges = -torch.tensor([camera.packed_view[3:6] for camera in cameras.values()], dtype=torch.float64)
-        up = (edges.mean(0) if edges.mean(0).norm() > 0.1 else edges[0]).tolist()
-    if len(up) != 3 or not 0 < math.hypot(*up) < math.inf:
-        raise ValueError(f"up must be a direction, three finite numbers that are not all 0, got {list(up)}")
     scene = {
         "cameras": [{"name": name, **camera_entry(camera)} for name, camera in cameras.items()],
         "background": list(background),
-        "up": list(up),
+        "up": up_of(list(cameras.values())).tolist(),
     }
     if scene_file is None:
-        source = f'<script data-seconds="{live:g}">\n{_source("served.js")}</script>'
+        source = f'<script data-seconds="{live:g}">\n{web_source("served.js")}</script>'
         connect = " connect-src 'self';"
     else:
         read_header(scene_file)  # verifies the file's checksum
         file = base64.b64encode(Path(scene_file).read_bytes()).decode()
         source, connect = f'<script id="file" type="text/plain">{file}</script>', ""
-    return Template(_source("viewer.html")).substitute(
+    return Template(web_source("viewer.html")).substitute(
         title=escape(title.encode("utf-8", "replace").decode()),
         scene=json.dumps(scene, separators=(",", ":"), allow_nan=False).replace("<", r"\u003c"),
         source=source,
         connect=connect,
-        css=_source("viewer.css"),
-        decoder=_source("nsvq.js"),
-        viewer=_source("viewer.js"),
+        css=web_source("viewer.css"),
+        decoder=web_source("nsvq.js"),
+        viewer=web_source("viewer.js"),
     )
 
 
@@ -147,8 +139,8 @@ def page_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
     return cameras
 
 
-def _source(name: str) -> str:
-    """Text of a file of the page."""
+def web_source(name: str) -> str:
+    """Text of a file that pages are made of."""
     return files("nsvq_lightning.report").joinpath("web", name).read_text(encoding="utf-8")
 
 

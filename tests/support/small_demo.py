@@ -6,10 +6,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 
 from nsvq_lightning.data import colmap
 from nsvq_lightning.data.colmap import import_pycolmap, read_model
-from nsvq_lightning.data.images import encode_png, read_image
+from nsvq_lightning.data.images import read_image
 
 DEMO = Path(colmap.__file__).parent / "demo"
 
@@ -39,7 +40,7 @@ def write_small_demo(root: Path, views: int, width: int, height: int, points: in
         posed = pycolmap.Image(name=name, keypoints=pixels[rows], camera_id=1, image_id=number)
         model.add_image_with_trivial_frame(posed, pycolmap.Rigid3d(image.viewmat[:3]))
         picture = cv2.resize(read_image(DEMO / "images" / image.name), (width, height), interpolation=cv2.INTER_AREA)
-        (root / "images" / name).write_bytes(encode_png(np.asarray(picture, np.uint8)))
+        PIL.Image.fromarray(np.asarray(picture, np.uint8)).save(root / "images" / name)
     seen = [row for row, track in enumerate(tracks) if len(track) >= min(3, views)]
     for row in seen[:: max(1, len(seen) // points)][:points]:
         track = pycolmap.Track()
