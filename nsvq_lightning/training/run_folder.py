@@ -1,24 +1,23 @@
 """Where a run writes: a folder of its own, which never overwrites another run; and the trainer that knows it."""
 
 import atexit
-import errno
 import logging
 import os
 import platform
-import sys
 from contextlib import nullcontext, suppress
 from itertools import count
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 from weakref import WeakKeyDictionary
 
+from filelock import FileLock, Timeout
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.profilers import PassThroughProfiler
 from lightning.pytorch.strategies import DDPStrategy
 
-from nsvq_lightning.io.atomic import remove_temporaries
+from nsvq_lightning.io.atomic import remove_temporaries, write_text
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.training.distributed import ViewParallelStrategy  # noqa: F401  registers its name
 from nsvq_lightning.training.module import SplatModule
@@ -32,11 +31,11 @@ RUN_FILES = (
     *("checkpoints", "last.ckpt", "renders", "predictions"),
 )
 
-# File that the process of a run keeps locked; it names that process and its machine.
-MARKER = ".running"
+# File that names the process of a run and its machine, and the one that this process keeps locked.
+MARKER, LOCK = ".running", ".running.lock"
 
-# The locked marker of each folder that this process writes a run to.
-_HELD: dict[Path, TextIO] = {}
+# The lock of each folder that this process writes a run to.
+_HELD: dict[Path, FileLock] = {}
 
 _FOLDERS: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
 _RESERVED: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
@@ -126,75 +125,43 @@ def take(folder: Path, checkpoint: str | Path | None) -> None:
 def hold(folder: Path) -> None:
     """Keep other processes from writing a run to a folder until :func:`let_go`, or until this process ends, however.
 
-    Only one process can lock the marker, and the system unlocks it when that ends: what a killed run has left is an
-    unlocked marker, and temporary files, which are removed.
+    The system unlocks what a process has locked when that ends: what a killed run has left is an unlocked file, and
+    temporary files, which are removed.
 
     Raises:
         FileExistsError: Another process holds the folder.
     """
     if folder.resolve() in _HELD:
         return
-    path = folder / MARKER
-    while True:
-        file = path.open("a+", encoding="utf-8", errors="replace")
-        try:
-            _lock(file)
-            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                break
-        except (BlockingIOError, PermissionError):
-            file.seek(0)
-            owner = file.read().strip() or "that has just started"
-            file.close()
-            raise FileExistsError(
-                f"another run is writing to {folder} now, process {owner}: wait until it has ended, or name another "
-                "folder"
-            ) from None
-        except FileNotFoundError:
-            pass
-        file.close()  # whoever held it has just removed it
-    file.seek(0)
-    remove_temporaries(folder, file.read().partition(" ")[0])
-    file.truncate(0)
-    file.write(f"{os.getpid()} on {platform.node()}\n")
-    file.flush()
-    _HELD[folder.resolve()] = file
+    marker = folder / MARKER
+    owner = marker.read_text(encoding="utf-8", errors="replace") if marker.is_file() else ""
+    lock = FileLock(folder / LOCK, blocking=False, thread_local=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise FileExistsError(
+            f"another run is writing to {folder} now, process {owner.strip() or 'that has just started'}: wait until "
+            "it has ended, or name another folder"
+        ) from None
+    remove_temporaries(folder, owner.partition(" ")[0])
+    write_text(marker, f"{os.getpid()} on {platform.node()}\n")
+    _HELD[folder.resolve()] = lock
 
 
 def let_go(folder: Path) -> None:
     """Let other processes write to a folder that this one holds; does nothing otherwise."""
-    file = _HELD.pop(folder.resolve(), None)
-    if file is not None:
-        with suppress(OSError):  # Windows removes no open file; an unlocked one does no harm
-            (folder / MARKER).unlink()
-        file.close()
+    lock = _HELD.pop(folder.resolve(), None)
+    if lock is not None:
+        for name in (MARKER, LOCK):
+            with suppress(OSError):  # Windows removes no open file; an unlocked one does no harm
+                (folder / name).unlink()
+        lock.release()
 
 
 @atexit.register
 def _let_go_of_all() -> None:
     for folder in list(_HELD):
         let_go(folder)
-
-
-def _lock(file: TextIO) -> None:
-    """Lock an open file until it is closed.
-
-    Raises:
-        BlockingIOError: Another process has locked it; on Windows a PermissionError.
-    """
-    if sys.platform == "win32":
-        import msvcrt
-
-        file.seek(1 << 20)  # a byte beyond the text: what is locked cannot be read
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-        return
-    import fcntl
-
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
-            raise
-        log.warning("this file system has no locks: make sure that no two runs are given the same folder")
 
 
 def _refuse_other_run(folder: Path, checkpoint: str | Path | None) -> None:

@@ -18,7 +18,7 @@ from nsvq_lightning.callbacks import ExportScene, MetricReport, PhaseSchedule, R
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io.atomic import atomic_write
-from nsvq_lightning.training.run_folder import _HELD, MARKER, claim_version, hold, let_go, run_folder, take
+from nsvq_lightning.training.run_folder import _HELD, LOCK, MARKER, claim_version, hold, let_go, run_folder, take
 
 
 class Elsewhere(Logger):
@@ -52,7 +52,7 @@ def test_every_run_gets_the_next_version_whatever_the_logger(
         folder = run_folder(trainer)
         assert folder == tmp_path / "runs" / demo_scene.name / f"version_{version}"
         assert {"scene.nsvq", "curve.csv", "checkpoints/last.ckpt"} <= contents(folder).keys()
-        assert MARKER not in contents(folder)
+        assert not {MARKER, LOCK} & contents(folder).keys()
         found.append(contents(folder))
     assert contents(tmp_path / "runs" / demo_scene.name / "version_0") == found[0]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["runs"]
@@ -148,6 +148,7 @@ def test_a_killed_run_holds_no_folder_and_what_it_left_unfinished_goes(tmp_path:
     ]
     let_go(tmp_path)
     assert not (tmp_path / MARKER).exists()
+    assert not (tmp_path / LOCK).exists()
 
 
 def test_nobody_continues_a_run_in_its_folder_while_it_trains(tmp_path: Path) -> None:

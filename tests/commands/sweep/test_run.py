@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from filelock import FileLock
 
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.commands.sweep import run as module
 from nsvq_lightning.commands.sweep.plan import Run, plan
 from nsvq_lightning.commands.sweep.results import Row
 from nsvq_lightning.commands.sweep.run import commands, folder_of, prepare, run_subprocess, sweep, train
-from nsvq_lightning.training.run_folder import MARKER, _lock
+from nsvq_lightning.training.run_folder import LOCK
 
 Calls = list[Sequence[str]]
 
@@ -90,8 +91,7 @@ def same(folder: Path, other: Path) -> bool:
 def held(folder: Path) -> Iterator[None]:
     """As if another process wrote to a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / MARKER, "a+") as file:
-        _lock(file)
+    with FileLock(folder / LOCK):
         yield
 
 
