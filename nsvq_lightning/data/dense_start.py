@@ -45,12 +45,8 @@ class _Photo(NamedTuple):
         return np.asarray(local / np.linalg.norm(local, axis=1, keepdims=True) @ self.rotation, np.float64)
 
 
-class _Points(NamedTuple):
-    """Triangulated pixels: positions ``[M, 3]``, colours ``[M, 3]`` and detail ``[M]``, both in bytes."""
-
-    positions: Floats
-    colors: NDArray[np.uint8]
-    detail: NDArray[np.uint8]
+# Triangulated pixels: positions ``[M, 3]``, colours ``[M, 3]`` and detail ``[M]``, both in bytes.
+_Points = tuple[Floats, NDArray[np.uint8], NDArray[np.uint8]]
 
 
 # Candidates over all flows; of more pixels than that, every third, fourth, ... row and column is taken.
@@ -197,4 +193,4 @@ def _followed(a: _Photo, b: _Photo, there: NDArray[np.float32], back: NDArray[np
     error = np.maximum(np.linalg.norm(pixel_a - start, axis=1), np.linalg.norm(pixel_b - end, axis=1))
     nearest, farthest = (share * a.depth for share in DEPTHS)
     kept = (error < MOST_ERROR) & (depth_a > nearest) & (depth_b > nearest) & (depth_a < farthest)
-    return _Points(points[kept], a.image[rows[kept], columns[kept]], a.detail[rows[kept], columns[kept]])
+    return points[kept], a.image[rows[kept], columns[kept]], a.detail[rows[kept], columns[kept]]

@@ -21,7 +21,7 @@ from nsvq_lightning.data.images import image_head
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.ply import read_ply_columns, read_ply_header
 from nsvq_lightning.random import generator
-from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.camera import Camera, looked_at, poses
 
 log = logging.getLogger(__name__)
 
@@ -327,35 +327,22 @@ def random_points(cameras: list[Camera]) -> NDArray[np.float64]:
     """
     draws = generator(0, 0, "random points")
     count = 8 * RANDOM_POINTS
-    views = np.stack([camera.viewmat.double().numpy() for camera in cameras])
-    rotations = views[:, :3, :3]
-    centres = -np.einsum("vji,vj->vi", rotations, views[:, :3, 3])
+    centres, turned = poses(cameras)
+    rotations, middle = turned.as_matrix(), centres.mean(0)
+    # The cameras look at where their axes meet, or as far away as their own extent if that is farther.
+    typical = float(np.median(np.linalg.norm(centres - looked_at(cameras), axis=1)))
+    distance = max(typical, float(np.linalg.norm(centres - middle, axis=1).max()), 1e-6)
     chosen = torch.randint(len(cameras), (count,), generator=draws).numpy()
     across, down, away = torch.rand(3, count, generator=draws, dtype=torch.float64).numpy()
     focal = np.array([camera.intrinsics for camera in cameras])[chosen]
     size = np.array([(camera.width, camera.height) for camera in cameras])[chosen]
-    depth = 2 * _distance(centres, rotations[:, 2]) * away
+    depth = 2 * distance * away
     x, y = (across * size[:, 0] - focal[:, 2]) / focal[:, 0], (down * size[:, 1] - focal[:, 3]) / focal[:, 1]
     rays = np.stack([x, y, np.ones_like(x)], axis=1)
-    points = centres[chosen] + np.einsum("pji,pj->pi", rotations[chosen], rays * depth[:, None])
+    points = centres[chosen] + np.einsum("pij,pj->pi", rotations[chosen], rays * depth[:, None])
     order = np.argsort(-_sightings(points, cameras), kind="stable")
     chosen_points: NDArray[np.float64] = points[order[:RANDOM_POINTS]]
     return chosen_points
-
-
-def _distance(centres: NDArray[np.float64], forward: NDArray[np.float64]) -> float:
-    """How far away the cameras look: to where their axes meet, or their own extent if that is farther."""
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    # Parallel axes meet nowhere; this little weight keeps the solution finite.
-    middle = centres.mean(0)
-    focus = middle + np.linalg.solve(
-        across.sum(0) + 1e-3 * len(centres) * np.eye(3), np.einsum("vij,vj->i", across, centres - middle)
-    )
-    return max(
-        float(np.median(np.linalg.norm(centres - focus, axis=1))),
-        float(np.linalg.norm(centres - middle, axis=1).max()),
-        1e-6,
-    )
 
 
 def _sightings(points: NDArray[np.float64], cameras: list[Camera]) -> NDArray[np.int64]:

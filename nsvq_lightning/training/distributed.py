@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, cast
 
 import torch
 import torch.distributed
@@ -82,10 +81,9 @@ def from_first_process(trainer: Trainer, tensor: Tensor) -> Tensor:
 
 def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:
     """Sum of a tensor over all processes, in place; the tensor unchanged if there is one process."""
-    if trainer.world_size == 1:
-        return tensor
-    reduced = trainer.strategy.reduce(tensor, reduce_op="sum")
-    return cast(Tensor, reduced)
+    if trainer.world_size > 1:
+        all_reduce(tensor)  # not the strategy's reduction, which has a barrier
+    return tensor
 
 
 log = logging.getLogger(__name__)
@@ -152,13 +150,6 @@ class ViewParallelStrategy(DDPStrategy):
             work.wait()
         for gradient in gradients:
             gradient.div_(self.world_size)  # not every backend has an average
-
-    def reduce(self, tensor: Any, group: Any | None = None, reduce_op: Any = "mean") -> Any:
-        """Reduce a tensor; a sum without the barrier that Lightning puts before each reduction."""
-        if isinstance(tensor, Tensor) and reduce_op == "sum" and group is None and self.world_size > 1:
-            all_reduce(tensor)
-            return tensor
-        return super().reduce(tensor, group, reduce_op)
 
 
 StrategyRegistry.register(

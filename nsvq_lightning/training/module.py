@@ -171,7 +171,7 @@ class SplatModule(resume.ResumedModule):
             self.background = scene_module.background_of(scene, self.background)
         if stage == "fit":
             distributed.check_strategy(self.trainer.strategy)
-            self.extent = self.extent or scene_module.extent_of(scene)
+            self.extent = self.extent or scene_module.extent_of(self.trainer)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """One Adam optimiser with a named group for each attribute and codebook; first splats, if there are none."""
@@ -194,7 +194,7 @@ class SplatModule(resume.ResumedModule):
         self._micro_batch = batch_idx % self.trainer.accumulate_grad_batches
         if self._micro_batch == 0:
             self._updates = True
-        rates, end = self._step_rates, self.schedule.position_decay_end
+        rates, end = self._step_rates, self.schedule.iteration(self.schedule.position_decay)
         for group in self.trainer.optimizers[0].param_groups:
             rate = optim.group_lr(group["name"], rates, self.extent)
             if group["name"] == "means":

@@ -4,7 +4,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, is_dataclass, replace
 from hashlib import sha256
 from operator import attrgetter
@@ -223,12 +223,7 @@ def check_scene(checkpoint: Mapping[str, Any], scene: Scene) -> None:
 class PlainCheckpointIO(TorchCheckpointIO):
     """Lightning's reading and writing of checkpoints, with :func:`read_checkpoint` for local files."""
 
-    def load_checkpoint(
-        self,
-        path: str | Path,
-        map_location: Callable[..., Any] | None = None,
-        weights_only: bool | None = None,
-    ) -> dict[str, Any]:
+    def load_checkpoint(self, path: str | Path, map_location: Any = None, weights_only: bool | None = None) -> Any:
         """Read a checkpoint; remote ones as Lightning does, but also refusing anything that could run code.
 
         Raises:

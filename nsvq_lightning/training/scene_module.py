@@ -271,14 +271,13 @@ def train_sensitivities(
         yield view, *sensitivity(splats, view.camera, module.render_splats, signs, view.mask)
 
 
-def extent_of(scene: Scene | None) -> float:
-    """Extent of the scene, scene units, above 0.
+def extent_of(trainer: Trainer) -> float:
+    """Extent of the trainer's scene, scene units, above 0.
 
     Raises:
         ValueError: There is no scene, or all its cameras are in one place.
     """
-    if scene is None:
-        raise ValueError("the extent of the scene is unknown; fit with a data module that has a scene")
+    scene = needed_scene(trainer, "the extent of the scene is unknown", "set the module's extent")
     if scene.extent <= 0.0:
         raise ValueError(f"the {len(scene.train)} train photos of {scene.root} {ONE_PLACE}")
     return scene.extent

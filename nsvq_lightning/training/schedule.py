@@ -221,11 +221,6 @@ class Schedule:
         """
         return reference / self.scale
 
-    @property
-    def position_decay_end(self) -> int:
-        """Iteration from which the position's learning rate is constant."""
-        return self.iteration(self.position_decay)
-
 
 @lru_cache
 def _times(schedule: Schedule, start: float, last: float, stride: float) -> tuple[int, ...]:

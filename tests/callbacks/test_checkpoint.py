@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from nsvq_lightning.callbacks.checkpoint import GracefulStop
+from nsvq_lightning.training import distributed
+
+Trainers = Callable[..., Any]
 
 
-def trainer(world_size: int, other: tuple[float, float] = (0.0, 0.0), device: str = "cpu", step: int = 1) -> Any:
-    """One of ``world_size`` processes; another has received so many SIGINT and SIGTERM."""
+@pytest.fixture
+def trainer(monkeypatch: pytest.MonkeyPatch) -> Trainers:
+    """Makes one of ``world_size`` processes; another has received so many SIGINT and SIGTERM."""
 
-    def reduce(tensor: Tensor, reduce_op: str) -> Tensor:
-        assert reduce_op == "sum"
-        return tensor.add_(torch.tensor(other))
+    def made(world_size: int, other: tuple[float, float] = (0.0, 0.0), device: str = "cpu", step: int = 1) -> Any:
+        monkeypatch.setattr(distributed, "all_reduce", lambda tensor: tensor.add_(torch.tensor(other)))
+        strategy = SimpleNamespace(root_device=torch.device(device))
+        return SimpleNamespace(world_size=world_size, strategy=strategy, global_step=step)
 
-    strategy = SimpleNamespace(reduce=reduce, root_device=torch.device(device))
-    return SimpleNamespace(world_size=world_size, strategy=strategy, global_step=step)
+    return made
 
 
 @pytest.fixture
@@ -35,7 +38,9 @@ def acted() -> Iterator[list[int]]:
 
 
 @pytest.mark.parametrize(("world_size", "at_once"), [(1, 1), (2, 0)])
-def test_a_second_signal_acts_at_once_in_one_process_alone(world_size: int, at_once: int, acted: list[int]) -> None:
+def test_a_second_signal_acts_at_once_in_one_process_alone(
+    world_size: int, at_once: int, acted: list[int], trainer: Trainers
+) -> None:
     held = GracefulStop()
     held.hold(trainer(world_size))
     signal.raise_signal(signal.SIGTERM)
@@ -49,7 +54,7 @@ def test_a_second_signal_acts_at_once_in_one_process_alone(world_size: int, at_o
     assert len(acted) == 2
 
 
-def test_a_signal_of_another_process_is_taken_for_ones_own(acted: list[int]) -> None:
+def test_a_signal_of_another_process_is_taken_for_ones_own(acted: list[int], trainer: Trainers) -> None:
     held = GracefulStop()
     held.hold(trainer(2))
     assert held.received(trainer(2)) == []
@@ -59,7 +64,7 @@ def test_a_signal_of_another_process_is_taken_for_ones_own(acted: list[int]) -> 
     held.release()
 
 
-def test_several_gpus_ask_each_other_now_and_then() -> None:
+def test_several_gpus_ask_each_other_now_and_then(trainer: Trainers) -> None:
     held, other = GracefulStop(), (0.0, 1.0)
     answers = [held.received(trainer(1, device="meta", step=step)) for step in (1, 16)]
     assert answers == [[], []]  # alone, nobody is asked

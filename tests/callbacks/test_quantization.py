@@ -25,6 +25,7 @@ from nsvq_lightning.callbacks.quantization import perplexity
 from nsvq_lightning.quantize import NSVQ, StraightThrough
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.training import distributed
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.training.row_ops import append_rows, keep_rows
 from nsvq_lightning.training.schedule import Phase, Schedule
@@ -85,14 +86,14 @@ def test_the_sh_degree_grows_up_to_that_of_the_splats() -> None:
 
 
 @pytest.mark.parametrize("rank", [0, 1])
-def test_usage_of_several_processes_is_saved_and_resumed_once(rank: int) -> None:
+def test_usage_of_several_processes_is_saved_and_resumed_once(rank: int, monkeypatch: pytest.MonkeyPatch) -> None:
     # Of two processes that counted the same; the checkpoint holds the buffers of the first.
+    monkeypatch.setattr(distributed, "all_reduce", lambda tensor: tensor.mul_(2))
     quantizer = NSVQ(4, 3)
     module: Any = host(quantizers={"scales": quantizer})
     trainer: Any = SimpleNamespace(
         world_size=2,
         is_global_zero=rank == 0,
-        strategy=SimpleNamespace(reduce=lambda tensor, reduce_op: tensor.mul_(2)),
         optimizers=[build_adam(param_groups(Splats(), {"scales": quantizer}, LearningRates(), 1.0))],
     )
     quantizer.usage.copy_(torch.tensor([3, 0, 1, 0]))

@@ -110,12 +110,6 @@ def test_accumulated_gradients_travel_once_and_remember_a_loss_that_was_not_fini
     assert scene.first.grad is None
 
 
-def test_sums_wait_for_nobody_first(strategy: OfTwo, monkeypatch: pytest.MonkeyPatch) -> None:
-    meet(monkeypatch, [1.0, 2.0])
-    monkeypatch.setattr(DDPStrategy, "reduce", lambda *_: pytest.fail("Lightning's reduction has a barrier"))
-    assert strategy.reduce(torch.tensor([1.0, 1.0]), reduce_op="sum").tolist() == [2.0, 3.0]
-
-
 ROWS = torch.randn(40, 3, generator=generator(0))
 
 
@@ -152,11 +146,12 @@ def trainer(world_size: int, parameters: dict[str, Tensor], first: Tensor | None
         world_size=world_size,
         global_step=600,
         optimizers=[SimpleNamespace(param_groups=[{"name": n, "params": [p]} for n, p in parameters.items()])],
-        strategy=SimpleNamespace(broadcast=broadcast, reduce=lambda tensor, reduce_op: tensor),
+        strategy=SimpleNamespace(broadcast=broadcast),
     )
 
 
-def test_replicas_that_differ_end_the_run_and_say_where() -> None:
+def test_replicas_that_differ_end_the_run_and_say_where(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(strategies, "all_reduce", lambda tensor: None)
     parameters = {"means": ROWS, "scales": ROWS + 1}
     same = torch.stack([checksum(tensor) for tensor in parameters.values()])
     check_replicas(trainer(2, parameters), "pruning")

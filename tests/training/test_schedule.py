@@ -42,7 +42,7 @@ def test_the_papers_run_has_the_papers_milestones() -> None:
         3,
         3,
     ]
-    assert schedule.position_decay_end == 30_000
+    assert schedule.iteration(schedule.position_decay) == 30_000
 
 
 def test_a_shorter_run_is_the_same_run_scaled() -> None:
@@ -55,7 +55,7 @@ def test_a_shorter_run_is_the_same_run_scaled() -> None:
     assert list(schedule.reset_times(12_000, 3000)) == [300, 600, 900, 1200]
     assert list(schedule.times(16_000, 20_000, 1000)) == [1600, 1700, 1800, 1900, 2000]
     assert schedule.sh_degree_at(300, 1000, 3) == 3
-    assert schedule.position_decay_end == 3000
+    assert schedule.iteration(schedule.position_decay) == 3000
 
 
 @pytest.mark.parametrize("total", [*range(100, 2000, 37), *range(2500, 50_000, 2500), 70_001])

@@ -180,7 +180,7 @@ def test_learning_rates_can_follow_the_views_of_a_step(run: RunFactory, recipe: 
         trainer, module = run(recipe().values(), module={"rates": rates}, accumulate_grad_batches=4, max_steps=2)
         groups = {group["name"]: group["lr"] for group in trainer.optimizers[0].param_groups}
         assert groups["opacities"] == factor * rates.opacities
-        positions = position_lr(2, module.extent, rates, module.schedule.position_decay_end)
+        positions = position_lr(2, module.extent, rates, module.schedule.iteration(module.schedule.position_decay))
         assert groups["means"] == pytest.approx(factor * positions)
 
 
