@@ -163,12 +163,14 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
             f"{files['points3D']} has no points, and training starts from them: triangulate with COLMAP "
             "(`colmap point_triangulator`) or run its mapper again"
         )
-    viewmats = np.tile(np.eye(4), (len(registered), 1, 1))
-    viewmats[:, :3] = [image.cam_from_world().matrix() for image in registered]
-    broken = [image.name for image, pose in zip(registered, viewmats, strict=True) if not _is_finite(pose)]
+    images = tuple(
+        ColmapImage(image.name, image.camera_id, np.vstack([image.cam_from_world().matrix(), np.eye(4)[3]]))
+        for image in registered
+    )
+    broken = [image.name for image in images if not _is_finite(image.viewmat)]
     if broken:
         raise SceneError(f"{files['images']}: {len(broken)} poses are not finite, first {broken[0]}: run COLMAP again")
-    for number in dict.fromkeys(image.camera_id for image in registered):
+    for number in dict.fromkeys(image.camera_id for image in images):
         camera = reconstruction.cameras[number]  # of a text table, which no check has seen before, it may be anything
         size = camera.width, camera.height
         if not 0 < min(size) <= max(size) <= LARGEST_SIDE or not _is_finite(camera.params):
@@ -178,7 +180,7 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
                 "model again or run COLMAP again"
             )
     return ColmapModel(
-        images=tuple(ColmapImage(i.name, i.camera_id, pose) for i, pose in zip(registered, viewmats, strict=True)),
+        images=images,
         cameras=dict(reconstruction.cameras.items()),
         points=np.array([point.xyz for _, point in points], np.float64),
         colors=np.array([point.color for _, point in points], np.uint8),

@@ -101,21 +101,17 @@ def _find_features(
     database: Path, images: Path, names: Sequence[str], report: Report, max_size: int, threads: int
 ) -> None:
     pycolmap = import_pycolmap()
-    found = {name for (name,) in _rows(database, "select name from images join keypoints using (image_id)")}
-    cameras = dict(_rows(database, "select name, camera_id from images"))
     groups: defaultdict[tuple[int, int], list[str]] = defaultdict(list)
     for name in names:
         groups[image_head(images / name).size].append(name)
     options = pycolmap.FeatureExtractionOptions(max_image_size=max_size, num_threads=threads, use_gpu=False)
-    done = len(found)
+    done = 0
     for group in groups.values():
         reader = pycolmap.ImageReaderOptions(camera_model="OPENCV" if len(group) >= SHARED else "SIMPLE_RADIAL")
-        reader.existing_camera_id = next((cameras[name] for name in group if name in cameras), -1)
-        todo = [name for name in group if name not in found]
-        while todo:
-            # The first one alone makes the camera of its group.
-            size = 4 if reader.existing_camera_id >= 0 else 1
-            batch, todo = todo[:size], todo[size:]
+        # The first one alone makes the camera of its group. COLMAP passes over photos that have features already.
+        for batch in (group[:1], *(group[start : start + 4] for start in range(1, len(group), 4))):
+            cameras = dict(_rows(database, "select name, camera_id from images"))
+            reader.existing_camera_id = next((cameras[name] for name in group if name in cameras), -1)
             pycolmap.extract_features(
                 database,
                 images,
@@ -125,9 +121,6 @@ def _find_features(
                 extraction_options=options,
                 device=pycolmap.Device.cpu,
             )
-            if reader.existing_camera_id < 0:
-                where = "select camera_id from images where name = ?"
-                reader.existing_camera_id = _rows(database, where, batch[0])[0][0]
             done += len(batch)
             report("finding features", done, len(names))
 

@@ -4,13 +4,14 @@ import csv
 import io
 import json
 import logging
+import os
 import re
 import shutil
 import subprocess
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import lru_cache
 from hashlib import sha256
 from itertools import cycle
@@ -227,21 +228,16 @@ def file_stem(name: str, names: tuple[str, ...] = ()) -> str:
 @lru_cache(maxsize=8)
 def _file_stems(names: tuple[str, ...]) -> dict[str, str]:
     """A file name without suffix for each name; those that are too long or used twice end in a digest."""
-    plain = {name: str(Path(name).with_suffix("")).replace("/", "_").replace("\\", "_") for name in names}
-    uses = Counter(map(_folded, plain.values()))
+    plain = {name: re.sub(r"[/\\]", "_", str(Path(name).with_suffix(""))) for name in names}
+    # What file systems that do not tell case or composed characters apart make of them.
+    folded = {name: normalize("NFKC", normalize("NFKC", stem).casefold()) for name, stem in plain.items()}
+    uses = Counter(folded.values())
     stems = {}
     for name, stem in plain.items():
-        data = stem.encode(errors="surrogateescape")
-        if uses[_folded(stem)] > 1 or len(data) > LONGEST or re.search("~[0-9a-f]{12}$", _folded(stem)):
-            ending = f"~{sha256(name.encode(errors='surrogateescape')).hexdigest()[:12]}"
-            stem = data[: LONGEST - len(ending)].decode(errors="ignore") + ending
+        if uses[folded[name]] > 1 or len(os.fsencode(stem)) > LONGEST or "~" in folded[name]:
+            stem = f"{stem[: LONGEST // 5]}~{sha256(os.fsencode(name)).hexdigest()[:12]}"
         stems[name] = stem
     return stems
-
-
-def _folded(stem: str) -> str:
-    """What file systems that do not tell case or composed characters apart make of a name."""
-    return normalize("NFKC", normalize("NFKC", stem).casefold())
 
 
 def comparison(image: Tensor, photo: Tensor, gain: float = 4.0) -> Tensor:
@@ -286,13 +282,11 @@ def log_pictures(loggers: Sequence[Logger], pictures: Sequence[Path], step: int)
                 logger.experiment.add_image(f"test/{path.stem}", image, step, dataformats="HWC")
 
 
-# Adds a picture ``[H, W, 3]``, RGB, to a video.
-AddPicture = Callable[[NDArray[np.uint8]], Any]
-
-
 @contextmanager
-def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[AddPicture]:
-    """Write a video atomically: it is there when the block, which gets the pictures, ends without an error.
+def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Callable[[NDArray[np.uint8]], Any]]:
+    """Write a video atomically: it is there when the block ends without an error.
+
+    The block gets a function that adds a picture ``[H, W, 3]``, RGB.
 
     It is H.264 where the program ``ffmpeg`` is installed, which every player opens; otherwise VP9, which browsers and
     most players open.
@@ -309,40 +303,23 @@ def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ad
     """
     if width % 2 or height % 2:
         raise ValueError(f"{path}: width and height of a video must be even, got {width}x{height}")
+    program = shutil.which("ffmpeg")
+    log.info("%s: %s", path, "H.264" if program else "VP9")
     # Both programs tell the container by the suffix, which the unfinished file does not have.
     with atomic_path(path) as unfinished, tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        file, program = Path(folder) / f"video{VIDEO}", shutil.which("ffmpeg")
-        log.info("%s: %s", path, "H.264" if program else "VP9")
-        with _h264(program, file, width, height, fps) if program else _vp9(file, width, height, fps) as add:
-            yield add
-        file.replace(unfinished)
-
-
-@contextmanager
-def _vp9(path: Path, width: int, height: int, fps: float) -> Iterator[AddPicture]:
-    video = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"vp09"), fps, (width, height))
-    if not video.isOpened():
-        raise OSError("OpenCV cannot write VP9 here: install ffmpeg, or write PNGs into a folder")
-    try:
-        yield lambda rgb: video.write(np.ascontiguousarray(rgb[:, :, ::-1]))
-    finally:
-        video.release()
-
-
-@contextmanager
-def _h264(program: str, path: Path, width: int, height: int, fps: float) -> Iterator[AddPicture]:
-    command = [program, "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
-    command += ["-r", str(fps), "-i", "-", "-c:v", "libx264", "-crf", "17", "-pix_fmt", "yuv420p"]  # 17: nearly no loss
-    command += ["-movflags", "+faststart", str(path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        pipe = process.stdin
-        assert pipe is not None
+        lossless, file = Path(folder) / "video.avi", Path(folder) / f"video{VIDEO}"
+        written, code = (lossless, "FFV1") if program else (file, "vp09")
+        video = cv2.VideoWriter(str(written), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*code), fps, (width, height))
+        if not video.isOpened():
+            raise OSError(f"OpenCV cannot write {code} here: write PNGs into a folder")
         try:
-            with suppress(BrokenPipeError):  # what ffmpeg says is the cause
-                yield lambda rgb: pipe.write(np.ascontiguousarray(rgb).data)
-        except BaseException:
-            process.kill()
-            raise
-        _, said = process.communicate()
-    if process.returncode:
-        raise OSError(f"ffmpeg could not write the video: {said.decode(errors='replace').strip()}")
+            yield lambda rgb: video.write(np.ascontiguousarray(rgb[:, :, ::-1]))
+        finally:
+            video.release()
+        if program:
+            options = ["-c:v", "libx264", "-crf", "17", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+            command = [program, "-loglevel", "error", "-i", str(lossless), *options, str(file)]
+            ended = subprocess.run(command, capture_output=True, check=False, stdin=subprocess.DEVNULL)
+            if ended.returncode:
+                raise OSError(f"ffmpeg could not write the video: {ended.stderr.decode(errors='replace').strip()}")
+        file.replace(unfinished)

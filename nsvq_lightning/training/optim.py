@@ -153,11 +153,10 @@ def find_group(optimizer: torch.optim.Optimizer, name: str) -> dict[str, Any]:
     Raises:
         ValueError: There is none.
     """
-    for group in optimizer.param_groups:
-        if group.get("name") == name:
-            return group
-    names = ", ".join(str(group.get("name")) for group in optimizer.param_groups)
-    raise ValueError(f"the optimiser has no parameter group {name!r}, only: {names}")
+    groups = {group.get("name"): group for group in optimizer.param_groups}
+    if name not in groups:
+        raise ValueError(f"the optimiser has no parameter group {name!r}, only: {', '.join(map(str, groups))}")
+    return groups[name]
 
 
 def check_groups(optimizers: Sequence[torch.optim.Optimizer], quantized: Iterable[str]) -> None:

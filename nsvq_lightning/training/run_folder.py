@@ -95,11 +95,9 @@ def claim_version(parent: Path) -> Path:
     numbers = [path.name.removeprefix("version_") for path in parent.glob("version_*")]
     for number in count(max((int(number) + 1 for number in numbers if number.isdecimal()), default=0)):
         folder = parent / f"version_{number}"
-        try:
+        with suppress(FileExistsError):
             folder.mkdir()
-        except FileExistsError:
-            continue
-        return folder
+            return folder
     raise AssertionError  # count() has no end
 
 
