@@ -19,7 +19,7 @@ from cv2.typing import MatLike
 
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
 from nsvq_lightning.data.images import DAMAGED, ORIENTATION, image_head
-from nsvq_lightning.io.atomic import atomic_path, atomic_write
+from nsvq_lightning.io.atomic import atomic_write
 
 
 @dataclass(frozen=True)
@@ -135,6 +135,7 @@ def _compare(database: Path, count: int, report: Report, is_video: bool, threads
     """Compare photos, and say now and then how many pairs are done."""
     pycolmap = import_pycolmap()
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
+    how = {"matching_options": matching, "device": pycolmap.Device.cpu}
     exhaustive = count <= (EXHAUSTIVE // 2 if is_video else EXHAUSTIVE)
     pairs = count * (count - 1) // 2 if exhaustive else 2 * OVERLAP * count
     ended = threading.Event()
@@ -149,12 +150,10 @@ def _compare(database: Path, count: int, report: Report, is_video: bool, threads
     polling.start()
     try:
         if exhaustive:
-            pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
+            pycolmap.match_exhaustive(database, **how)
         else:
             pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True)
-            pycolmap.match_sequential(
-                database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu
-            )
+            pycolmap.match_sequential(database, pairing_options=pairing, **how)
     finally:
         ended.set()
         polling.join()
@@ -269,17 +268,15 @@ def copy_photos(photos: Sequence[Path], folder: Path, done: Callable[[int], None
         target = folder / path.name
         try:
             with PIL.Image.open(path) as image:
-                turned = image.getexif().get(ORIENTATION, 1) != 1
-                if not turned:
-                    image.load()
-                elif not target.exists():
-                    upright = PIL.ImageOps.exif_transpose(image)
+                image.load()
+                if not target.exists():
                     with atomic_write(target) as copy:
-                        exif = upright.getexif().tobytes()
-                        upright.save(copy, image.format, quality=JPEG_QUALITY, exif=exif)
-            if not turned and not target.exists():
-                with atomic_path(target) as unfinished:
-                    shutil.copyfile(path, unfinished)
+                        if image.getexif().get(ORIENTATION, 1) == 1:
+                            copy.write(path.read_bytes())
+                        else:
+                            upright = PIL.ImageOps.exif_transpose(image)
+                            exif = upright.getexif().tobytes()
+                            upright.save(copy, image.format, quality=JPEG_QUALITY, exif=exif)
         except DAMAGED as error:
             damaged.append((path, str(error)))
         done(count)

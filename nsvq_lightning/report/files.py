@@ -166,15 +166,12 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: Collection[str]) -> str:
     """A Markdown table that also reads well as plain text; columns named in ``words`` align left, numbers right."""
-    lines = [list(head), *map(list, rows)]
-    widths = [max(3, *map(len, column)) for column in zip(*lines, strict=True)]
-    left = [name in words for name in head]
-    rule = ["-" * width if word else "-" * (width - 1) + ":" for word, width in zip(left, widths, strict=True)]
-    padded = [
-        [cell.ljust(width) if word else cell.rjust(width) for word, cell, width in zip(left, line, widths, strict=True)]
-        for line in lines
-    ]
-    return "\n".join(f"| {' | '.join(line)} |" for line in [padded[0], rule, *padded[1:]])
+    columns = []
+    for name, *cells in zip(head, *rows, strict=True):
+        width = max(3, *map(len, (name, *cells)))
+        rule, pad = ("-" * width, str.ljust) if name in words else ("-" * (width - 1) + ":", str.rjust)
+        columns.append([pad(cell, width) for cell in (name, rule, *cells)])
+    return "\n".join(f"| {' | '.join(line)} |" for line in zip(*columns, strict=True))
 
 
 def curve_figure(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> Any:

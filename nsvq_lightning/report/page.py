@@ -20,6 +20,8 @@ from nsvq_lightning.report.viewer import web_source
 from nsvq_lightning.training.schedule import Schedule
 from nsvq_lightning.version import __version__
 
+Values = Mapping[str, Any]
+
 
 def write_page(
     folder: Path,
@@ -76,9 +78,7 @@ def write_page(
     return path
 
 
-def _facts(
-    history: Sequence[Mapping[str, Any]], schedule: Schedule, metrics: Mapping[str, Any] | None
-) -> dict[str, str]:
+def _facts(history: Sequence[Values], schedule: Schedule, metrics: Values | None) -> dict[str, str]:
     """What a run has come to or, without ``metrics``, how far it has come."""
     last = metrics or history[-1]
     quality = {"test PSNR": _decibels(last["psnr"]), "SSIM": f"{last['ssim']:.4f}"}

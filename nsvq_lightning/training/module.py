@@ -110,7 +110,7 @@ class SplatModule(resume.ResumedModule):
         """How many splats the scene is to have in the end; None for as many as density control makes."""
         self.evaluation_splats = None
         self.history: list[dict[str, Any]] = []
-        self._step_rates = self.rates
+        self._step_factor = 1.0
         self._rate_factors: dict[str, float] = {}
         self._updates = True
         self._late_loss: tuple[str, AsyncScalar] | None = None
@@ -181,12 +181,11 @@ class SplatModule(resume.ResumedModule):
         return optim.build_adam(optim.param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
 
     def on_train_start(self) -> None:
-        """Set the learning rates of this run, not those of a checkpoint; start measuring the training time."""
+        """Set Adam's numbers of this run, not those of a checkpoint; start measuring the training time."""
         scene_module.warn_of_device(self.device)
         views = self.trainer.world_size * self.trainer.accumulate_grad_batches
         optim.check_groups(self.trainer.optimizers, self.quantizers)
-        optim.apply_rates(self.trainer.optimizers[0], self.rates, self.extent, views)
-        self._step_rates = self.rates.of_step(views)
+        self._step_factor = optim.adapt_to_views(self.trainer.optimizers[0], self.rates, views)
         self.stopwatch.start()
 
     def on_train_batch_start(self, batch: View, batch_idx: int) -> None:
@@ -194,12 +193,12 @@ class SplatModule(resume.ResumedModule):
         self._micro_batch = batch_idx % self.trainer.accumulate_grad_batches
         if self._micro_batch == 0:
             self._updates = True
-        rates, end = self._step_rates, self.schedule.iteration(self.schedule.position_decay)
+        end = self.schedule.iteration(self.schedule.position_decay)
         for group in self.trainer.optimizers[0].param_groups:
-            rate = optim.group_lr(group["name"], rates, self.extent)
+            rate = optim.group_lr(group["name"], self.rates, self.extent)
             if group["name"] == "means":
-                rate = optim.position_lr(self.global_step + 1, self.extent, rates, end)
-            group["lr"] = rate * self._rate_factors.pop(group["name"], 1.0)
+                rate = optim.position_lr(self.global_step + 1, self.extent, self.rates, end)
+            group["lr"] = self._step_factor * rate * self._rate_factors.pop(group["name"], 1.0)
 
     def _photometric_term(self, rendered: Render, view: View) -> Tensor:
         """(1 - w)·L1 + w·(1 - SSIM) of picture and photo (paper, section 3.3)."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -26,7 +26,7 @@ class LearningRates:
         shN: Higher colour coefficients.
         codebook_factor: Factor from the rate of an attribute to that of its codebook.
         scale_with_views: For B views in a step, multiply these rates by √B and adapt Adam's other settings
-            (:func:`apply_rates`); otherwise use the rates for one view.
+            (:func:`adapt_to_views`); otherwise use the rates for one view.
 
     Raises:
         ValueError: A rate is negative or not finite, or a rate of the position is 0.
@@ -50,12 +50,6 @@ class LearningRates:
                 raise ValueError(
                     f"rate {field.name} must be finite and {'above' if positive else 'at least'} 0, got {value}"
                 )
-
-    def of_step(self, views: int) -> "LearningRates":
-        """The rates for a step of ``views`` views, with nothing left to scale."""
-        factor = math.sqrt(views) if self.scale_with_views else 1.0
-        scaled = {name: factor * getattr(self, name) for name in (*ATTRIBUTES, "means_final")}
-        return replace(self, **scaled, scale_with_views=False)
 
 
 def position_lr(iteration: int, extent: float, rates: LearningRates, decay_end: int) -> float:
@@ -111,8 +105,8 @@ def group_lr(name: str, rates: LearningRates, extent: float) -> float:
 EPS = 1e-15
 
 
-def apply_rates(optimizer: torch.optim.Optimizer, rates: LearningRates, extent: float, views: int = 1) -> None:
-    """Set learning rates, betas and epsilon of all groups, for example after a checkpoint has replaced them.
+def adapt_to_views(optimizer: torch.optim.Optimizer, rates: LearningRates, views: int) -> float:
+    """Set betas and epsilon of all groups, for example after a checkpoint has replaced them.
 
     With ``rates.scale_with_views``, for a step of B views with averaged gradients: √B·lr, 1 - B·(1 - β), ε / √B.
     B views in one step then move parameters like B steps of a view each, in mean and in variance (Malladi et al. 2022,
@@ -121,8 +115,10 @@ def apply_rates(optimizer: torch.optim.Optimizer, rates: LearningRates, extent: 
     Args:
         optimizer: Adam with named groups.
         rates: Learning rates for a step of one view.
-        extent: Extent of the scene, scene units.
         views: Views in a step, over all processes and micro-batches.
+
+    Returns:
+        By what the learning rates of such a step are multiplied.
 
     Raises:
         ValueError: So many views that a beta would not be positive.
@@ -134,10 +130,9 @@ def apply_rates(optimizer: torch.optim.Optimizer, rates: LearningRates, extent: 
             f"rates cannot scale with {views} views a step, as Adam's first beta would be {betas[0]:.2g}: train fewer "
             "at once, or leave --model.rates.scale_with_views off"
         )
-    scaled = rates.of_step(views)
     for group in optimizer.param_groups:
-        group["lr"] = group_lr(group["name"], scaled, extent)
         group["betas"], group["eps"] = betas, EPS / math.sqrt(scale)
+    return math.sqrt(scale)
 
 
 def build_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
