@@ -164,7 +164,7 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
             "(`colmap point_triangulator`) or run its mapper again"
         )
     images = tuple(
-        ColmapImage(image.name, image.camera_id, np.vstack([image.cam_from_world().matrix(), np.eye(4)[3]]))
+        ColmapImage(image.name, image.camera_id, np.array([*image.cam_from_world().matrix(), (0.0, 0.0, 0.0, 1.0)]))
         for image in registered
     )
     broken = [image.name for image in images if not _is_finite(image.viewmat)]

@@ -250,10 +250,6 @@ class SplatModule(resume.ResumedModule):
         if not self._updates:
             optimizer.zero_grad()
 
-    def on_train_batch_end(self, outputs: Any, batch: View, batch_idx: int) -> None:
-        """Add the time of this step."""
-        self.stopwatch.lap()
-
     def on_train_end(self) -> None:
         """Stop measuring the training time."""
         self.stopwatch.stop()

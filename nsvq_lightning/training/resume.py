@@ -289,6 +289,7 @@ class ResumedModule(SceneModule):
 
     def get_extra_state(self) -> Tensor:
         """Phase, SH degree, extent and seconds of training ``[4]``, float64."""
+        self.stopwatch.lap()
         values = self.phase, self.active_sh_degree, self.extent, self.stopwatch.seconds
         return torch.tensor(values, dtype=torch.float64)
 

@@ -5,6 +5,7 @@ iterations) and asks the :class:`Schedule` for the numbers of this run.
 """
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property, lru_cache
@@ -146,11 +147,7 @@ class Schedule:
 
     def phase_at(self, iteration: int) -> Phase:
         """Phase of a 1-based iteration; iterations past the end belong to the last phase that exists."""
-        ends = self.ends
-        for phase in Phase:
-            if iteration <= ends[phase]:
-                return phase
-        return max(phase for phase in Phase if ends[phase] > (ends[phase - 1] if phase else 0))
+        return Phase(bisect_left(self.ends, min(iteration, self.ends[-1])))
 
     def first_of(self, phase: Phase) -> int | None:
         """First iteration of a phase, or None if this run has no such phase."""
