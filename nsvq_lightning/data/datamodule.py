@@ -69,9 +69,6 @@ class DevicePhotos:
             self._free -= taken
         return moved
 
-    def __getstate__(self) -> dict[str, object]:
-        return {**self.__dict__, "_device": torch.device("cpu"), "_kept": {}}
-
 
 def _spare(device: torch.device) -> int:
     """Bytes of a device's memory that photos may take: a quarter of a GPU's that is free, as splats grow."""

@@ -284,9 +284,6 @@ class ImageStore:
         self._kept: dict[int, Picture] = {}
         self._coming: dict[int, Future[Picture]] = {}
 
-    def __len__(self) -> int:
-        return len(self.sources)
-
     def __getitem__(self, index: int) -> Picture:
         """Picture ``index`` on the CPU; treat it as read-only.
 
@@ -319,15 +316,9 @@ class ImageStore:
 log = logging.getLogger(__name__)
 
 
-class Maps(NamedTuple):
-    """Source column and row of each pixel, ``[H, W]``, in OpenCV's pixels (centres at integers).
-
-    ``blank [H, W]`` marks the pixels that the camera never saw; None if it saw all.
-    """
-
-    x: NDArray[np.float32]
-    y: NDArray[np.float32]
-    blank: NDArray[np.bool_] | None
+# Source column and row of each pixel, ``[H, W]``, in OpenCV's pixels (centres at integers), and which pixels the camera
+# never saw.
+Maps = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -360,7 +351,7 @@ class Undistortion:
         camera: Distorted ``pycolmap.Camera``.
         width: Width of the image files in pixels.
         height: Height of the image files in pixels.
-        keep_maps: Keep the map, 8 bytes per pixel, for the next image of this camera.
+        keep_maps: Keep the map, 9 bytes per pixel, for the next image of this camera.
 
     Raises:
         SceneError: The camera has no pinhole counterpart, for example a spherical one.
@@ -397,16 +388,16 @@ class Undistortion:
         Returns:
             The pinhole image, and its pixels that the camera saw and whose sources count ``[H, W]``; None if all count.
         """
-        maps = self.maps()
+        columns, rows, blank = self.maps()
         # replicate the border, so that the cubic kernel does not mix black into the edge of the crop
-        result: NDArray[np.uint8] = cv2.remap(image, maps.x, maps.y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        result: NDArray[np.uint8] = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         count = None
         if kept is not None:
             whole = kept.astype(np.uint8) * np.uint8(255)
-            count = cv2.remap(whole, maps.x, maps.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) == 255
-        if maps.blank is not None:
-            result[maps.blank] = 0
-            count = ~maps.blank if count is None else count & ~maps.blank
+            count = cv2.remap(whole, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) == 255
+        if blank.any():
+            result[blank] = 0
+            count = ~blank if count is None else count & ~blank
         return result, count
 
     def maps(self) -> Maps:
@@ -417,8 +408,7 @@ class Undistortion:
         # more than a pixel outside, or NaN where the ray leaves the domain of the camera model
         blank: NDArray[np.bool_] = np.any((pixels <= -1) | (pixels >= self._size) | np.isnan(pixels), axis=-1)
         columns, rows = (np.nan_to_num(pixels[..., i], nan=-1.0) for i in (0, 1))
-        maps = Maps(columns, rows, blank if blank.any() else None)
-        if maps.blank is not None and not self._warned:
+        if blank.any() and not self._warned:
             self._warned = True
             log.warning(
                 "camera %s (%s): %.1f %% of the pinhole image is left out: its field of view is too wide for a pinhole",
@@ -427,8 +417,8 @@ class Undistortion:
                 100 * blank.mean(),
             )
         if self._keep_maps:
-            self._maps = maps
-        return maps
+            self._maps = columns, rows, blank
+        return columns, rows, blank
 
     def _source_pixels(self) -> NDArray[np.float32]:
         """Where each pixel of the pinhole image comes from ``[H, W, 2]``."""

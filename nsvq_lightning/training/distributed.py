@@ -69,8 +69,7 @@ def check_replicas(trainer: Trainer, event: str) -> None:
             f"iteration {trainer.global_step}, after {event}: the replicas of {trainer.world_size} processes differ in "
             f"{', '.join(different)}. A decision used data of one process alone, or the machines compute "
             "differently: pass it through sum_over_processes or from_first_process of "
-            "nsvq_lightning.training.distributed, "
-            "and train on machines of one kind"
+            "nsvq_lightning.training.distributed, and train on machines of one kind"
         )
 
 

@@ -109,8 +109,6 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such checkpoint; {WAY_OUT}")
-    if path.is_dir():
-        raise FormatError(f"{path}: a folder, not a checkpoint", WAY_OUT)
     try:
         with ZipFile(path) as archive:  # torch itself does not verify its checksums
             damaged = archive.testzip()

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import logging
-import pickle
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
@@ -167,13 +166,6 @@ def test_the_first_photos_stay_while_the_budget_lasts() -> None:
     for there, here in zip(again, views, strict=True):
         assert (there.image.is_meta, there.mask is not None and there.mask.is_meta) == (True, True)
         assert (there.name, there.camera) == (here.name, here.camera)
-
-
-def test_no_photo_on_a_device_is_pickled() -> None:
-    photos, view = DevicePhotos(10 * BYTES), _view(0)
-    kept = photos.move(view, ELSEWHERE)
-    copy = pickle.loads(pickle.dumps(photos))
-    assert copy.move(view, ELSEWHERE).image is not kept.image
 
 
 def test_a_gpu_gives_a_part_of_what_is_free(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -328,10 +328,10 @@ def test_pixels_that_a_wide_lens_never_saw_do_not_count(make_scene: SceneFactory
     scene = load_scene(root)
     undistortion = scene.images.sources[0].undistortion
     assert undistortion is not None
-    maps = undistortion.maps()
-    blank = np.zeros(maps.x.shape, bool)
+    columns, rows, _ = undistortion.maps()
+    blank = np.zeros(columns.shape, bool)
     blank[:4] = True
-    undistortion._maps = maps._replace(blank=blank)
+    undistortion._maps = columns, rows, blank
     masked, kept = scene.view(0).mask, scene.view(1).mask
     assert kept is not None
     assert torch.equal(kept, torch.from_numpy(~blank))
