@@ -146,15 +146,13 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
         SceneError: The file is damaged, or has another aspect ratio than the photo.
     """
     grey = _decoded(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-    kept: NDArray[np.uint8] = (grey > int(grey.max()) / 2).astype(np.uint8)
+    kept = (grey > int(grey.max()) / 2).astype(np.uint8)
     if abs(kept.shape[1] * height / (kept.shape[0] * width) - 1) > ROUNDED:
         raise SceneError(
             f"mask {path} is of {kept.shape[1]}x{kept.shape[0]}, its photo of {width}x{height}, another shape: "
             "make it from that photo, or remove it"
         )
-    if kept.shape != (height, width):
-        kept = np.asarray(cv2.resize(kept, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
-    return kept.astype(bool)
+    return np.asarray(cv2.resize(kept, (width, height), interpolation=cv2.INTER_NEAREST), bool)
 
 
 def resized_mask(kept: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:

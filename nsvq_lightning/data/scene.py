@@ -288,15 +288,13 @@ def _image_sources(
     model: ColmapModel, paths: list[Path], masks: list[Path | None], divisor: int, max_width: int | None
 ) -> list[ImageSource]:
     """One source per view; views with the same camera and file size share their undistortion."""
-    kinds, orientations, transparent = [], [], []
-    for image, path in zip(model.images, paths, strict=True):
-        camera, head = model.cameras[image.camera_id], image_head(path)
-        size, on_its_side = head.size, head.size[::-1]
+    kinds, orientations, heads = [], [], [image_head(path) for path in paths]
+    for image, head in zip(model.images, heads, strict=True):
+        camera, size, on_its_side = model.cameras[image.camera_id], head.size, head.size[::-1]
         # COLMAP calibrates photos as they are stored, other programs as their EXIF orientation shows them.
         turned = head.orientation >= ON_ITS_SIDE and not same_shape(camera, *size) and same_shape(camera, *on_its_side)
         kinds.append((image.camera_id, on_its_side if turned else size))
         orientations.append(head.orientation if turned else 1)
-        transparent.append(head.has_alpha)
     if turned_count := sum(orientation != 1 for orientation in orientations):
         log.info("%d of %d photos are turned by their EXIF orientation, as their cameras are", turned_count, len(kinds))
     if others := sum(not same_shape(model.cameras[camera_id], *size) for camera_id, size in kinds):
@@ -309,8 +307,8 @@ def _image_sources(
         pinhole = full.resized(max(1, round(full.width * scale)), max(1, round(full.height * scale)))
         rectified[camera_id, size] = size, undistortion, pinhole
     return [
-        ImageSource(path, *rectified[kind], orientation, mask, has_alpha, model.synthetic)
-        for path, kind, orientation, mask, has_alpha in zip(paths, kinds, orientations, masks, transparent, strict=True)
+        ImageSource(path, *rectified[kind], orientation, mask, head.has_alpha, model.synthetic)
+        for path, kind, orientation, mask, head in zip(paths, kinds, orientations, masks, heads, strict=True)
     ]
 
 
