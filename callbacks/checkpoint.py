@@ -1,11 +1,9 @@
-"""Checkpoints of a run: after a complete iteration, when a signal asks for a stop, and after an exception."""
+"""Checkpoints of a run: regularly, and when a signal asks for a stop."""
 
 import logging
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, is_dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -13,9 +11,6 @@ from typing import Any
 import torch
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import Checkpoint
-from lightning.pytorch.loops.loop import _Loop
-from torch import Tensor, nn
-from torch.optim import Optimizer
 
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import atomic_path
@@ -101,81 +96,6 @@ class GracefulStop:
             self._handlers[number](number, frame)
 
 
-Fingerprint = list[tuple[int, int, int]]
-
-
-class StepSnapshot:
-    """Remembers what an iteration changes before its update, so that an incomplete one can be undone.
-
-    Until its update an iteration may change the phase, the SH degree, the usage counts of the codes, the trainer's
-    counters and the state of callbacks: a copy of these, which is small, is kept. All else (splats, codebooks, frozen
-    codes, side tables, Adam's moments) must be unchanged, judged by identity, address and version of every tensor. Once
-    the update begins, or a view of the next iteration is in the statistics, the state is lost: call :meth:`drop`.
-    """
-
-    def __init__(self) -> None:
-        self.iteration = -1
-        self._kept: Fingerprint | None = None
-        self._undo: list[Callable[[], object]] = []
-
-    def take(self, trainer: Trainer, module: SplatModule) -> None:
-        """Remember the state now, at the end of an iteration."""
-        self.iteration = trainer.global_step
-        self._kept = _fingerprint(trainer, module)
-        self._undo = [partial(vars(module).update, phase=module.phase, active_sh_degree=module.active_sh_degree)]
-        self._undo += [partial(tensor.copy_, tensor.clone()) for tensor in _counters(module)]
-        for place in _places(trainer.fit_loop):
-            numbers = {name: value for name, value in place.items() if type(value) in (int, bool)}
-            self._undo.append(partial(place.update, numbers))
-        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
-        states = ((callback, callback.state_dict()) for callback in callbacks)
-        self._undo += [partial(callback.load_state_dict, state) for callback, state in states if state]
-
-    def drop(self) -> None:
-        """Forget the state: it can no longer be restored."""
-        self._kept = None
-
-    def restore(self, trainer: Trainer, module: SplatModule) -> bool:
-        """Restore the state of module, trainer and callbacks; returns whether that was possible."""
-        if self._kept is None or self._kept != _fingerprint(trainer, module):
-            return False
-        for undo in self._undo:
-            undo()
-        return True
-
-
-def _fingerprint(trainer: Trainer, module: SplatModule) -> Fingerprint:
-    """Identity, address and version of every tensor that an iteration must not change before its update."""
-    changing = {id(tensor) for tensor in _counters(module)}
-    tensors: list[object] = [value for state in trainer.optimizers[0].state.values() for value in state.values()]
-    # Not module.parameters() and module.buffers(), which take three times as long, and this runs in every step.
-    parts: list[nn.Module | None] = [module]
-    for part in parts:
-        if part is None:
-            continue
-        parts += part._modules.values()
-        tensors += part._parameters.values()
-        tensors += part._buffers.values()
-    return [
-        (id(tensor), tensor.data_ptr(), tensor._version)
-        for tensor in tensors
-        if isinstance(tensor, Tensor) and id(tensor) not in changing
-    ]
-
-
-def _counters(module: SplatModule) -> Iterator[Tensor]:
-    for quantizer in module.quantizers.values():
-        yield from (quantizer.usage, quantizer.window)
-
-
-def _places(loop: object) -> Iterator[dict[str, Any]]:
-    """The attribute dictionaries of one of Lightning's loops, of its inner loops and of their counters."""
-    yield vars(loop)
-    for value in vars(loop).values():
-        if isinstance(value, _Loop) or is_dataclass(value):
-            yield from _places(value)
-
-
 @dataclass(eq=False)
 class RunCheckpoint(WritingCallback, Checkpoint):
     """Saves the whole state of the run in ``checkpoints/last.ckpt``: regularly, at ends of phases, and when it stops.
@@ -185,11 +105,8 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     atomically: the previous one stays until the new one is complete.
 
     Ctrl-C and SIGTERM stop the run after the current iteration, with a checkpoint of it; a second one stops it at once.
-    An exception leaves a checkpoint of the last complete iteration if it comes before the update of the next one
-    begins. During an update the state belongs to no iteration, and the last checkpoint is the one to continue from.
-
-    Several processes stop together after the iteration in which any of them receives a signal. After an exception in
-    one they can no longer agree on an iteration, and the last periodic checkpoint is the one to continue from.
+    Several processes stop together after the iteration in which any of them receives a signal. After an exception,
+    which comes in the middle of an iteration, the last checkpoint is the one to continue from.
 
     Args:
         every: Iterations between two checkpoints; None is a tenth of the schedule, 0 saves only at the end of the run.
@@ -216,7 +133,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
 
     def __post_init__(self) -> None:
         self.check({"at least 0": ("every",)})
-        self._snapshot, self._stop = StepSnapshot(), GracefulStop()
+        self._stop = GracefulStop()
 
     @property
     def last_path(self) -> Path | None:
@@ -239,7 +156,6 @@ class RunCheckpoint(WritingCallback, Checkpoint):
         trainer.callbacks = [*(each for each in callbacks if each is not self), self]  # type: ignore[attr-defined]
         if stage == "fit":
             self.best_model_path, self._saved = "", -1
-            self._snapshot.drop()
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Start to hold back signals."""
@@ -248,25 +164,20 @@ class RunCheckpoint(WritingCallback, Checkpoint):
         self._training = True
         self._stop.hold(trainer)
 
-    def on_before_optimizer_step(self, trainer: Trainer, module: SplatModule, optimizer: Optimizer) -> None:
-        """The update begins: from here until the end of the iteration there is no state to save."""
-        self._snapshot.drop()
-
     def on_train_batch_end(
         self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, batch_idx: int
     ) -> None:
         """Save when it is time; stop here if a signal came."""
         iteration = trainer.global_step
         if iteration == 0 or not self._first_time("after", iteration):
-            self._snapshot.drop()  # of the next iteration some micro-batches are done
-            return
-        if trainer.world_size == 1:
-            self._snapshot.take(trainer, module)
+            return  # of the next iteration some micro-batches are done
         if iteration == trainer.max_steps:
-            return  # the end of training belongs to the checkpoint, too: it is saved then, and signals wait
+            self._save(
+                trainer, module
+            )  # the end of training may fail; it belongs to a checkpoint, too, and signals wait
+            return
         received = self._stop.received(trainer)
-        # One process writes its checkpoint when it has stopped; several can do so together only now.
-        if self.is_due(module.schedule, iteration) or (received and trainer.world_size > 1):
+        if received or self.is_due(module.schedule, iteration):
             self._save(trainer, module)
         self._stop.deliver(received)
 
@@ -279,16 +190,11 @@ class RunCheckpoint(WritingCallback, Checkpoint):
         self._stop.release()
 
     def on_exception(self, trainer: Trainer, module: SplatModule, exception: BaseException) -> None:
-        """Save the last complete iteration if it still exists; say where to continue from."""
+        """Say where to continue from."""
         self._stop.release()
         if not self._training or is_fast_dev_run(trainer):
             return
         self._training = False
-        if self._snapshot.iteration != self._saved and self._snapshot.restore(trainer, module):
-            try:
-                self._save(trainer, module)
-            except Exception as error:  # the user must see what stopped the run
-                log.warning("the checkpoint of iteration %d could not be written: %s", self._snapshot.iteration, error)
         if self.last_path is not None:
             log.warning("stopped; the last checkpoint is of iteration %d: %s", self._saved, self.last_path)
         else:
