@@ -56,7 +56,7 @@ def ctrl_c() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-WHOLE_RUNS = {"benchmark", "sweep", "training", "runs"}
+WHOLE_RUNS = {"benchmark", "training", "runs"}
 """Folders whose tests train: ``properties/runs/test_skips.py`` does so for all of them between guard words."""
 
 

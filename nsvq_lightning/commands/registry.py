@@ -27,7 +27,7 @@ COMMANDS = {
     "merge": Command("join the trained parts of a scene", "nsvq_lightning.commands.merge"),
     "view": Command("look at a scene in the browser, also while it trains", "nsvq_lightning.commands.view"),
     "render": Command("render pictures or a video along a path of cameras", "nsvq_lightning.commands.render"),
-    "sweep": Command("train many runs and compare them", "nsvq_lightning.commands.sweep.run"),
+    "sweep": Command("train many runs and compare them", "nsvq_lightning.commands.sweep"),
     "doctor": Command("check whether this machine and a scene folder are fit", "nsvq_lightning.commands.doctor"),
     "benchmark": Command("measure run time against error on this machine", "nsvq_lightning.commands.benchmark.command"),
 }

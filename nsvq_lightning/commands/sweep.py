@@ -1,0 +1,412 @@
+"""Train every combination of the lists; write a table and a picture of PSNR over file size.
+
+The same command goes on where it was, and trains only what is new. Options of 'nsvq fit' may follow; they hold for
+every run: --data.factor=2 --splats=80000
+
+Examples:
+  nsvq sweep --scenes fox --codebooks 0.5k,1k,2k,4k,8k,16k --seeds 0,1,2 --max-steps 4500 --output sweeps/fox
+  nsvq sweep --scenes fox,horns --configs paper,plain,own.yaml --output sweeps/own
+"""
+
+import argparse
+import hashlib
+import io
+import json
+import logging
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import redirect_stdout, suppress
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nsvq_lightning.commands import arguments as given
+from nsvq_lightning.io.atomic import write_text
+from nsvq_lightning.version import __version__
+
+log = logging.getLogger(__name__)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what ``nsvq sweep`` takes; what it does not know are options of ``nsvq fit``."""
+    parser.usage = "nsvq sweep --output FOLDER [options] [options of nsvq fit]"
+    parser.allow_abbrev = False
+    parser.set_defaults(further=[])
+    parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="where all results go")
+    add = parser.add_argument_group("what is combined; lists have commas between their entries").add_argument
+    add(
+        "--scenes",
+        type=given.names,
+        default=(),
+        metavar="A,B",
+        help="COLMAP folders (default: that of the configuration)",
+    )
+    add(
+        "--configs",
+        type=given.names,
+        default=(),
+        metavar="A,B",
+        help="files or shipped names, as for nsvq fit --config",
+    )
+    add("--quantizers", type=given.names, default=(), metavar="A,B", help="classes, as for nsvq fit --model.quantizer")
+    add(
+        "--codebooks",
+        type=given.names,
+        default=(),
+        metavar="1k,4k",
+        help="sizes, for configurations that have codebooks",
+    )
+    add("--seeds", type=given.integers, default=(), metavar="0,1,2", help="of the draws and of the order of the views")
+    add("--max-steps", type=int, metavar="N", help="iterations of every run (default: those of its configuration)")
+    parser.add_argument("--keep-checkpoints", action="store_true", help="keep those of finished runs")
+    help_ = "only print a command for each unfinished run, to be run anywhere"
+    parser.add_argument("--commands", action="store_true", help=help_)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Train what is missing and write the tables.
+
+    Returns:
+        0, or 1 if a run has failed.
+
+    Raises:
+        argparse.ArgumentError: There is an argument that is no option.
+        ValueError: The scenes or configurations are wrong.
+        OSError: Another sweep writes to the folder, or a file cannot be read or written.
+        KeyboardInterrupt: After Ctrl-C or SIGTERM.
+    """
+    from nsvq_lightning.training.run_folder import hold, let_go
+
+    output, further = options.output, options.further
+    if further and not further[0].startswith("--"):
+        message = f"unknown argument {further[0]!r}; a list has commas between its entries, and no spaces"
+        raise argparse.ArgumentError(None, message)
+    runs = plan(options)
+    output.mkdir(parents=True, exist_ok=True)
+    hold(output)
+    # What a job scheduler sends ends the training that is on, too; it would go on alone otherwise.
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        if options.commands:
+            sys.stdout.writelines(commands(runs))
+            return 0
+        rows = sweep(output, runs, options.keep_checkpoints)
+    except KeyboardInterrupt:
+        sys.stderr.write("nsvq sweep: interrupted; the same command goes on where it stopped\n")
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, before)
+        let_go(output)
+    sys.stdout.write((output / "results.md").read_text(encoding="utf-8"))
+    return int(any(row["error"] for row in rows))
+
+
+Row = dict[str, Any]
+
+
+class Run(NamedTuple):
+    """One run.
+
+    Attributes:
+        names: What tells it from the others: ``scene`` (name of the folder), ``config`` (name), ``quantizer`` (class),
+            ``codebooks`` and ``seed``, the last three empty where the configuration decides.
+        config: All settings of ``nsvq fit``, as YAML.
+        folder: Its folder: the names, and a digest of settings and version, so that no other run writes there.
+    """
+
+    names: Row
+    config: str
+    folder: Path
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether it has been trained and measured."""
+        return (self.folder / "metrics.json").is_file()
+
+
+def plan(options: argparse.Namespace) -> list[Run]:
+    """All runs that options of ``nsvq sweep`` ask for, one configuration after the other.
+
+    An empty list leaves the choice to the configurations. Quantizers and codebook sizes are only for those that have
+    codebooks.
+
+    Raises:
+        SystemExit: A configuration or an option of ``nsvq fit`` is wrong; a line on stderr says how.
+        ValueError: A codebook size is unknown, a scene is no folder, two runs have the same names, or options give a
+            checkpoint to go on from, or two sizes of the scene.
+    """
+    import yaml
+
+    from nsvq_lightning.splats.attributes import codebook_sizes
+
+    for size in options.codebooks:
+        codebook_sizes(size)
+    for scene in options.scenes:
+        if not Path(scene).is_dir():
+            raise ValueError(f"{scene} is no folder; --scenes takes COLMAP folders with commas between them")
+    common = [*options.further, "--trainer.logger=false"]
+    if options.max_steps is not None:
+        common.append(f"--trainer.max_steps={options.max_steps}")
+    runs: list[Run] = []
+    for config in options.configs or ("",):
+        arguments = [f"--config={config}", *common] if config else common
+        default = yaml.safe_load(resolve([*arguments, *(f"--data.root={scene}" for scene in options.scenes[:1])]))
+        if default["ckpt_path"] is not None:
+            raise ValueError(f"a sweep has checkpoints of its own; leave ckpt_path={default['ckpt_path']} out")
+        roots = options.scenes or (default["data"]["init_args"].get("root", ""),)
+        quantizers, sizes = options.quantizers, options.codebooks
+        if default["model"]["codebooks"] is None:
+            quantizers = sizes = ()
+        for root, quantizer, size, seed in product(roots, quantizers or ("",), sizes or ("",), options.seeds or ("",)):
+            # Absolute, so that the same sweep started from another folder finds its runs.
+            chosen = [("data.root", Path(root).resolve()), ("model.quantizer", quantizer), ("model.codebooks", size)]
+            chosen += [("model.seed", seed), ("data.seed", seed)]
+            text = resolve([*arguments, *(f"--{option}={value}" for option, value in chosen if value != "")])
+            names = {"scene": Path(root).resolve().name, "config": Path(config).stem or "default"}
+            names |= {"quantizer": quantizer.rpartition(".")[2], "codebooks": size, "seed": seed}
+            title = "-".join(str(name) for name in names.values() if name != "")
+            if any(run.names == names for run in runs):
+                raise ValueError(f"two runs are called {title}: rename a scene or configuration to tell them apart")
+            digest = hashlib.sha256(f"{__version__}\n{text}".encode()).hexdigest()
+            runs.append(Run(names, text, options.output.resolve() / "runs" / f"{title}-{digest[:12]}"))
+    return runs
+
+
+def resolve(arguments: Sequence[str]) -> str:
+    """What ``nsvq fit ARGUMENTS --print_config`` prints.
+
+    Raises:
+        SystemExit: The arguments are wrong; a line on stderr says how.
+        ValueError: They name two sizes of the scene.
+    """
+    from nsvq_lightning.commands.fit import SplatCLI
+
+    printed = io.StringIO()
+    with warnings.catch_warnings(action="ignore"), redirect_stdout(printed):
+        try:
+            SplatCLI(["fit", *given.expand(arguments), "--print_config"])
+        except SystemExit as end:
+            if end.code:
+                raise
+    return printed.getvalue()
+
+
+CHECKPOINT = Path("checkpoints", "last.ckpt")
+
+
+def prepare(run: Run) -> list[str]:
+    """Make the folder of a run ready and write its settings there.
+
+    What a training that failed before its first checkpoint has left in the folder is removed.
+
+    Returns:
+        Arguments of ``nsvq`` that train, from the checkpoint in the folder if there is one.
+
+    Raises:
+        FileExistsError: Another process writes to the folder.
+    """
+    from nsvq_lightning.training.run_folder import RUN_FILES, hold, let_go
+
+    run.folder.mkdir(parents=True, exist_ok=True)
+    hold(run.folder)
+    try:
+        begun = (run.folder / CHECKPOINT).is_file()
+        if not begun:
+            for path in map(run.folder.joinpath, RUN_FILES):
+                shutil.rmtree(path, ignore_errors=True)
+                path.unlink(missing_ok=True)
+        write_text(run.folder / "config.yaml", run.config)
+    finally:
+        let_go(run.folder)
+    arguments = ["fit", "--config", str(run.folder / "config.yaml"), f"--trainer.run_folder={run.folder}"]
+    return [*arguments, f"--ckpt_path={run.folder / CHECKPOINT}"] if begun else arguments
+
+
+def commands(runs: Sequence[Run]) -> Iterator[str]:
+    """A line for a shell in any folder for each run that is neither finished nor being trained."""
+    for run in runs:
+        if not run.is_finished:
+            try:
+                yield shlex.join(["nsvq", *prepare(run)]) + "\n"
+            except FileExistsError as error:
+                log.info("%s", error)
+
+
+def run_subprocess(arguments: Sequence[str], log: Path) -> int:
+    """Run ``nsvq ARGUMENTS`` as a process of its own: what goes wrong in it, or is not given back, ends with it.
+
+    Returns:
+        Its exit status.
+    """
+    command = [sys.executable, "-u", "-X", "utf8", "-m", "nsvq_lightning", *arguments]
+    with (
+        open(log, "wb") as file,
+        subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT) as process,
+    ):
+        try:
+            return process.wait()
+        except KeyboardInterrupt:
+            process.terminate()
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(20.0)  # seconds that it has to stop by itself
+            raise
+        finally:
+            process.kill()  # nothing if it has ended
+
+
+def train(run: Run) -> str:
+    """Train, from the checkpoint in the folder if there is one.
+
+    Returns:
+        Why the training has failed, in one line; nothing if it is done.
+    """
+    said = run.folder / "log.txt"
+    log.info("%s: see %s", run.folder.name, said)
+    try:
+        status = run_subprocess(prepare(run), said)
+    except OSError as error:  # of the disk, or another process trains there
+        return str(error)
+    if status == 0 and run.is_finished:
+        return ""
+    if status == 0:
+        reason = "the run has left no metrics.json: callbacks.report must stay"
+    elif status < 0:
+        reason = f"killed by signal {-status}{', perhaps for want of memory' * (status == -9)}"
+    else:
+        lines = said.read_text(encoding="utf-8", errors="replace").split("\n")
+        lines = [line.strip() for line in lines if line.strip()] or [f"exit status {status}"]
+        reason = next((line for line in reversed(lines) if line.startswith("error: ")), lines[-1])
+    return f"{reason.removeprefix('error: ')} (see {said})"
+
+
+def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> list[Row]:
+    """Train what is not finished yet; a run that fails does not keep the others from theirs.
+
+    The tables are written anew after each run, so they are complete whenever this is interrupted.
+
+    Args:
+        output: Where ``results.csv``, ``results.md`` and ``results.png`` go.
+        runs: The runs.
+        keep_checkpoints: Keep those of finished runs, too.
+
+    Returns:
+        A row for each run, in their order.
+    """
+    rows = {number: row_of(run) for number, run in enumerate(runs) if run.is_finished}
+    if rows:
+        write_results(output, list(rows.values()))
+    for number, run in enumerate(runs):
+        if number not in rows:
+            rows[number] = row_of(run, train(run))
+            write_results(output, [rows[each] for each in sorted(rows)])
+        row = rows[number]
+        if not (row["error"] or keep_checkpoints):  # they are larger than everything else
+            shutil.rmtree(run.folder / CHECKPOINT.parent, ignore_errors=True)
+        said = f"failed: {row['error']}" if row["error"] else "PSNR {psnr} dB, {bytes} bytes".format(**row)
+        log.info("[%d/%d] %s: %s", number + 1, len(runs), run.folder.name, said)
+    return [rows[number] for number in sorted(rows)]
+
+
+def row_of(run: Run, error: str = "") -> Row:
+    """What a run came to that has finished, or failed with an error.
+
+    Returns:
+        Scene, config, quantizer, codebooks, seed; PSNR (dB; None where infinite) and SSIM of the decoded file on the
+        test views, its bytes and splats; its bytes at level ``paper``, and the PSNR of the scene before it was stored,
+        which is that of level ``paper``; the seconds of training; the PSNR of the plain splats at the end of the prune
+        phase, None without codebooks; the version of the package that trained it; folder; error. What is not known, as
+        in a failed run, is None.
+    """
+    metrics = {} if error else json.loads((run.folder / "metrics.json").read_text(encoding="utf-8"))
+    return {
+        **run.names,
+        "psnr": metrics.get("psnr"),
+        "ssim": metrics.get("ssim"),
+        "bytes": metrics.get("file_bytes"),
+        "splats": metrics.get("num_splats"),
+        "bytes_paper": metrics.get("paper_level", {}).get("file_bytes"),
+        "psnr_paper": metrics.get("phases", [{}])[-1].get("psnr"),
+        "seconds": metrics.get("train_seconds"),
+        "psnr_before": (metrics.get("before_quantization") or {}).get("psnr"),
+        "version": None if error else __version__,
+        "folder": run.folder,
+        "error": error,
+    }
+
+
+# Columns that say which runs a line of the table is about: they differ in the seed alone.
+NAMES = ("scene", "config", "quantizer", "codebooks")
+# Format of the columns of the table.
+TABLE = {"psnr": ".2f", "ssim": ".4f", "bytes": ",.0f", "splats": ",.0f", "psnr_before": ".2f", "seconds": ",.0f"}
+
+
+def write_results(output: Path, rows: Sequence[Row]) -> None:
+    """Write ``results.csv``, a row a run, and of those that have not failed ``results.md`` and ``results.png``.
+
+    Those that differ in the seed alone are a line of the table, with mean and standard deviation, and a point of the
+    picture with whiskers. That has a panel for each scene, and a curve for each configuration and quantizer.
+    """
+    from nsvq_lightning.report import files
+
+    groups: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+        if not row["error"]:
+            groups.setdefault(tuple(row[name] for name in NAMES), []).append(row)
+    lines = []
+    for key, group in groups.items():
+        line = [*(name or "–" for name in key), str(len(group))]
+        for column, form in TABLE.items():
+            mean, spread = moments(group, column)
+            plus_minus = f" ± {spread:{form}}" if len(group) > 1 else ""
+            line.append("–" if np.isnan(mean) else f"{mean:{form}}{plus_minus}")
+        lines.append(line)
+    text = f"# nsvq sweep\n\n{files.markdown_table([*NAMES, 'runs', *TABLE], lines, words=NAMES)}\n\n"
+    text += "Mean ± standard deviation over the seeds. PSNR (dB) and SSIM are of the decoded file on the test views, "
+    text += "psnr_before of the plain splats.\n"
+    failed = ["* {scene}, {config}, {codebooks}, seed {seed}: {error}\n".format(**row) for row in rows if row["error"]]
+    files.write_csv(output / "results.csv", rows)
+    write_text(output / "results.md", text + "".join(["\nFailed:\n\n", *failed] if failed else failed))
+    if groups:
+        files.write_figure(output / "results.png", figure(list(groups.values())))
+
+
+def moments(rows: Sequence[Row], column: str) -> tuple[float, float]:
+    """Mean and standard deviation (n - 1; 0 for a single run) of a column; NaN where none knows it."""
+    values = [row[column] for row in rows if row[column] is not None]
+    spread = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+    return float(np.mean(values)) if values else np.nan, spread
+
+
+def figure(groups: Sequence[Sequence[Row]]) -> Any:
+    """PSNR over file size, as a Matplotlib figure; each group is a point.
+
+    Args:
+        groups: Runs that differ in the seed alone.
+    """
+    from nsvq_lightning.report.files import new_figure
+
+    curves: dict[str, dict[str, list[Sequence[Row]]]] = {}
+    for group in groups:
+        name = ", ".join(filter(None, (group[0]["config"], group[0]["quantizer"])))
+        curves.setdefault(group[0]["scene"], {}).setdefault(name, []).append(group)
+    drawn = new_figure(7.0, 4.6 * len(curves))  # inches
+    for axis, (scene, named) in zip(drawn.subplots(len(curves), squeeze=False).flat, curves.items(), strict=True):
+        for name, points in named.items():
+            points.sort(key=lambda point: moments(point, "bytes"))
+            x, x_spread = np.transpose([moments(point, "bytes") for point in points]) / 1e6
+            y, y_spread = np.transpose([moments(point, "psnr") for point in points])
+            axis.errorbar(x, y, yerr=y_spread, xerr=x_spread, fmt="o-", linewidth=1, capsize=2, label=name)
+            for point, *place in zip(points, x, y, strict=True):
+                axis.annotate(point[0]["codebooks"], place, (4, 5), textcoords="offset points", fontsize=7)
+        # Files without codebooks are many times as large.
+        axis.set(title=scene, xscale="log", xlabel="size of the file, MB", ylabel="test PSNR of the decoded file, dB")
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=8)
+    return drawn
