@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from threads import use_threads
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark.timing import use_threads
 from nsvq_lightning.quantize import NSVQ, kmeans, nearest_reference
 from nsvq_lightning.quantize.kmeans import distinct_rows, draw_far_rows, rows_far_apart, sum_by_code
 from nsvq_lightning.random import generator

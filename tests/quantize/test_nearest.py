@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from threads import use_threads
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark.timing import use_threads
 from nsvq_lightning.quantize import nearest_reference
 from nsvq_lightning.quantize.nearest import cheapest, cheapest_reference, code_rates, nearest
 from nsvq_lightning.random import generator

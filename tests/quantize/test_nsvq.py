@@ -6,9 +6,9 @@ import numba
 import numpy as np
 import pytest
 import torch
+from threads import use_threads
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark.timing import use_threads
 from nsvq_lightning.quantize import NSVQ, CodebookQuantizer, DiVeQ, nearest, substitution
 from nsvq_lightning.quantize.nsvq import noise_substitution
 from nsvq_lightning.quantize.substitution import fill_normal

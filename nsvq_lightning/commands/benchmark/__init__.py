@@ -35,7 +35,6 @@ class Scope:
     """What is measured, and how thoroughly: what the command line says, with its defaults filled in.
 
     Attributes:
-        threads: Thread counts that are measured, each at least 1.
         quick: Small workloads and few repeats, for continuous integration.
         repeats: Timed calls of each case, at least 1.
         seconds: A case is not called again once its calls have taken this long together.
@@ -48,7 +47,6 @@ class Scope:
         config: Config of the runs of ``train``; by default ``fast.yaml``, without photos ``demo.yaml``.
     """
 
-    threads: tuple[int, ...]
     quick: bool = False
     repeats: int = 15
     seconds: float = 5.0

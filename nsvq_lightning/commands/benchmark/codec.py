@@ -19,7 +19,7 @@ from nsvq_lightning.splats.splats import SplatTensors
 
 
 def run(scope: Scope) -> Iterator[timing.Measurement]:
-    """Time writing and reading with every number of threads."""
+    """Time writing and reading."""
     for workload in workloads(scope):
         with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder:
             yield from _file_rows(workload, scope, Path(folder))
@@ -28,20 +28,19 @@ def run(scope: Scope) -> Iterator[timing.Measurement]:
 def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[timing.Measurement]:
     values: dict[str, Mapping[str, float]] = {}
     paths: dict[str, Path] = {}
-    with timing.use_threads(max(scope.threads)):
-        # Codebooks of one step of k-means: sizes and times do not depend on how good they are.
-        fitted = quantize.prepare(workload.splats, scope.codebooks)
-        scene = to_compressed(workload.splats, {name: as_quantizer(each.quantizer) for name, each in fitted.items()})
-        writers: dict[str, Callable[[Path], int]] = {".ply": partial(save, workload.splats)}
-        writers |= {f".nsvq {level}": partial(save, scene, storage=Storage(level)) for level in LEVELS}
-        images = {".ply": _image(workload, workload.splats), ".nsvq": _image(workload, scene.decode())}
-        for name, write in writers.items():
-            suffix = name.partition(" ")[0]
-            path = paths[name] = folder / f"scene{len(paths)}{suffix}"
-            size = write(path)
-            error = float((_image(workload, load(path)) - images[suffix]).abs().mean())
-            each = size / len(workload.splats.means)
-            values[name] = {"bytes a splat": each, "bytes": float(size), "image error": error}
+    # Codebooks of one step of k-means: sizes and times do not depend on how good they are.
+    fitted = quantize.prepare(workload.splats, scope.codebooks)
+    scene = to_compressed(workload.splats, {name: as_quantizer(each.quantizer) for name, each in fitted.items()})
+    writers: dict[str, Callable[[Path], int]] = {".ply": partial(save, workload.splats)}
+    writers |= {f".nsvq {level}": partial(save, scene, storage=Storage(level)) for level in LEVELS}
+    images = {".ply": _image(workload, workload.splats), ".nsvq": _image(workload, scene.decode())}
+    for name, write in writers.items():
+        suffix = name.partition(" ")[0]
+        path = paths[name] = folder / f"scene{len(paths)}{suffix}"
+        size = write(path)
+        error = float((_image(workload, load(path)) - images[suffix]).abs().mean())
+        each = size / len(workload.splats.means)
+        values[name] = {"bytes a splat": each, "bytes": float(size), "image error": error}
     described = f"{workload.name}, {scope.codebooks} codebooks"
     writes = {name: partial(write, paths[name]) for name, write in writers.items()}
     reads = {name: partial(load, path) for name, path in paths.items()}

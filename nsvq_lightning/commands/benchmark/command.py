@@ -8,7 +8,7 @@ Suites:
 
 Examples:
   nsvq benchmark all --quick
-  nsvq benchmark render --threads 1,2 > render.md
+  nsvq benchmark render > render.md
   nsvq benchmark train --scene path/to/colmap/folder --switches all
   nsvq benchmark quantize,codec --scene scene.ply
 """
@@ -21,7 +21,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.commands.arguments import integers, positive, some_of
+from nsvq_lightning.commands.arguments import positive, some_of
 from nsvq_lightning.commands.benchmark import SIZES, SUITES, Scope
 from nsvq_lightning.skips import SKIPS
 
@@ -43,8 +43,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("how much").add_argument
     add("--quick", action="store_true", help="small workloads, few repeats: all within a minute")
     add("--repeats", type=positive(int), metavar="N", help="timed calls of each case (15; quick 3)")
-    add("--threads", type=integers, metavar="N,N", help="thread counts (1 and all; quick all)")
-    add("--json", action="store_true", help="print JSON, which has every sample, instead of tables")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -55,26 +53,18 @@ def run(options: argparse.Namespace) -> int:
         ValueError: The scene cannot be used.
         OSError: A file cannot be read.
     """
-    import numba
-
     from nsvq_lightning.commands.benchmark import timing, workloads
 
-    most = int(numba.config.NUMBA_NUM_THREADS)
-    values: dict[str, Any] = {"threads": tuple(sorted({1, most}))}
-    if options.quick:
-        values = {"threads": (most,), "repeats": 3, "seconds": 0.5, "workloads": ("A20k",), "steps": 40}
-    given = {name: value for name, value in vars(options).items() if name in Scope.__dataclass_fields__}
-    scope = Scope(**values | {name: value for name, value in given.items() if value is not None})
-    wrong = ""
-    if min(scope.threads) < 1 or max(scope.threads) > most:
-        wrong = f"--threads: at least 1 and at most {most} can be measured here; NUMBA_NUM_THREADS, which is the "
-        wrong += "number of cores by default, raises the limit"
-    elif scope.steps < 4:
-        wrong = f"--steps must be at least 4, one for each phase, got {scope.steps}"
-    elif scope.init_from is not None and scope.photos is None:
-        wrong = "--init-from needs a COLMAP folder as --scene, whose cameras look at its splats"
-    if wrong:
-        raise argparse.ArgumentError(None, wrong)
+    values: dict[str, Any] = (
+        {"repeats": 3, "seconds": 0.5, "workloads": ("A20k",), "steps": 40} if options.quick else {}
+    )
+    values |= {name: value for name, value in vars(options).items() if name != "suites" and value is not None}
+    scope = Scope(**values)
+    if scope.steps < 4:
+        raise argparse.ArgumentError(None, f"--steps must be at least 4, one for each phase, got {scope.steps}")
+    if scope.init_from is not None and scope.photos is None:
+        message = "--init-from needs a COLMAP folder as --scene, whose cameras look at its splats"
+        raise argparse.ArgumentError(None, message)
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
     if scope.scene is not None:
         workloads.workloads(scope)  # before anything is measured: a wrong file must end in one line
@@ -83,5 +73,5 @@ def run(options: argparse.Namespace) -> int:
         suite, start = importlib.import_module(f"{__package__}.{name}"), time.perf_counter()
         found[name] = list(suite.run(scope))
         sys.stderr.write(f"{name}: {time.perf_counter() - start:.1f} s\n")
-    sys.stdout.write((timing.as_json if options.json else timing.as_markdown)(facts, scope, found))
+    sys.stdout.write(timing.as_markdown(facts, scope, found))
     return 0

@@ -1,6 +1,6 @@
 """Suite ``quantize``: a step of NSVQ, and the search for the nearest code in it."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from itertools import count
 from typing import NamedTuple, cast
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.commands.benchmark import Scope
-from nsvq_lightning.commands.benchmark.timing import Measurement, compare, use_threads
+from nsvq_lightning.commands.benchmark.timing import Measurement, compare
 from nsvq_lightning.commands.benchmark.workloads import relative_l2, synthetic_workload, workloads
 from nsvq_lightning.quantize import NSVQ, CodebookQuantizer, nearest, nearest_reference
 from nsvq_lightning.quantize.attributes import attribute_rows, build_quantizers
@@ -45,26 +45,23 @@ Results = dict[str, tuple[Tensor, Tensor, Tensor]]
 
 
 def run(scope: Scope) -> Iterator[Measurement]:
-    """Time every operation with every number of threads."""
+    """Time every operation."""
     source = synthetic_workload("A20k" if scope.quick else "B100k") if scope.scene is None else workloads(scope)[0]
-    with use_threads(max(scope.threads)):
-        attributes = prepare(source.splats, scope.codebooks)
+    attributes = prepare(source.splats, scope.codebooks)
     for name, attribute in attributes.items():
         x, codebook = attribute.x.detach(), attribute.quantizer.codebook.detach()
         seen, size = x[attribute.rows], f"D {x.shape[1]}, K {len(codebook)}"
         searches = {"nsvq_lightning": nearest, "cdist + argmin": _by_distances}
         cases = {method: partial(search, seen, codebook) for method, search in searches.items()}
-        with use_threads(max(scope.threads)):
-            errors = {method: code_errors(seen, codebook, call()) for method, call in cases.items()}
+        errors = {method: code_errors(seen, codebook, call()) for method, call in cases.items()}
         yield from compare(SEARCH, f"{name}: {len(seen)} rows, {size}", cases, errors, scope)
     # The step comes last: it moves rows and codes, and the search measures them as they are fitted.
-    methods, clock = {"NSVQ": step, "plain torch": plain_step}, count(1)
-    with use_threads(max(scope.threads)):
-        errors = {method: step_errors(attributes, call(attributes, 0)) for method, call in methods.items()}
+    clock = count(1)
+    methods: dict[str, Callable[..., Results]] = {"NSVQ": step, "plain torch": partial(step, quantize=plain_nsvq)}
+    errors = {method: step_errors(attributes, call(attributes, 0)) for method, call in methods.items()}
     steps = {method: lambda call=call: call(attributes, next(clock)) for method, call in methods.items()}
-    note = f"codes checked on at most {CHECKED_ROWS} rows an attribute"
     workload, move = f"{source.name}, {scope.codebooks} codebooks", lambda: _advance(attributes, next(clock))
-    yield from compare(STEP, workload, steps, errors, scope, note, prepare=move)
+    yield from compare(STEP, workload, steps, errors, scope, prepare=move)
 
 
 def prepare(splats: RawSplats, codebooks: str) -> dict[str, Attribute]:
@@ -92,28 +89,31 @@ def _advance(attributes: Mapping[str, Attribute], iteration: int) -> None:
             values += attribute.rate * (2 * torch.rand(values.shape, generator=draw) - 1)
 
 
-def step(attributes: Mapping[str, Attribute], iteration: int) -> Results:
-    """One forward and backward pass of the quantizers of the package."""
+# Quantized rows ``[V, D]`` and their codes ``[V]``, given quantizer, rows of all splats, noise and visible rows.
+Quantize = Callable[[CodebookQuantizer, Tensor, torch.Generator, Tensor], tuple[Tensor, Tensor]]
+
+
+def step(
+    attributes: Mapping[str, Attribute], iteration: int, quantize: Quantize = CodebookQuantizer.__call__
+) -> Results:
+    """One forward and backward pass, by default of the quantizers of the package."""
     results: Results = {}
     for name, (quantizer, x, rows, upstream, _) in attributes.items():
-        quantized, codes = quantizer(x, generator(0, iteration, "noise", name), rows)
+        quantized, codes = quantize(quantizer, x, generator(0, iteration, "noise", name), rows)
         gradient, _ = torch.autograd.grad(quantized, (x, quantizer.codebook), upstream)
         results[name] = quantized.detach(), gradient, codes
     return results
 
 
-def plain_step(attributes: Mapping[str, Attribute], iteration: int) -> Results:
-    """The same in a few lines of torch: all distances, noise by ``randn``, gradients by autograd."""
-    results: Results = {}
-    for name, (quantizer, table, rows, upstream, _) in attributes.items():
-        x, codebook = table[rows], quantizer.codebook
-        codes = _by_distances(x.detach(), codebook.detach())
-        noise = torch.randn(x.shape, generator=generator(0, iteration, "noise", name))
-        length = torch.linalg.vector_norm(x - codebook[codes], dim=1, keepdim=True)
-        quantized = x + length * noise / noise.norm(dim=1, keepdim=True)
-        gradient, _ = torch.autograd.grad(quantized, (table, codebook), upstream)
-        results[name] = quantized.detach(), gradient, codes
-    return results
+def plain_nsvq(
+    quantizer: CodebookQuantizer, table: Tensor, draw: torch.Generator, rows: Tensor
+) -> tuple[Tensor, Tensor]:
+    """NSVQ in a few lines of torch: all distances, noise by ``randn``, gradients by autograd."""
+    x, codebook = table[rows], quantizer.codebook
+    codes = _by_distances(x.detach(), codebook.detach())
+    noise = torch.randn(x.shape, generator=draw)
+    length = torch.linalg.vector_norm(x - codebook[codes], dim=1, keepdim=True)
+    return x + length * noise / noise.norm(dim=1, keepdim=True), codes
 
 
 def step_errors(attributes: Mapping[str, Attribute], results: Results) -> dict[str, float]:

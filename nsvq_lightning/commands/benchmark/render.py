@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.commands.benchmark import Scope
-from nsvq_lightning.commands.benchmark.timing import Measurement, compare, use_threads
+from nsvq_lightning.commands.benchmark.timing import Measurement, compare
 from nsvq_lightning.commands.benchmark.workloads import Workload, relative_l2, workloads
 from nsvq_lightning.compute.devices import fast_backends
 from nsvq_lightning.quality.loss import photometric_loss
@@ -40,7 +40,7 @@ class Traced(NamedTuple):
 
 
 def run(scope: Scope) -> Iterator[Measurement]:
-    """Time every back-end of every device on every workload with every number of threads; errors once a workload."""
+    """Time every back-end of every device on every workload; errors once a workload."""
     for device in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
         for workload in workloads(scope):
             yield from _render_rows(workload.to(device), scope, device)
@@ -63,16 +63,15 @@ def _render_rows(workload: Workload, scope: Scope, device: str) -> Iterator[Meas
     crop = workload
     while len(crop.splats.means) * crop.camera.width * crop.camera.height > ORACLE_WORK[scope.quick]:
         crop = workload.crop(crop.camera.width // 2, crop.camera.height // 2)
-    with use_threads(max(scope.threads)):
-        truth = trace(crop, every["plain torch"], torch.float64)
-        errors = {name: errors_of(crop, paint, truth) for name, paint in every.items()}
-    note = f"errors on {'all' if crop is workload else f'the middle {crop.size}'} pixels"
+    truth = trace(crop, every["plain torch"], torch.float64)
+    errors = {name: errors_of(crop, paint, truth) for name, paint in every.items()}
+    pixels = {"error pixels": float(crop.camera.width * crop.camera.height)}
     for where, painters in ((workload, fast), (crop, every)) if crop is not workload else ((workload, every),):
         leaves = RawSplats(*(tensor.clone().requires_grad_() for tensor in where.splats))
         for operation, call in ((FORWARD, _forward), (BOTH, _both)):
             cases = {name: partial(call, paint, where, leaves) for name, paint in painters.items()}
-            values = {name: errors[name][operation] for name in painters}
-            yield from compare(operation, str(where), cases, values, scope, note, device)
+            values = {name: pixels | errors[name][operation] for name in painters}
+            yield from compare(operation, str(where), cases, values, scope, device)
 
 
 @torch.no_grad()
@@ -149,11 +148,10 @@ def _loss_rows(scope: Scope, device: str) -> Iterator[Measurement]:
         image = image.detach().requires_grad_()
         return torch.autograd.grad(loss(image, photo, 0.2), image)[0]
 
-    with use_threads(max(scope.threads)):
-        truth = gradient(plain_loss, image.double())
-        errors = {name: {"gradient error": relative_l2(gradient(loss, image), truth)} for name, loss in methods.items()}
+    truth = gradient(plain_loss, image.double())
+    errors = {name: {"gradient error": relative_l2(gradient(loss, image), truth)} for name, loss in methods.items()}
     cases = {name: partial(gradient, loss, image) for name, loss in methods.items()}
-    yield from compare(LOSS, f"{PHOTO[1]}x{PHOTO[0]}", cases, errors, scope, device=device)
+    yield from compare(LOSS, f"{PHOTO[1]}x{PHOTO[0]}", cases, errors, scope, device)
 
 
 def plain_loss(image: Tensor, photo: Tensor, dssim_weight: float) -> Tensor:

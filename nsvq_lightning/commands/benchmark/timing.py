@@ -2,18 +2,15 @@
 
 import gc
 import importlib.metadata
-import json
 import os
 import platform
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from llvmlite import binding
 
@@ -27,16 +24,24 @@ SGEMM_SIDE = 2048
 
 
 @dataclass(frozen=True)
-class Timing:
-    """Times of one case and of the matrix products that were interleaved with it.
+class Measurement:
+    """One row of a table.
 
     Attributes:
+        operation: What was done; measurements of one operation are compared with each other.
+        workload: What it was done to.
+        method: How it was done.
         samples: Milliseconds of each call, in the order of the calls.
-        sgemm: Milliseconds of each 2048³ float32 matrix product of torch.
+        sgemm: Milliseconds of each 2048³ float32 matrix product of torch that was interleaved with them.
+        values: Errors and sizes by name, the unit in the name where there is one.
     """
 
-    samples: tuple[float, ...]
-    sgemm: tuple[float, ...]
+    operation: str
+    workload: str
+    method: str
+    samples: Sequence[float]
+    sgemm: Sequence[float]
+    values: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def median(self) -> float:
@@ -44,38 +49,9 @@ class Timing:
         return statistics.median(self.samples)
 
     @property
-    def quartiles(self) -> tuple[float, float]:
-        """First and third quartile, ms; the sample itself where there is only one."""
-        first, third = map(float, np.quantile(self.samples, (0.25, 0.75)))
-        return first, third
-
-    @property
     def ratio(self) -> float:
         """Median as a multiple of the median matrix product: comparable between machines and between busy hours."""
         return self.median / statistics.median(self.sgemm)
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """One row of a table.
-
-    Attributes:
-        operation: What was done; measurements of one operation are compared with each other.
-        workload: What it was done to.
-        method: How it was done; what is before a colon is the name of a curve.
-        threads: Threads it was done with.
-        timing: How long it took.
-        values: Errors and sizes by name, the unit in the name where there is one.
-        note: How the errors were measured, where that is not on the workload itself.
-    """
-
-    operation: str
-    workload: str
-    method: str
-    threads: int
-    timing: Timing
-    values: Mapping[str, float] = field(default_factory=dict)
-    note: str = ""
 
 
 # What is timed.
@@ -88,77 +64,42 @@ def compare(
     cases: Mapping[str, Call],
     values: Mapping[str, Mapping[str, float]],
     scope: Scope,
-    note: str = "",
     device: str = "cpu",
     prepare: Call | None = None,
-) -> Iterator[Measurement]:
-    """Time the methods of one operation with every number of threads; on a GPU only with the most, those of the host.
+) -> list[Measurement]:
+    """Time the methods of an operation in turns, in an order that rotates from round to round.
+
+    The first call of each is not counted: it compiles kernels and grows buffers. A method that has used up
+    ``scope.seconds`` sits out the remaining rounds, so that one slow method does not make the run endless; the matrix
+    product never sits out. Python's cyclic collector waits for the end.
 
     Args:
         operation: See :class:`Measurement`.
         workload: See :class:`Measurement`.
         cases: What to time, by method.
         values: Errors and sizes by method, then by name.
-        scope: Numbers of threads and of rounds, and the time limit.
-        note: See :class:`Measurement`.
-        device: Where the work is done.
-        prepare: Done before every call, not timed.
-    """
-    for threads in scope.threads if device == "cpu" else (max(scope.threads),):
-        for method, timing in measure(cases, scope, threads, device, prepare).items():
-            yield Measurement(operation, workload, method, threads, timing, values[method], note)
-
-
-def measure(
-    cases: Mapping[str, Call], scope: Scope, threads: int, device: str = "cpu", prepare: Call | None = None
-) -> dict[str, Timing]:
-    """Time cases in turns, in an order that rotates from round to round, after one call each that is not counted.
-
-    The first call compiles kernels and grows buffers. A case that has used up ``scope.seconds`` sits out the
-    remaining rounds, so that one slow method does not make the run endless; the matrix product never sits out. Python's
-    cyclic collector waits for the end.
-
-    Args:
-        cases: What to time, by name.
         scope: Number of rounds and time limit.
-        threads: Threads of torch and of the kernels.
         device: Where the work is done, and the matrix product.
-        prepare: Done before every call of a case, not timed.
-
-    Returns:
-        Times by name of the case.
+        prepare: Done before every call of a method, not timed.
     """
-    product = sgemm(device)
-    players = [("", product), *cases.items()]
+    players = [("", sgemm(device)), *cases.items()]
     samples: dict[str, list[float]] = {name: [] for name, _ in players}
     gc.collect()
     gc.disable()
     try:
-        with use_threads(threads):
-            for turn in range(-1, scope.repeats):
-                shift = max(turn, 0) % len(players)
-                for name, call in players[shift:] + players[:shift]:
-                    if name and sum(samples[name]) >= 1000 * scope.seconds:
-                        continue
-                    if name and prepare is not None:
-                        prepare()
-                    took = milliseconds(call, device)
-                    if turn >= 0:
-                        samples[name].append(took)
+        for turn in range(-1, scope.repeats):
+            shift = max(turn, 0) % len(players)
+            for name, call in players[shift:] + players[:shift]:
+                if name and sum(samples[name]) >= 1000 * scope.seconds:
+                    continue
+                if name and prepare is not None:
+                    prepare()
+                took = milliseconds(call, device)
+                if turn >= 0:
+                    samples[name].append(took)
     finally:
         gc.enable()
-    return {name: Timing(tuple(samples[name]), tuple(samples[""])) for name in cases}
-
-
-@contextmanager
-def use_threads(threads: int) -> Iterator[None]:
-    """Let torch, and with it the kernels of this package, use a number of threads for a while."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+    return [Measurement(operation, workload, name, samples[name], samples[""], values[name]) for name in cases]
 
 
 def milliseconds(call: Call, device: str = "cpu") -> float:
@@ -221,67 +162,34 @@ def listed(facts: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} {value}" for name, value in facts.items() if value is not None)
 
 
-# Measurements by the name of their suite.
-Suites = Mapping[str, Sequence[Measurement]]
-
-
-def as_json(facts: Mapping[str, Mapping[str, Any]], scope: Scope, suites: Suites) -> str:
-    """Everything that was measured, samples included.
+def as_markdown(
+    facts: Mapping[str, Mapping[str, Any]], scope: Scope, suites: Mapping[str, Sequence[Measurement]]
+) -> str:
+    """The machine, then one table for every operation of every suite.
 
     Args:
         facts: From :func:`describe_machine`.
         scope: What was measured, and how thoroughly.
-        suites: Measurements.
+        suites: Measurements by the name of their suite.
     """
-    rows = []
-    for suite, found in suites.items():
-        for row in found:
-            times = {"median_ms": row.timing.median, "quartiles_ms": row.timing.quartiles}
-            rows.append({"suite": suite, **asdict(row), **times, "sgemm_ratio": row.timing.ratio})
-    document = {**facts, "settings": asdict(scope), "rows": rows}
-    return json.dumps(document, indent=2, ensure_ascii=False, default=str) + "\n"  # paths are not JSON
-
-
-def as_markdown(facts: Mapping[str, Mapping[str, Any]], scope: Scope, suites: Suites) -> str:
-    """The machine, then one table for every operation of every suite."""
     parts = ["# nsvq benchmark", *map(listed, facts.values())]
     parts.append(
-        f"Rounds: {scope.repeats}; threads: {', '.join(map(str, scope.threads))}{'; quick' * scope.quick}. "
-        "ms: median of the calls; quartiles and n beside it. sgemm: the median as a multiple of a 2048³ float32 matrix "
-        "product of torch that took turns with it."
+        f"Rounds: {scope.repeats}; threads: {torch.get_num_threads()}{'; quick' * scope.quick}. ms: median of the n "
+        "calls. sgemm: the median as a multiple of a 2048³ float32 matrix product of torch that took turns with it."
     )
     for suite, rows in suites.items():
         parts.append(f"## {suite}")
         for operation in dict.fromkeys(row.operation for row in rows):
-            parts += _table([row for row in rows if row.operation == operation])
+            some = [row for row in rows if row.operation == operation]
+            names = list(dict.fromkeys(name for row in some for name in row.values))
+            cells = []
+            for row in some:
+                numbers = [row.median, min(row.samples), len(row.samples), row.ratio]
+                values = [number(row.values[name]) if name in row.values else "" for name in names]
+                cells.append([row.workload, row.method, *map(number, numbers), *values])
+            head = ["workload", "method", "ms", "min", "n", "sgemm", *names]
+            parts += [f"### {operation}", markdown_table(head, cells, words=head[:2])]
     return "\n\n".join(parts) + "\n"
-
-
-def _table(rows: Sequence[Measurement]) -> Iterator[str]:
-    """Title, table and notes of one operation; what is the same in all rows is said once, in the title."""
-    own = ["workload", "method", "threads"]
-    title = f"### {rows[0].operation}"
-    if len({row.workload for row in rows}) == 1:
-        own.remove("workload")
-        title += f", {rows[0].workload}"
-    if len({row.threads for row in rows}) == 1:
-        own.remove("threads")
-        title += f", {rows[0].threads} thread{'s' * (rows[0].threads != 1)}"
-    yield title
-    names = list(dict.fromkeys(name for row in rows for name in row.values))
-    cells = []
-    for row in rows:
-        timing = row.timing
-        times = [number(timing.median), "–".join(map(number, timing.quartiles)), number(min(timing.samples))]
-        times += [str(len(timing.samples)), number(timing.ratio)]
-        values = [number(row.values[name]) if name in row.values else "" for name in names]
-        cells.append([*(str(getattr(row, name)) for name in own), *times, *values])
-    head = [*own, "ms", "quartiles", "min", "n", "sgemm", *names]
-    yield markdown_table(head, cells, words=("workload", "method"))
-    notes = dict.fromkeys(row.note for row in rows if row.note)
-    for note in notes:
-        about = dict.fromkeys(row.workload for row in rows if row.note == note)
-        yield f"{'; '.join(about)}: {note}." if len(notes) > 1 else f"{note[0].upper()}{note[1:]}."
 
 
 def number(value: float) -> str:

@@ -67,14 +67,9 @@ class StepClock(Callback):
         self._since = time.perf_counter()
 
     @property
-    def timing(self) -> timing.Timing:
-        """Times of all steps."""
-        return timing.Timing(tuple(took for _, took in self.steps), tuple(self.products))
-
-    @property
     def relative(self) -> float:
         """The mean step in matrix products, so that a busy machine is not mistaken for a slow variant."""
-        return fmean(self.timing.samples) / median(self.products)
+        return fmean(took for _, took in self.steps) / median(self.products)
 
 
 class _Run(SplatCLI):
@@ -97,12 +92,11 @@ class _Run(SplatCLI):
 WATCHING = ("report", "export", "predictions", "checkpoint", "progress")
 
 
-def _train(scope: Scope, threads: int, clock: StepClock, options: Sequence[str] = ()) -> dict[str, Tensor]:
+def _train(scope: Scope, clock: StepClock, options: Sequence[str] = ()) -> dict[str, Tensor]:
     """Train ``scope.steps`` iterations of the config on the scene, or on the demo scene if that is no folder of photos.
 
     Args:
         scope: Says which config, scene, first splats and length.
-        threads: Of torch and of the kernels.
         clock: Times the steps.
         options: Further ones of ``nsvq fit``.
 
@@ -116,11 +110,7 @@ def _train(scope: Scope, threads: int, clock: StepClock, options: Sequence[str] 
         data += (f"--model.init_from={scope.init_from}",)
     logging.disable(logging.WARNING)  # of Lightning, about devices, loaders and the end of the run
     try:
-        with (
-            tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder,
-            timing.use_threads(threads),
-            warnings.catch_warnings(action="ignore"),
-        ):
+        with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder, warnings.catch_warnings(action="ignore"):
             arguments = [
                 "fit",
                 f"--config={find_config(_config(scope))}",
@@ -143,31 +133,30 @@ def _config(scope: Scope) -> str:
 
 
 def run(scope: Scope) -> Iterator[timing.Measurement]:
-    """Train as shipped, with fewer threads, and without codebooks or with each inverted switch that is asked for."""
-    most, rounds = max(scope.threads), 1 if scope.quick else 2
-    variants: dict[str, tuple[int, tuple[str, ...]]] = {"as shipped": (most, ())}
-    variants |= {f"{n} thread{'s' * (n > 1)}": (n, ()) for n in scope.threads if n != most}
-    variants |= {f"no skip of {name}": (most, (f"--skips.{name}=false",)) for name in scope.switches}
+    """Train as shipped, and without codebooks or with each inverted switch that is asked for."""
+    rounds = 1 if scope.quick else 2
+    variants: dict[str, tuple[str, ...]] = {"as shipped": ()}
+    variants |= {f"no skip of {name}": (f"--skips.{name}=false",) for name in scope.switches}
     if not scope.switches:
-        variants["without codebooks"] = most, ("--model.codebooks=null",)
+        variants["without codebooks"] = ("--model.codebooks=null",)
     # Not counted, through all phases: kernels are loaded, and compiled where they never were.
-    _train(replace(scope, steps=8), most, StepClock())
+    _train(replace(scope, steps=8), StepClock())
     clocks = {name: StepClock() for name in variants}
     trained: dict[str, dict[str, Tensor]] = {}
     for turn in range(rounds):
         order = list(variants)
         for name in order[turn:] + order[:turn]:
-            threads, options = variants[name]
-            trained[name] = _train(scope, threads, clocks[name], options)
+            trained[name] = _train(scope, clocks[name], variants[name])
     shipped, numbers = clocks["as shipped"], trained["as shipped"]
     scene = "demo" if scope.photos is None else scope.photos.resolve().name
     for name, clock in clocks.items():
         by_phase: dict[Phase, list[float]] = {}
         for phase, took in clock.steps:
             by_phase.setdefault(phase, []).append(took)
+        samples = [took for _, took in clock.steps]
         values = {
             "PSNR dB": clock.psnr,
-            "seconds": sum(clock.timing.samples) / 1000 / rounds,
+            "seconds": sum(samples) / 1000 / rounds,
             "times as shipped": clock.relative / shipped.relative,
             **{f"{phase.name.lower()} ms": median(times) for phase, times in by_phase.items()},
             "splats": float(len(trained[name]["splats.means"])),
@@ -176,8 +165,7 @@ def run(scope: Scope) -> Iterator[timing.Measurement]:
         if name.startswith("no skip"):
             values["saves %"] = 100 * (1 - shipped.relative / clock.relative)
         described = f"{scene}, {Path(_config(scope)).name}, {scope.steps} steps"
-        note = "times are of whole steps, those that start a phase included; PSNR is that of the test views"
-        yield timing.Measurement("run", described, name, variants[name][0], clock.timing, values, note)
+        yield timing.Measurement("run", described, name, samples, clock.products, values)
 
 
 @torch.no_grad()

@@ -52,13 +52,8 @@ class Workload:
         background, image_gradient = self.background.to(device), self.image_gradient.to(device)
         return replace(self, splats=splats, background=background, image_gradient=image_gradient)
 
-    @property
-    def size(self) -> str:
-        """Pixels across and down, as ``400x300``."""
-        return f"{self.camera.width}x{self.camera.height}"
-
     def __str__(self) -> str:
-        return f"{self.name} {self.size}"
+        return f"{self.name} {self.camera.width}x{self.camera.height}"
 
 
 def relative_l2(value: Tensor, truth: Tensor) -> float:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -16,13 +15,10 @@ def test_results_are_printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     monkeypatch.setattr(timing, "SGEMM_SIDE", 16)
     monkeypatch.setattr(render, "PHOTO", (40, 48, 3))
     monkeypatch.setattr(render, "workloads", lambda _: [])
-    arguments = ["benchmark", "render", "--quick", "--repeats", "1", "--threads", "1"]
-    assert main(arguments) == 0
-    assert f"### {render.LOSS}, 48x40, 1 thread\n" in capsys.readouterr().out
-    assert main([*arguments, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert [row["method"] for row in found["rows"]] == ["fused, cpu", "plain torch, cpu"]
-    assert found["settings"]["threads"] == [1]
+    assert main(["benchmark", "render", "--quick", "--repeats", "1"]) == 0
+    _, _, table = capsys.readouterr().out.partition(f"### {render.LOSS}\n\n")
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
+    assert [row[:2] for row in rows] == [["48x40", "fused, cpu"], ["48x40", "plain torch, cpu"]]
 
 
 @pytest.mark.parametrize(("name", "message"), [("none.ply", "No such file"), ("bad.ply", "bad.ply"), ("x.md", ".md")])

@@ -38,7 +38,7 @@ def test_scene_file_is_seen_whole_and_without_broken_splats(tmp_path: Path, monk
     source.means.add_(torch.tensor([10.0, -3.0, 7.0]))
     path = tmp_path / "scene.ply"
     save(source, path)
-    scope = Scope((1,), scene=path)
+    scope = Scope(scene=path)
     (whole,) = workloads(scope)
     assert str(whole) == "scene.ply 800x533"
     assert float((render(whole.splats, whole.camera).radii > 0).float().mean()) > 0.7
@@ -54,7 +54,7 @@ def test_scene_file_is_seen_whole_and_without_broken_splats(tmp_path: Path, monk
 
 def test_folder_is_seen_by_its_first_train_camera(demo_scene: Path) -> None:
     scene = load_scene(demo_scene)
-    (workload,) = workloads(Scope((1,), scene=demo_scene))
+    (workload,) = workloads(Scope(scene=demo_scene))
     assert torch.equal(workload.camera.viewmat, scene.cameras[scene.train[0]].viewmat)
     assert torch.equal(workload.splats.means, scene.points)
 
