@@ -5,20 +5,20 @@ Each line is good, a note (works, could be better or faster) or a problem (a run
 Examples:
   nsvq doctor
   nsvq doctor path/to/scene
-  nsvq doctor path/to/scene --json > doctor.json
+  nsvq doctor path/to/scene > doctor.txt
 """
 
 import argparse
-import json
 import logging
 import math
 import os
 import platform
 import re
 import shutil
-import sys
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import packages_distributions
@@ -43,7 +43,6 @@ SMALL_DISK = 2 << 30
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq doctor`` takes."""
     parser.add_argument("folder", nargs="?", type=Path, metavar="FOLDER", help="COLMAP folder to check")
-    parser.add_argument("--json", action="store_true", help="print JSON instead of lines")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -53,19 +52,12 @@ def run(options: argparse.Namespace) -> int:
         0, or 1 if there is a problem: the self-test fails or the folder cannot be used.
     """
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
-    findings = []
+    counts: Counter[str] = Counter()
     for finding in check_all(options.folder):
-        findings.append(finding)
-        if not options.json:
-            print(finding, flush=True)  # each check takes seconds
-    verdicts = [finding.verdict for finding in findings]
-    problems, notes = verdicts.count("problem"), verdicts.count("note")
-    if options.json:
-        document = {"ok": not problems, "findings": [finding._asdict() for finding in findings]}
-        sys.stdout.write(json.dumps(document, indent=2, ensure_ascii=False) + "\n")
-    else:
-        said = f"{problems or 'no'} problem{'s' * (problems != 1)}, {notes or 'no'} note{'s' * (notes != 1)}"
-        sys.stdout.write(f"\n{said}\n")
+        print(finding, flush=True)  # each check takes seconds
+        counts[finding.verdict] += 1
+    problems, notes = counts["problem"], counts["note"]
+    print(f"\n{problems or 'no'} problem{'s' * (problems != 1)}, {notes or 'no'} note{'s' * (notes != 1)}")
     return 1 if problems else 0
 
 
@@ -102,11 +94,6 @@ def judged(subject: str, text: str, *advice: str | Literal[False]) -> Finding:
     return Finding("note" if said else "good", subject, f"{text}: {said}" if said else text)
 
 
-def problem(subject: str, text: str) -> Finding:
-    """A run would fail or be worthless."""
-    return Finding("problem", subject, text)
-
-
 def attempt(subject: str, check: Iterator[Finding]) -> Iterator[Finding]:
     """The findings of a check; if it raises, that is one more, and the other checks can still be made."""
     try:
@@ -115,7 +102,7 @@ def attempt(subject: str, check: Iterator[Finding]) -> Iterator[Finding]:
         text = " ".join(str(error).split())
         # That of a bad file says what is wrong and where.
         ours = isinstance(error, ValueError | OSError)
-        yield problem(subject, text if ours else f"the check itself failed: {type(error).__name__}: {text}")
+        yield Finding("problem", subject, text if ours else f"the check itself failed: {type(error).__name__}: {text}")
 
 
 def check_machine() -> Iterator[Finding]:
@@ -141,7 +128,7 @@ def check_packages() -> Iterator[Finding]:
     try:
         import cv2
     except ImportError as error:
-        yield problem("opencv", f"cannot be loaded ({error}): pip install {OPENCV}")
+        yield Finding("problem", "opencv", f"cannot be loaded ({error}): pip install {OPENCV}")
     else:
         text = f"{cv2.__version__} ({' and '.join(packages) or 'not from pip'})"
         advice = f"they overwrite each other's files; uninstall all of them, then pip install {OPENCV}"
@@ -211,7 +198,7 @@ def check_backends() -> Iterator[Finding]:
                 yield judged("self-test", text)
             else:
                 advice = f"do not trust a run; remove {kernel_folder()}, and if that does not help report it with "
-                yield problem("self-test", f"{text}: {advice}nsvq doctor --json")
+                yield Finding("problem", "self-test", f"{text}: {advice}what nsvq doctor says")
 
 
 def check_folder(root: Path) -> Iterator[Finding]:
@@ -226,7 +213,7 @@ def check_model(root: Path) -> Iterator[Finding]:
 
     model = read_poses(root, observations=True)
     if model.source == "COLMAP" and (larger := larger_models(root)) is not None:
-        yield problem("model", larger)
+        yield Finding("problem", "model", larger)
     yield from attempt("cameras", check_cameras(model))
     yield from attempt("points", check_points(model))
     yield from attempt("overlap", check_overlap(model))
@@ -256,7 +243,9 @@ def check_points(model: "ColmapModel") -> Iterator[Finding]:
         advice = "name a point cloud (ply_file_path in the file), or run COLMAP"
         yield judged("points", text, not model.synthetic and advice)
     elif not len(finite):
-        yield problem("points", f"none is finite: run {'COLMAP' if model.source == 'COLMAP' else 'the export'} again")
+        yield Finding(
+            "problem", "points", f"none is finite: run {'COLMAP' if model.source == 'COLMAP' else 'the export'} again"
+        )
     else:
         distances = np.linalg.norm(finite - np.median(finite, axis=0), axis=1)
         # Ten times farther from the median than four fifths of the points.
@@ -302,7 +291,7 @@ def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
     advice = "few; what lies between them is guessed, and the test score says little; take more photos"
     yield judged("split", text, train < 20 and advice)
     if not scene.extent > 0:
-        yield problem("extent", f"all train photos {ONE_PLACE}")
+        yield Finding("problem", "extent", f"all train photos {ONE_PLACE}")
     yield from attempt("sizes", check_sizes(scene, model))
     yield from attempt("photos", check_photos(scene, model))
     yield from attempt("run time", check_budget(scene))
@@ -320,7 +309,7 @@ def check_sizes(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     used = _range([(source.pinhole.width, source.pinhole.height) for source in sources])
     text = f"trained at {used}; {others or scaled} of {len(sources)} files "
     if others:
-        yield problem("sizes", f"{text}{OTHER_SHAPE}")
+        yield Finding("problem", "sizes", f"{text}{OTHER_SHAPE}")
     else:
         yield judged("sizes", f"{text}are scaled from what {model.source} says, their cameras with them")
 
@@ -343,7 +332,7 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
         photos = dict(zip(scene.names, pool.map(read, range(len(scene))), strict=True))
     broken = [photo for photo in photos.values() if isinstance(photo, str)]
     if broken:
-        yield problem("photos", f"{len(broken)} of {len(photos)} cannot be used; first: {broken[0]}")
+        yield Finding("problem", "photos", f"{len(broken)} of {len(photos)} cannot be used; first: {broken[0]}")
     else:
         yield judged("photos", f"all {len(photos)} registered photos can be read")
     masked = {name: photo for name, photo in photos.items() if isinstance(photo, float) and photo < 1}
@@ -364,6 +353,10 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
         yield judged("registered", text, "they are not used; if many, photos lack overlap or sharpness")
 
 
+# Default of ``--data.cache_bytes``.
+CACHE_BYTES = 4 << 30
+
+
 def check_budget(scene: "Scene") -> Iterator[Finding]:
     """Memory against what is available; time from renders of the scene grown as two recipes grow it."""
     from nsvq_lightning.callbacks.growth import splats_for_photos
@@ -372,7 +365,11 @@ def check_budget(scene: "Scene") -> Iterator[Finding]:
     # Splats over a run, on average, as a multiple of the default for the photos.
     default = splats_for_photos(len(scene.train), detailed_pixels(scene))
     fast, paper = round(1.3 * default), round(4.0 * default)
-    photos, needed, free = scene.images.nbytes, run_bytes(scene, paper), available_memory()
+    photos, free = scene.images.nbytes, available_memory()
+    needed = 1.2e9 + min(photos, CACHE_BYTES)  # Python, torch, Lightning, compiled kernels and evaluations
+    needed += 59 * 4 * 6 * paper  # float32 of a splat, each with gradient, two moments, and copies while editing
+    # Buffers of the renderer, the loss and the picture itself.
+    needed += 100 * max(camera.width * camera.height for camera in scene.cameras)
     shown = readable_bytes(min(photos, CACHE_BYTES))
     text = f"about {readable_bytes(needed)} with {paper:,} splats and {shown} of photos"
     if photos > CACHE_BYTES:
@@ -424,49 +421,19 @@ def grown(scene: "Scene", count: int) -> "Splats":
     return Splats.from_tensors(**tensors)
 
 
-# Default of ``--data.cache_bytes``.
-CACHE_BYTES = 4 << 30
-
-
-def run_bytes(scene: "Scene", splats: int, cache_bytes: int = CACHE_BYTES) -> float:
-    """Most memory that a run on a CPU takes.
-
-    Args:
-        scene: What it is trained on.
-        splats: Most splats that it has at a time.
-        cache_bytes: Memory for decoded photos.
-    """
-    base = 1.2e9  # Python, torch, Lightning, compiled kernels and evaluations
-    a_splat = 59 * 4 * 6  # 59 float32, each with gradient, two moments, and copies while quantizing or editing
-    a_pixel = 100  # buffers of the renderer, the loss and the picture itself
-    pixels = max(camera.width * camera.height for camera in scene.cameras)
-    return base + min(scene.images.nbytes, cache_bytes) + a_splat * splats + a_pixel * pixels
-
-
 def readable_bytes(count: float) -> str:
     """A number of bytes in readable form."""
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
 
 
 def available_memory() -> int | None:
-    """Bytes that this process may still allocate: of the machine, or of its control group if less."""
-    limits = [_machine_available(), _group_available()]
-    return min((limit for limit in limits if limit is not None), default=None)
-
-
-def _machine_available() -> int | None:
-    try:
+    """Bytes that this process may still allocate: of the machine, or of its control group if less; None if not told."""
+    limits = []
+    with suppress(OSError):
         found = re.search(r"^MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text(encoding="ascii"), re.MULTILINE)
-    except OSError:
-        return None
-    return 1024 * int(found[1]) if found else None
-
-
-def _group_available() -> int | None:
-    """What the container may still allocate; its usage includes page cache, which is reclaimable."""
+        limits += [1024 * int(found[1])] if found else []
     group = Path("/sys/fs/cgroup")
-    try:
-        limit, used = ((group / name).read_text(encoding="ascii").strip() for name in ("memory.max", "memory.current"))
-        return None if limit == "max" else max(0, int(limit) - int(used))
-    except (OSError, ValueError):
-        return None
+    with suppress(OSError, ValueError):  # "max" is no number, and no limit
+        limit, used = (int((group / name).read_text(encoding="ascii")) for name in ("memory.max", "memory.current"))
+        limits.append(max(0, limit - used))  # usage includes page cache, which is reclaimable
+    return min(limits, default=None)
