@@ -8,16 +8,14 @@ import shlex
 import shutil
 import sys
 import textwrap
-from argparse import SUPPRESS, ArgumentParser
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from argparse import SUPPRESS
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import resolve_name
 from types import NoneType
 from typing import Any, ClassVar, NamedTuple, NoReturn
 
-import docstring_parser
 from jsonargparse import Namespace
 from jsonargparse import _typehints as typehints
 from lightning.pytorch import Callback, LightningModule, Trainer, loggers
@@ -343,7 +341,7 @@ class Option(NamedTuple):
     text: str
 
 
-def command_help(parser: ArgumentParser, command: str, data: type | None, own_trainer: Collection[str]) -> str:
+def command_help(parser: LightningArgumentParser, command: str, data: type | None, own_trainer: Collection[str]) -> str:
     """Help text of a command: every option once, with its default and a one-sentence description.
 
     The parser's own help lists all classes that any option might take, even those of torch, but none of the options of
@@ -356,13 +354,10 @@ def command_help(parser: ArgumentParser, command: str, data: type | None, own_tr
         own_trainer: Options of the trainer that are explained; the others are Lightning's, and are listed.
     """
     groups: dict[str, list[Option]] = {"run": [], "callbacks": [], "model": [], "skips": [], "trainer": []}
-    defaults = parser.get_defaults()  # type: ignore[attr-defined]  # jsonargparse's, with those of the default config
-    for action in parser._actions:
-        name = (action.option_strings or [""])[-1].lstrip("-").removesuffix("+")
-        group = name.partition(".")[0] if "." in name else "run"
-        if name and group in groups and name not in groups and not name.endswith((".help", "model.splats")):
-            default = inspect.Parameter.empty if action.default == SUPPRESS else defaults.get(action.dest)
-            groups[group].append(Option(name, default, first_sentence(action.help)))
+    for option in _options(parser):
+        group = option.name.partition(".")[0] if "." in option.name else "run"
+        if group in groups and option.name not in (*groups, "model.splats"):
+            groups[group].append(option)
     budget = [Option(name, inspect.Parameter.empty, text) for name, text in SHORTHANDS.items()]
     explained = [option for option in groups["trainer"] if option.name.removeprefix("trainer.") in own_trainer]
     others = " ".join(f"--{each.name}{_default(each.default)}" for each in groups["trainer"] if each not in explained)
@@ -385,7 +380,21 @@ def command_help(parser: ArgumentParser, command: str, data: type | None, own_tr
 
 def class_help(prefix: str, kind: type) -> str:
     """Help text for the options of a class, all named ``prefix.…``."""
-    return _section(prefix, _class_options(prefix, kind), f"{first_sentence(kind.__doc__)}.")
+    parser = LightningArgumentParser(add_help=False)
+    parser.add_class_arguments(kind, prefix)
+    options = [option for option in _options(parser) if option.name.startswith(f"{prefix}.")]
+    return _section(prefix, options, f"{first_sentence(kind.__doc__)}.")
+
+
+def _options(parser: LightningArgumentParser) -> Iterator[Option]:
+    """The options of a parser, with the defaults of its default config."""
+    defaults = parser.get_defaults()
+    for action in parser._actions:
+        name = (action.option_strings or [""])[-1].lstrip("-").removesuffix("+")
+        if name and not name.endswith(".help"):
+            required = action.default == SUPPRESS or action.required
+            default = inspect.Parameter.empty if required else defaults.get(action.dest)
+            yield Option(name, default, first_sentence(action.help))
 
 
 def first_sentence(text: str | None) -> str:
@@ -395,24 +404,6 @@ def first_sentence(text: str | None) -> str:
     return re.split(r"(?<=[a-z0-9)\]]{2}[.:]) (?=[A-Z*])", plain)[0].rstrip(".:") if plain else ""
 
 
-def _class_options(prefix: str, kind: type) -> Iterator[Option]:
-    """The options of a class from its constructor and docstring, with dataclass arguments expanded in place.
-
-    Args:
-        prefix: Name in front, such as ``callbacks.density``.
-        kind: The class.
-    """
-    texts = _texts(kind)
-    for name, parameter in inspect.signature(kind).parameters.items():
-        if is_dataclass(parameter.default):
-            inner = _texts(type(parameter.default))
-            for field in fields(parameter.default):
-                value = getattr(parameter.default, field.name)
-                yield Option(f"{prefix}.{name}.{field.name}", value, inner.get(field.name, ""))
-        elif parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
-            yield Option(f"{prefix}.{name}", parameter.default, texts.get(name, ""))
-
-
 def _section(title: str, options: Iterable[Option], introduction: str = "") -> str:
     """A section of the help: the title, and for each option a line with its default, and its text below."""
     lines = [f"{title}:", *_wrapped(introduction, "  ")]
@@ -420,12 +411,6 @@ def _section(title: str, options: Iterable[Option], introduction: str = "") -> s
         lines.append(f"  --{option.name}{_default(option.default)}")
         lines += _wrapped(option.text, " " * 8)
     return "\n".join(lines) + "\n"
-
-
-def _texts(kind: type) -> Mapping[str, str]:
-    """First sentence for each argument or attribute by name, from the docstring."""
-    found = docstring_parser.parse(inspect.getdoc(kind) or "", docstring_parser.DocstringStyle.GOOGLE).params
-    return {each.arg_name.lstrip("*"): first_sentence(each.description) for each in found}
 
 
 # Largest width in columns to which text is wrapped, even on a wider terminal.

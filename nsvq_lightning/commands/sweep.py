@@ -246,19 +246,18 @@ def run_subprocess(arguments: Sequence[str], log: Path) -> int:
         Its exit status.
     """
     command = [sys.executable, "-u", "-X", "utf8", "-m", "nsvq_lightning", *arguments]
-    with (
-        open(log, "wb") as file,
-        subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT) as process,
-    ):
-        try:
-            return process.wait()
-        except KeyboardInterrupt:
-            process.terminate()
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(20.0)  # seconds that it has to stop by itself
-            raise
-        finally:
-            process.kill()  # nothing if it has ended
+    with open(log, "wb") as file:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT)
+    try:
+        return process.wait()
+    except KeyboardInterrupt:
+        process.terminate()
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(20.0)  # seconds that it has to stop by itself
+        raise
+    finally:  # nothing if it has ended
+        process.kill()
+        process.wait()
 
 
 def train(run: Run) -> str:
@@ -273,17 +272,13 @@ def train(run: Run) -> str:
         status = run_subprocess(prepare(run), said)
     except OSError as error:  # of the disk, or another process trains there
         return str(error)
-    if status == 0 and run.is_finished:
-        return ""
     if status == 0:
-        reason = "the run has left no metrics.json: callbacks.report must stay"
-    elif status < 0:
-        reason = f"killed by signal {-status}{', perhaps for want of memory' * (status == -9)}"
-    else:
-        lines = said.read_text(encoding="utf-8", errors="replace").split("\n")
-        lines = [line.strip() for line in lines if line.strip()] or [f"exit status {status}"]
-        reason = next((line for line in reversed(lines) if line.startswith("error: ")), lines[-1])
-    return f"{reason.removeprefix('error: ')} (see {said})"
+        return "" if run.is_finished else f"the run has left no metrics.json: callbacks.report must stay (see {said})"
+    if status < 0:
+        return f"killed by signal {-status}{', perhaps for want of memory' * (status == -9)} (see {said})"
+    lines = [line.strip() for line in said.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
+    return f"{(errors or lines or [f'exit status {status}'])[-1]} (see {said})"
 
 
 def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> list[Row]:
@@ -299,19 +294,17 @@ def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> 
     Returns:
         A row for each run, in their order.
     """
-    rows = {number: row_of(run) for number, run in enumerate(runs) if run.is_finished}
-    if rows:
-        write_results(output, list(rows.values()))
-    for number, run in enumerate(runs):
-        if number not in rows:
-            rows[number] = row_of(run, train(run))
-            write_results(output, [rows[each] for each in sorted(rows)])
-        row = rows[number]
-        if not (row["error"] or keep_checkpoints):  # they are larger than everything else
+    failed: dict[Path, str] = {}
+    for number, run in enumerate(runs, start=1):
+        if not run.is_finished and (error := train(run)):
+            failed[run.folder] = error
+        elif not keep_checkpoints:  # they are larger than everything else
             shutil.rmtree(run.folder / CHECKPOINT.parent, ignore_errors=True)
-        said = f"failed: {row['error']}" if row["error"] else "PSNR {psnr} dB, {bytes} bytes".format(**row)
-        log.info("[%d/%d] %s: %s", number + 1, len(runs), run.folder.name, said)
-    return [rows[number] for number in sorted(rows)]
+        log.info("[%d/%d] %s: %s", number, len(runs), run.folder.name, failed.get(run.folder, "finished"))
+        known = [each for each in runs if each.is_finished or each.folder in failed]
+        rows = [row_of(each, failed.get(each.folder, "")) for each in known]
+        write_results(output, rows)
+    return rows
 
 
 def row_of(run: Run, error: str = "") -> Row:
