@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import math
 import os
 import re
 import shlex
@@ -309,14 +310,14 @@ def summary(folder: Path, metrics: dict[str, Any]) -> str:
     before = metrics["before_quantization"]
     lines = [
         f"{folder}",
-        f"  PSNR {_number(metrics['psnr'], '.2f')} dB, SSIM {_number(metrics['ssim'], '.4f')} "
+        f"  PSNR {metrics['psnr'] or math.inf:.2f} dB, SSIM {metrics['ssim'] or math.nan:.4f} "
         f"on {metrics['views']} test views, rendered from the decoded file",
         f"  {metrics['num_splats']} splats in {metrics['file_bytes']} bytes (scene.nsvq), "
         f"{metrics['ratio']:.1f} times smaller than the plain .ply",
         f"  {metrics['train_seconds']:.0f} s of training",
     ]
     if before is not None:
-        lines.insert(2, f"  before quantization: PSNR {_number(before['psnr'], '.2f')} dB")
+        lines.insert(2, f"  before quantization: PSNR {before['psnr'] or math.inf:.2f} dB")
     return "\n".join(lines) + "\n"
 
 
@@ -327,10 +328,6 @@ def default_loggers(folder: Path) -> list[loggers.Logger]:
     if find_spec("tensorboard") is not None:
         found.append(loggers.TensorBoardLogger(**place, default_hp_metric=False))
     return found
-
-
-def _number(value: float | None, form: str) -> str:
-    return "infinite" if value is None else format(value, form)
 
 
 class Option(NamedTuple):
@@ -424,14 +421,10 @@ def _wrapped(text: str, indent: str) -> list[str]:
 
 def _default(value: Any) -> str:
     """``=default`` as one would type it; empty if there is no default."""
-    if value is inspect.Parameter.empty:
-        return ""
-    if value is None or isinstance(value, bool):
-        return f"={'null' if value is None else str(value).lower()}"
-    if isinstance(value, type):
-        return f"={value.__name__}"
     if isinstance(value, Namespace) and "class_path" in value:
         return f"={value.class_path.rpartition('.')[2]}"
     if isinstance(value, tuple | list):
         return f"=[{','.join(map(str, value))}]"
+    if value is None or isinstance(value, bool):
+        return f"={json.dumps(value)}"
     return f"={value}" if isinstance(value, int | float | str) else ""

@@ -79,7 +79,7 @@ def compare(
         cases: What to time, by method.
         values: Errors and sizes by method, then by name.
         scope: Number of rounds and time limit.
-        device: Where the work is done, and the matrix product.
+        device: Where the work is done, and with it the matrix product.
         prepare: Done before every call of a method, not timed.
     """
     players = [("", sgemm(device)), *cases.items()]
@@ -94,7 +94,7 @@ def compare(
                     continue
                 if name and prepare is not None:
                     prepare()
-                took = milliseconds(call, device)
+                took = milliseconds(call)
                 if turn >= 0:
                     samples[name].append(took)
     finally:
@@ -102,19 +102,9 @@ def compare(
     return [Measurement(operation, workload, name, samples[name], samples[""], values[name]) for name in cases]
 
 
-def milliseconds(call: Call, device: str = "cpu") -> float:
-    """Time one call.
-
-    On a GPU, that is from when it begins the first work to when it ends the last, its waits for the host included.
-    """
+def milliseconds(call: Call) -> float:
+    """Time one call, with the work of a GPU that it begins."""
     finish()
-    if torch.device(device).type == "cuda":
-        first, last = (torch.cuda.Event(enable_timing=True) for _ in range(2))  # type: ignore[no-untyped-call]
-        first.record()
-        call()
-        last.record()
-        last.synchronize()
-        return float(first.elapsed_time(last))
     start = time.perf_counter_ns()
     call()
     finish()
