@@ -313,14 +313,24 @@ def photos_of(path: Path) -> Path | None:
     return Path(root) if isinstance(root, str) and Path(root).is_dir() else None
 
 
-def cameras_of(path: Path) -> "dict[str, Camera]":
-    """Cameras by name that the run has recorded that a scene lies in, for when its photos are gone; none without it.
+def cameras_of(path: Path, root: Path | None) -> "dict[str, Camera]":
+    """Cameras by name of the photos that a scene was trained on; where these are gone, what its run has recorded.
+
+    Args:
+        path: A scene file, or the folder of a run; without a run, there are none.
+        root: Scene folder whose cameras they are instead.
 
     Raises:
-        ValueError: Its ``viewer.html`` is damaged.
+        SceneError: The folder is not a scene.
+        ValueError: ``viewer.html`` of the run is damaged.
     """
+    from nsvq_lightning.data.scene import load_scene
     from nsvq_lightning.report.viewer import page_cameras
 
+    root = root or photos_of(path)
+    if root is not None:
+        scene = load_scene(root)
+        return dict(zip(scene.names, scene.cameras, strict=True))
     page = (path if path.is_dir() else path.parent) / "viewer.html"
     return page_cameras(page) if page.is_file() else {}
 
@@ -344,6 +354,6 @@ def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -
     if root is not None:
         scene = load_scene(root)
         return [scene.cameras[index] for index in scene.some_train(most)], scene
-    recorded = list(cameras_of(path).values())
+    recorded = list(cameras_of(path, None).values())
     # A square picture with the pixels of a photo: what a wide one shows at its edges, photos seldom do.
     return recorded[:: -(-len(recorded) // most) or 1] or likely_cameras(splats, most, 640, 640, degrees=50), None

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from nsvq_lightning.commands.arguments import cameras_of, photos_of, positive, scene_file
+from nsvq_lightning.commands.arguments import cameras_of, positive, scene_file
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -109,27 +109,21 @@ def run(options: argparse.Namespace) -> int:
 def _path(options: argparse.Namespace, splats: "Splats", is_video: bool) -> "tuple[list[Camera], float]":
     """The cameras and frames per second that the options ask for."""
     from nsvq_lightning.compression.viewpoints import likely_cameras
-    from nsvq_lightning.data.scene import load_scene
     from nsvq_lightning.rendering.camera import orbit, read_camera_path, reframed, smooth_path
 
-    fps = options.fps or FPS
-    root = options.root or photos_of(options.scene)
-    recorded = list(cameras_of(options.scene).values()) if root is None else []
-    kind = options.path or ("through" if root is not None or recorded else "orbit")
-    if kind not in ("through", "cameras", "orbit"):
+    fps, kind = options.fps or FPS, options.path
+    if kind not in (None, "through", "cameras", "orbit"):
         given, own = read_camera_path(Path(kind))
         fps = options.fps or own
-    elif root is not None:
-        given = list(load_scene(root).cameras)
-    elif recorded:
-        given = recorded
-    elif kind == "orbit":
-        log.info("no photos: their cameras are guessed from the scene; --data.root names the folder of the photos")
-        given = likely_cameras(splats, 24)
     else:
-        raise ValueError(
-            f"--path {kind} needs the cameras of photos: name their folder with --data.root, or take orbit"
-        )
+        given = list(cameras_of(options.scene, options.root).values())
+        kind = kind or ("through" if given else "orbit")
+        if not given and kind != "orbit":
+            message = f"--path {kind} needs the cameras of photos: name their folder with --data.root, or take orbit"
+            raise ValueError(message)
+        if not given:
+            log.info("no photos: their cameras are guessed from the scene; --data.root names the folder of the photos")
+            given = likely_cameras(splats, 24)
     width, height = options.size or (given[0].width, given[0].height)
     if is_video and (width % 2 or height % 2):
         width, height = max(2, width - width % 2), max(2, height - height % 2)

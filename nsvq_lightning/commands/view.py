@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from nsvq_lightning.commands.arguments import cameras_of, photos_of, scene_file
+from nsvq_lightning.commands.arguments import cameras_of, scene_file
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
@@ -105,15 +105,11 @@ def _nsvq_file(options: argparse.Namespace) -> Iterator[Path]:
 def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     """Cameras of the photos, or guessed ones."""
     from nsvq_lightning.compression.viewpoints import likely_cameras
-    from nsvq_lightning.data.scene import load_scene
     from nsvq_lightning.io.formats import load
-    from nsvq_lightning.report.viewer import some_cameras
 
-    root = options.root or photos_of(options.scene)
-    if root is not None:
-        return some_cameras(load_scene(root))
-    if recorded := cameras_of(options.scene):
-        return recorded
+    cameras = list(cameras_of(options.scene, options.root).items())
+    if cameras:
+        return dict(cameras[:: -(-len(cameras) // 300)])  # at most as many as the page of a run has
     if options.live:
         raise ValueError(f"{options.scene} does not say where its photos are: name their folder with --data.root")
     splats = load(file)
