@@ -111,12 +111,11 @@ def check_machine() -> Iterator[Finding]:
 
     from nsvq_lightning.commands.benchmark import timing
 
-    facts = timing.describe_machine()
+    machine, versions = timing.describe_machine()
     built = torch.version.cuda or torch.version.hip
     advice = "check nvidia-smi and CUDA_VISIBLE_DEVICES" if built else "for an NVIDIA GPU install a CUDA build"
-    alone = facts["machine"]["gpu"] is None and f"torch finds no GPU: {advice}"
-    yield judged("machine", timing.listed(facts["machine"]), alone)
-    yield judged("versions", timing.listed(facts["versions"]))
+    yield judged("machine", machine, not torch.cuda.is_available() and f"torch finds no GPU: {advice}")
+    yield judged("versions", versions)
 
 
 OPENCV = "opencv-contrib-python-headless"

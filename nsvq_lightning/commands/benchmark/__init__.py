@@ -30,6 +30,10 @@ SIZES = {
 }
 
 
+# What --quick changes of a scope.
+QUICK = {"repeats": 3, "seconds": 0.5, "workloads": ("A20k",), "steps": 40}
+
+
 @dataclass(frozen=True)
 class Scope:
     """What is measured, and how thoroughly: what the command line says, with its defaults filled in.

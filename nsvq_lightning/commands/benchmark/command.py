@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from nsvq_lightning.commands.arguments import positive, some_of
-from nsvq_lightning.commands.benchmark import SIZES, SUITES, Scope
+from nsvq_lightning.commands.benchmark import QUICK, SIZES, SUITES, Scope
 from nsvq_lightning.skips import SKIPS
 
 
@@ -55,9 +55,7 @@ def run(options: argparse.Namespace) -> int:
     """
     from nsvq_lightning.commands.benchmark import timing, workloads
 
-    values: dict[str, Any] = (
-        {"repeats": 3, "seconds": 0.5, "workloads": ("A20k",), "steps": 40} if options.quick else {}
-    )
+    values: dict[str, Any] = dict(QUICK) if options.quick else {}
     values |= {name: value for name, value in vars(options).items() if name != "suites" and value is not None}
     scope = Scope(**values)
     if scope.steps < 4:
@@ -68,10 +66,10 @@ def run(options: argparse.Namespace) -> int:
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
     if scope.scene is not None:
         workloads.workloads(scope)  # before anything is measured: a wrong file must end in one line
-    facts, found = timing.describe_machine(), {}  # as busy as the machine is before
+    about, found = timing.describe_machine(), {}  # as busy as the machine is before
     for name in options.suites:
         suite, start = importlib.import_module(f"{__package__}.{name}"), time.perf_counter()
         found[name] = list(suite.run(scope))
         sys.stderr.write(f"{name}: {time.perf_counter() - start:.1f} s\n")
-    sys.stdout.write(timing.as_markdown(facts, scope, found))
+    sys.stdout.write(timing.as_markdown(about, scope, found))
     return 0

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
 from llvmlite import binding
@@ -125,8 +124,8 @@ def sgemm(device: str = "cpu") -> Call:
     return lambda: torch.mm(left, right, out=out)
 
 
-def describe_machine() -> dict[str, dict[str, Any]]:
-    """The machine and how busy it is, and the versions of packages that results depend on, as JSON values."""
+def describe_machine() -> list[str]:
+    """A line about the machine and how busy it is, and one with the versions of packages that results depend on."""
     # The platform module knows only the architecture of the processor on Linux.
     about = Path("/proc/cpuinfo")
     lines = about.read_text(encoding="utf-8").splitlines() if about.is_file() else []
@@ -144,29 +143,27 @@ def describe_machine() -> dict[str, dict[str, Any]]:
     }
     packages = ("numpy", "torch", "numba", "llvmlite", "lightning", "torchmetrics", "jsonargparse", "scipy", "pycolmap")
     versions = {"nsvq-lightning": __version__, "python": platform.python_version()}
-    return {"machine": machine, "versions": versions | {name: importlib.metadata.version(name) for name in packages}}
+    versions |= {name: importlib.metadata.version(name) for name in packages}
+    return [
+        ", ".join(f"{name} {value}" for name, value in facts.items() if value is not None)
+        for facts in (machine, versions)
+    ]
 
 
-def listed(facts: Mapping[str, Any]) -> str:
-    """What is known of some facts, on one line."""
-    return ", ".join(f"{name} {value}" for name, value in facts.items() if value is not None)
-
-
-def as_markdown(
-    facts: Mapping[str, Mapping[str, Any]], scope: Scope, suites: Mapping[str, Sequence[Measurement]]
-) -> str:
+def as_markdown(about: Sequence[str], scope: Scope, suites: Mapping[str, Sequence[Measurement]]) -> str:
     """The machine, then one table for every operation of every suite.
 
     Args:
-        facts: From :func:`describe_machine`.
+        about: From :func:`describe_machine`.
         scope: What was measured, and how thoroughly.
         suites: Measurements by the name of their suite.
     """
-    parts = ["# nsvq benchmark", *map(listed, facts.values())]
-    parts.append(
+    parts = [
+        "# nsvq benchmark",
+        *about,
         f"Rounds: {scope.repeats}; threads: {torch.get_num_threads()}{'; quick' * scope.quick}. ms: median of the n "
-        "calls. sgemm: the median as a multiple of a 2048³ float32 matrix product of torch that took turns with it."
-    )
+        "calls. sgemm: the median as a multiple of a 2048³ float32 matrix product of torch that took turns with it.",
+    ]
     for suite, rows in suites.items():
         parts.append(f"## {suite}")
         for operation in dict.fromkeys(row.operation for row in rows):
