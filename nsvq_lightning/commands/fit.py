@@ -10,7 +10,7 @@ import shutil
 import sys
 import textwrap
 from argparse import SUPPRESS
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import resolve_name
@@ -55,11 +55,7 @@ class QuietParser(LightningArgumentParser):
     def format_help(self, *args: Any) -> str:
         """Help of a command, see :func:`command_help`."""
         subcommand = self.prog.rpartition(" ")[2]
-        if subcommand not in COMMANDS:
-            return super().format_help(*args)
-        data = None if subcommand == "export" else ColmapDataModule
-        explained = "run_folder", "allow_other_scene", "max_steps", "accelerator", "devices", "logger", "callbacks"
-        return command_help(self, subcommand, data, explained)
+        return command_help(self, subcommand) if subcommand in COMMANDS else super().format_help(*args)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Write the message to stderr and exit with status 2."""
@@ -338,7 +334,11 @@ class Option(NamedTuple):
     text: str
 
 
-def command_help(parser: LightningArgumentParser, command: str, data: type | None, own_trainer: Collection[str]) -> str:
+# Options of the trainer that the help explains; the others are Lightning's, and are listed.
+EXPLAINED = ("run_folder", "allow_other_scene", "max_steps", "accelerator", "devices", "logger", "callbacks")
+
+
+def command_help(parser: LightningArgumentParser, command: str) -> str:
     """Help text of a command: every option once, with its default and a one-sentence description.
 
     The parser's own help lists all classes that any option might take, even those of torch, but none of the options of
@@ -347,8 +347,6 @@ def command_help(parser: LightningArgumentParser, command: str, data: type | Non
     Args:
         parser: Its parser, with options named ``group.name``.
         command: Its name.
-        data: Class whose constructor arguments are also options, ``data.…``, if it reads photos.
-        own_trainer: Options of the trainer that are explained; the others are Lightning's, and are listed.
     """
     groups: dict[str, list[Option]] = {"run": [], "callbacks": [], "model": [], "skips": [], "trainer": []}
     for option in _options(parser):
@@ -356,14 +354,14 @@ def command_help(parser: LightningArgumentParser, command: str, data: type | Non
         if group in groups and option.name not in (*groups, "model.splats"):
             groups[group].append(option)
     budget = [Option(name, inspect.Parameter.empty, text) for name, text in SHORTHANDS.items()]
-    explained = [option for option in groups["trainer"] if option.name.removeprefix("trainer.") in own_trainer]
+    explained = [option for option in groups["trainer"] if option.name.removeprefix("trainer.") in EXPLAINED]
     others = " ".join(f"--{each.name}{_default(each.default)}" for each in groups["trainer"] if each not in explained)
     return "\n".join(
         [
             f"usage: nsvq {command} [--config NAME] [--OPTION=VALUE ...]\n\n{parser.description}\n",
             _section("run", groups["run"]),
             *([_section("budget", budget)] if command == "fit" else []),
-            *([class_help("data", data)] if data is not None else []),
+            *([class_help("data", ColmapDataModule)] if command != "export" else []),
             _section("callbacks", groups["callbacks"], "Their options: --callbacks.density.help; null leaves one out."),
             _section("model", groups["model"]),
             _section("skips", groups["skips"]),
