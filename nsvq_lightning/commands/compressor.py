@@ -17,6 +17,7 @@ from nsvq_lightning.compression.components import components
 from nsvq_lightning.compression.importance import contributions, most_contributing, row_weights
 from nsvq_lightning.compression.setting import STEPS, Setting, setting_for
 from nsvq_lightning.compression.viewpoints import Measure
+from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.datamodule import SceneDataModule
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import decode, encode
@@ -226,7 +227,10 @@ class Compressor:
                 self.stopped = True
             finally:
                 chatter.setLevel(level)
-        return replace(module.compressed().finite(), origin=self._scene.origin)
+        found = replace(module.compressed().finite(), origin=self._scene.origin)
+        del module
+        trim()
+        return found
 
     def usual_steps(self, splats: int) -> int:
         """How many steps a training of this many of the splats takes."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nsvq_lightning.compute.environment import usable_cores
+from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.images import resized_mask
 from nsvq_lightning.data.scene import Scene, edge_strength
 from nsvq_lightning.random import draw_rows, generator
@@ -91,13 +92,22 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
         cv2.setNumThreads(threads)
     if not found:
         return torch.empty(0, 3), torch.empty(0, 3)
-    positions, colors, detail = map(np.concatenate, zip(*found, strict=True))
-    cells = np.floor(positions / (CELL * np.median([photo.depth for photo in photos]))).astype(np.int64)
-    _, cell, crowd = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    crowd = crowd[cell.ravel()]
+    edge = CELL * np.median([photo.depth for photo in photos])
+    del photos, pairs
+    positions, colors, detail = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    found.clear()
+    # Cells by one number each: 2^21 along an axis.
+    cells = np.zeros(len(positions), np.int64)
+    for axis in positions.T:
+        cells = cells << 21 | np.floor(axis / edge).astype(np.int64) & (1 << 21) - 1
+    _, cell, crowd = np.unique(cells, return_inverse=True, return_counts=True)
+    crowd = crowd[cell]
     weight = np.where(crowd >= AGREEING, (detail / 255 + LEAST_DETAIL) / crowd**CROWDED, 0)
     drawn = draw_rows(torch.from_numpy(weight), count, generator(seed, 0, "dense start")).numpy()
-    return torch.from_numpy(positions[drawn]).float(), torch.from_numpy(colors[drawn]).float() / 255
+    chosen = torch.from_numpy(positions[drawn]).float(), torch.from_numpy(colors[drawn]).float() / 255
+    del positions, colors, detail, cells, cell, crowd, weight
+    trim()
+    return chosen
 
 
 # Photos are looked at with at most so many pixels on their longer side.
