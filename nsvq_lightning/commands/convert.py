@@ -24,17 +24,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from nsvq_lightning.commands.compress import share_or_number
-from nsvq_lightning.io import formats, lod, spz
-from nsvq_lightning.io.compressed import (
-    UP_AXES,
-    CompressedScene,
-    cropped,
-    joined,
-    moved,
-    rotated,
-    turn_up,
-    with_degree,
-)
+from nsvq_lightning.io import compressed, formats, lod, spz
+from nsvq_lightning.io.compressed import UP_AXES, CompressedScene
 from nsvq_lightning.io.describe import attribute_errors
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.sog import PALETTE_LIMIT
@@ -118,7 +109,7 @@ def run(options: argparse.Namespace) -> int:
     entry = formats.format_of(output)
     if not output.parent.is_dir() and formats.suffix_of(output) != lod.NAME:
         raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
-    scene = _edited(joined([formats.read_scene(path).finite() for path in options.inputs]), options)
+    scene = _edited(compressed.joined([formats.read_scene(path).finite() for path in options.inputs]), options)
     size = formats.save(scene, output, **writer)
     # What reading the output back would say of it is known here.
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
@@ -137,7 +128,7 @@ def _edited(scene: CompressedScene, options: argparse.Namespace) -> CompressedSc
     """The scene within the box, without floaters, thinned, turned and moved, up to a degree, in this order."""
     before = len(scene)
     if options.crop is not None:
-        scene = cropped(scene, np.array(options.crop[:3]), np.array(options.crop[3:]))
+        scene = compressed.cropped(scene, np.array(options.crop[:3]), np.array(options.crop[3:]))
         if len(scene) == 0:
             named = ", ".join(map(str, options.inputs))
             raise ValueError(f"no splat of {named} is in the box {' '.join(map(str, options.crop))}")
@@ -149,16 +140,16 @@ def _edited(scene: CompressedScene, options: argparse.Namespace) -> CompressedSc
         if asked < len(scene):
             scene = _thinned(scene, max(1, asked), options)
     if options.up is not None:
-        scene = rotated(scene, turn_up(_up(options), options.up))
+        scene = compressed.rotated(scene, compressed.turn_up(_up(options), options.up))
     if options.matrix is not None:
-        scene = moved(scene, np.array([*options.matrix, 0, 0, 0, 1]).reshape(4, 4))
+        scene = compressed.moved(scene, np.array([*options.matrix, 0, 0, 0, 1]).reshape(4, 4))
     if options.align is not None:
         from nsvq_lightning.data.colmap import alignment
         from nsvq_lightning.data.transforms import read_poses
 
-        scene = moved(scene, alignment(*(read_poses(folder) for folder in (options.root, options.align))))
+        scene = compressed.moved(scene, alignment(*(read_poses(folder) for folder in (options.root, options.align))))
     if options.sh_degree is not None and options.sh_degree < scene.sh_degree:
-        scene = with_degree(scene, options.sh_degree)
+        scene = compressed.with_degree(scene, options.sh_degree)
     return scene.in_use() if len(scene) < before else scene
 
 

@@ -20,21 +20,11 @@ from scipy.ndimage import distance_transform_edt
 
 from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.scene import Scene
-from nsvq_lightning.io.atomic import atomic_path, atomic_write, write_text
+from nsvq_lightning.io.atomic import atomic_write, write_text
 from nsvq_lightning.io.compressed import turn_up
 from nsvq_lightning.rendering.camera import Camera, up_of
 
 BLOCK = "block.json"
-# Where a part without a neighbour ends.
-_FAR = 1e30
-# Widths of a photo in cells; in each, the points that are in front tell what it shows.
-CELLS = 50
-# Points up to so many times as far as the nearest one in the cell count as in front, too.
-FRONT = 1.05
-# Surroundings of a core beyond each seam, as a share of what photos show of the part.
-OVERLAP = 0.15
-# A photo belongs to a part if it shows it in this share of its cells.
-LEAST_SHOWN = 0.02
 
 
 @dataclass(frozen=True)
@@ -76,6 +66,8 @@ class Block:
             raise SceneError(f"{folder} is no part of a scene ({error}): make it anew with 'nsvq split'") from None
 
 
+# Points up to so many times as far as the nearest one in the cell count as in front, too.
+FRONT = 1.05
 # Rows of points, and the cell of a picture that each is in.
 _Front = tuple[NDArray[np.intp], NDArray[np.intp]]
 
@@ -99,10 +91,22 @@ def points_in_front(points: NDArray[np.float64], camera: Camera) -> _Front:
     return seen[front], cells[front]
 
 
+# Widths of a photo in cells; in each, the points that are in front tell what it shows.
+CELLS = 50
+
+
 def _cells(camera: Camera) -> tuple[int, int, int]:
     """Columns and rows of the cells of a picture, and their side in pixels."""
     size = max(4, camera.width // CELLS)
     return math.ceil(camera.width / size), math.ceil(camera.height / size), size
+
+
+# Surroundings of a core beyond each seam, as a share of what photos show of the part.
+OVERLAP = 0.15
+
+
+# Where a part without a neighbour ends.
+_FAR = 1e30
 
 
 def cut(scene: Scene, count: int) -> list[Block]:
@@ -161,6 +165,10 @@ _SEAM = 0.3
 def near_seams(points: NDArray[np.float64], blocks: Sequence[Block]) -> NDArray[np.bool_]:
     """Which points ``[P, 3]`` lie where two parts meet."""
     return np.asarray(sum(block.contains(points, _SEAM).astype(int) for block in blocks) > 1)
+
+
+# A photo belongs to a part if it shows it in this share of its cells.
+LEAST_SHOWN = 0.02
 
 
 def write_blocks(scene: Scene, blocks: Sequence[Block], folders: Sequence[Path]) -> list[tuple[int, int]]:
@@ -239,8 +247,8 @@ def _write_photo(
     for name, pixels in zip(names.values(), (image[box][..., ::-1], 255 * mask[box].astype(np.uint8)), strict=True):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(cv2.imencode(".png", np.ascontiguousarray(pixels))[1].tobytes())
+        with atomic_write(path) as file:
+            file.write(cv2.imencode(".png", np.ascontiguousarray(pixels))[1].tobytes())
     fx, fy, cx, cy = camera.intrinsics
     height, width = mask[box].shape
     # The file has the inverse, y up, z backward.

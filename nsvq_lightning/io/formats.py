@@ -150,7 +150,7 @@ FORMATS: dict[str, Format] = {
         magics=(b"\x1f\x8b", b"NGSP"),
         in_order=spz.in_spz_order,
     ),
-    ".glb": Format("glTF, KHR_gaussian_splatting", glb.read_glb, glb.write_glb, glb.describe_glb, (b"glTF",)),
+    ".glb": Format("glTF, KHR_gaussian_splatting", glb.read_glb, glb.write_glb),
     ".usda": Format("OpenUSD, for scenes of moderate size", usda.read_usda, usda.write_usda),
     ".compressed.ply": Format(
         "PlayCanvas, SuperSplat",

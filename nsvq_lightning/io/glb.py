@@ -23,18 +23,19 @@ from nsvq_lightning.io.numbers import logits_of, opacity_of
 from nsvq_lightning.splats.conventions import SH_C0, sh_coefficients, unit
 
 EXTENSION = "KHR_gaussian_splatting"
-# Magic, version, length of the file; then, of each chunk, length and type.
-_HEAD, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
-_MOST_JSON = 1 << 26
-_FLOAT, _BYTE, _ARRAY_BUFFER = 5126, 5121, 34962
-_COMPONENTS = {5120: "i1", _BYTE: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 def _harmonic(number: int) -> str:
     """Name of a coefficient, counted over all degrees from 0."""
     degree = int(number**0.5)
     return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{number - degree * degree}"
+
+
+# Magic, version, length of the file; then, of each chunk, length and type.
+_HEAD, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+_FLOAT, _BYTE, _ARRAY_BUFFER = 5126, 5121, 34962
+_COMPONENTS = {5120: "i1", _BYTE: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 def write_glb(path: str | os.PathLike[str], scene: CompressedScene) -> int:
@@ -125,6 +126,9 @@ def read_glb(path: str | os.PathLike[str]) -> CompressedScene:
     return replace(scene, config={"antialiased": True}) if antialiased else scene
 
 
+_MOST_JSON = 1 << 26
+
+
 def _parsed(data: bytes) -> tuple[dict[str, Any], memoryview]:
     """JSON and binary chunk."""
     if len(data) < _HEAD.size + _CHUNK.size or data[:4] != b"glTF":
@@ -212,10 +216,3 @@ def _accessor(document: dict[str, Any], data: memoryview, number: int) -> NDArra
     if dtype.kind != "f":  # normalized
         rows = np.maximum(rows / np.float32(np.iinfo(dtype).max), np.float32(-1))
     return rows
-
-
-def describe_glb(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Facts about a file, see :class:`nsvq_lightning.io.formats.Format`; errors are those of :func:`read_glb`."""
-    scene, total = read_glb(path), os.path.getsize(path)
-    streams = {"file": ("glTF", total)}
-    return {"format": f"glb, {EXTENSION}", "splats": len(scene), "sh_degree": scene.sh_degree, "streams": streams}

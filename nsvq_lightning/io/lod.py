@@ -26,14 +26,6 @@ from nsvq_lightning.io.sog import META, PALETTE_LIMIT, describe_sog, read_sog, s
 from nsvq_lightning.splats.conventions import unit
 
 NAME = "lod-meta.json"
-# Most splats of the finest level in a leaf, and of any level in a file.
-LEAF, FILE = 1 << 14, 1 << 17
-# The box of a splat ends where its density is that of so many standard deviations.
-_REACH = 3.0
-
-# Splats of each level.
-_Rows = list[NDArray[np.intp]]
-_Node = dict[str, Any]
 
 
 def write_lod(
@@ -102,6 +94,13 @@ def in_lod_order(scene: CompressedScene) -> CompressedScene:
     return scene.take(np.concatenate([rows[0] for rows, _ in leaves]))
 
 
+# Most splats of the finest level in a leaf, and of any level in a file.
+LEAF, FILE = 1 << 14, 1 << 17
+# Splats of each level.
+_Rows = list[NDArray[np.intp]]
+_Node = dict[str, Any]
+
+
 def _tree(levels: Sequence[CompressedScene]) -> tuple[_Node, list[tuple[_Rows, _Node]]]:
     """The root, and in their order the leaves with the splats of each level in them."""
     from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
@@ -127,6 +126,10 @@ def _tree(levels: Sequence[CompressedScene]) -> tuple[_Node, list[tuple[_Rows, _
     return node([np.arange(len(level)) for level in levels]), leaves
 
 
+# The box of a splat ends where its density is that of so many standard deviations.
+_REACH = 3.0
+
+
 def _boxes(scene: CompressedScene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Smallest and largest coordinates ``[N, 3]`` of the ellipsoid of each splat."""
     from scipy.spatial.transform import Rotation
@@ -137,7 +140,7 @@ def _boxes(scene: CompressedScene) -> tuple[NDArray[np.float64], NDArray[np.floa
     return scene.means - reach, scene.means + reach
 
 
-def _files(runs: _Rows) -> Iterator[list[int]]:
+def _files(runs: list[NDArray[np.intp]]) -> Iterator[list[int]]:
     """Which leaves, of those that have any splats, share a file."""
     some: list[int] = []
     count = 0
