@@ -101,8 +101,9 @@ def _cells(camera: Camera) -> tuple[int, int, int]:
     return math.ceil(camera.width / size), math.ceil(camera.height / size), size
 
 
-# Surroundings of a core beyond each seam, as a share of what photos show of the part.
-OVERLAP = 0.15
+# Surroundings of a core beyond each seam, as a share of what photos show of the part, and of its width at most; and how
+# far the seam may move from where both sides have their share, to lie in the widest gap.
+OVERLAP, SLACK = 0.15, 0.1
 
 
 # Where a part without a neighbour ends.
@@ -135,10 +136,14 @@ def cut(scene: Scene, count: int) -> list[Block]:
             return [Block(axes.tolist(), core.tolist(), around.tolist(), root)]
         spread = [np.subtract(*_quantiles(column, weights, (0.95, 0.05))) for column in places.T]
         axis, first = int(np.argmax(spread)), number // 2
-        shares = np.array([first - OVERLAP, first, first + OVERLAP]) / number
-        lower, seam, upper = _quantiles(places[:, axis], weights, shares)
+        shares = np.array([first - OVERLAP, first - SLACK, first + SLACK, first + OVERLAP]) / number
+        lower, start, stop, upper = _quantiles(places[:, axis], weights, shares)
+        near = np.sort(places[(places[:, axis] >= start) & (places[:, axis] <= stop), axis])
+        gap = int(np.diff(near, append=near[-1]).argmax())
+        seam = near[gap : gap + 2].mean()
+        reach = OVERLAP * spread[axis] / number
         found = []
-        for below, end in ((True, upper), (False, lower)):
+        for below, end in ((True, min(upper, seam + reach)), (False, max(lower, seam - reach))):
             side = some & ((ground[:, axis] < seam) == below)
             inner, outer = core.copy(), around.copy()
             inner[int(below), axis], outer[int(below), axis] = seam, end
@@ -168,7 +173,7 @@ def near_seams(points: NDArray[np.float64], blocks: Sequence[Block]) -> NDArray[
 
 
 # A photo belongs to a part if it shows it in this share of its cells.
-LEAST_SHOWN = 0.02
+LEAST_SHOWN = 0.05
 
 
 def write_blocks(scene: Scene, blocks: Sequence[Block], folders: Sequence[Path]) -> list[tuple[int, int]]:

@@ -122,9 +122,8 @@ def test_text_files_are_utf_8_whatever_the_locale() -> None:
 
 def test_no_file_of_the_package_is_written_in_place() -> None:
     # Every call that writes a file, outside of what makes writing atomic. Those listed write into a temporary folder
-    # that takes its name when it is complete, a log that grows, or the marker of who writes to a folder.
+    # that takes its name when it is complete, or a log that grows.
     allowed = {
-        ("training/run_folder.py", "open"),
         ("io/atomic.py", "open"),
         ("commands/sweep.py", "open"),
         ("report/files.py", "savefig"),  # into memory
