@@ -70,12 +70,12 @@ COMMAND_LINES = dict(commands())
 def workplace(tmp_path: Path, demo_scene: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with everything that the pages name."""
     monkeypatch.chdir(tmp_path)
-    for name in ("path/to/scene", "my/scene", "nsvq_lightning/data/demo", "fox"):
+    for name in ("path/to/scene", "my/scene", "nsvq_lightning/data/demo", "fox", "old/scene", "new/scene"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).symlink_to(demo_scene, target_is_directory=True)
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
     scene = coded_scene(200)
-    for name in ("scene.nsvq", "scene.ply", "scene.sog"):
+    for name in ("scene.nsvq", "scene.ply", "scene.sog", "house.ply", "garden.spz", "old.nsvq"):
         save(scene, tmp_path / name)
     run = tmp_path / "runs/scene/version_0"
     (run / "checkpoints").mkdir(parents=True)
@@ -138,7 +138,7 @@ def test_commands_are_understood(
 
     def parse_only(parser: Any, *args: Any, **kwargs: Any) -> Any:
         _, unknown = parse(parser, *args, **kwargs)
-        assert not unknown or arguments[0] == "sweep", unknown
+        assert not unknown or arguments[0] in ("sweep", "split"), unknown
         raise Understood
 
     monkeypatch.setattr(argparse.ArgumentParser, "parse_known_args", parse_only)
@@ -152,6 +152,12 @@ def test_settings_are_accepted(block: Block, workplace: Path, capsys: pytest.Cap
     with pytest.raises(SystemExit) as stop:
         main(["fit", "--config", "paper", "--config", "own.yaml", "--data.root=my/scene", "--print_config"])
     assert stop.value.code == 0, capsys.readouterr().err
+
+
+def test_the_table_of_formats_is_that_of_the_package() -> None:
+    first, _, _ = (ROOT / "docs/formats.md").read_text().partition("\n## ")
+    rows = re.findall(r"^\| `([\w.-]+)`.* \|$", first, re.MULTILINE)
+    assert sorted(rows) == sorted(nsvq_lightning.io.FORMATS)
 
 
 @pytest.mark.slow

@@ -249,6 +249,24 @@ def test_keyframes_become_a_camera_path(tab: Page, page: Path) -> None:
 
 
 @needs_chromium
+def test_a_slow_device_sorts_what_shows_most(tab: Page, page: Path) -> None:
+    """Oracle: numpy."""
+    _shown(tab, page.as_uri(), 97, 64)
+    draws = np.random.default_rng(3)
+    means, scales, opacities = draws.normal(size=(50, 3)), draws.uniform(0.1, 2, (50, 3)), draws.uniform(0, 1, 50)
+    floats = {"means": means, "scales": scales, "opacities": opacities}
+    given = ", ".join(f"{name}: Float32Array.from({values.ravel().tolist()})" for name, values in floats.items())
+    for share in (1, 0.3):
+        some = round(50 * share)
+        order = tab.run(f"Array.from(makeSorter({{count: 50, {given}}})([0.6, 0, 0.8], {share}))")
+        area = np.sort(scales, axis=1)[:, 1:].prod(1)
+        shown = np.argsort(-opacities * area)[:some]
+        depths = means[shown] @ [0.6, 0, 0.8]
+        assert order[:some] == shown[np.argsort(-depths)].tolist()
+        assert order[some:] == [some] * (2048 - some) if share == 1 else set(order[some:]) == {50}
+
+
+@needs_chromium
 def test_a_drag_orbits_what_is_in_front_and_reset_returns(tab: Page, scene_file: Path, tmp_path: Path) -> None:
     page = tmp_path / "upright.html"
     write_viewer(page, scene_file, {"front": _cameras()["front"]}, "t")
