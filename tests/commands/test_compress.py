@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from splat_scenes import ball
 
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.io import CompressedScene, read_header, read_nsvq, write_ply
-from nsvq_lightning.io.formats import save
+from nsvq_lightning.io.formats import read_scene, save
 
 
 @pytest.fixture(autouse=True)
@@ -42,6 +43,15 @@ def test_a_share_or_a_number_of_splats_is_left(splats: str, left: int, tmp_path:
     paths = str(tmp_path / "scene.ply"), str(tmp_path / "x.nsvq")
     assert main(["compress", *paths, "--codebooks=none", "--steps=3", f"--splats={splats}"]) == 0
     assert len(read_nsvq(tmp_path / "x.nsvq")) == left
+
+
+def test_levels_of_detail_have_a_quarter_of_the_splats_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_ply(tmp_path / "scene.ply", ball(400))
+    index = tmp_path / "www" / "lod-meta.json"
+    assert main(["compress", str(tmp_path / "scene.ply"), str(index), "--levels=3", "--steps=4"]) == 0
+    assert "levels of 400, 100, 25 splats" in capsys.readouterr().out
+    assert json.loads(index.read_text())["counts"] == [400, 100, 25]
+    assert len(read_scene(index)) == 400
 
 
 def test_photos_are_trained_on(tmp_path: Path, demo_scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -106,7 +116,9 @@ def test_bad_files_and_aims_are_one_line_and_status_1(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["a.ply", "b.ply"], "is a .nsvq file"),
+        (["a.ply", "b.ply"], "is a .nsvq file or lod-meta.json"),
+        (["a.ply", "b.nsvq", "--levels=2"], "--levels is for lod-meta.json"),
+        (["a.ply", "lod-meta.json", "--codebooks=4k"], "no codebooks and no limits"),
         (["a.ply", "b.nsvq", "--max-error", "0"], "must be above 0"),
         (["a.ply", "b.nsvq", "--steps=0"], "--steps: must be above 0, got 0"),
         (["a.ply", "b.nsvq", "--splats=0"], "expected a number of splats, or a share such as 25%, got '0'"),
