@@ -60,9 +60,7 @@ class SplatCallback(Callback):
             TypeError: It is no SplatModule.
         """
         if not isinstance(module, SplatModule):
-            raise TypeError(
-                f"{type(self).__name__} needs a nsvq_lightning.SplatModule: derive {type(module).__name__} from it"
-            )
+            raise TypeError(f"{type(self).__name__} needs a SplatModule: derive {type(module).__name__} from it")
         if stage == "fit":
             for name in ("_acted", *self.state):
                 vars(self).pop(name, None)
@@ -87,9 +85,7 @@ class SplatCallback(Callback):
         if self._first_time("before", iteration):
             self.before_step(trainer, module, iteration)
 
-    def on_train_batch_end(
-        self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, module: SplatModule, outputs: Any, *args: Any) -> None:
         """Call :meth:`after_step`."""
         iteration = trainer.global_step
         if iteration and self._first_time("after", iteration):

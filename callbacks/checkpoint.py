@@ -12,7 +12,6 @@ import torch
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 
-from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import atomic_path
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.module import SplatModule
@@ -164,17 +163,14 @@ class RunCheckpoint(WritingCallback, Checkpoint):
         self._training = True
         self._stop.hold(trainer)
 
-    def on_train_batch_end(
-        self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, module: SplatModule, outputs: Any, *args: Any) -> None:
         """Save when it is time; stop here if a signal came."""
         iteration = trainer.global_step
         if iteration == 0 or not self._first_time("after", iteration):
             return  # of the next iteration some micro-batches are done
         if iteration == trainer.max_steps:
-            self._save(
-                trainer, module
-            )  # the end of training may fail; it belongs to a checkpoint, too, and signals wait
+            # The end of training may fail; it belongs to a checkpoint, too, and signals wait.
+            self._save(trainer, module)
             return
         received = self._stop.received(trainer)
         if received or self.is_due(module.schedule, iteration):

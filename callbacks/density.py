@@ -92,13 +92,11 @@ class Densification(SplatCallback, ABC):
         super().on_train_batch_start(trainer, module, batch, batch_idx)
         self._counts = self.ask(module, trainer.global_step + 1, batch)
 
-    def on_train_batch_end(
-        self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, module: SplatModule, outputs: Any, *args: Any) -> None:
         """Add the statistics of this view; after a complete step do what is due."""
         if self._counts:
             self._observe(trainer, module, self._view(trainer, module, outputs or {}))
-        super().on_train_batch_end(trainer, module, outputs, batch, batch_idx)
+        super().on_train_batch_end(trainer, module, outputs, *args)
 
     def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Drop non-finite splats, then do what is due."""
@@ -304,9 +302,8 @@ class DensityControl(Densification):
             ranks = torch.where(grown, statistic, -torch.inf)
             grown &= most_contributing(ranks, max(0, self.max_splats - len(splats)))
         divided, before = grown & large, len(splats)
-        clones, parents = (
-            RawSplats(*(tensor.detach()[mask] for tensor in splats.raw())) for mask in (grown & ~large, divided)
-        )
+        chosen = grown & ~large, divided
+        clones, parents = (RawSplats(*(tensor.detach()[mask] for tensor in splats.raw())) for mask in chosen)
         children = split(parents, self.shrink, generator(module.seed, iteration, "split"))
         new = (torch.cat(pair) for pair in zip(clones, children, strict=True))
         row_ops.append_rows(splats, optimizer, RawSplats(*new)._asdict())

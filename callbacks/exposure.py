@@ -61,9 +61,8 @@ class ExposureCompensation(SplatCallback):
         Raises:
             ValueError: The trainer has no data module with a scene, or the checkpoint is of another number of photos.
         """
-        scene = scene_module.needed_scene(
-            trainer, "exposures are those of the train photos", "leave out ExposureCompensation"
-        )
+        need = "exposures are those of the train photos"
+        scene = scene_module.needed_scene(trainer, need, "leave out ExposureCompensation")
         self._row = {view: row for row, view in enumerate(scene.train)}
         start = torch.zeros(len(scene.train), 3, 4)
         if self._loaded is not None:
@@ -103,11 +102,8 @@ class ExposureCompensation(SplatCallback):
         self._leave(module)
         gains = 1 + self._changes.detach()[:, :, :3].diagonal(dim1=1, dim2=2).mean(1)
         if len(gains):
-            low, high = gains.log2().aminmax()
-            log.info(
-                f"exposures of the train photos: {low - gains.log2().mean():+.2f} to {high - gains.log2().mean():+.2f} "
-                "stops"
-            )
+            stops = gains.log2() - gains.log2().mean()
+            log.info(f"exposures of the train photos: {stops.min():+.2f} to {stops.max():+.2f} stops")
 
     def on_exception(self, trainer: Trainer, module: SplatModule, exception: BaseException) -> None:
         """Leave the module as it was."""

@@ -83,11 +83,8 @@ class SplatBudget(SplatCallback):
             )
             reason = f"for a file of {self.bytes} bytes"
         elif self.splats is None:
-            scene = scene_module.needed_scene(
-                trainer,
-                "a budget from the photos needs them",
-                "give a number of splats (--splats) or bytes (--bytes)",
-            )
+            advice = "give a number of splats (--splats) or bytes (--bytes)"
+            scene = scene_module.needed_scene(trainer, "a budget from the photos needs them", advice)
             detail = detailed_pixels(scene)
             budget = splats_for_photos(len(scene.train), detail, self.quality)
             reason = (

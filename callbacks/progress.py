@@ -10,7 +10,6 @@ from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.callbacks.progress.tqdm_progress import Tqdm
 
 from nsvq_lightning.compute.jit import compile_seconds, compile_watcher
-from nsvq_lightning.data.scene import View
 from nsvq_lightning.training.module import SplatModule
 
 # Lines of a run if the output is not a terminal.
@@ -77,9 +76,7 @@ class SplatProgressBar(TQDMProgressBar):
     def on_train_epoch_start(self, trainer: Trainer, *args: Any) -> None:
         """Leave the bar unchanged: there is only one epoch, and a resumed run is in the middle of it."""
 
-    def on_train_batch_end(
-        self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, module: SplatModule, outputs: Any, *args: Any) -> None:
         """Refresh the bar, or write a line."""
         # A resumed run counts batches from zero; its bar does not.
         done = trainer.global_step

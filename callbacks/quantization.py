@@ -110,9 +110,8 @@ class CodebookInit(SplatCallback):
         if iteration != module.schedule.first_of(Phase.QUANTIZE):
             return
         keep_finite_splats(trainer, module)
-        weights = (
-            row_weights(scene_module.train_contributions(trainer, module)) if self.weights == "contribution" else None
-        )
+        weighted = self.weights == "contribution"
+        weights = row_weights(scene_module.train_contributions(trainer, module)) if weighted else None
         for name, quantizer in module.quantizers.items():
             if trainer.is_global_zero:
                 if self.values_per_splat is not None and hasattr(quantizer, "limit"):
@@ -174,18 +173,13 @@ class CodebookReplacement(SplatCallback):
     def __post_init__(self) -> None:
         self.check({"in (0, 1]": ("jitter",), "at least 1": ("start", "early_every", "late_every")})
         if not self.start <= self.early_end <= self.end:
-            raise ValueError(
-                f"replacement needs start <= early_end <= end, got {self.start}, {self.early_end} and {self.end}"
-            )
+            raise ValueError(f"needs start <= early_end <= end, got {self.start}, {self.early_end} and {self.end}")
 
     def is_due(self, module: SplatModule, iteration: int) -> bool:
         """Whether codes are replaced after this iteration."""
         schedule = module.schedule
-        if schedule.phase_at(iteration) is not Phase.QUANTIZE:
-            return False
-        return iteration in schedule.replacement_times(
-            self.start, self.early_end, self.early_every, self.end, self.late_every
-        )
+        times = schedule.replacement_times(self.start, self.early_end, self.early_every, self.end, self.late_every)
+        return schedule.phase_at(iteration) is Phase.QUANTIZE and iteration in times
 
     def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Replace the inactive codes of every codebook when it is time."""
@@ -272,9 +266,7 @@ class CodebookRefit(SplatCallback):
     def is_due(self, module: SplatModule, iteration: int) -> bool:
         """Whether codebooks are refitted in this iteration."""
         schedule = module.schedule
-        if schedule.phase_at(iteration) is not Phase.QUANTIZE:
-            return False
-        return iteration in schedule.refit_times(self.every)
+        return schedule.phase_at(iteration) is Phase.QUANTIZE and iteration in schedule.refit_times(self.every)
 
     def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Drop non-finite splats before a refit to all rows: after the backward pass this would lose the gradients."""

@@ -208,13 +208,7 @@ class MetricReport(WritingCallback):
             self._lpips.to(module.device)
 
     def on_test_batch_end(
-        self,
-        trainer: Trainer,
-        module: SplatModule,
-        outputs: Any,
-        batch: View,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, batch_idx: int, dataloader_idx: int = 0
     ) -> None:
         """Keep the scores of one view and write its picture."""
         if self._scene is None:
@@ -242,7 +236,12 @@ class MetricReport(WritingCallback):
         """Write the figures."""
         if self._scene is None:
             return
-        scores = _gathered(trainer, self._scores)
+        scores = self._scores
+        if trainer.world_size > 1:
+            gathered: list[list[dict[str, Any]]] = [[] for _ in range(trainer.world_size)]
+            torch.distributed.all_gather_object(gathered, scores)
+            scores = [score for part in gathered for score in part]
+        scores = sorted(scores, key=lambda score: score["name"])
         if trainer.is_global_zero and scores:
             folder = self._folder
             lpips: tuple[float | None, str | None] = (None, self._lpips_reason)
@@ -258,12 +257,3 @@ class MetricReport(WritingCallback):
             if self.pictures:
                 files.log_pictures(trainer.loggers, paths, trainer.global_step)
         self._scene, self._lpips = None, None
-
-
-def _gathered(trainer: Trainer, scores: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The scores of all processes, by name of the view."""
-    if trainer.world_size > 1:
-        gathered: list[list[dict[str, Any]]] = [[] for _ in range(trainer.world_size)]
-        torch.distributed.all_gather_object(gathered, scores)
-        scores = [score for part in gathered for score in part]
-    return sorted(scores, key=lambda score: score["name"])

@@ -90,11 +90,7 @@ class PhaseSchedule(SplatCallback):
             limit = max(self.iterations_per_photo * photos, self.least_iterations)
             if not 0 <= trainer.max_steps <= limit:
                 trainer.fit_loop.epoch_loop.max_steps = limit
-                log.info(
-                    "iterations: %d for %d photos; more with a larger --callbacks.phases.iterations_per_photo",
-                    limit,
-                    photos,
-                )
+                log.info(f"iterations: {limit} for {photos} photos; --callbacks.phases.iterations_per_photo changes it")
         self._steps = trainer.max_steps
         total = self.total if self.total is not None else trainer.max_steps
         if total < 1:

@@ -9,6 +9,26 @@ from nsvq_lightning.top_level import folder_of
 
 from . import checkpoint, growth, outputs, progress, pruning, quantization, report, schedule
 
+
+def _callbacks_of(config: str) -> dict[str, Callback | None]:
+    """What a config says of callbacks: null, a class by name or with its settings, or settings of the standard one."""
+    import yaml
+
+    text = (folder_of("configs") / f"{config}.yaml").read_text(encoding="utf-8")
+    made: dict[str, Callback | None] = {}
+    for name, value in yaml.safe_load(text).get("callbacks", {}).items():
+        if value is None:
+            made[name] = None
+            continue
+        named: dict[str, Any] = {"class_path": value} if isinstance(value, str) else value
+        if "class_path" in named:
+            kind = getattr(import_module(__package__), named["class_path"])
+            made[name] = kind(**named.get("init_args", {}))
+        else:
+            made[name] = STANDARD[name](**named)
+    return made
+
+
 # Callback by name. Density control comes before the canonical form, which may act after the same iteration; codebooks
 # are placed, and codes replaced, before rate and distortion choose among them.
 STANDARD: dict[str, type[Callback]] = {
@@ -66,22 +86,3 @@ def standard(config: str | None = None, /, **replaced: Callback | None) -> list[
     given = dict.fromkeys(OPTIONAL) | settings | replaced
     chosen = (given[name] if name in given else kind() for name, kind in STANDARD.items())
     return [callback for callback in chosen if callback is not None]
-
-
-def _callbacks_of(config: str) -> dict[str, Callback | None]:
-    """What a config says of callbacks: null, a class by name or with its settings, or settings of the standard one."""
-    import yaml
-
-    text = (folder_of("configs") / f"{config}.yaml").read_text(encoding="utf-8")
-    made: dict[str, Callback | None] = {}
-    for name, value in yaml.safe_load(text).get("callbacks", {}).items():
-        if value is None:
-            made[name] = None
-            continue
-        named: dict[str, Any] = {"class_path": value} if isinstance(value, str) else value
-        if "class_path" in named:
-            kind = getattr(import_module(__package__), named["class_path"])
-            made[name] = kind(**named.get("init_args", {}))
-        else:
-            made[name] = STANDARD[name](**named)
-    return made

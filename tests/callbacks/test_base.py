@@ -40,7 +40,7 @@ KINDS = [
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_another_module_is_refused_before_anything_starts(kind: type[Callback]) -> None:
-    said = rf"{kind.__name__} needs a nsvq_lightning.SplatModule: derive LightningModule from it"
+    said = rf"{kind.__name__} needs a SplatModule: derive LightningModule from it"
     with pytest.raises(TypeError, match=said):
         kind().setup(SimpleNamespace(callbacks=[]), LightningModule(), "fit")  # type: ignore[arg-type]
 
@@ -116,7 +116,7 @@ OUT_OF_RANGE = [
     (CodebookInit, {"weights": "area"}, "weights must be 'none' or 'contribution', got 'area'"),
     (CodebookInit, {"values_per_splat": math.inf}, "values_per_splat must be above 0, got inf"),
     (CodebookRefit, {"steps": 0}, "steps must be at least 1, got 0"),
-    (CodebookReplacement, {"early_end": 100}, "replacement needs start <= early_end <= end, got 10700, 100 and 12000"),
+    (CodebookReplacement, {"early_end": 100}, "needs start <= early_end <= end, got 10700, 100 and 12000"),
     (CodebookReplacement, {"late_every": 0}, "late_every must be at least 1, got 0"),
     (CodebookReplacement, {"jitter": 0.0}, r"jitter must be in \(0, 1\], got 0.0"),
     (FiniteCodes, {"every": 0}, "every must be at least 1, got 0"),

@@ -142,7 +142,7 @@ def test_few_photos_shorten_the_run(run: RunFactory, recipe: Recipe, caplog: pyt
     phases = PhaseSchedule(reference_total=60, iterations_per_photo=2, **ENDS)
     with caplog.at_level(logging.INFO):
         trainer, module = run(recipe(phases=phases).values())
-    assert "iterations: 14 for 7 photos; more with" in caplog.text
+    assert "iterations: 14 for 7 photos; --callbacks.phases.iterations_per_photo" in caplog.text
     assert trainer.global_step == module.schedule.total == trainer.max_steps == 14
     assert module.phase is Phase.FINETUNE  # which ends with it
     assert run(recipe(phases=phases).values(), max_steps=3)[0].global_step == 3
