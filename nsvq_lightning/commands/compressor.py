@@ -13,9 +13,9 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nsvq_lightning.callbacks import LearningRateDecay, PhaseSchedule, SplatBudget, standard
-from nsvq_lightning.compression.components import components
 from nsvq_lightning.compression.importance import contributions, most_contributing, row_weights
 from nsvq_lightning.compression.setting import STEPS, Setting, setting_for
+from nsvq_lightning.compression.stored import components
 from nsvq_lightning.compression.viewpoints import Measure
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.datamodule import SceneDataModule

@@ -17,10 +17,11 @@ from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.sh import C0
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 
+# The rasterizer with its settings.
+Renderer = Callable[[SplatTensors, Camera], Render]
 
-def contributions(
-    splats: SplatTensors, cameras: Iterable[Camera], render: Callable[[SplatTensors, Camera], Render]
-) -> Tensor:
+
+def contributions(splats: SplatTensors, cameras: Iterable[Camera], render: Renderer) -> Tensor:
     """Blending weight T·α of each splat, summed over all pixels of all cameras: ``[N]``, in pixels.
 
     An image is linear in the colours of its splats, so the weight is the derivative of the sum of the pixels with
@@ -68,11 +69,7 @@ def row_weights(contribution: Tensor, least: float = 0.01) -> Tensor:
 
 
 def sensitivity(
-    splats: SplatTensors,
-    camera: Camera,
-    render: Callable[[SplatTensors, Camera], Render],
-    signs: torch.Generator,
-    mask: Tensor | None = None,
+    splats: SplatTensors, camera: Camera, render: Renderer, signs: torch.Generator, mask: Tensor | None = None
 ) -> tuple[RawSplats, Tensor]:
     """Σ (∂I/∂θ)² over the pixels and channels I of a picture, for every number θ of every splat, and the picture.
 
@@ -117,9 +114,7 @@ def by_opacity(opacities: Tensor) -> Tensor:
 log = logging.getLogger(__name__)
 
 
-def floaters(
-    splats: SplatTensors, views: Callable[[], Iterable[View]], render: Callable[[SplatTensors, Camera], Render]
-) -> Tensor:
+def floaters(splats: SplatTensors, views: Callable[[], Iterable[View]], render: Renderer) -> Tensor:
     """Mask ``[N]`` of the splats that no train view supports, as removing them lowers the error or changes nothing.
 
     A floater hides what is behind it, so removing that, too, would seem to help; therefore the worst ones are removed
@@ -153,11 +148,7 @@ def floaters(
 
 
 def removal_effects(
-    splats: SplatTensors,
-    views: Iterable[View],
-    render: Callable[[SplatTensors, Camera], Render],
-    signs: torch.Generator,
-    probes: int = 4,
+    splats: SplatTensors, views: Iterable[View], render: Renderer, signs: torch.Generator, probes: int = 4
 ) -> tuple[Tensor, Tensor, float]:
     """What removing each splat, and no other one, does to the squared error of pictures.
 

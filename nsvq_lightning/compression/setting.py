@@ -12,7 +12,7 @@ class Setting:
     Attributes:
         splats: How many are left.
         codebooks: The paper's name of their sizes, or "none".
-        step: Of spherical harmonics on a basis (:func:`nsvq_lightning.compression.components.components`), without
+        step: Of spherical harmonics on a basis (:func:`nsvq_lightning.compression.stored.components`), without
             codebooks; 0 stores them as the others.
         kept: Share of these that are stored.
         more: Codes of spherical harmonics beyond those of the size.

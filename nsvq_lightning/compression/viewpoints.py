@@ -147,31 +147,24 @@ def likely_cameras(
         degrees: Horizontal field of view.
     """
     angle = math.radians(degrees)
-    eyes, targets = _candidates(splats, 5 * count, np.random.default_rng(seed))
-    views = zip(eyes, targets, strict=True)
-    low = 96, round(96 * height / width)
-    scores = [_detail(splats, look_at(target, eye, *low, angle)) for eye, target in views]
-    best = np.argsort(-np.array(scores), kind="stable")[:count]
-    return [look_at(targets[k], eyes[k], width, height, angle) for k in best]
-
-
-def _candidates(
-    splats: SplatTensors, count: int, draws: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where random views stand and what they look at, both ``[count, 3]``."""
     means = splats.means.detach().double().cpu().numpy()
     # Small, opaque splats are where the detail is.
     detail = torch.sigmoid(splats.opacities.detach()).double() * torch.exp(-splats.scales.detach().double().mean(1))
     weights = (detail / detail.sum()).cpu().numpy()
     middle = weights @ means
     reach = max(math.sqrt(weights @ ((means - middle) ** 2).sum(1)), 2 * NEAR)
-    directions = draws.standard_normal((count, 3))
+    draws, candidates = np.random.default_rng(seed), 5 * count
+    directions = draws.standard_normal((candidates, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    eyes = middle + reach * draws.uniform(1.5, 3.0, (count, 1)) * directions
-    targets = middle + reach * 0.6 * draws.standard_normal((count, 3))
+    eyes = middle + reach * draws.uniform(1.5, 3.0, (candidates, 1)) * directions
+    targets = middle + reach * 0.6 * draws.standard_normal((candidates, 3))
     across, up, _ = np.abs(eyes - targets).T
     eyes[:, 0] += np.where(across < 0.05 * up, 0.2 * up, 0.0)  # straight up or down, a camera has no upright
-    return eyes, targets
+    views = zip(eyes, targets, strict=True)
+    low = 96, round(96 * height / width)
+    scores = [_detail(splats, look_at(target, eye, *low, angle)) for eye, target in views]
+    best = np.argsort(-np.array(scores), kind="stable")[:count]
+    return [look_at(targets[k], eyes[k], width, height, angle) for k in best]
 
 
 @torch.no_grad()
