@@ -36,9 +36,6 @@ if TYPE_CHECKING:
     from nsvq_lightning.data.scene import Scene
     from nsvq_lightning.splats.splats import Splats
 
-# Bytes; less may not hold checkpoints and report.
-SMALL_DISK = 2 << 30
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq doctor`` takes."""
@@ -154,6 +151,10 @@ def check_threads() -> Iterator[Finding]:
     yield judged("waiting", f"OMP_WAIT_POLICY is {policy}", policy.lower() != "passive" and advice)
 
 
+# Bytes; less may not hold checkpoints and report.
+SMALL_DISK = 2 << 30
+
+
 def check_room(folder: Path) -> Iterator[Finding]:
     """Memory for a run, and disk space for checkpoints, report and exports where runs are written."""
     free, disk = available_memory(), shutil.disk_usage(folder).free
@@ -242,9 +243,8 @@ def check_points(model: "ColmapModel") -> Iterator[Finding]:
         advice = "name a point cloud (ply_file_path in the file), or run COLMAP"
         yield judged("points", text, not model.synthetic and advice)
     elif not len(finite):
-        yield Finding(
-            "problem", "points", f"none is finite: run {'COLMAP' if model.source == 'COLMAP' else 'the export'} again"
-        )
+        program = "COLMAP" if model.source == "COLMAP" else "the export"
+        yield Finding("problem", "points", f"none is finite: run {program} again")
     else:
         distances = np.linalg.norm(finite - np.median(finite, axis=0), axis=1)
         # Ten times farther from the median than four fifths of the points.

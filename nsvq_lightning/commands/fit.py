@@ -39,12 +39,6 @@ from nsvq_lightning.training.run_folder import SplatTrainer, is_fast_dev_run, re
 # Names that options take as they are: short class names resolve to what is imported.
 CLASSES = (*callbacks.__all__, *quantize.__all__, "ColmapDataModule", "DemoDataModule")
 
-PARSER_SETTINGS: dict[str, Any] = {
-    "prog": "nsvq",
-    **{name: {"description": command.summary} for name, command in COMMANDS.items() if command.module is None},
-}
-PARSER_SETTINGS["fit"]["default_config_files"] = [given.find_config("fast")]
-
 
 class QuietParser(LightningArgumentParser):
     """Reports errors without the usage, which has about a hundred lines, and lists options without their classes."""
@@ -120,6 +114,13 @@ class RunStart(SaveConfigCallback):
             write_text(folder / self.config_filename, self.parser.dump(self.config, skip_none=False))
 
 
+PARSER_SETTINGS: dict[str, Any] = {
+    "prog": "nsvq",
+    **{name: {"description": command.summary} for name, command in COMMANDS.items() if command.module is None},
+}
+PARSER_SETTINGS["fit"]["default_config_files"] = [given.find_config("fast")]
+
+
 TRAINER_DEFAULTS: dict[str, Any] = {
     "max_epochs": -1,  # the sampler is endless: steps end the run
     "limit_val_batches": 0,  # MetricReport evaluates, outside the training time
@@ -175,9 +176,8 @@ class SplatCLI(LightningCLI):
             key = f"callbacks.{name}"
             default = None if name in OPTIONAL else {"class_path": f"{kind.__module__}.{kind.__qualname__}"}
             # Settings alone mean the standard class; another one need not be derived from it.
-            parser.add_argument(
-                f"--{key}", type=kind | Callback | None, default=default, help=first_sentence(kind.__doc__)
-            )
+            about = first_sentence(kind.__doc__)
+            parser.add_argument(f"--{key}", type=kind | Callback | None, default=default, help=about)
             parser.callback_keys.append(key)
 
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:

@@ -41,9 +41,7 @@ def _text(facts: dict[str, Any]) -> str:
         entries = ((a["name"], a["storage"], a["dim"], a["codes"], a["bits"]) for a in facts["attributes"])
         parts.append(_table(("attribute", "storage", "D", "K", "bits"), entries))
     streams = ((s["name"], s["encoding"], s["bytes"]) for s in facts["streams"])
-    shares = (
-        (*stream, f"{8 * stream[2] / splats:.2f}", f"{100 * stream[2] / max(1, size):.1f} %") for stream in streams
-    )
+    shares = ((*row, f"{8 * row[2] / splats:.2f}", f"{100 * row[2] / max(1, size):.1f} %") for row in streams)
     parts.append(_table(("stream", "encoding", "bytes", "bits per splat", "share"), shares))
     for key in ("metrics", "config"):
         if facts.get(key):

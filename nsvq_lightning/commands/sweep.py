@@ -41,28 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(further=[])
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="where all results go")
     add = parser.add_argument_group("what is combined; lists have commas between their entries").add_argument
-    add(
-        "--scenes",
-        type=given.names,
-        default=(),
-        metavar="A,B",
-        help="COLMAP folders (default: that of the configuration)",
-    )
-    add(
-        "--configs",
-        type=given.names,
-        default=(),
-        metavar="A,B",
-        help="files or shipped names, as for nsvq fit --config",
-    )
-    add("--quantizers", type=given.names, default=(), metavar="A,B", help="classes, as for nsvq fit --model.quantizer")
-    add(
-        "--codebooks",
-        type=given.names,
-        default=(),
-        metavar="1k,4k",
-        help="sizes, for configurations that have codebooks",
-    )
+    listed: dict[str, Any] = {"type": given.names, "default": ()}
+    add("--scenes", **listed, metavar="A,B", help="COLMAP folders (default: that of the configuration)")
+    add("--configs", **listed, metavar="A,B", help="files or shipped names, as for nsvq fit --config")
+    add("--quantizers", **listed, metavar="A,B", help="classes, as for nsvq fit --model.quantizer")
+    add("--codebooks", **listed, metavar="1k,4k", help="sizes, for configurations that have codebooks")
     add("--seeds", type=given.integers, default=(), metavar="0,1,2", help="of the draws and of the order of the views")
     add("--max-steps", type=int, metavar="N", help="iterations of every run (default: those of its configuration)")
     parser.add_argument("--keep-checkpoints", action="store_true", help="keep those of finished runs")

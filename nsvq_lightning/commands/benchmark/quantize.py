@@ -18,8 +18,6 @@ from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.optim import LearningRates
 
 STEP, SEARCH = "step, forward + backward", "search"
-# Rows an attribute whose codes are checked: the float64 oracle is slow.
-CHECKED_ROWS = 4_000
 
 
 class Attribute(NamedTuple):
@@ -93,23 +91,19 @@ def _advance(attributes: Mapping[str, Attribute], iteration: int) -> None:
 Quantize = Callable[[CodebookQuantizer, Tensor, torch.Generator, Tensor], tuple[Tensor, Tensor]]
 
 
-def step(
-    attributes: Mapping[str, Attribute], iteration: int, quantize: Quantize = CodebookQuantizer.__call__
-) -> Results:
+def step(attributes: Mapping[str, Attribute], turn: int, quantize: Quantize = CodebookQuantizer.__call__) -> Results:
     """One forward and backward pass, by default of the quantizers of the package."""
     results: Results = {}
     for name, (quantizer, x, rows, upstream, _) in attributes.items():
-        quantized, codes = quantize(quantizer, x, generator(0, iteration, "noise", name), rows)
+        quantized, codes = quantize(quantizer, x, generator(0, turn, "noise", name), rows)
         gradient, _ = torch.autograd.grad(quantized, (x, quantizer.codebook), upstream)
         results[name] = quantized.detach(), gradient, codes
     return results
 
 
-def plain_nsvq(
-    quantizer: CodebookQuantizer, table: Tensor, draw: torch.Generator, rows: Tensor
-) -> tuple[Tensor, Tensor]:
+def plain_nsvq(quantizer: CodebookQuantizer, raw: Tensor, draw: torch.Generator, rows: Tensor) -> tuple[Tensor, Tensor]:
     """NSVQ in a few lines of torch: all distances, noise by ``randn``, gradients by autograd."""
-    x, codebook = table[rows], quantizer.codebook
+    x, codebook = raw[rows], quantizer.codebook
     codes = _by_distances(x.detach(), codebook.detach())
     noise = torch.randn(x.shape, generator=draw)
     length = torch.linalg.vector_norm(x - codebook[codes], dim=1, keepdim=True)
@@ -137,6 +131,10 @@ def step_errors(attributes: Mapping[str, Attribute], results: Results) -> dict[s
         gradients.append(relative_l2(gradient[clear], expected[clear]))
         wrong += code_errors(x, codebook, codes)["wrong codes"]
     return {"gradient error": max(gradients), "length error": max(lengths), "wrong codes": wrong}
+
+
+# Rows an attribute whose codes are checked: the float64 oracle is slow.
+CHECKED_ROWS = 4_000
 
 
 def code_errors(x: Tensor, codebook: Tensor, codes: Tensor) -> dict[str, float]:

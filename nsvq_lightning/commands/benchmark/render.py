@@ -24,12 +24,6 @@ from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats
 
 FORWARD, BOTH, LOSS = "forward", "forward + backward", "L1 + D-SSIM, forward + backward"
-# Splats times pixels that the oracle is given, quick and full: half a minute on one core at most.
-ORACLE_WORK = {True: 1e8, False: 6e9}
-PHOTO = (533, 800, 3)
-
-# Renders splats as the camera of a workload sees them: image ``[H, W, 3]``.
-Painter = Callable[[RawSplats, Workload], Tensor]
 
 
 class Traced(NamedTuple):
@@ -47,6 +41,10 @@ def run(scope: Scope) -> Iterator[Measurement]:
         yield from _loss_rows(scope, device)
 
 
+# Renders splats as the camera of a workload sees them: image ``[H, W, 3]``.
+Painter = Callable[[RawSplats, Workload], Tensor]
+
+
 def painter(backend: str) -> Painter:
     """What renders with a back-end."""
 
@@ -55,6 +53,10 @@ def painter(backend: str) -> Painter:
         return render(splats, workload.camera, background=background, backend=backend).image
 
     return paint
+
+
+# Splats times pixels that the oracle is given, quick and full: half a minute on one core at most.
+ORACLE_WORK = {True: 1e8, False: 6e9}
 
 
 def _render_rows(workload: Workload, scope: Scope, device: str) -> Iterator[Measurement]:
@@ -134,6 +136,7 @@ def image_errors(image: Tensor, truth: Tensor) -> tuple[dict[str, float], Tensor
 
 # Of an image and a photo ``[H, W, 3]``, with the weight of D-SSIM.
 Loss = Callable[[Tensor, Tensor, float], Tensor]
+PHOTO = (533, 800, 3)
 
 
 def _loss_rows(scope: Scope, device: str) -> Iterator[Measurement]:

@@ -19,8 +19,6 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.report.files import markdown_table
 from nsvq_lightning.version import __version__
 
-SGEMM_SIDE = 2048
-
 
 @dataclass(frozen=True)
 class Measurement:
@@ -114,6 +112,9 @@ def finish() -> None:
     """Wait for kernels of a GPU that are still running."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
+
+
+SGEMM_SIDE = 2048
 
 
 def sgemm(device: str = "cpu") -> Call:
