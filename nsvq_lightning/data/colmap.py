@@ -358,9 +358,7 @@ def _check_rows(path: Path, rows: int) -> None:
         head = "".join(itertools.takewhile(lambda line: line.startswith("#"), file))
     announced = re.search(r"^# Number of \w+: (\d+)", head, re.MULTILINE)
     if announced and int(announced[1]) > rows:
-        raise SceneError(
-            f"{path} announces {announced[1]} rows but has {rows}: it is truncated; copy it again or export it anew"
-        )
+        raise SceneError(f"{path} announces {announced[1]} rows but has {rows}: it is truncated; copy it again")
 
 
 def _observations(registered: Sequence[Any], points: Sequence[tuple[int, Any]]) -> NDArray[np.int64]:

@@ -200,10 +200,8 @@ class ColmapDataModule(SceneDataModule):
         masks: str | None = "masks",
         allow_outside: bool = False,
     ) -> None:
-        load = partial(
-            load_scene, root, factor, max_width, test_every, cache_bytes, images_folder, model, masks, allow_outside
-        )
-        super().__init__(load, seed, cache_bytes)
+        settings = factor, max_width, test_every, cache_bytes, images_folder, model, masks, allow_outside
+        super().__init__(partial(load_scene, root, *settings), seed, cache_bytes)
         self.root, self.cache_bytes = Path(root), cache_bytes
 
 

@@ -183,9 +183,8 @@ def _followed(a: _Photo, b: _Photo, there: NDArray[np.float32], back: NDArray[np
     places = np.mgrid[:height, :width][::-1].astype(np.float32)
     ends = places.transpose(1, 2, 0) + there[:height, :width]
     returned = there[:height, :width] + cv2.remap(back, ends, None, cv2.INTER_LINEAR)
-    good = (np.linalg.norm(returned, axis=2) < MOST_ERROR) & (
-        (ends > 1) & (ends < np.array(b.grey.shape[::-1]) - 2)
-    ).all(2)
+    inside = (ends > 1) & (ends < np.array(b.grey.shape[::-1]) - 2)
+    good = (np.linalg.norm(returned, axis=2) < MOST_ERROR) & inside.all(2)
     for photo, at in ((a, places), (b, ends.transpose(2, 0, 1))):
         if photo.counts is not None:
             good &= cv2.remap(photo.counts.view(np.uint8), at[0], at[1], cv2.INTER_NEAREST) > 0

@@ -409,10 +409,8 @@ class Undistortion:
         if blank.any() and not self._warned:
             self._warned = True
             log.warning(
-                "camera %s (%s): %.1f %% of the pinhole image is left out: its field of view is too wide for a pinhole",
-                self._camera.camera_id,
-                self._camera.model_name,
-                100 * blank.mean(),
+                f"camera {self._camera.camera_id} ({self._camera.model_name}): {100 * blank.mean():.1f} % of the "
+                "pinhole image is left out: its field of view is too wide for a pinhole"
             )
         if self._keep_maps:
             self._maps = columns, rows, blank

@@ -72,7 +72,7 @@ def reconstruct(
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     pycolmap.set_random_seed(0)
     database, images = scene / "database.db", scene / "images"
-    _find_features(database, images, names, report, max_size, threads)
+    _extract(database, images, names, report, max_size, threads)
     _compare(database, len(names), report, is_video, threads)
     models = _map(database, scene, len(names), report, threads)
     common = _partners(database)
@@ -97,9 +97,7 @@ def reconstruct(
 SHARED = 8
 
 
-def _find_features(
-    database: Path, images: Path, names: Sequence[str], report: Report, max_size: int, threads: int
-) -> None:
+def _extract(database: Path, images: Path, names: Sequence[str], report: Report, max_size: int, threads: int) -> None:
     pycolmap = import_pycolmap()
     groups: defaultdict[tuple[int, int], list[str]] = defaultdict(list)
     for name in names:

@@ -173,9 +173,7 @@ def load_scene(
     cameras = tuple(_camera(image, source) for image, source in zip(poses.images, sources, strict=True))
     if not len(poses.points):
         points = random_points([cameras[index] for index in train])
-        log.info(
-            "%s has no points: %d random ones in the volume that the cameras see take their place", root, len(points)
-        )
+        log.info("%s has no points: %d random ones in what the cameras see take their place", root, len(points))
         poses = replace(poses, points=points, colors=np.full((len(points), 3), 128, np.uint8))
     centres = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in poses.images])
     middle = centres[list(train)].mean(0)
@@ -183,9 +181,8 @@ def load_scene(
     distance = float(np.linalg.norm(middle))
     if extent > 0 and distance > _FARTHEST * extent:
         log.warning(
-            "the cameras are %.0f times the extent of the scene from the origin, where float32 positions are coarse; "
-            "move the origin near the cameras (colmap model_transformer)",
-            distance / extent,
+            f"the cameras are {distance / extent:.0f} times the extent of the scene from the origin, where float32 "
+            "positions are coarse; move the origin near the cameras (colmap model_transformer)"
         )
     usable = _away_from(centres, poses.points, _AT_CAMERA * extent)
     return Scene(
