@@ -49,11 +49,7 @@ class Clamped:
         self._counts: dict[str, int] = {}
 
     def nearest(
-        self,
-        name: str,
-        values: NDArray[np.floating[Any]],
-        ends: tuple[int, int],
-        uses: NDArray[np.integer] | None = None,
+        self, name: str, values: NDArray[np.floating], ends: tuple[int, int], uses: NDArray[np.integer] | None = None
     ) -> NDArray[np.int32]:
         """The nearest integers that the format has.
 
@@ -87,9 +83,7 @@ class Clamped:
         changed = ", ".join(f"{name} {splats}" for name, splats in self._counts.items() if splats)
         if changed:
             suffix = os.path.splitext(path)[1].lower()
-            logger.warning(
-                f"{path}: out of the range of {suffix} files and clamped to it: {changed} (of {count} splats)"
-            )
+            logger.warning(f"{path}: out of the range of {suffix} files, clamped to it: {changed} (of {count} splats)")
 
 
 def power_below(value: float) -> float:

@@ -50,8 +50,6 @@ from nsvq_lightning.splats import conventions
 
 logger = logging.getLogger(__name__)
 
-_MAGIC = b"NGSP"
-
 
 @dataclass(frozen=True)
 class SpzHeader:
@@ -87,6 +85,7 @@ class SpzHeader:
         return {name: self.count * size for name, size in self.sizes.items() if self.count * size}
 
 
+_MAGIC = b"NGSP"
 # Magic, version, N, SH degree, fractional bits, flags, and number of streams (0 up to version 3).
 _HEADER = struct.Struct("<4sIIBBBB")
 _TABLE_OFFSET = struct.Struct("<I12x")
@@ -179,9 +178,8 @@ def _table(data: bytes) -> tuple[SpzHeader, dict[str, int]]:
     if not _HEAD <= offset <= start <= len(data):
         raise FormatError(f"truncated or damaged: a table of {streams} streams at {offset}, of {len(data)} bytes")
     lengths = {}
-    for (name, expected), (length, size) in zip(
-        header.streams.items(), _ENTRY.iter_unpack(data[offset:start]), strict=True
-    ):
+    entries = zip(header.streams.items(), _ENTRY.iter_unpack(data[offset:start]), strict=True)
+    for (name, expected), (length, size) in entries:
         # One byte of Zstandard expands to 32 KiB at most: a block of 128 KiB of equal bytes takes four.
         if size != expected or size > length << 15:
             raise FormatError(f"damaged: {name} of {header.count} splats cannot be {size} bytes in {length}")
@@ -273,9 +271,7 @@ def _parse(start: bytes, file_bytes: int) -> SpzHeader:
         raise FormatError("not a .spz file: it does not start with a whole header 'NGSP'")
     _, version, count, sh_degree, fraction_bits, flags, _ = _HEADER.unpack(start)
     if not 1 <= version <= 4:
-        raise FormatError(
-            f"version {version} of the format; this release reads 1 to 4", "save it as version 3 or as .ply"
-        )
+        raise FormatError(f"version {version} of the format; this release reads 1 to 4", "save it as version 3 or .ply")
     if sh_degree > 3:
         raise FormatError(f"damaged, or of a degree that this release does not read: SH degree {sh_degree}, not 0 to 3")
     if fraction_bits > MOST_FRACTION:
@@ -418,10 +414,8 @@ def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
         for name, size in header.sizes.items()
     }
     if not header.axes:
-        taken = (
-            "taken as right, down, front, as in .ply. If it is upside down: nsvq convert --up minus-y --up-from 0 1 0"
-        )
-        logger.info("%s: the file does not say where its axes point; %s", path, taken)
+        advice = "If it is upside down: nsvq convert --up minus-y --up-from 0 1 0"
+        logger.info("%s: the file does not say where its axes point; taken as right, down, front. %s", path, advice)
     axes = header.axes or DEFAULT_AXES.upper()
     turn = axes[1] in "FB"
     if turn:  # z is up or down: signs first, then a quarter turn, as Niantic's library does it, which writes such files

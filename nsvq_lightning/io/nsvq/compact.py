@@ -148,22 +148,20 @@ def _encoded(attribute: rounding.Stored, order: NDArray[np.int64], neighbours: N
     return paths if codebook is None else paths | {f"{entry.name}.codebook": entropy.encode_integers(codebook)}
 
 
-def _decoded(
-    entry: AttributeEntry, streams: Mapping[str, memoryview], neighbours: NDArray[np.int32]
-) -> rounding.Stored:
+def _decoded(entry: AttributeEntry, streams: Mapping[str, memoryview], near: NDArray[np.int32]) -> rounding.Stored:
     """Invert :func:`_encoded`."""
     if entry.storage == "steps":
-        return rounding.Stored(entry, entropy.decode_integers(streams[entry.name], len(neighbours), entry.dim))
+        return rounding.Stored(entry, entropy.decode_integers(streams[entry.name], len(near), entry.dim))
     if entry.storage == "components":
         basis = entropy.decode_integers(streams[f"{entry.name}.basis"], entry.codes, entry.dim)
-        coefficients = entropy.decode_integers(streams[entry.name], len(neighbours), entry.codes)
+        coefficients = entropy.decode_integers(streams[entry.name], len(near), entry.codes)
         for integers in (basis, coefficients):
             if max(-int(integers.min(initial=0)), int(integers.max(initial=0))) >= rounding.SMALL:
                 raise FormatError(f"damaged: a component of {entry.name} is not below 2^23 in size")
         return rounding.Stored(entry, coefficients, basis)
     leaf_of = np.full(1 << entry.bits, -1)
     leaf_of[leaf_paths(entry.codes)] = np.arange(entry.codes)
-    values = leaf_of[entropy.decode_paths(streams[entry.name], entry.bits, neighbours)]
+    values = leaf_of[entropy.decode_paths(streams[entry.name], entry.bits, near)]
     if (values < 0).any():
         raise FormatError(f"damaged: a code of {entry.name} is not one of {entry.codes}")
     if entry.storage == "levels":

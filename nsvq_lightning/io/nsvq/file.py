@@ -30,8 +30,6 @@ def encode(scene: CompressedScene, storage: Storage) -> tuple[Header, dict[str, 
         from nsvq_lightning.io.nsvq.compact import encode_compact
 
         return encode_compact(scene, storage.precision)
-    from nsvq_lightning.io.nsvq.file import encode_paper
-
     return encode_paper(scene)
 
 
@@ -95,12 +93,8 @@ def decode(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene
 
         return decode_compact(header, streams)
     if header.level == "paper":
-        from nsvq_lightning.io.nsvq.file import decode_paper
-
         return decode_paper(header, streams)
-    raise FormatError(
-        f"compression level {header.level!r}; this release reads {', '.join(LEVELS)}", "update nsvq-lightning"
-    )
+    raise FormatError(f"level {header.level!r}; this release reads {', '.join(LEVELS)}", "update nsvq-lightning")
 
 
 # Rows per chunk: a multiple of 8, so that every chunk ends on a whole byte, and small enough for the cache.
@@ -143,9 +137,8 @@ def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) ->
         One array ``[N]`` per field: uint16 up to 16 bits, uint32 above.
     """
     packed, record = np.frombuffer(data, np.uint8), sum(widths)
-    fields: list[NDArray[np.unsignedinteger]] = [
-        np.zeros(rows, np.uint16 if width <= 16 else np.uint32) for width in widths
-    ]
+    kinds = (np.uint16 if width <= 16 else np.uint32 for width in widths)
+    fields: list[NDArray[np.unsignedinteger]] = [np.zeros(rows, kind) for kind in kinds]
     for start in range(0, rows, _CHUNK):
         count = min(_CHUNK, rows - start)
         chunk = packed[start * record // 8 : (start + _CHUNK) * record // 8]
@@ -207,9 +200,7 @@ def decode_paper(header: Header, streams: Mapping[str, memoryview]) -> Compresse
             means=_floats(streams["means"], n, 3),
             opacities=_floats(streams["opacities"], n, 1)[:, 0],
             codes={entry.name: codes for entry, codes in zip(coded, packed, strict=True)},
-            codebooks={
-                entry.name: _floats(streams[f"{entry.name}.codebook"], entry.codes, entry.dim) for entry in coded
-            },
+            codebooks={each.name: _floats(streams[f"{each.name}.codebook"], each.codes, each.dim) for each in coded},
             raw={entry.name: _floats(streams[entry.name], n, entry.dim) for entry in raw},
             **header.of_scene,
         )

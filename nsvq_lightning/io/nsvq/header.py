@@ -20,16 +20,6 @@ from typing import Any, NamedTuple, TypeVar, get_type_hints
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 
-# Its line ends and high bit expose transfers that treat it as text.
-MAGIC = b"\x89NSVQ\r\n\x1a"
-# Versions that are read. A file has the first one unless an attribute has what came with the second: a basis.
-VERSIONS = 2, 3
-
-# Magic, BLAKE2b digest of everything after it, version, and bytes of the JSON, whose keys are sorted, without spaces.
-_PREFIX = struct.Struct("<8s16sII")
-_DIGEST_END = 24
-_T = TypeVar("_T")
-
 
 class AttributeEntry(NamedTuple):
     """How one attribute of the splats is stored.
@@ -70,6 +60,11 @@ class StreamEntry(NamedTuple):
     encoding: str
 
 
+# Magic, BLAKE2b digest of everything after it, version, and bytes of the JSON, whose keys are sorted, without spaces.
+_PREFIX = struct.Struct("<8s16sII")
+_DIGEST_END = 24
+
+
 @dataclass(frozen=True)
 class Header:
     """All that a ``.nsvq`` file says about its streams.
@@ -96,16 +91,12 @@ class Header:
 
     @classmethod
     def of(
-        cls,
-        scene: CompressedScene,
-        level: str,
-        attributes: tuple[AttributeEntry, ...],
-        streams: tuple[StreamEntry, ...],
+        cls, scene: CompressedScene, level: str, entries: tuple[AttributeEntry, ...], streams: tuple[StreamEntry, ...]
     ) -> "Header":
         """Header of the file of a scene."""
         x, y, z = map(float, scene.origin)
         told = dict(scene.config), dict(scene.metrics)
-        return cls(level, len(scene), scene.sh_degree, (x, y, z), attributes, streams, *told)
+        return cls(level, len(scene), scene.sh_degree, (x, y, z), entries, streams, *told)
 
     @property
     def of_scene(self) -> dict[str, Any]:
@@ -162,15 +153,16 @@ class Header:
             raise FormatError(f"damaged: SH degree {header.sh_degree}, the highest is 3")
         if len({stream.name for stream in header.streams}) != len(header.streams):
             raise FormatError("damaged: two streams have the same name")
-        if any(
-            isinstance(value, bool) or not isinstance(value, int | float | None) for value in header.metrics.values()
-        ):
+        if any(isinstance(each, bool) or not isinstance(each, int | float | None) for each in header.metrics.values()):
             raise FormatError("damaged: header entry 'metrics' must hold numbers only")
         return header
 
 
 def _no_number(name: str) -> None:
     raise ValueError(f"it holds {name}, which JSON does not have")
+
+
+_T = TypeVar("_T")
 
 
 def _entry(table: object, key: str, kind: type[_T]) -> _T:
@@ -198,6 +190,12 @@ def _origin(values: list[Any]) -> tuple[float, float, float]:
     if len(values) != 3 or not numbers or not all(abs(value) <= sys.float_info.max for value in values):
         raise FormatError("damaged: header entry 'origin' must be three finite numbers")
     return float(values[0]), float(values[1]), float(values[2])
+
+
+# Its line ends and high bit expose transfers that treat it as text.
+MAGIC = b"\x89NSVQ\r\n\x1a"
+# Versions that are read. A file has the first one unless an attribute has what came with the second: a basis.
+VERSIONS = 2, 3
 
 
 def frame(header: Header, streams: Mapping[str, bytes]) -> list[bytes]:

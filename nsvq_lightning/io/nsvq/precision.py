@@ -7,11 +7,6 @@ from typing import Any
 
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 
-# Compression levels: ``compact`` is small; ``paper`` stores float32 values and whole bits, as the paper counts.
-LEVELS = ("compact", "paper")
-
-DEFAULT_LEVEL = "compact"
-
 # Largest number of opacity levels that readers accept.
 MOST_OPACITY_LEVELS = 1 << 20
 
@@ -64,6 +59,12 @@ class Precision:
     def opacity_levels(self) -> int:
         """Number of levels that the opacity has."""
         return max(2, math.ceil(0.5 / self.opacity))
+
+
+# Compression levels: ``compact`` is small; ``paper`` stores float32 values and whole bits, as the paper counts.
+LEVELS = ("compact", "paper")
+
+DEFAULT_LEVEL = "compact"
 
 
 @dataclass(frozen=True)

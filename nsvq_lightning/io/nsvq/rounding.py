@@ -58,7 +58,9 @@ def rounded(scene: CompressedScene, name: str, precision: Precision) -> Stored:
         ValueError: A value is too large for its step.
     """
     if name == "opacities":
-        return _levels(scene.opacities, precision.opacity_levels)
+        count = precision.opacity_levels
+        values = np.minimum((opacity_of(scene.opacities) * count).astype(np.int64), count - 1)
+        return Stored(AttributeEntry("opacities", 1, "levels", count), values)
     if name in scene.bases:
         basis = scene.bases[name]
         step = min(_step(basis, nearest_power(float(np.abs(basis).max()) * 2.0**-13 or 1.0)), 1.0)
@@ -73,25 +75,14 @@ def rounded(scene: CompressedScene, name: str, precision: Precision) -> Stored:
 def _coded(name: str, codes: NDArray[np.integer], codebook: NDArray[np.float32], error: float) -> Stored:
     used = np.bincount(codes, minlength=len(codebook)) > 0
     rows = codebook[used] if len(codes) else np.zeros_like(codebook[:1])
-    step = _codebook_step(name, rows, error)
+    distinct = np.unique(unit(rows).astype(np.float32) if name == "quats" else rows, axis=0)
+    step = _step(rows, nearest_power(2 * error * sibling_distance(distinct[tree_order(distinct)]) or 2.0**-16))
     integers, merged = np.unique(_integers(name, rows, step), axis=0, return_inverse=True)
     order = tree_order((integers * step).astype(np.float32))
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     entry = AttributeEntry(name, rows.shape[1], "codes", len(integers), step)
     return Stored(entry, place[merged.reshape(-1)[np.cumsum(used)[codes] - 1]], integers[order])
-
-
-def _codebook_step(name: str, rows: NDArray[np.float32], error: float) -> float:
-    """Step of the codebook of an attribute, a power of two.
-
-    Args:
-        name: The attribute.
-        rows: The rows ``[K, D]`` in use.
-        error: Largest error, as a share of how much neighbouring codes typically differ.
-    """
-    distinct = np.unique(unit(rows).astype(np.float32) if name == "quats" else rows, axis=0)
-    return _step(rows, nearest_power(2 * error * sibling_distance(distinct[tree_order(distinct)]) or 2.0**-16))
 
 
 def _step(rows: NDArray[np.float32], wanted: float) -> float:
@@ -111,12 +102,6 @@ def _integers(name: str, rows: NDArray[np.float32], step: float, limit: float = 
 
 
 # Opacities
-
-
-def _levels(logits: NDArray[np.float32], count: int) -> Stored:
-    shares = opacity_of(logits)
-    values = np.minimum((shares * count).astype(np.int64), count - 1)
-    return Stored(AttributeEntry("opacities", 1, "levels", count), values)
 
 
 def logits_of_levels(count: int) -> NDArray[np.float32]:
