@@ -95,10 +95,8 @@ def fast_backends(like: Tensor) -> list[str]:
 def _warn_of_plain_torch(device: str, problem: str) -> None:
     """Warn once that a device has no kernels of its own; a run of hours would else silently become one of weeks."""
     log.warning(
-        "rendering on %s in plain torch, much slower than on the CPU (--trainer.accelerator=cpu); "
-        "backend 'cuda' cannot be used: %s",
-        device,
-        problem,
+        f"rendering on {device} in plain torch, much slower than on the CPU (--trainer.accelerator=cpu); "
+        f"backend 'cuda' cannot be used: {problem}"
     )
 
 

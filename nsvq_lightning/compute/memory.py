@@ -168,9 +168,7 @@ def check_tensor(
     if tensor.dtype != dtype:
         raise TypeError(f"{name} must be {dtype}, got {tensor.dtype}; convert it")
     if tensor.shape != shape or tensor.device != device:
-        raise ValueError(
-            f"{name} must have shape {list(shape)} on {device}, got {list(tensor.shape)} on {tensor.device}"
-        )
+        raise ValueError(f"{name} needs shape {list(shape)} on {device}, got {list(tensor.shape)} on {tensor.device}")
     if not tensor.is_contiguous():
         raise ValueError(f"{name} must be contiguous, got strides {tensor.stride()}; pass a copy")
 

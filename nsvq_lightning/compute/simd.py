@@ -291,9 +291,8 @@ def exp2(context, builder, sig, values):
     shifted = builder.fadd(values[0], magic)
     fraction = builder.fsub(values[0], builder.fsub(shifted, magic))
     # Minimax polynomial of 2**f on [-1/2, 1/2].
-    power = _polynomial(
-        builder, fraction, (1.32764715e-3, 9.67554133e-3, 5.55071327e-2, 2.40221197e-1, 6.93146967e-1, 1.00000007)
-    )
+    powers = (1.32764715e-3, 9.67554133e-3, 5.55071327e-2, 2.40221197e-1, 6.93146967e-1, 1.00000007)
+    power = _polynomial(builder, fraction, powers)
     exponent = builder.shl(builder.bitcast(shifted, _VI), _integers(23))
     return builder.bitcast(builder.add(builder.bitcast(power, _VI), exponent), _VF)
 
@@ -473,9 +472,7 @@ def _scatterer(columns: int) -> Any:
         return context.get_dummy_value()
 
     emit.__name__ = f"scatter_rows{columns}"
-    emit.__doc__ = (
-        f"``scatter_rows{columns}(array, indices, start, vectors)``: the inverse of ``gather_rows{columns}``."
-    )
+    emit.__doc__ = f"``scatter_rows{columns}(array, indices, start, rows)``: the inverse of ``gather_rows{columns}``."
     return _function(types.void, 4)(emit)
 
 
@@ -490,9 +487,7 @@ def _row_loader(columns: int) -> Any:
         return context.make_tuple(builder, sig.return_type, vectors)
 
     emit.__name__ = f"load_rows{columns}"
-    emit.__doc__ = (
-        f"``load_rows{columns}(array, offset)``: 16 consecutive rows of {columns} floats as {columns} vectors."
-    )
+    emit.__doc__ = f"``load_rows{columns}(array, offset)``: 16 consecutive rows of {columns} floats as vectors."
     return _function(types.UniTuple(Lanes, columns), 2)(emit)
 
 
@@ -513,19 +508,16 @@ def _joined(builder: Any, parts: Sequence[Any]) -> Any:
 
 
 def _block_loader(channels: int) -> Any:
+    """``offset`` is the element of a block's first pixel, ``stride`` the floats from the start of a row to the next."""
+
     def emit(context, builder, sig, values):
         lines = [_line(context, builder, sig, *values, row) for row in range(4)]
         block = _joined(builder, [_read(builder, line, 4 * channels) for line in lines])
-        planes = [
-            _shuffle(builder, block, block, range(first, WIDTH * channels, channels)) for first in range(channels)
-        ]
+        planes = [_shuffle(builder, block, block, range(k, WIDTH * channels, channels)) for k in range(channels)]
         return context.make_tuple(builder, sig.return_type, planes)
 
     emit.__name__ = f"load_block{channels}"
-    emit.__doc__ = (
-        f"``load_block{channels}(image, offset, stride)``: a 4x4 block of an image with {channels} channels.\n\n"
-        "``offset`` is the element of its first pixel, ``stride`` the floats between the starts of two image rows."
-    )
+    emit.__doc__ = f"``load_block{channels}(image, offset, stride)``: a 4x4 block of an image, {channels} channels."
     return _function(types.UniTuple(Lanes, channels), 3)(emit)
 
 

@@ -188,9 +188,8 @@ def sweep(
                     simd.store(ring, slot + x, blur_along(derivatives, x))
         done = y - SSIM_RADIUS
         if done >= first:
-            sums[2 * done + 1] = gradient_of_row(
-                image, gradient, images, ring, done, length, pitch, l1_step, ssim_step, lanes
-            )
+            apart = gradient_of_row(image, gradient, images, ring, done, length, pitch, l1_step, ssim_step, lanes)
+            sums[2 * done + 1] = apart
 
 
 @kernel

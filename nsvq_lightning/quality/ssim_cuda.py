@@ -17,15 +17,6 @@ from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
 
-MOMENTS = 4
-DERIVATIVES = 3
-# Image rows per program: four floats per thread, so that registers suffice for all taps.
-ROWS = 4
-# Floats of each row per program, three to a pixel.
-COLUMNS = 128
-# Number of programs whose sums are added up at a time.
-BLOCK = 1024
-
 
 @triton.jit
 def place(ROWS: tl.constexpr, COLUMNS: tl.constexpr):
@@ -188,6 +179,16 @@ def gradient_kernel(
     value = tl.where(free, (sign * l1_step - g * ssim_step) * tl.load(scale), 0.0)
     at = row.to(tl.int64) * length + column
     tl.store(gradient + at, value, mask=(row < height) & (column < length))
+
+
+MOMENTS = 4
+DERIVATIVES = 3
+# Image rows per program: four floats per thread, so that registers suffice for all taps.
+ROWS = 4
+# Floats of each row per program, three to a pixel.
+COLUMNS = 128
+# Number of programs whose sums are added up at a time.
+BLOCK = 1024
 
 
 def _grid(image: Tensor) -> tuple[int, int]:

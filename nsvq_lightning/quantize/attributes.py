@@ -68,10 +68,7 @@ def decoded(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> RawSplats
 
 
 def noisy_rows(
-    splats: RawSplats,
-    rows: Tensor,
-    quantizers: Mapping[str, Quantizer],
-    noise: Callable[[str], torch.Generator],
+    splats: RawSplats, rows: Tensor, quantizers: Mapping[str, Quantizer], noise: Callable[[str], torch.Generator]
 ) -> RawSplats:
     """Some of the splats, their quantized attributes replaced by the training stand-in (paper, section 3.2).
 

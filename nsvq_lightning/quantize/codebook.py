@@ -181,9 +181,7 @@ class CodebookQuantizer(nn.Module, ABC):
         if not self.training:
             return self.decode(codes), codes
         if generator is None:
-            raise ValueError(
-                "a quantizer in training needs a generator: pass nsvq_lightning.random.generator(seed, step)"
-            )
+            raise ValueError("training needs a generator: pass nsvq_lightning.random.generator(seed, step)")
         self.count(codes)
         return self.approximate(x, codes, generator, rows), codes
 
@@ -307,7 +305,7 @@ class CodebookQuantizer(nn.Module, ABC):
     def _frozen_codes(self, count: int, rows: Tensor | None) -> Tensor:
         if count != self.codes.shape[0]:
             raise ValueError(
-                f"codes are frozen for {self.codes.shape[0]} rows, got {count}; pass all of them, and `rows` to choose"
+                f"codes are frozen for {len(self.codes)} rows, got {count}; pass all, and `rows` to choose"
             )
         return self.codes if rows is None else self.codes[rows]
 

@@ -47,9 +47,7 @@ def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtyp
         TypeError: The codes are not int64, or the values neither float32 nor float64.
     """
     if values.dim() != 2 or codes.shape != values.shape[:1]:
-        raise ValueError(
-            f"values must have shape [N, D] and codes [N], got {list(values.shape)} and {list(codes.shape)}"
-        )
+        raise ValueError(f"values must be [N, D] and codes [N], got {list(values.shape)} and {list(codes.shape)}")
     if values.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"values must be float32 or float64, got {values.dtype}")
     values, dtype = values.detach(), dtype or values.dtype

@@ -33,9 +33,7 @@ def check_rows(x: Tensor, codebook: Tensor) -> None:
         TypeError: They differ in dtype or are not floating point.
     """
     if x.dim() != 2 or codebook.dim() != 2 or x.shape[1] != codebook.shape[1] or x.shape[1] == 0:
-        raise ValueError(
-            f"x [N, D] and codebook [K, D] must share D > 0, got {list(x.shape)} and {list(codebook.shape)}"
-        )
+        raise ValueError(f"x [N, D] and codebook [K, D] must share D, got {list(x.shape)} and {list(codebook.shape)}")
     if codebook.shape[0] == 0:
         raise ValueError(f"the codebook has no code, shape {list(codebook.shape)}; fit it first")
     if x.dtype != codebook.dtype or not x.dtype.is_floating_point:

@@ -63,9 +63,7 @@ def noise_substitution(
 
 class _Substitution(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, x: Tensor, codebook: Tensor, codes: Tensor, rows: Tensor, mix: tuple[int, float, float]
-    ) -> Tensor:
+    def forward(ctx: Any, x: Tensor, codebook: Tensor, codes: Tensor, rows: Tensor, mix: Any) -> Tensor:
         ctx.mix, ctx.kernels = mix, _kernels(x)
         if ctx.kernels is None:
             chosen = x.index_select(0, rows)

@@ -321,9 +321,8 @@ def substitute_backward(
         TypeError: A dtype is wrong.
     """
     inputs = _checked(x, rows, codebook, codes)
-    slope, moved = (
-        flat_checked(name, table, (len(rows), x.shape[1])) for name, table in (("grad", grad), ("out", out))
-    )
+    shape = len(rows), x.shape[1]
+    slope, moved = flat_checked("grad", grad, shape), flat_checked("out", out, shape)
     grad_x, grad_codebook = recycled(x.shape), recycled(codebook.shape)
     # Enough parts for the threads, few enough that adding them up is cheap.
     parts = max(4, min(64, len(rows) // (4 * len(codebook))))

@@ -83,9 +83,7 @@ class Camera:
         """Camera centre ``[3]`` in world coordinates."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
-    def to(
-        self, device: torch.device | str | None = None, dtype: torch.dtype | None = None, **kwargs: object
-    ) -> "Camera":
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None, **_: object) -> "Camera":
         """The camera with both matrices on ``device`` and in ``dtype``; the same object if they already are."""
         K, viewmat = (matrix.to(device=device, dtype=dtype) for matrix in (self.K, self.viewmat))
         if K is self.K and viewmat is self.viewmat:

@@ -38,9 +38,8 @@ class Projection(NamedTuple):
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotations ``[N, 3, 3]`` of quaternions ``[N, 4]`` (wxyz, any norm; zero is the identity)."""
     # Squares of a huge quaternion would overflow.
-    quats = quats * torch.where(
-        quats.detach().abs().amax(-1, keepdim=True) > constants.HUGE_QUATERNION, constants.SHRINK, 1.0
-    )
+    huge = quats.detach().abs().amax(-1, keepdim=True) > constants.HUGE_QUATERNION
+    quats = quats * torch.where(huge, constants.SHRINK, 1.0)
     norm = quats.square().sum(-1, keepdim=True).clamp_min(MIN_SQUARED_NORM).sqrt()
     w, x, y, z = (quats / norm).unbind(-1)
     rows = [
@@ -166,9 +165,8 @@ def render(
             right = min(left + side, camera.width)
             here = (low[:, 0] <= right) & (high[:, 0] >= left) & (low[:, 1] <= bottom) & (high[:, 1] >= top)
             near = order[here]
-            ys, xs = torch.meshgrid(
-                torch.arange(top, bottom).to(centres), torch.arange(left, right).to(centres), indexing="ij"
-            )
+            down, across = torch.arange(top, bottom).to(centres), torch.arange(left, right).to(centres)
+            ys, xs = torch.meshgrid(down, across, indexing="ij")
             pixels = torch.stack([xs, ys], -1).reshape(-1, 2) + 0.5
             weights_here = pixel_weights[top:bottom, left:right].reshape(-1)
             inputs = (

@@ -121,13 +121,10 @@ def empty_memory(count: int, dim: int, device: torch.device) -> tuple[Tensor, ..
     distance below which there was no code but the nearest, plus how far the codes had moved by then, ``[N]`` in
     float64, because movements add up over a whole run; and the same for codes outside the list.
     """
-    return (
-        torch.full((count,), -1, dtype=torch.int32, device=device),
-        torch.zeros(count, LIST, dtype=torch.int32, device=device),
-        torch.zeros(count, dim, device=device),
-        torch.full((count,), -torch.inf, dtype=torch.float64, device=device),
-        torch.full((count,), -torch.inf, dtype=torch.float64, device=device),
-    )
+    codes = torch.full((count,), -1, dtype=torch.int32, device=device)
+    lists = torch.zeros(count, LIST, dtype=torch.int32, device=device)
+    clearance, limits = torch.full((2, count), -torch.inf, dtype=torch.float64, device=device)
+    return codes, lists, torch.zeros(count, dim, device=device), clearance, limits
 
 
 SLACK = tl.constexpr(ROUNDING)

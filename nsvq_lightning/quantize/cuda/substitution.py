@@ -17,11 +17,6 @@ from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quantize import substitution
 
-GOLDEN, FIRST, SECOND = (tl.constexpr(value) for value in substitution.MULTIPLIERS)
-C0, C1, C2, C3, C4, C5 = (tl.constexpr(value) for value in substitution.COS)
-S0, S1, S2, S3, S4, S5 = (tl.constexpr(value) for value in substitution.SIN)
-UNIT = tl.constexpr(2.0**-24)
-MINUS_TWO_LN2 = tl.constexpr(-2 * math.log(2))
 SPLIT = tl.constexpr(0x3F3504F3)  # bits of 1/√2: a mantissa lies in [1/√2, √2)
 TWO_LOG2_E = tl.constexpr(2 / math.log(2))
 L0, L1, L2, L3, L4 = (tl.constexpr(1 / odd) for odd in (11, 9, 7, 5, 3))
@@ -40,6 +35,13 @@ def log2(x):
     series = tl.fma(tl.fma(series, squared, L2), squared, L3)
     series = tl.fma(tl.fma(series, squared, L4), squared, 1.0)
     return tl.fma(s * TWO_LOG2_E, series, exponent.to(tl.float32))
+
+
+GOLDEN, FIRST, SECOND = (tl.constexpr(value) for value in substitution.MULTIPLIERS)
+C0, C1, C2, C3, C4, C5 = (tl.constexpr(value) for value in substitution.COS)
+S0, S1, S2, S3, S4, S5 = (tl.constexpr(value) for value in substitution.SIN)
+UNIT = tl.constexpr(2.0**-24)
+MINUS_TWO_LN2 = tl.constexpr(-2 * math.log(2))
 
 
 @triton.jit
@@ -235,9 +237,7 @@ def part_kernel(
 
 
 @triton.jit
-def sum_kernel(
-    partial, offsets, sums, dim, PARTS: tl.constexpr, PART: tl.constexpr, WIDTH: tl.constexpr
-):  # fmt: skip
+def sum_kernel(partial, offsets, sums, dim, PARTS: tl.constexpr, PART: tl.constexpr, WIDTH: tl.constexpr):
     """Sum the parts of a code; 0 for a code without rows."""
     code = tl.program_id(0).to(tl.int64)
     column = tl.program_id(1) * WIDTH + tl.arange(0, WIDTH)

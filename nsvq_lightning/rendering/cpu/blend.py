@@ -23,17 +23,6 @@ BATCH = 128
 BLOCKS = 16
 BLOCK_SIDE = 4
 
-# Planes of the per-thread scratch of the forward pass, with one vector per block: T keeps falling once a pixel is
-# closed, T_LEFT is the transmittance that the image keeps.
-T, T_LEFT, R_SUM, G_SUM, B_SUM, Z_SUM = (256 * plane for plane in range(6))
-FORWARD_SCRATCH = 6 * 256 + (BATCH + 1) * rec.RECORD
-# Vectors of one block in the scratch of the backward pass.
-BACK_T, BACK_REST, BACK_RED, BACK_GREEN, BACK_BLUE, BACK_DEPTH, BACK_WEIGHT, BACK_X, BACK_Y = (
-    16 * part for part in range(9)
-)
-BLOCK_STATE = 16 * 9
-BACKWARD_SCRATCH = BLOCKS * BLOCK_STATE
-
 
 def pixel_grid() -> np.ndarray[tuple[int], np.dtype[np.float32]]:
     """Pixel centres in a tile: x of block k at 16·k, y at 256 + 16·k; first x and y of the blocks at 512 and 528."""
@@ -41,6 +30,16 @@ def pixel_grid() -> np.ndarray[tuple[int], np.dtype[np.float32]]:
     x = (block % 4) * BLOCK_SIDE + lane % 4 + 0.5
     y = (block // 4) * BLOCK_SIDE + lane // 4 + 0.5
     return np.concatenate([x.ravel(), y.ravel(), x[:, 0], y[:, 0]]).astype(np.float32)
+
+
+# Planes of the per-thread scratch of the forward pass, with one vector per block: T keeps falling once a pixel is
+# closed, T_LEFT is the transmittance that the image keeps.
+T, T_LEFT, R_SUM, G_SUM, B_SUM, Z_SUM = (256 * plane for plane in range(6))
+FORWARD_SCRATCH = 6 * 256 + (BATCH + 1) * rec.RECORD
+# Vectors of one block in the scratch of the backward pass.
+BACK_T, BACK_REST, BACK_RED, BACK_GREEN, BACK_BLUE, BACK_DEPTH, BACK_WEIGHT, BACK_X, BACK_Y = range(0, 16 * 9, 16)
+BLOCK_STATE = 16 * 9
+BACKWARD_SCRATCH = BLOCKS * BLOCK_STATE
 
 
 @inline
@@ -484,11 +483,9 @@ def total_slots(threads, ids, count, slots, records, integers, sums, g_means2d, 
             row = np.int64(simd.get(ids, i))
             r = rec.RECORD * row
             slot = np.int64(simd.get(integers, r + rec.SLOT))
-            end = (
-                np.int64(simd.get(integers, rec.RECORD * np.int64(simd.get(ids, i + 1)) + rec.SLOT))
-                if i + 1 < count
-                else slots
-            )
+            end = np.int64(slots)
+            if i + 1 < count:
+                end = np.int64(simd.get(integers, rec.RECORD * np.int64(simd.get(ids, i + 1)) + rec.SLOT))
             o = rec.RECORD * slot
             if end > slot + 1:
                 total = simd.load(sums, o)
@@ -497,9 +494,8 @@ def total_slots(threads, ids, count, slots, records, integers, sums, g_means2d, 
                 simd.store(sums, o, total)
             u, v = simd.get(sums, o + rec.SUM_U), simd.get(sums, o + rec.SUM_V)
             simd.put(g_means2d, 2 * row, TWO_LN2 * simd.get(records, r + rec.A) * u)
-            simd.put(
-                g_means2d, 2 * row + 1, TWO_LN2 * (simd.get(records, r + rec.B) * u + simd.get(records, r + rec.C) * v)
-            )
+            b, c = simd.get(records, r + rec.B), simd.get(records, r + rec.C)
+            simd.put(g_means2d, 2 * row + 1, TWO_LN2 * (b * u + c * v))
             if with_absgrad:
                 simd.put(absgrad, 3 * row, abs(TWO_LN2 * simd.get(records, r + rec.A)) * simd.get(sums, o + rec.ABS_X))
                 simd.put(absgrad, 3 * row + 1, TWO_LN2 * simd.get(sums, o + rec.ABS_Y))

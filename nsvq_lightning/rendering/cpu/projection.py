@@ -162,9 +162,8 @@ def project_range(camera, means, quats, scales, logits, first, last, records, in
         if bits == 0:
             continue
         x, y, a, b, c, opacity, depth, slope_x, slope_y = record
-        rows = simd.transpose(
-            (x, y, a, b, c, opacity, zero, zero, zero, depth, slope_x, slope_y, zero, zero, zero, zero)
-        )
+        fields = (x, y, a, b, c, opacity, zero, zero, zero, depth, slope_x, slope_y, zero, zero, zero, zero)
+        rows = simd.transpose(fields)
         for lane in range(16):
             simd.store(scratch, 128 + 16 * lane, rows[lane])
         for k in range(4):
@@ -218,9 +217,8 @@ def finish_records(threads, camera, means, colors, bands, runs, records, integer
         for k in range(counts[thread]):
             row = np.int64(simd.get(found, first + k))
             simd.put(ids, start + k, row)
-            simd.put(
-                integers, rec.RECORD * row + rec.SLOT, np.int64(simd.get(integers, rec.RECORD * row + rec.SLOT)) + slot
-            )
+            place = rec.RECORD * row + rec.SLOT
+            simd.put(integers, place, np.int64(simd.get(integers, place)) + slot)
             # Depths are positive, so their bits sort as integers.
             simd.put(keys, start + k, simd.get(integers, rec.RECORD * row + rec.DEPTH))
             simd.put(order, start + k, start + k)

@@ -144,11 +144,10 @@ def project_backward(
             quat, scale = simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start)
             g_mean, g_quat, g_scale = geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y)
             # A colour below 0 was clamped.
-            rgb = (
-                simd.select(record[rec.RED] > 0, total[rec.SUM_RED], 0),
-                simd.select(record[rec.GREEN] > 0, total[rec.SUM_GREEN], 0),
-                simd.select(record[rec.BLUE] > 0, total[rec.SUM_BLUE], 0),
-            )
+            red = simd.select(record[rec.RED] > 0, total[rec.SUM_RED], 0)
+            green = simd.select(record[rec.GREEN] > 0, total[rec.SUM_GREEN], 0)
+            blue = simd.select(record[rec.BLUE] > 0, total[rec.SUM_BLUE], 0)
+            rgb = red, green, blue
             gx, gy, gz = color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, work)
             simd.scatter_rows3(g_means, ids, start, (g_mean[0] + gx, g_mean[1] + gy, g_mean[2] + gz))
             simd.scatter_rows4(g_quats, ids, start, g_quat)

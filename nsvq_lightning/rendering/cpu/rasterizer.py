@@ -156,15 +156,8 @@ class _Blend(torch.autograd.Function):
     """Projected splats to image, alpha and depth."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        frame: _Frame,
-        means2d: Tensor,
-        token: Tensor,
-        background: Tensor,
-        pixel_weights: Tensor | None,
-        absgrad: Tensor | None,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(ctx: Any, frame: _Frame, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
+        _means2d, _token, background, pixel_weights, _absgrad = inputs
         shape = frame.size[::-1]
         image, transmittance, depth, alpha = (recycled((*shape, *last)) for last in ((3,), (), (), ()))
         frame.bin()
@@ -205,9 +198,7 @@ class _Blend(torch.autograd.Function):
             frame.threads, frame.ids, frame.count, frame.slots, frame.records, frame.integers, frame.sums,
             flat(g_means2d), with_absgrad, flat(g_absgrad),
         )  # fmt: skip
-        g_background = None
-        if ctx.needs_input_grad[3]:
-            g_background = (g_image * transmittance[..., None]).sum((0, 1))
+        g_background = (g_image * transmittance[..., None]).sum((0, 1)) if ctx.needs_input_grad[3] else None
         return None, g_means2d, torch.zeros(()), g_background, None, g_absgrad if with_absgrad else None
 
 

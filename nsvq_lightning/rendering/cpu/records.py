@@ -36,14 +36,6 @@ SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_D
 
 TILE_SHIFT = 4
 TILE = 1 << TILE_SHIFT
-GROUP_SHIFT = 2
-# Tiles in a group.
-GROUP_TILES = 1 << 2 * GROUP_SHIFT
-
-LOG2_ALPHA_MIN = F(-math.log2(255))
-LOG2_E = F(math.log2(math.e))
-# √(½·log2 e): turns the Cholesky factor of the inverse covariance into that of the binary exponent.
-FACTOR_SCALE = F(math.sqrt(0.5 * math.log2(math.e)))
 
 # Elements of the camera array of `pack_camera`.
 ROTATION, TRANSLATION, POSITION, FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, WIDTH, HEIGHT = (
@@ -65,18 +57,27 @@ def pack_camera(camera: Camera) -> Array:
     if version != camera.viewmat._version:
         size = camera.width, camera.height
         if max(size) > MAX_SIDE:
-            raise ValueError(
-                f"an image may have {MAX_SIDE} pixels along a side, got {size[0]}x{size[1]}; render it in parts"
-            )
+            raise ValueError(f"an image side may have {MAX_SIDE} pixels, got {size[0]}x{size[1]}; render it in parts")
         packed = np.array([*camera.packed_view, *camera.intrinsics, *camera.slope_limits, *size], np.float32)
         _packed[camera] = camera.viewmat._version, packed
     return packed
+
+
+GROUP_SHIFT = 2
+# Tiles in a group.
+GROUP_TILES = 1 << 2 * GROUP_SHIFT
 
 
 def group_grid(width: int, height: int) -> tuple[int, int]:
     """Columns and rows of groups that cover an image."""
     side = TILE << GROUP_SHIFT
     return -(-width // side), -(-height // side)
+
+
+LOG2_ALPHA_MIN = F(-math.log2(255))
+LOG2_E = F(math.log2(math.e))
+# √(½·log2 e): turns the Cholesky factor of the inverse covariance into that of the binary exponent.
+FACTOR_SCALE = F(math.sqrt(0.5 * math.log2(math.e)))
 
 
 @inline

@@ -21,11 +21,6 @@ from nsvq_lightning.rendering.cuda.binning import Tiles
 from nsvq_lightning.rendering.cuda.harmonics import load3
 from nsvq_lightning.rendering.cuda.projection import Lens
 
-# Splats whose slots a program adds up: most have a few, and a program for each would have little to do.
-SPLATS = 16
-# Number of slots of one splat that are added up at a time.
-SLOTS = 8
-
 
 @triton.jit
 def tile_pixels(tile, columns, width, height):
@@ -141,11 +136,8 @@ def blend_backward_kernel(
         record = fetched[0]
         raw, u, v, alpha, after, is_open, weight = blend_step(fetched, left, top, x, y, t)
         if tl.max(weight, 0) > 0:
-            d = (
-                g_red * tl.load(record + rec.RED)
-                + g_green * tl.load(record + rec.GREEN)
-                + g_blue * tl.load(record + rec.BLUE)
-            )
+            d = g_red * tl.load(record + rec.RED) + g_green * tl.load(record + rec.GREEN)
+            d += g_blue * tl.load(record + rec.BLUE)
             if WITH_DEPTH:
                 d += g_far * tl.load(record + rec.DEPTH)
             # The cap of α has no gradient.
@@ -254,6 +246,12 @@ def blend(lens: Lens, records: Tensor, tiles: Tiles, background: Tensor) -> tupl
         columns, lens.width, lens.height, BATCH=32, num_warps=1, **COMPILE,
     )  # fmt: skip
     return image, transmittance, depth, ends
+
+
+# Splats whose slots a program adds up: most have a few, and a program for each would have little to do.
+SPLATS = 16
+# Number of slots of one splat that are added up at a time.
+SLOTS = 8
 
 
 def blend_backward(

@@ -52,11 +52,9 @@ def axes_of(quat, log_scales):
     w, x, y, z = w * shrink, x * shrink, y * shrink, z * shrink
     inverse = 1 / tl.sqrt(tl.maximum(w * w + x * x + y * y + z * z, rec.MIN_SQUARED_NORM))
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
-    s0, s1, s2 = (
-        tl.exp2(log_scales[0] * rec.LOG2_E),
-        tl.exp2(log_scales[1] * rec.LOG2_E),
-        tl.exp2(log_scales[2] * rec.LOG2_E),
-    )
+    s0 = tl.exp2(log_scales[0] * rec.LOG2_E)
+    s1 = tl.exp2(log_scales[1] * rec.LOG2_E)
+    s2 = tl.exp2(log_scales[2] * rec.LOG2_E)
     m0 = ((1 - 2 * (y * y + z * z)) * s0, 2 * (x * y - w * z) * s1, 2 * (x * z + w * y) * s2)
     m1 = (2 * (x * y + w * z) * s0, (1 - 2 * (x * x + z * z)) * s1, 2 * (y * z - w * x) * s2)
     m2 = (2 * (x * z - w * y) * s0, 2 * (y * z + w * x) * s1, (1 - 2 * (x * x + y * y)) * s2)
@@ -88,11 +86,7 @@ def affine_row(view, k, scale, slope):
 @triton.jit
 def image_axes(t, m0, m1, m2):
     """One row of U = T·M: the splat's axes along one image axis."""
-    return (
-        t[0] * m0[0] + t[1] * m1[0] + t[2] * m2[0],
-        t[0] * m0[1] + t[1] * m1[1] + t[2] * m2[1],
-        t[0] * m0[2] + t[1] * m1[2] + t[2] * m2[2],
-    )
+    return dot3(t, (m0[0], m1[0], m2[0])), dot3(t, (m0[1], m1[1], m2[1])), dot3(t, (m0[2], m1[2], m2[2]))
 
 
 @triton.jit
@@ -163,10 +157,8 @@ def project_kernel(
         tl.store(means2d + 2 * row, px, mask=seen)
         tl.store(means2d + 2 * row + 1, py, mask=seen)
         x0, y0 = tl.where(seen, left, 0.0).to(tl.int32) // rec.TILE, tl.where(seen, top, 0.0).to(tl.int32) // rec.TILE
-        x1, y1 = (
-            tl.where(seen, right, 0.0).to(tl.int32) // rec.TILE,
-            tl.where(seen, bottom, 0.0).to(tl.int32) // rec.TILE,
-        )
+        x1 = tl.where(seen, right, 0.0).to(tl.int32) // rec.TILE
+        y1 = tl.where(seen, bottom, 0.0).to(tl.int32) // rec.TILE
         box = boxes + 4 * row
         tl.store(box, x0, mask=seen)
         tl.store(box + 1, y0, mask=seen)
@@ -252,25 +244,14 @@ def project_backward_kernel(
     gu = (a * e[0], a * e[1], a * e[2])
     gv = (b * e[0] + c * f[0], b * e[1] + c * f[1], b * e[2] + c * f[2])
 
-    gm0, gm1, gm2 = (
-        scaled_row(t0[0], t1[0], gu, gv),
-        scaled_row(t0[1], t1[1], gu, gv),
-        scaled_row(t0[2], t1[2], gu, gv),
-    )
-    store3(
-        g_scales + 3 * row,
-        fu[0] * e[0] + fv[0] * f[0],
-        fu[1] * e[1] + fv[1] * f[1],
-        fu[2] * e[2] + fv[2] * f[2],
-        inside,
-    )
-    gw, gx, gy, gz = quaternion_gradient(
-        q,
-        q_inverse,
-        (gm0[0] * s[0], gm0[1] * s[1], gm0[2] * s[2]),
-        (gm1[0] * s[0], gm1[1] * s[1], gm1[2] * s[2]),
-        (gm2[0] * s[0], gm2[1] * s[1], gm2[2] * s[2]),
-    )
+    gs = (fu[0] * e[0] + fv[0] * f[0], fu[1] * e[1] + fv[1] * f[1], fu[2] * e[2] + fv[2] * f[2])
+    store3(g_scales + 3 * row, gs[0], gs[1], gs[2], inside)
+    gm0, gm1 = scaled_row(t0[0], t1[0], gu, gv), scaled_row(t0[1], t1[1], gu, gv)
+    gm2 = scaled_row(t0[2], t1[2], gu, gv)
+    r0 = (gm0[0] * s[0], gm0[1] * s[1], gm0[2] * s[2])
+    r1 = (gm1[0] * s[0], gm1[1] * s[1], gm1[2] * s[2])
+    r2 = (gm2[0] * s[0], gm2[1] * s[1], gm2[2] * s[2])
+    gw, gx, gy, gz = quaternion_gradient(q, q_inverse, r0, r1, r2)
     tl.store(g_quats + 4 * row, gw, mask=inside)
     store3(g_quats + 4 * row + 1, gx, gy, gz, inside)
 
@@ -292,11 +273,9 @@ def project_backward_kernel(
 
     # A colour below 0 was clamped.
     rgb, g_rgb = load3(record + rec.RED, seen), load3(total + rec.SUM_RED, seen)
-    red, green, blue = (
-        tl.where(rgb[0] > 0, g_rgb[0], 0.0),
-        tl.where(rgb[1] > 0, g_rgb[1], 0.0),
-        tl.where(rgb[2] > 0, g_rgb[2], 0.0),
-    )
+    red = tl.where(rgb[0] > 0, g_rgb[0], 0.0)
+    green = tl.where(rgb[1] > 0, g_rgb[1], 0.0)
+    blue = tl.where(rgb[2] > 0, g_rgb[2], 0.0)
     dx, dy, dz, d_inverse = unit_direction(view, mean)
     cx_, cy_, cz_ = color_backward(
         g_sh0, g_shN, shN, row, row * STRIDE, dx, dy, dz, red, green, blue, seen, inside, DEGREE
@@ -304,13 +283,10 @@ def project_backward_kernel(
     for k in range(3 * (DEGREE + 1) * (DEGREE + 1) - 3, STRIDE):  # of the bands that are not evaluated
         tl.store(g_shN + row * STRIDE + k, 0.0, mask=inside)
     radial = cx_ * dx + cy_ * dy + cz_ * dz
-    store3(
-        g_means + 3 * row,
-        w0[0] * vx + w1[0] * vy + w2[0] * vz + (cx_ - radial * dx) * d_inverse,
-        w0[1] * vx + w1[1] * vy + w2[1] * vz + (cy_ - radial * dy) * d_inverse,
-        w0[2] * vx + w1[2] * vy + w2[2] * vz + (cz_ - radial * dz) * d_inverse,
-        inside,
-    )
+    g_x = w0[0] * vx + w1[0] * vy + w2[0] * vz + (cx_ - radial * dx) * d_inverse
+    g_y = w0[1] * vx + w1[1] * vy + w2[1] * vz + (cy_ - radial * dy) * d_inverse
+    g_z = w0[2] * vx + w1[2] * vy + w2[2] * vz + (cz_ - radial * dz) * d_inverse
+    store3(g_means + 3 * row, g_x, g_y, g_z, inside)
     logit = tl.load(logits + row, mask=seen, other=0.0)
     h = tl.load(total + rec.SUM_H, mask=seen, other=0.0)
     tl.store(g_logits + row, h / (1 + tl.exp2(logit * rec.LOG2_E)), mask=inside)

@@ -24,9 +24,7 @@ class _Project(torch.autograd.Function):
     """Raw attributes to centres, radii and records; the gradient of a record is its moments, see ``records``."""
 
     @staticmethod
-    def forward(
-        ctx: Any, lens: Lens, degree: int, *attributes: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def forward(ctx: Any, lens: Lens, degree: int, *attributes: Tensor) -> tuple[Tensor, ...]:
         projected = project(lens, attributes, degree)
         ctx.lens, ctx.degree = lens, degree
         ctx.save_for_backward(projected.ids, projected.records, *attributes)
@@ -48,17 +46,8 @@ class _Blend(torch.autograd.Function):
     """Projected splats to image, alpha and depth."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        lens: Lens,
-        means2d: Tensor,
-        ids: Tensor,
-        records: Tensor,
-        boxes: Tensor,
-        background: Tensor,
-        pixel_weights: Tensor | None,
-        absgrad: Tensor | None,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(ctx: Any, lens: Lens, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
+        means2d, ids, records, boxes, background, pixel_weights, _absgrad = inputs
         tiles = list_tiles(boxes, *tile_grid(lens.width, lens.height))
         image, transmittance, depth, ends = blend(lens, records, tiles, background.contiguous())
         ctx.lens, ctx.n = lens, len(means2d)
