@@ -6,12 +6,6 @@ All switches are on and do not change a bit of the result. They exist so that ea
 * on the command line: ``nsvq fit --skips.blocks=false``, in a config ``skips: {blocks: false}``
 
 Switches hold for the whole process, so set them before work starts, not while another thread renders.
-
-Similar cases have no switch, because switching them off would only call a function that returns its argument: the sum
-over processes where there is one process, and gradients of outputs on which nothing depends.
-
-An attribute with no more distinct rows than codes has no switch either: its codebook starts as these rows, but from the
-first step on, training moves rows and codes apart, so that they must be searched like any others.
 """
 
 from collections.abc import Iterator

@@ -5,12 +5,12 @@ Windows, it writes small text files instead; this module then finds the folders 
 """
 
 import sys
-from collections.abc import Sequence
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec
 from importlib.util import spec_from_file_location
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 _PACKAGE = Path(__file__).parent
 
@@ -34,9 +34,7 @@ class _Finder(MetaPathFinder):
     def __init__(self, name: str, folder: Path) -> None:
         self._name, self._folder = name, folder
 
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
+    def find_spec(self, fullname: str, path: Any, target: ModuleType | None = None) -> ModuleSpec | None:
         if fullname != self._name:
             return None
         start = self._folder / "__init__.py"

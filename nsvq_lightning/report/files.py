@@ -93,19 +93,13 @@ def summarize(
         module: The module, for its history and schedule.
         paper: :func:`paper_level` of the scene that was stored.
     """
-
-    def mean(name: str) -> float:
-        return float(sum(score[name] for score in scores)) / len(scores)
-
+    scored = "psnr", "ssim", "cc_psnr", "cc_ssim"
     file_bytes, header = path.stat().st_size, read_header(path)
     plain_bytes = plain_ply_bytes(len(scene), scene.sh_degree)
     last = {str(entry["phase"]): dict(entry) for entry in module.history}  # the last evaluation of each phase
     ends = [last[phase.name.lower()] for phase in Phase if phase.name.lower() in last]
     return {
-        "psnr": mean("psnr"),
-        "ssim": mean("ssim"),
-        "cc_psnr": mean("cc_psnr"),
-        "cc_ssim": mean("cc_ssim"),
+        **{name: float(sum(score[name] for score in scores)) / len(scores) for name in scored},
         "lpips": lpips[0],
         "lpips_reason": lpips[1],
         "views": len(scores),

@@ -18,13 +18,14 @@ from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.nsvq.header import read_header
 from nsvq_lightning.rendering.camera import Camera, up_of
 
-# RGB of the backgrounds that have names.
-BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-
 
 def some_cameras(scene: Scene) -> dict[str, Camera]:
     """Cameras of at most 300 photos by name, evenly spaced."""
     return dict(list(zip(scene.names, scene.cameras, strict=True))[:: -(-len(scene) // 300)])
+
+
+# RGB of the backgrounds that have names.
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 def write_viewer(

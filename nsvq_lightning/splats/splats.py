@@ -279,12 +279,8 @@ def canonical(scales: Tensor, quats: Tensor) -> Canonical:
     turned = _apply(turns, quats)
     signs = torch.where(turned[:, :1] < 0, -1.0, 1.0).to(quats)
     axes = torch.eye(3, dtype=scales.dtype, device=scales.device)
-    return Canonical(
-        scales.gather(1, order),
-        signs * turned / lengths,
-        axes[order],
-        (signs * lengths)[:, :, None] * turns,
-    )
+    quat_maps = (signs * lengths)[:, :, None] * turns
+    return Canonical(scales.gather(1, order), signs * turned / lengths, axes[order], quat_maps)
 
 
 def _turns_to(order: Tensor, quats: Tensor) -> Tensor:

@@ -70,12 +70,9 @@ def check_continuation(
             "the checkpoint holds weights without the state of the optimiser, so training cannot continue from it; "
             "export its scene and start from that (--model.init_from=scene.ply)"
         )
-    degrees = [sh_degree_of(values["splats.shN"]) for values in (checkpoint["state_dict"], own)]
-    if degrees[0] != degrees[1]:
-        raise ValueError(
-            f"the checkpoint is of a run with SH degree {degrees[0]}, this one has {degrees[1]}; pass "
-            f"--model.sh_degree={degrees[0]}"
-        )
+    stored, here = (sh_degree_of(values["splats.shN"]) for values in (checkpoint["state_dict"], own))
+    if stored != here:
+        raise ValueError(f"the checkpoint has SH degree {stored}, this run {here}; pass --model.sh_degree={stored}")
     trained = checkpoint[QUANTIZER_SETTINGS]
     if trained != quantizers:
         raise ValueError(

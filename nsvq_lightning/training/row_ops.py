@@ -172,16 +172,14 @@ def _finite_or_warn(splats: Splats, where: str, error: type[Exception], advice: 
     return kept
 
 
-def _rebind(
-    splats: Splats, optimizer: Optimizer, name: str, values: Tensor, edit_moment: Callable[[Tensor], Tensor]
-) -> None:
+def _rebind(splats: Splats, optimizer: Optimizer, name: str, values: Tensor, edit: Callable[[Tensor], Tensor]) -> None:
     """Bind ``values`` as the new parameter ``name`` everywhere the old one was referenced."""
     group = find_group(optimizer, name)
     old = group["params"][0]
     new = nn.Parameter(values.contiguous(), requires_grad=old.requires_grad)
     state = optimizer.state.pop(old, None)
     if state is not None:
-        optimizer.state[new] = {key: edit_moment(value) if key in MOMENTS else value for key, value in state.items()}
+        optimizer.state[new] = {key: edit(value) if key in MOMENTS else value for key, value in state.items()}
     group["params"][0] = new
     setattr(splats, name, new)
 

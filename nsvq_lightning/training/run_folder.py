@@ -25,18 +25,6 @@ from nsvq_lightning.training.resume import PlainCheckpointIO, read_checkpoint
 
 log = logging.getLogger(__name__)
 
-# Files that show that a folder holds a run.
-RUN_FILES = (
-    *("scene.nsvq", "metrics.json", "metrics.csv", "curve.csv"),
-    *("checkpoints", "last.ckpt", "renders", "predictions"),
-)
-
-# File that names the process of a run and its machine, and the one that this process keeps locked.
-MARKER, LOCK = ".running", ".running.lock"
-
-# The lock of each folder that this process writes a run to.
-_HELD: dict[Path, FileLock] = {}
-
 _FOLDERS: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
 _RESERVED: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
 
@@ -120,6 +108,13 @@ def take(folder: Path, checkpoint: str | Path | None) -> None:
         log_file.rename(next(p for n in count(1) if not (p := folder / f"metrics_{n}.csv").exists()))
 
 
+# File that names the process of a run and its machine, and the one that this process keeps locked.
+MARKER, LOCK = ".running", ".running.lock"
+
+# The lock of each folder that this process writes a run to.
+_HELD: dict[Path, FileLock] = {}
+
+
 def hold(folder: Path) -> None:
     """Keep other processes from writing a run to a folder until :func:`let_go`, or until this process ends, however.
 
@@ -160,6 +155,13 @@ def let_go(folder: Path) -> None:
 def _let_go_of_all() -> None:
     for folder in list(_HELD):
         let_go(folder)
+
+
+# Files that show that a folder holds a run.
+RUN_FILES = (
+    *("scene.nsvq", "metrics.json", "metrics.csv", "curve.csv"),
+    *("checkpoints", "last.ckpt", "renders", "predictions"),
+)
 
 
 def _refuse_other_run(folder: Path, checkpoint: str | Path | None) -> None:

@@ -300,10 +300,8 @@ def first_splats(module: SceneModule) -> Splats:
     sh_degree, path = module.splats.sh_degree, module.init_from
     if path is not None:
         loaded = load(path)
-        if loaded.sh_degree != sh_degree:
-            raise ValueError(
-                f"{path} has SH degree {loaded.sh_degree}, the module has {sh_degree}; set sh_degree={loaded.sh_degree}"
-            )
+        if (degree := loaded.sh_degree) != sh_degree:
+            raise ValueError(f"{path} has SH degree {degree}, the module has {sh_degree}; set sh_degree={degree}")
         return finite_splats(loaded, path)
     scene = needed_scene(module.trainer, "no splats to start from", "set init_from")
     points, colors = scene.points, scene.colors
@@ -343,9 +341,8 @@ def warn_of_device(device: torch.device) -> None:
     """Warn of kernels that have never run on such a device, and of other processes that want the same cores."""
     if device.type == "cuda":
         log.warning(
-            "training on %s with kernels that are tested under Triton's interpreter, but have never run on a GPU: "
-            "--trainer.accelerator=cpu trains without them, and docs/backends.md says more",
-            torch.cuda.get_device_name(device),
+            f"training on {torch.cuda.get_device_name(device)} with kernels that are tested under Triton's interpreter "
+            "but have never run on a GPU: --trainer.accelerator=cpu trains without them, and docs/backends.md says more"
         )
     elif threads_spin() and torch.get_num_threads() > 1 and hasattr(os, "getloadavg") and os.getloadavg()[0] > 1.0:
         log.warning(
