@@ -42,15 +42,15 @@ class ExportScene(WritingCallback):
         >>> from nsvq_lightning.callbacks import ExportScene
         >>> ExportScene(["nsvq", "sog"]).formats  # --callbacks.export.formats=[nsvq,sog]
         ('nsvq', 'sog')
-        >>> ExportScene(["obj"])
+        >>> ExportScene(["obj"])  # doctest: +ELLIPSIS
         Traceback (most recent call last):
-        ValueError: unknown export formats obj; choose from ply, nsvq, sog, spz, splat
+        ValueError: unknown export formats obj; choose from ply, nsvq, sog, ...
     """
 
     formats: Sequence[str] = ("nsvq", "ply")
 
     def __post_init__(self) -> None:
-        known = [suffix.removeprefix(".") for suffix in FORMATS]
+        known = [suffix.removeprefix(".") for suffix, entry in FORMATS.items() if entry.write]
         if unknown := sorted(set(self.formats) - set(known)):
             raise ValueError(f"unknown export formats {', '.join(unknown)}; choose from {', '.join(known)}")
         self.formats = tuple(self.formats)
