@@ -36,6 +36,13 @@ def share_or_number(text: str) -> float:
     return value
 
 
+def splats_left(asked: float | None, count: int) -> int:
+    """How many of ``count`` splats a result of :func:`share_or_number` leaves; all if it is None."""
+    if asked is None:
+        return count
+    return min(count, max(1, round(asked * (count if asked <= 1 else 1))))
+
+
 DEFAULT_SIZE, MINUTES, LOD_LEVELS = "16k", 4.0, 3
 # Number of own pictures.
 VIEWS = 96
@@ -91,8 +98,7 @@ def run(options: argparse.Namespace) -> int:
     scene = read_scene(options.input).finite()
     if len(scene) == 0:
         raise ValueError(f"{options.input} holds no finite splat; there is nothing to compress")
-    asked = len(scene) if options.splats is None else options.splats * (len(scene) if options.splats <= 1 else 1)
-    most, books = min(len(scene), max(1, round(asked))), options.codebooks or DEFAULT_SIZE
+    most, books = splats_left(options.splats, len(scene)), options.codebooks or DEFAULT_SIZE
     # What is impossible is said before the scene is looked at.
     if options.target_bytes is not None:
         setting_for(options.target_bytes, most, scene.sh_degree)

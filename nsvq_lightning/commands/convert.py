@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from nsvq_lightning.commands.compress import share_or_number
+from nsvq_lightning.commands.compress import share_or_number, splats_left
 from nsvq_lightning.io import compressed, formats, lod, spz
 from nsvq_lightning.io.compressed import UP_AXES, CompressedScene
 from nsvq_lightning.io.describe import attribute_errors
@@ -135,10 +135,8 @@ def _edited(scene: CompressedScene, options: argparse.Namespace) -> CompressedSc
         sys.stdout.write(f"crop: {before - len(scene):,} of {before:,} splats are outside\n")
     if options.floaters:
         scene = _without_floaters(scene, options.root)
-    if options.splats is not None:
-        asked = round(options.splats * (len(scene) if options.splats <= 1 else 1))
-        if asked < len(scene):
-            scene = _thinned(scene, max(1, asked), options)
+    if (left := splats_left(options.splats, len(scene))) < len(scene):
+        scene = _thinned(scene, left, options)
     if options.up is not None:
         scene = compressed.rotated(scene, compressed.turn_up(_up(options), options.up))
     if options.matrix is not None:

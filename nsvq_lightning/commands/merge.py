@@ -6,10 +6,8 @@ Examples:
 
 import argparse
 import sys
-from collections.abc import Iterator
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
+from statistics import fmean
 
 import numpy as np
 
@@ -32,11 +30,11 @@ def run(options: argparse.Namespace) -> int:
     import torch
 
     from nsvq_lightning.data.blocks import BLOCK, Block, near_seams, points_in_front, shown
-    from nsvq_lightning.data.scene import View, load_scene
+    from nsvq_lightning.data.scene import load_scene
     from nsvq_lightning.io.compressed import joined
     from nsvq_lightning.io.formats import format_of, read_scene, save
+    from nsvq_lightning.quality.metrics import eight_bit, psnr
     from nsvq_lightning.rendering.rasterize import render
-    from nsvq_lightning.report.files import evaluate
 
     format_of(options.output)
     folders = sorted(
@@ -63,24 +61,20 @@ def run(options: argparse.Namespace) -> int:
     points = photos.points.double().numpy()
     seams = near_seams(points, blocks)
 
-    def views(keep: bool | None) -> Iterator[View]:
-        """The test views; with ``keep``, only their pixels at the seams, or only those elsewhere."""
-        for index in photos.test:
-            view = photos.view(index)
-            at_seam = torch.from_numpy(shown(points_in_front(points, view.camera), seams, view.camera))
-            if keep is not None:
-                mask = at_seam if keep else ~at_seam
-                view = replace(view, mask=mask if view.mask is None else mask & view.mask)
-            if view.mask is None or view.mask.any():
-                yield view
-
-    look = partial(render, splats, antialiased=scene.antialiased)
     # Where parts lie apart, no photo shows a seam.
-    places = {"": None, "; at seams": True, ", elsewhere": False} if any(views(True)) else {"": None}
-    scores = {
-        place: evaluate(lambda camera: look(camera).image, views(keep), torch.device("cpu"))[0]
-        for place, keep in places.items()
-    }
-    listed = "".join(f"{place} {psnr:.2f} dB" for place, psnr in scores.items())
+    scores: dict[str, list[float]] = {"": [], "; at seams": [], ", elsewhere": []}
+    for index in photos.test:
+        view = photos.view(index)
+        with torch.no_grad():
+            image = render(splats, view.camera, antialiased=scene.antialiased).image
+        pair = eight_bit(image), eight_bit(view.image)
+        seam = torch.from_numpy(shown(points_in_front(points, view.camera), seams, view.camera))
+        for place, chosen in zip(scores, (None, seam, ~seam), strict=True):
+            masks = [each for each in (chosen, view.mask) if each is not None]
+            mask = torch.stack(masks).all(0) if masks else None
+            if mask is None or mask.any():
+                scores[place].append(float(psnr(*pair, mask)))
+    places = scores if scores["; at seams"] else [""]
+    listed = "".join(f"{place} {fmean(scores[place]):.2f} dB" for place in places)
     sys.stdout.write(f"  test photos of {photos.root}:{listed}\n")
     return 0

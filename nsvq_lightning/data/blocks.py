@@ -7,7 +7,6 @@ and masks leave out what is in front of it or behind: no splat is spent on that,
 
 import json
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.atomic import atomic_write, write_text
 from nsvq_lightning.io.compressed import turn_up
+from nsvq_lightning.io.ply import write_elements
 from nsvq_lightning.rendering.camera import Camera, up_of
 
 BLOCK = "block.json"
@@ -172,6 +172,7 @@ def near_seams(points: NDArray[np.float64], blocks: Sequence[Block]) -> NDArray[
     return np.asarray(sum(block.contains(points, _SEAM).astype(int) for block in blocks) > 1)
 
 
+_POINT = [(axis, "<f4") for axis in "xyz"] + [(color, "u1") for color in ("red", "green", "blue")]
 # A photo belongs to a part if it shows it in this share of its cells.
 LEAST_SHOWN = 0.05
 
@@ -210,7 +211,9 @@ def write_blocks(scene: Scene, blocks: Sequence[Block], folders: Sequence[Path])
             raise SceneError(
                 f"a part is in {len(found['train'])} train and {len(found['test'])} test photos: ask for fewer parts"
             )
-        _write_points(folder / "points.ply", points[some], scene.colors.numpy()[some])
+        # Positions, then colours.
+        columns = [*points[some].T, *np.rint(255 * scene.colors.numpy()[some]).T]
+        write_elements(folder / "points.ply", {"vertex": np.rec.fromarrays(columns, dtype=_POINT)})
         model = {
             "camera_model": "PINHOLE",
             "ply_file_path": "points.ply",
@@ -260,19 +263,3 @@ def _write_photo(
     pose = np.linalg.inv(camera.viewmat.double().numpy()) * np.array([1, -1, -1, 1])
     lens = {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx - float(left), "cy": cy - float(top)}
     return names | lens | {"transform_matrix": pose.tolist()}
-
-
-def _write_points(path: str | os.PathLike[str], points: NDArray[np.float64], colors: NDArray[np.float32]) -> None:
-    rows = np.empty(len(points), [(axis, "<f4") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")])
-    for axis, name in enumerate("xyz"):
-        rows[name] = points[:, axis]
-    for channel, name in enumerate(("red", "green", "blue")):
-        rows[name] = np.rint(255 * colors[:, channel])
-    properties = "".join(
-        f"property {'float' if len(name) == 1 else 'uchar'} {name}\n" for name in rows.dtype.names or ()
-    )
-    with atomic_write(path) as file:
-        file.write(
-            f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n".encode()
-        )
-        file.write(rows.tobytes())

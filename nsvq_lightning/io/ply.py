@@ -398,21 +398,35 @@ def write_compressed_ply(path: str | os.PathLike[str], scene: CompressedScene) -
             strict=True,
         )
     )
-    tables: list[tuple[str, int, str, dict[str, NDArray[Any]]]] = [
-        ("chunk", len(starts), "float", bounds),
-        ("vertex", len(scene), "uint", words),
-        ("sh", len(scene), "uchar", sh),
-    ]
-    if not sh:
-        tables.pop()
+    tables = [("chunk", "f4", bounds), ("vertex", "u4", words), ("sh", "u1", sh)]
+    elements = {
+        name: np.rec.fromarrays(list(columns.values()), dtype=[(column, f"<{kind}") for column in columns])
+        for name, kind, columns in tables
+        if columns
+    }
+    return write_elements(path, elements, _comments(scene.antialiased))
+
+
+def write_elements(path: str | os.PathLike[str], elements: Mapping[str, NDArray[np.void]], comments: str = "") -> int:
+    """Write tables as little-endian ``.ply``.
+
+    Args:
+        path: File to write, replaced atomically.
+        elements: Structured arrays ``[N]`` by the names of their elements; their fields are the properties.
+        comments: Lines of the header.
+
+    Returns:
+        Bytes of the file.
+    """
+    kinds = {code: name for name, code in reversed(_TYPES.items())}
+    head = f"ply\nformat binary_little_endian 1.0\n{comments}"
+    for name, rows in elements.items():
+        head += f"element {name} {len(rows)}\n"
+        head += "".join(f"property {kinds[rows.dtype[field].str[1:]]} {field}\n" for field in rows.dtype.names or ())
     with atomic_write(path) as file:
-        file.write(f"ply\nformat binary_little_endian 1.0\n{_comments(scene.antialiased)}".encode())
-        for name, count, kind, columns in tables:
-            properties = "".join(f"property {kind} {column}\n" for column in columns)
-            file.write(f"element {name} {count}\n{properties}".encode())
-        file.write(b"end_header\n")
-        for _, _, kind, columns in tables:
-            file.write(np.stack(list(columns.values()), axis=1).astype("<" + _TYPES[kind]).tobytes())
+        file.write(f"{head}end_header\n".encode("ascii"))
+        for rows in elements.values():
+            file.write(rows.tobytes())
         return file.tell()
 
 
