@@ -11,6 +11,7 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 
 from .base import SplatCallback
+from .forecast import iterations_within
 
 log = logging.getLogger(__name__)
 
@@ -37,9 +38,11 @@ class PhaseSchedule(SplatCallback):
         iterations_per_photo: Most iterations for each train photo, as few are soon overfitted. None is
             ``trainer.max_steps`` whatever the photos; ``total`` goes before it.
         least_iterations: What ``iterations_per_photo`` leaves in any case.
+        minutes: Time to train on this machine, instead of a number of iterations: as many are chosen as measured steps
+            are likely to allow. ``config.yaml`` of the run has their number.
 
     Raises:
-        ValueError: ``iterations_per_photo`` is below 1; or see :class:`~nsvq_lightning.training.schedule.Schedule`.
+        ValueError: A number is out of range; or see :class:`~nsvq_lightning.training.schedule.Schedule`.
 
     Example:
         >>> from nsvq_lightning.callbacks import PhaseSchedule
@@ -61,10 +64,11 @@ class PhaseSchedule(SplatCallback):
     min_finetune: int = Schedule.min_finetune
     iterations_per_photo: int | None = None
     least_iterations: int = 1
+    minutes: float | None = None
     _steps: int = field(default=-1, init=False)
 
     def __post_init__(self) -> None:
-        self.check({"at least 1": ("iterations_per_photo", "least_iterations")})
+        self.check({"at least 1": ("iterations_per_photo", "least_iterations"), "above 0": ("minutes",)})
         if self.total is not None or self.reference_total is not None:
             # Report wrong settings at once, not after the scene is loaded.
             self.schedule(self.total or self.reference_total or 1)
@@ -84,7 +88,11 @@ class PhaseSchedule(SplatCallback):
         super().setup(trainer, module, stage)
         if stage != "fit":
             return
-        if self.iterations_per_photo is not None and self.total is None:
+        if self.minutes is not None:
+            steps = iterations_within(self.minutes, trainer, module, self.schedule(self.reference_total or 1))
+            trainer.fit_loop.epoch_loop.max_steps = steps
+            log.info("iterations: %d, as many as %g minutes are likely to allow", steps, self.minutes)
+        elif self.iterations_per_photo is not None and self.total is None:
             need = "a number of iterations for each photo needs the photos"
             photos = len(scene_module.needed_scene(trainer, need, "leave iterations_per_photo unset").train)
             limit = max(self.iterations_per_photo * photos, self.least_iterations)

@@ -29,13 +29,14 @@ def _callbacks_of(config: str) -> dict[str, Callback | None]:
     return made
 
 
-# Callback by name. Density control comes before the canonical form, which may act after the same iteration; codebooks
-# are placed, and codes replaced, before rate and distortion choose among them.
+# Callback by name. The length of a run in minutes depends on the budget. Density control comes before the canonical
+# form, which may act after the same iteration; codebooks are placed, and codes replaced, before rate and distortion
+# choose among them.
 STANDARD: dict[str, type[Callback]] = {
+    "budget": growth.SplatBudget,
     "phases": schedule.PhaseSchedule,
     "sh_degree": schedule.ShDegreeSchedule,
     "rate_decay": schedule.LearningRateDecay,
-    "budget": growth.SplatBudget,
     "density": growth.BudgetedGrowth,
     "selection": pruning.SplatSelection,
     "opacity": pruning.OpacityRegularization,
@@ -77,7 +78,7 @@ def standard(config: str | None = None, /, **replaced: Callback | None) -> list[
         True
         >>> few = standard(density=DensityControl(max_splats=200_000), report=None, progress=None)
         >>> [type(callback).__name__ for callback in few[:2]]
-        ['PhaseSchedule', 'ShDegreeSchedule']
+        ['SplatBudget', 'PhaseSchedule']
     """
     unknown = sorted(set(replaced) - set(STANDARD))
     if unknown:

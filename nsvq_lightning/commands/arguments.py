@@ -10,6 +10,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from nsvq_lightning.data import NO_FOLDER
 from nsvq_lightning.top_level import folder_of
 
 if TYPE_CHECKING:
@@ -72,11 +73,13 @@ def positive(kind: type[int] | type[float], zero: bool = False) -> Callable[[str
 
 BUDGET = "--callbacks.budget"
 
-# Name and meaning of the numbers of :class:`nsvq_lightning.callbacks.SplatBudget`, of which one holds.
+# Short options of ``fit``. The first three are numbers of :class:`nsvq_lightning.callbacks.SplatBudget`, of which one
+# holds.
 SHORTHANDS: dict[str, str] = {
     "quality": "Splats, as a multiple of the default for the photos; more look better and take more bytes and time",
     "splats": "Splats of the scene, instead of --quality",
     "bytes": "Size of the file, instead of --quality",
+    "minutes": "Time to train on this machine: as many iterations as measured steps are likely to allow",
 }
 
 
@@ -110,10 +113,12 @@ def expand(arguments: Sequence[str]) -> list[str]:
             expanded.append(CONFIG + find_config(value))
         elif not option.startswith("--") or name not in SHORTHANDS:
             expanded.append(argument)
-        elif given not in (None, name):
+        elif name != "minutes" and given not in (None, name):
             raise ValueError(f"--{given} and --{name} both say how large the scene is to be: give one of them")
         elif not value:
             raise ValueError(f"{option} needs a number")
+        elif name == "minutes":
+            expanded.append(f"--callbacks.phases.minutes={value}")
         else:
             given = name
             expanded.append(f"{BUDGET}.{name}={value}")
@@ -138,6 +143,45 @@ def unknown_option(message: str, options: Iterable[str]) -> str:
         return ""
     known = [option for option in options if option.startswith("--") and not option.endswith((".help", "+"))]
     return nearest("--" + (found[1] or found[2]), known)
+
+
+# What ``nsvq fit --help`` prints without Lightning, whose import takes seconds; a test compares it with its parser.
+FIT_HELP = Path(__file__).with_name("fit_help.txt")
+
+
+def check_early(arguments: Sequence[str]) -> None:
+    """Refuse what takes no import of Lightning to refuse: configs and scenes that do not exist, and options of ``fit``.
+
+    Args:
+        arguments: Expanded ones, after the command.
+
+    Raises:
+        argparse.ArgumentError: There is no such config, or no such option.
+        FileNotFoundError: There is no such scene folder.
+    """
+    configs = configs_among(arguments)
+    for config in configs:
+        if not Path(config).is_file():
+            shipped = shipped_configs()
+            meant = f"{nearest(Path(config).stem, shipped)}\nShipped ones: {', '.join(shipped)}"
+            raise argparse.ArgumentError(None, f"there is no config {config}{meant}")
+    options = [argument[2:].partition("=") for argument in arguments if argument.startswith("--")]
+    root = next((value for name, _, value in reversed(options) if name in ("data.root", "data.init_args.root")), None)
+    if root and not Path(root).exists() and not any(name == "print_config" for name, _, _ in options):
+        raise FileNotFoundError(NO_FOLDER.format(root))
+    if arguments[0] != "fit":
+        return
+    known = {name for name in re.findall(r"--([\w.]+)", FIT_HELP.read_text(encoding="utf-8")) if name[-5:] != ".help"}
+    parents = {name.rpartition(".")[0] for name in known}
+    settings = (*arguments, *settings_of(configs))
+    other_data = any(setting.startswith(("--data=", "--data.class_path")) for setting in settings)
+    for option, _, _ in options:
+        name = option.removesuffix("+").replace(".init_args", "")
+        # Options of a class that an option names are known to Lightning's parser only.
+        nested = any(name.startswith(f"{leaf}.") for leaf in (*(known - parents), *["data"] * other_data))
+        if not (nested or name.endswith((".help", ".class_path")) or any(each.startswith(name) for each in known)):
+            meant = nearest(f"--{name}", (f"--{each}" for each in known))
+            raise argparse.ArgumentError(None, f"there is no option --{name}{meant}")
 
 
 def in_plain_words(message: str, classes: Iterable[str], arguments: Iterable[str]) -> str:

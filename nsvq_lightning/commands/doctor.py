@@ -10,7 +10,6 @@ Examples:
 
 import argparse
 import logging
-import math
 import os
 import platform
 import re
@@ -19,8 +18,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import replace
-from functools import partial
 from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -30,11 +27,8 @@ import numpy as np
 # Each check imports what it needs: --help answers at once, and a package that is missing or broken fails only the
 # checks that need it.
 if TYPE_CHECKING:
-    import torch
-
     from nsvq_lightning.data.colmap import ColmapModel
     from nsvq_lightning.data.scene import Scene
-    from nsvq_lightning.splats.splats import Splats
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -168,33 +162,20 @@ def check_room(folder: Path) -> Iterator[Finding]:
 
 
 def check_backends() -> Iterator[Finding]:
-    """Image and gradients of every usable back-end against the float64 oracle, which takes seconds."""
+    """Every usable back-end against plain torch in float64, which takes seconds."""
     import torch
 
-    from nsvq_lightning.commands.benchmark import render, workloads
-    from nsvq_lightning.compute.devices import fast_backends
     from nsvq_lightning.compute.kernel_cache import kernel_folder
-    from nsvq_lightning.splats.splats import RawSplats
+    from nsvq_lightning.training.self_check import TOLERANCE, kernel_errors, written
 
-    def results(workload: workloads.Workload, backend: str, dtype: "torch.dtype") -> "dict[str, torch.Tensor]":
-        traced = render.trace(workload, render.painter(backend), dtype)
-        return {"image": traced.image, **render.gradients_of(traced, workload.image_gradient.to(dtype))}
-
-    crop = workloads.synthetic_workload("A20k").crop(96, 72)  # of splats in random order, so any part will do
-    small = replace(crop, splats=RawSplats(*(tensor[:4000].clone() for tensor in crop.splats)))
-    truth = results(small, "reference", torch.float64)
     for device in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
-        here = small.to(device)
-        if not (backends := fast_backends(here.splats.means)):
+        found = kernel_errors(device)
+        if not found:
             advice = "this version renders on it in plain torch, slower than on the CPU; use the CPU"
             yield judged("self-test", f"{device} has no back-end", advice)
-        for backend in backends:
-            found = results(here, backend, torch.float32)
-            errors = {name: workloads.relative_l2(value.cpu(), truth[name]) for name, value in found.items()}
-            text = f"{backend}: relative errors against the float64 oracle: "
-            text += ", ".join(f"{name} {error:.1e}" for name, error in errors.items())
-            # Rounding stays below 1e-4, but a splat that crosses α = 1/255 costs more; NaN is never below.
-            if all(error < 1e-3 for error in errors.values()):
+        for backend, errors in found.items():
+            text = f"{backend}: relative errors against float64: {written(errors)}"
+            if all(error < TOLERANCE for error in errors.values()):
                 yield judged("self-test", text)
             else:
                 advice = f"do not trust a run; remove {kernel_folder()}, and if that does not help report it with "
@@ -357,13 +338,14 @@ CACHE_BYTES = 4 << 30
 
 
 def check_budget(scene: "Scene") -> Iterator[Finding]:
-    """Memory against what is available; time from renders of the scene grown as two recipes grow it."""
+    """Memory against what is available; time from steps with as many splats as two recipes make of the scene."""
+    from nsvq_lightning.callbacks import BudgetedGrowth, PhaseSchedule
+    from nsvq_lightning.callbacks.forecast import PAPER_SPLATS, iteration_seconds, stretches
     from nsvq_lightning.callbacks.growth import splats_for_photos
     from nsvq_lightning.data.scene import detailed_pixels
 
-    # Splats over a run, on average, as a multiple of the default for the photos.
     default = splats_for_photos(len(scene.train), detailed_pixels(scene))
-    fast, paper = round(1.3 * default), round(4.0 * default)
+    budget, paper = round(0.9 * default), round(PAPER_SPLATS * default)
     photos, free = scene.images.nbytes, available_memory()
     needed = 1.2e9 + min(photos, CACHE_BYTES)  # Python, torch, Lightning, compiled kernels and evaluations
     needed += 59 * 4 * 6 * paper  # float32 of a splat, each with gradient, two moments, and copies while editing
@@ -375,49 +357,12 @@ def check_budget(scene: "Scene") -> Iterator[Finding]:
         text += f" (all would take {readable_bytes(photos)}; the others are decoded each time)"
     advice = f"{readable_bytes(free or 0)} are available; lower --data.max_width or --data.cache_bytes"
     yield judged("run memory", text, free is not None and needed > free and advice)
-    # A step is a render forward and backward, and as long again for loss, optimizer and codebooks.
-    step, paper_step = (2.0 * render_seconds(scene, count) for count in (fast, paper))
+    parts = stretches(PhaseSchedule().schedule(15_000), BudgetedGrowth(), round(0.8 * budget), budget)
+    step, paper_step = (iteration_seconds(scene, each) for each in (parts, [(1.0, paper)]))
     steps = min(max(20 * len(scene.train), 2500), 4500)
-    text = f"about {steps * step / 60:.0f} min for fast.yaml ({steps:,} steps, {fast:,} splats on average), "
+    text = f"about {steps * step / 60:.0f} min for fast.yaml ({steps:,} steps, up to {2 * budget:,} splats), "
     text += f"{45_000 * paper_step / 3600:.1f} h for the paper's run (45,000, {paper:,}), on a machine as busy as now"
     yield judged("run time", text)
-
-
-# Views that are rendered for the time of a run, each as often.
-REPEATS = 3
-
-
-def render_seconds(scene: "Scene", count: int) -> float:
-    """Median over views of the shortest time to render ``count`` splats forward and backward."""
-    from nsvq_lightning.commands.benchmark.timing import milliseconds
-    from nsvq_lightning.rendering.rasterize import render
-
-    splats = grown(scene, count)
-
-    def step(view: int) -> None:
-        render(splats, scene.cameras[view]).image.mean().backward()  # type: ignore[no-untyped-call]
-
-    cases = [partial(step, view) for view in scene.some_train(REPEATS)]
-    return float(np.median([min(milliseconds(case) for _ in range(REPEATS)) for case in cases])) / 1000
-
-
-def grown(scene: "Scene", count: int) -> "Splats":
-    """The scene's points as splats, repeated with small shifts until there are ``count``, and shrunk to match."""
-    import torch
-
-    from nsvq_lightning.random import generator
-    from nsvq_lightning.splats.splats import Splats
-
-    start = Splats.from_points(scene.points, scene.colors)
-    copies, draw = -(-count // len(start)), generator(0, 0, "doctor")
-    rows = torch.arange(len(start)).repeat(copies)[: max(count, len(start))]
-    tensors = {name: value.detach()[rows] for name, value in start.attributes().items()}
-    tensors["means"] = tensors["means"] + tensors["scales"].exp() * torch.randn(len(rows), 3, generator=draw)
-    # More splats cover the surfaces with smaller ones, and trained ones overlap in many layers. With these two numbers,
-    # renders of fox, bonsai and photos of two megapixels take about as long as those of the trained scenes.
-    tensors["scales"] = tensors["scales"] - math.log(copies) / 2 + 0.5
-    tensors["opacities"] = torch.randn(len(rows), generator=draw) - 0.5
-    return Splats.from_tensors(**tensors)
 
 
 def readable_bytes(count: float) -> str:

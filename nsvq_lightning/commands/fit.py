@@ -59,10 +59,6 @@ class QuietParser(LightningArgumentParser):
             message += " (--data.root=path/to/scene)"
         elif message.startswith('Parser key "data":') and Path(message.rpartition("Given value: ")[2]).is_dir():
             message = "--data takes the name of a data module; the folder of a scene is --data.root=path/to/scene"
-        elif missing := re.match(r"Parser key \"config\": File does not exist: '(.*)'", message):
-            names = given.shipped_configs()
-            path = Path(missing[1])
-            message = f"there is no config {path}{given.nearest(path.stem, names)}\nShipped ones: {', '.join(names)}"
         else:
             message = given.in_plain_words(message, CLASSES, self.arguments)
             parsers = getattr(self._subcommands_action, "_name_parser_map", {"": self}).values()
@@ -108,6 +104,10 @@ class RunStart(SaveConfigCallback):
             if isinstance(callback, ModelCheckpoint) and callback.dirpath is None:
                 callback.dirpath = str(folder / "checkpoints")
         if trainer.is_global_zero:
+            phases = self.config.get("callbacks.phases.init_args", {})
+            if phases.get("minutes") is not None:  # the iterations that were chosen, so that the run can be repeated
+                self.config["trainer.max_steps"] = trainer.max_steps
+                phases.minutes = phases.iterations_per_photo = None
             root = self.config.get("data.init_args.root")
             if isinstance(root, str):  # so that it is found from any folder
                 self.config["data.init_args.root"] = os.path.abspath(root)
@@ -276,7 +276,7 @@ class SplatCLI(LightningCLI):
             for callback in self.trainer.callbacks:  # type: ignore[attr-defined]  # Lightning does not type it
                 path = callback.last_path if isinstance(callback, callbacks.RunCheckpoint) else None
                 if subcommand == "fit" and path is not None and self.trainer.is_global_zero:
-                    sys.stderr.write(f"continue with: {continuation(self._arguments, path)}\n")
+                    sys.stderr.write(f"continue with: {continuation(path)}\n")
             raise
 
     def after_fit(self) -> None:
@@ -293,12 +293,12 @@ class SplatCLI(LightningCLI):
             sys.stdout.write(summary(path.parent, json.loads(path.read_text(encoding="utf-8"))))
 
 
-def continuation(arguments: Sequence[str], checkpoint: Path) -> str:
-    """The shell command that continues from a checkpoint with the arguments of the run that wrote it."""
+def continuation(checkpoint: Path) -> str:
+    """The shell command that continues from a checkpoint, with the settings of the run that wrote it."""
     as_module = Path(sys.argv[0]).parts[-2:] == ("nsvq_lightning", "__main__.py")
     program = ["python", "-m", "nsvq_lightning"] if as_module else ["nsvq"]
-    kept = [argument for argument in given.joined(arguments) if not argument.startswith("--ckpt_path=")]
-    return shlex.join([*program, *kept, f"--ckpt_path={checkpoint}"])
+    config = checkpoint.parents[1] / "config.yaml"
+    return shlex.join([*program, "fit", f"--config={config}", f"--ckpt_path={checkpoint}"])
 
 
 def summary(folder: Path, metrics: dict[str, Any]) -> str:

@@ -139,6 +139,18 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
 
 
 def _run_lightning(arguments: list[str]) -> int:
+    if arguments == ["fit", "--help"]:
+        sys.stdout.write(given.FIT_HELP.read_text(encoding="utf-8"))
+        return 0
+    try:
+        arguments = given.expand(arguments)
+        given.check_early(arguments)
+    except argparse.ArgumentError as error:
+        sys.stderr.write(f"error: {error}\nAll options: nsvq {arguments[0]} --help\n")
+        sys.exit(2)
+    except (ValueError, OSError) as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 1
     # Fragments of Lightning's and torch's warnings that a user of this command can do nothing about.
     not_actionable = (
         "does not have many workers",  # views come from a cache in memory; each worker would hold a copy
@@ -160,10 +172,8 @@ def _run_lightning(arguments: list[str]) -> int:
     if os.getcwd() not in sys.path:  # last, unlike `python -m`: for the user's own quantizers and callbacks
         sys.path.append(os.getcwd())
     given.limit_aliases()
-    configs: list[str] = []
+    configs = given.configs_among(arguments)
     try:
-        arguments = given.expand(arguments)
-        configs += given.configs_among(arguments)
         SplatCLI(arguments)
     except SIGTERMException:  # a kind of SystemExit
         return 128 + signal.SIGTERM  # Lightning itself would exit with the status of success

@@ -18,6 +18,8 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
+from nsvq_lightning.data import NO_FOLDER
+
 
 class SceneError(ValueError):
     """A scene folder that cannot be used; the message names the file, what is wrong with it and what to do."""
@@ -141,7 +143,7 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
             point.
     """
     if not root.is_dir():
-        raise SceneError(f"scene folder {root} does not exist: give the folder that holds images/ and sparse/")
+        raise SceneError(NO_FOLDER.format(root))
     folders = FOLDERS if chosen is None else (f"sparse/{chosen}" if chosen.isdecimal() else chosen,)
     files = find_model(root, folders)
     if files is None:

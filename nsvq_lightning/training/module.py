@@ -182,7 +182,7 @@ class SplatModule(resume.ResumedModule):
 
     def on_train_start(self) -> None:
         """Set Adam's numbers of this run, not those of a checkpoint; start measuring the training time."""
-        scene_module.warn_of_device(self.device)
+        scene_module.check_device(self.device)
         views = self.trainer.world_size * self.trainer.accumulate_grad_batches
         optim.check_groups(self.trainer.optimizers, self.quantizers)
         self._step_factor = optim.adapt_to_views(self.trainer.optimizers[0], self.rates, views)

@@ -34,6 +34,7 @@ from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.row_ops import finite_splats
 from nsvq_lightning.training.schedule import Phase, Schedule
+from nsvq_lightning.training.self_check import check_kernels
 from nsvq_lightning.version import __version__
 
 
@@ -337,13 +338,10 @@ def background_of(scene: Scene, asked: str) -> str:
     return background
 
 
-def warn_of_device(device: torch.device) -> None:
-    """Warn of kernels that have never run on such a device, and of other processes that want the same cores."""
+def check_device(device: torch.device) -> None:
+    """Check the kernels of a GPU at its first use; on a CPU, warn of other processes that want the same cores."""
     if device.type == "cuda":
-        log.warning(
-            f"training on {torch.cuda.get_device_name(device)} with kernels that are tested under Triton's interpreter "
-            "but have never run on a GPU: --trainer.accelerator=cpu trains without them, and docs/backends.md says more"
-        )
+        check_kernels(device)
     elif threads_spin() and torch.get_num_threads() > 1 and hasattr(os, "getloadavg") and os.getloadavg()[0] > 1.0:
         log.warning(
             "other processes also need the cores, and idle threads occupy them: a run may take twice as long; "

@@ -13,14 +13,15 @@ import cv2
 import numpy as np
 import pytest
 
+from nsvq_lightning.callbacks import forecast
 from nsvq_lightning.commands import doctor
-from nsvq_lightning.commands.benchmark import render as rendering
 from nsvq_lightning.commands.doctor import Finding, attempt, check_folder
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.compute import environment, jit
 from nsvq_lightning.data.colmap import import_pycolmap, read_model
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.rendering.rasterize import Render, render
+from nsvq_lightning.training import self_check
 
 GOOD = Finding("good", "run time", "not measured")
 
@@ -44,9 +45,9 @@ def test_every_finding_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert last.startswith("no problems, ")
     assert findings.keys() == {"machine", "versions", "opencv", "threads", "waiting", "memory", "disk", "self-test"}
     text = findings["self-test"][3]
-    assert text.startswith("cpu: relative errors against the float64 oracle: image ")
+    assert text.startswith("cpu: relative errors against float64: image ")
     errors = [float(part.split()[-1]) for part in text.partition("image")[2].split(",")]
-    assert (findings["self-test"][1], len(errors)) == ("good", 7)
+    assert (findings["self-test"][1], len(errors)) == ("good", 9)
     assert 0 < max(errors) < 1e-4
 
 
@@ -120,11 +121,11 @@ def test_little_memory_and_disk_are_noted(tmp_path: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("factor", [1.01, float("nan")])
 def test_wrong_kernels_fail(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
-    def wrong(splats, camera, *, background, backend):  # type: ignore[no-untyped-def]
-        result = render(splats, camera, background=background, backend=backend)
+    def wrong(splats, camera, *, backend):  # type: ignore[no-untyped-def]
+        result = render(splats, camera, backend=backend)
         return Render(result.image * factor, *result[1:]) if backend == "cpu" else result
 
-    monkeypatch.setattr(rendering, "render", wrong)
+    monkeypatch.setattr(self_check, "render", wrong)
     finding = next(doctor.check_backends())
     assert finding.verdict == "problem"
     assert "image" in finding.text
@@ -142,12 +143,12 @@ def test_a_sound_scene_has_no_problem(scene: Path) -> None:
 
 def test_the_estimate_of_a_run_is_measured(demo_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = load_scene(demo_scene)
-    assert len(doctor.grown(scene, 2000)) == 2000
+    assert len(forecast.grown(scene, 2000)) == 2000
     memory, time = doctor.check_budget(scene)
     assert re.match(r"about 1\.\d GB with", memory.text)
     assert re.match(r"about \d+ min for fast.yaml", time.text)
     # With a millisecond for each splat, instead of what a busy machine takes:
-    monkeypatch.setattr(doctor, "render_seconds", lambda scene, count: count / 1000)
+    monkeypatch.setattr(forecast, "step_seconds", lambda scene, count, device: count / 1000)
     _, time = doctor.check_budget(scene)
     found = re.search(r"about (\d+) min .* ([\d.]+) h for the paper", time.text)
     assert found is not None

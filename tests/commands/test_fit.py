@@ -212,7 +212,7 @@ def test_only_the_command_line_names_what_is_imported(
     checkpoint = torch.load(finished / "checkpoints" / "last.ckpt", weights_only=True)
     checkpoint["hyper_parameters"]["quantizer"]["class_path"] = "elsewhere.Mine"
     torch.save(checkpoint, tmp_path / "last.ckpt")
-    for command in (["export"], ["predict", "--data.root=nowhere"]):
+    for command in (["export"], ["predict", "--data.root=."]):
         assert main([*command, "--ckpt_path=last.ckpt"]) == 1
         assert "name it: --model.quantizer=elsewhere.Mine, or" in capsys.readouterr().err
         assert not mark.exists()
@@ -368,7 +368,7 @@ def test_wrong_settings_name_the_file_they_came_from(tmp_path: Path, capsys: pyt
     ):
         path.write_text(settings)
         with pytest.raises(SystemExit) as stop:
-            main(["fit", "--config", str(path), "--data.root=x"])
+            main(["fit", "--config", str(path), f"--data.root={tmp_path}"])
         assert stop.value.code == 2
         message = capsys.readouterr().err
         assert said in message

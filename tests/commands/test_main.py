@@ -18,6 +18,7 @@ import torch
 import nsvq_lightning
 from nsvq_lightning.callbacks import STANDARD
 from nsvq_lightning.commands import main as main_module
+from nsvq_lightning.commands.arguments import FIT_HELP
 from nsvq_lightning.commands.fit import SplatCLI, class_help
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.commands.registry import COMMANDS
@@ -60,11 +61,17 @@ def test_no_command_is_an_error_that_shows_them(capsys: pytest.CaptureFixture[st
 
 @pytest.fixture(scope="module")
 def fit_help() -> str:
+    """What Lightning's parser says."""
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as printed:
         patch.setenv("COLUMNS", "80")
         with pytest.raises(SystemExit):
-            main(["fit", "--help"])
+            SplatCLI(["fit", "--help"])
     return printed.getvalue()
+
+
+def test_the_stored_help_of_fit_is_that_of_the_parser(fit_help: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fit", "--help"]) == 0
+    assert capsys.readouterr().out == fit_help, f"write the help anew: it is what {FIT_HELP} has to hold"
 
 
 def test_help_says_what_there_is_and_names_none_of_torchs_classes(fit_help: str) -> None:
@@ -107,24 +114,36 @@ def test_one_callback_says_what_it_takes(capsys: pytest.CaptureFixture[str]) -> 
         (["fit", "--data", "{folder}"], "the folder of a scene is --data.root=path/to/scene"),
         (["fit", "--data", "no.Such"], "no.Such"),
         (["fit", "--bytes=abc"], "error: bytes: expected a whole number or null, got 'abc'\n"),
-        (["fit", "--data.root=x", "--data.factor", "3"], "error: data.factor: expected 1, 2, 4, 8 or null, got '3'\n"),
-        (["fit", "--data.root=x", "--trainer.max_steps=x"], "trainer.max_steps: expected a whole number, got 'x'\n"),
-        (["fit", "--data.root=x", "--model.background=gray"], "expected auto, black, white or random, got 'gray'\n"),
         (
-            ["fit", "--data.root=x", "--callbacks.density=NoSuch"],
+            ["fit", "--data.root={folder}", "--data.factor", "3"],
+            "error: data.factor: expected 1, 2, 4, 8 or null, got '3'\n",
+        ),
+        (
+            ["fit", "--data.root={folder}", "--trainer.max_steps=x"],
+            "trainer.max_steps: expected a whole number, got 'x'\n",
+        ),
+        (
+            ["fit", "--data.root={folder}", "--model.background=gray"],
+            "expected auto, black, white or random, got 'gray'\n",
+        ),
+        (
+            ["fit", "--data.root={folder}", "--callbacks.density=NoSuch"],
             "expected BudgetedGrowth, Callback or null, got 'NoSuch'\n",
         ),
-        (["fit", "--data.root=x", "--callbacks.density=BudgetGrowth"], "'BudgetGrowth'; did you mean BudgetedGrowth?"),
-        (["fit", "--data.root=x", "--model.quantizer=NSVX"], "got 'NSVX'; did you mean NSVQ?"),
-        (["fit", "--data.root=x", "--callbacks.densty=null"], "did you mean --callbacks.density?"),
-        (["fit", "--data.root=x", "--callbacks.density.min_splat=5"], "did you mean --min_splats?"),
         (
-            ["fit", "--data.root=x", "--callbacks.report.every=2", "--callbacks.sh_degree.every=abc"],
+            ["fit", "--data.root={folder}", "--callbacks.density=BudgetGrowth"],
+            "'BudgetGrowth'; did you mean BudgetedGrowth?",
+        ),
+        (["fit", "--data.root={folder}", "--model.quantizer=NSVX"], "got 'NSVX'; did you mean NSVQ?"),
+        (["fit", "--data.root={folder}", "--callbacks.densty=null"], "did you mean --callbacks.density?"),
+        (["fit", "--data.root={folder}", "--callbacks.density.min_splat=5"], "did you mean --min_splats?"),
+        (
+            ["fit", "--data.root={folder}", "--callbacks.report.every=2", "--callbacks.sh_degree.every=abc"],
             "error: callbacks.sh_degree.every: expected a whole number, got 'abc'\n",
         ),
-        (["fit", "--data.root=x", "--qualty=2"], "did you mean --quality?"),
+        (["fit", "--data.root={folder}", "--qualty=2"], "did you mean --quality?"),
         (
-            ["fit", "--data.root=x", "--config", "fats.yaml"],
+            ["fit", "--data.root={folder}", "--config", "fats.yaml"],
             "fats.yaml; did you mean fast?\nShipped ones: best, ",
         ),
         (["view", "{folder}", "--prot=3"], "did you mean --port?"),
@@ -171,7 +190,7 @@ def test_a_missing_opencv_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: p
     assert capsys.readouterr().err.startswith("error: OpenCV (cv2) is missing: pip install opencv-")
 
 
-SCENE = ["--data.root=no_scene", "--callbacks.progress=null"]
+SCENE = ["--data.root=.", "--callbacks.progress=null"]
 
 
 @pytest.mark.parametrize(

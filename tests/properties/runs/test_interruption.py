@@ -294,7 +294,8 @@ def test_the_command_says_how_to_continue(
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("continue with: ")]
     program, *arguments = shlex.split(line.removeprefix("continue with: "))
     path = folder / demo_scene.name / "version_0" / "checkpoints" / "last.ckpt"
-    assert (program, arguments) == ("nsvq", [*arguments_of(demo_scene, folder), f"--ckpt_path={path}"])
+    config = path.parents[1] / "config.yaml"
+    assert (program, arguments) == ("nsvq", ["fit", f"--config={config}", f"--ckpt_path={path}"])
     assert iteration_of(path) == 4
     assert main(arguments) == 0
     assert (folder / demo_scene.name / "version_1" / "scene.nsvq").read_bytes() == command_scene
@@ -313,12 +314,12 @@ def test_ctrl_c_is_the_status_130_of_every_command(
     assert main(["info", "scene.ply"]) == 128 + signal.SIGINT
 
 
-def test_the_command_that_continues_again_names_one_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
-    for before in (["--ckpt_path", "old.ckpt"], ["--ckpt_path=old.ckpt"], []):
-        command = continuation(["fit", *before, "--data.root=a b"], Path("new.ckpt"))
-        assert shlex.split(command) == ["nsvq", "fit", "--data.root=a b", "--ckpt_path=new.ckpt"]
+def test_the_command_that_continues_is_that_of_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint = Path("a b", "checkpoints", "last.ckpt")
+    rest = ["fit", f"--config={Path('a b', 'config.yaml')}", f"--ckpt_path={checkpoint}"]
+    assert shlex.split(continuation(checkpoint)) == ["nsvq", *rest]
     monkeypatch.setattr(sys, "argv", ["/somewhere/nsvq_lightning/__main__.py"])
-    assert continuation(["fit"], Path("new.ckpt")) == "python -m nsvq_lightning fit --ckpt_path=new.ckpt"
+    assert shlex.split(continuation(checkpoint)) == ["python", "-m", "nsvq_lightning", *rest]
 
 
 KILLED = """

@@ -24,6 +24,7 @@ from nsvq_lightning.callbacks import (
     RunCheckpoint,
     SplatBudget,
     SplatSelection,
+    forecast,
 )
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.data.datamodule import DEMO
@@ -317,3 +318,30 @@ def test_the_shipped_configs_run(
     config = yaml.safe_load(next(tmp_path.rglob("config.yaml")).read_text())
     assert config["model"]["quantizer"]["class_path"].endswith(".TrainedStraightThrough")
     assert (config["callbacks"]["rate_distortion"] is None) == (name != "small")
+
+
+def test_minutes_choose_the_iterations(
+    run: RunFactory, recipe: Recipe, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(forecast, "step_seconds", lambda scene, count, device: count / 1000)
+    phases = PhaseSchedule(reference_total=60, minutes=0.5, **ENDS)
+    options = recipe_options(phases=phases, density=BudgetedGrowth(overshoot=2.0, full=ENDS["warmup_end"]))
+    with caplog.at_level(logging.INFO):
+        trainer, module = run(recipe(**options).values(), module=RECIPE_MODULE)
+    points = forecast.stretches(module.schedule, BudgetedGrowth(full=ENDS["warmup_end"]), 100, BUDGET)[0][1]
+    assert 100 < points < 2 * BUDGET
+    assert 1 < trainer.global_step == trainer.max_steps == module.schedule.total
+    assert f"iterations: {trainer.max_steps}, as many as 0.5 minutes are likely to allow" in caplog.text
+
+
+def test_a_run_of_some_minutes_can_be_repeated(
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(forecast, "step_seconds", lambda scene, count, device: 1.0)
+    folder = tmp_path / "run"
+    options = ["--splats=300", "--model.codebooks=null", f"--trainer.run_folder={folder}", "--callbacks.report=null"]
+    assert main(["fit", f"--data.root={demo_scene}", "--minutes=0.1", *options]) == 0
+    settings = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+    phases = settings["callbacks"]["phases"]["init_args"]
+    assert settings["trainer"]["max_steps"] == round(6 / forecast.LOOP)
+    assert phases["minutes"] is phases["iterations_per_photo"] is None

@@ -1,0 +1,110 @@
+"""How long a run will take: steps measured on this machine, on the scene with as many splats as the run will have."""
+
+import math
+import time
+
+import torch
+from lightning.pytorch import Trainer
+
+from nsvq_lightning.data.scene import Scene, detailed_pixels
+from nsvq_lightning.quality.loss import photometric_loss
+from nsvq_lightning.random import generator
+from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.training import optim, scene_module
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.schedule import Schedule
+
+from .growth import BudgetedGrowth, splats_for_photos
+
+# An iteration of a run over a step as it is measured here: what callbacks, codebooks and the loop take.
+LOOP = 1.3
+# Views that a step is measured on; the first is rendered once more, before them.
+VIEWS = 12
+
+
+def step_seconds(scene: Scene, count: int, device: torch.device | str = "cpu") -> float:
+    """Mean time of a training step without codebooks and callbacks: render, loss, backward pass and Adam.
+
+    Args:
+        scene: Its cameras, photos and points.
+        count: Number of splats.
+        device: Where to train.
+    """
+    splats = grown(scene, count).to(device)
+    adam = optim.build_adam(optim.param_groups(splats, {}, optim.LearningRates(), scene.extent))
+    views = [scene.view(index).to(device) for index in scene.some_train(VIEWS)]
+    start = 0.0
+    for view in [views[0], *views]:
+        loss = photometric_loss(render(splats, view.camera).image, view.image, 0.2, view.mask)
+        adam.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        adam.step()
+        if not start:
+            torch.get_device_module(device).synchronize()
+            start = time.perf_counter()
+    torch.get_device_module(device).synchronize()
+    return (time.perf_counter() - start) / len(views)
+
+
+def grown(scene: Scene, count: int) -> Splats:
+    """The scene's points as splats, repeated with small shifts until there are ``count``, and shrunk to match."""
+    start = Splats.from_points(scene.points, scene.colors)
+    copies, draw = -(-count // len(start)), generator(0, 0, "forecast")
+    rows = torch.arange(len(start)).repeat(copies)[: max(count, len(start))]
+    tensors = {name: value.detach()[rows] for name, value in start.attributes().items()}
+    tensors["means"] = tensors["means"] + tensors["scales"].exp() * torch.randn(len(rows), 3, generator=draw)
+    # More splats cover the surfaces with smaller ones, and trained ones overlap in many layers. With these two numbers,
+    # renders of fox, bonsai and photos of two megapixels take about as long as those of the trained scenes.
+    tensors["scales"] = tensors["scales"] - math.log(copies) / 2 + 0.5
+    tensors["opacities"] = torch.randn(len(rows), generator=draw) - 0.5
+    return Splats.from_tensors(**tensors)
+
+
+# Splats of the paper's density control, on average over its run, as a multiple of the default for the photos.
+PAPER_SPLATS = 4.0
+
+
+def stretches(schedule: Schedule, growth: BudgetedGrowth, first: int, budget: int) -> list[tuple[float, int]]:
+    """Shares of a run, and how many splats it has in them on average: while it grows, fully grown, after the selection.
+
+    Args:
+        schedule: Phases of the run.
+        growth: Its density control.
+        first: Splats at the start.
+        budget: Splats at the end.
+    """
+    warmup = schedule.warmup_end / schedule.reference_total
+    full, most = min(growth.full / schedule.reference_total, warmup), round(growth.overshoot * budget)
+    grows = round(first + (most - first) * 2 / 3)  # along the root of the time
+    return [(full, grows), (warmup - full, most), (1 - warmup, budget)]
+
+
+def iteration_seconds(scene: Scene, parts: list[tuple[float, int]], device: torch.device | str = "cpu") -> float:
+    """Mean time of an iteration of a run with :func:`stretches`."""
+    return LOOP * sum(share * step_seconds(scene, count, device) for share, count in parts if share > 0)
+
+
+def iterations_within(minutes: float, trainer: Trainer, module: SplatModule, schedule: Schedule) -> int:
+    """How many iterations a run has time for, the same in all processes.
+
+    Args:
+        minutes: Time to train.
+        trainer: Its data module has the scene, its callbacks say how splats grow.
+        module: With its budget.
+        schedule: Phases of a run of any length.
+
+    Raises:
+        ValueError: The trainer has no data module with a scene.
+    """
+    scene = scene_module.needed_scene(trainer, "minutes are measured on the photos", "give trainer.max_steps")
+    growth = next((each for each in trainer.callbacks if isinstance(each, BudgetedGrowth)), None)  # type: ignore[attr-defined]
+    budget = module.splat_budget
+    if growth is None or budget is None:
+        parts = [(1.0, budget or round(PAPER_SPLATS * splats_for_photos(len(scene.train), detailed_pixels(scene))))]
+    else:
+        parts = stretches(schedule, growth, max(len(scene.points), module.first_points or 0), budget)
+    steps = (
+        60 * minutes / (trainer.accumulate_grad_batches * iteration_seconds(scene, parts, trainer.strategy.root_device))
+    )
+    return int(trainer.strategy.broadcast(max(1, round(steps))))

@@ -1,0 +1,88 @@
+"""Whether the kernels of a device compute what they should: each against the definition, on a tiny scene."""
+
+import logging
+
+import torch
+from torch import Tensor
+
+from nsvq_lightning.compute.devices import fast_backends
+from nsvq_lightning.compute.kernel_cache import kernel_folder
+from nsvq_lightning.io.atomic import write_text
+from nsvq_lightning.quality.loss import photometric_loss
+from nsvq_lightning.quantize.nearest import nearest, nearest_reference
+from nsvq_lightning.random import generator
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.splats.attributes import attribute_shapes
+from nsvq_lightning.splats.splats import RawSplats
+from nsvq_lightning.version import __version__
+
+log = logging.getLogger(__name__)
+
+# Largest relative error of sound kernels: rounding stays below 1e-4, but a splat that crosses α = 1/255 costs more.
+TOLERANCE = 1e-3
+
+
+def kernel_errors(device: str) -> dict[str, dict[str, float]]:
+    """Relative L2 errors of image, loss, gradients and distances to codes by back-end, against plain torch in float64.
+
+    A device whose only back-end is plain torch has none.
+    """
+    truth = _step("reference", "cpu", torch.float64)
+    backends = fast_backends(torch.empty(0, device=device))
+    found = {backend: _step(backend, device, torch.float32) for backend in backends}
+    return {
+        backend: {name: float((value.cpu() - truth[name]).norm() / truth[name].norm()) for name, value in step.items()}
+        for backend, step in found.items()
+    }
+
+
+def _step(backend: str, device: str, dtype: torch.dtype) -> dict[str, Tensor]:
+    """What a training step computes for 3000 random splats and 100 random codes."""
+    draw = generator(0, 0, "self check")
+    made = {
+        name: torch.randn(3000, *shape, generator=draw, dtype=torch.float64)
+        for name, shape in attribute_shapes(3).items()
+    }
+    made["means"][:, 2] += 6
+    made["scales"] -= 2.5
+    photo, codebook = torch.rand(72, 96, 3, generator=draw), torch.randn(100, 4, generator=draw).to(device, dtype)
+    splats = RawSplats(**{name: value.to(device, dtype).requires_grad_() for name, value in made.items()})
+    focal, view = torch.tensor([[80.0, 0, 48], [0, 80, 36], [0, 0, 1]]), torch.eye(4)
+    image = render(splats, Camera(focal, view, 96, 72), backend=backend).image
+    loss = photometric_loss(image, photo.to(device, dtype))
+    loss.backward()  # type: ignore[no-untyped-call]
+    quats = splats.quats.detach()
+    codes = (nearest if dtype == torch.float32 else nearest_reference)(quats, codebook)
+    distances = (quats - codebook[codes]).norm(dim=1)
+    gradients = {name: tensor.grad for name, tensor in splats._asdict().items()}
+    return {"image": image.detach(), "loss": loss.detach(), **gradients, "codes": distances}
+
+
+def check_kernels(device: torch.device) -> None:
+    """Check the kernels of a GPU when it is first used with these versions.
+
+    Raises:
+        RuntimeError: They compute something else.
+    """
+    name = f"{torch.cuda.get_device_name(device)}, nsvq_lightning {__version__}, torch {torch.__version__}"
+    folder = kernel_folder()
+    record = folder / "checked-devices.txt" if folder is not None else None
+    known = record.read_text(encoding="utf-8") if record is not None and record.exists() else ""
+    if name in known:
+        return
+    for backend, errors in kernel_errors(str(device)).items():
+        said = f"{backend} on {name}: relative errors of the kernels: " + written(errors)
+        if not all(error < TOLERANCE for error in errors.values()):  # NaN is never below
+            raise RuntimeError(
+                f"{said}: this device computes wrong numbers; report this line, and train on the CPU with "
+                "--trainer.accelerator=cpu"
+            )
+        log.info(said)
+    if record is not None:
+        write_text(record, f"{known}{name}\n")
+
+
+def written(errors: dict[str, float]) -> str:
+    """Errors in one line."""
+    return ", ".join(f"{name} {error:.1e}" for name, error in errors.items())
