@@ -67,7 +67,8 @@ def run(options: argparse.Namespace) -> int:
             size = write_viewer(options.output, file, cameras, title)
             sys.stdout.write(f"{options.output}: {size:,} bytes\n")
             return 0
-        page = viewer_page(cameras, title, live=3.0 if options.live else 0.0).encode()  # seconds between two looks
+        # Seconds between two looks.
+        page = viewer_page(file, cameras, title, live=3.0 if options.live else 0.0).encode()
         live = options.scene / LIVE_SCENE if options.live else None
         handler = type("Handler", (_Handler,), {"page": page, "file": file, "live": live, "host": options.host})
         try:

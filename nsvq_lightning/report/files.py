@@ -136,17 +136,10 @@ def new_figure(width: float, height: float) -> Any:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def figure_png(figure: Any) -> bytes:
-    """A figure as a PNG file, cropped to its content."""
-    data = io.BytesIO()
-    figure.savefig(data, format="png", bbox_inches="tight")
-    return data.getvalue()
-
-
 def write_figure(path: Path, figure: Any) -> None:
-    """Write a figure as PNG, atomically."""
+    """Write a figure as PNG, cropped to its content, atomically."""
     with atomic_write(path) as file:
-        file.write(figure_png(figure))
+        figure.savefig(file, format="png", bbox_inches="tight")
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -1,12 +1,11 @@
 """``report.html``: what a run has come to, on one page that needs no other file."""
 
-import base64
+import math
 import platform
 from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import cv2
@@ -15,9 +14,8 @@ import torch
 from cv2.typing import MatLike
 
 from nsvq_lightning.io.atomic import write_text
-from nsvq_lightning.report.files import curve_figure, figure_png
-from nsvq_lightning.report.viewer import web_source
-from nsvq_lightning.training.schedule import Schedule
+from nsvq_lightning.report.viewer import data_address, fill, script_json
+from nsvq_lightning.training.schedule import Phase, Schedule
 from nsvq_lightning.version import __version__
 
 Values = Mapping[str, Any]
@@ -47,35 +45,30 @@ def write_page(
         The file.
     """
     title = escape(f"{folder.resolve().parent.name} / {folder.resolve().name}")
-    refresh = "" if metrics else '<meta http-equiv="refresh" content="5">'
-    template = Template(web_source("report.html"))
-    preview, config = folder / "preview.png", folder / "config.yaml"
-    sections: dict[str, str] = {}
+    preview, config, viewer = (folder / name for name in ("preview.png", "config.yaml", "viewer.html"))
+    sections = {"Test views": _views(folder, views)}
     if metrics is None and preview.exists():
-        sections["Photo and render"] = f'<img class="preview" alt="photo and render" src="{_jpeg(_read(preview))}">'
-    if history:
-        curve = _address("png", figure_png(curve_figure(history, schedule)))
-        sections["While it trained"] = f'<img class="preview" alt="PSNR and splats by iteration" src="{curve}">'
-    sections["Test views"] = _views(folder, views)
+        sections["Photo and render"] = f'<img class="wide" alt="photo and render" src="{_jpeg(_read(preview))}">'
+    sections["While it trained"] = _curve(history, schedule) if history else ""
     tables = _times(history, seconds) if metrics is None else _sizes(metrics) | _times(history, seconds)
     sections |= {heading: _table(*table) for heading, table in tables.items()}
     if config.exists():
         text = escape(config.read_text(encoding="utf-8"))
         sections["Settings"] = f"<details><summary>config.yaml</summary><pre>{text}</pre></details>"
-    shown = [f"<h2>{heading}</h2>{content}" for heading, content in sections.items() if content]
+    shown = [f"<section><h2>{heading}</h2>{content}</section>" for heading, content in sections.items() if content]
     packages = ", ".join(f"{name} {version(name)}" for name in ("torch", "lightning", "numba"))
     machine = f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads"
     versions = f"nsvq-lightning {__version__}, Python {platform.python_version()}, {packages}; {machine}"
     facts = _facts(history, schedule, metrics).items()
-    figures = "".join(f"<div>{name}<b>{value}</b></div>" for name, value in facts)
-    how = "measured on the decoded file" if metrics else "as a file written at that moment would decode to"
-    viewer = ' <a href="viewer.html">viewer.html</a> beside this page shows the scene.'
-    summary = f"<p>Quality on test views, {how}.{viewer if (folder / 'viewer.html').exists() else ''}</p>"
-    parts = [f"<h1>{title}</h1>", f'<div class="figures">{figures}</div>{summary}', *shown]
-    body = "\n".join([*parts, f"<footer>{escape(versions)}</footer>"])
-    path = folder / "report.html"
-    write_text(path, template.substitute(title=title, refresh=refresh, body=body))
-    return path
+    parts = {
+        "figures": "".join(f"<div>{name}<b>{value}</b></div>" for name, value in facts),
+        "how": "measured on the decoded file" if metrics else "as a file written at that moment would decode to",
+        "refresh": "" if metrics else '<meta http-equiv="refresh" content="5">',
+        "viewer": '<a class="button" href="viewer.html">Open viewer.html</a>' if viewer.exists() else "",
+    }
+    text = fill("report", title=title, sections="\n".join(shown), versions=escape(versions), **parts)
+    write_text(folder / "report.html", text)
+    return folder / "report.html"
 
 
 def _facts(history: Sequence[Values], schedule: Schedule, metrics: Values | None) -> dict[str, str]:
@@ -97,6 +90,7 @@ def _facts(history: Sequence[Values], schedule: Schedule, metrics: Values | None
 
 
 def _views(folder: Path, views: Sequence[Mapping[str, Any]]) -> str:
+    """Photo, render and error of each view, which lie side by side in its picture; ``report.js`` adds the slider."""
     worst = min((row["psnr"] for row in views), default=0.0)
     figures = []
     for row in views:
@@ -104,8 +98,19 @@ def _views(folder: Path, views: Sequence[Mapping[str, Any]]) -> str:
         if path.exists():
             remark = ", the lowest" if row["psnr"] == worst and len(views) > 1 else ""
             caption = f"{escape(row['name'])}: {_decibels(row['psnr'])}, SSIM {row['ssim']:.4f}{remark}"
-            figures.append(_figure(_read(path), caption))
+            parts = zip(("photo", "render", "error"), np.array_split(_read(path), 3, axis=1), strict=True)
+            pictures = "".join(f'<img alt="{part}" src="{_jpeg(picture)}">' for part, picture in parts)
+            figures.append(f"<figure>{pictures}<figcaption>{caption}</figcaption></figure>")
     return f'<div class="views">{"".join(figures)}</div>' if figures else ""
+
+
+def _curve(history: Sequence[Values], schedule: Schedule) -> str:
+    """What ``report.js`` draws."""
+    decibels = [entry["psnr"] if math.isfinite(entry["psnr"]) else None for entry in history]
+    rows = [[entry["iteration"], value, entry["splats"]] for entry, value in zip(history, decibels, strict=True)]
+    phases = [[phase.name.lower(), end] for phase, end in zip(Phase, schedule.ends, strict=False)]
+    data = script_json({"history": rows, "phases": phases})
+    return f'<div id="curve" class="card"></div><script>const trained = {data};</script>'
 
 
 # Head and rows of a table.
@@ -116,11 +121,10 @@ def _sizes(metrics: Mapping[str, Any]) -> dict[str, _Table]:
     """The tables of the file by their headings."""
     splats, whole = max(1, metrics["num_splats"]), metrics["file_bytes"]
     streams = [
-        (name, f"{size:,}", f"{8 * size / splats:.2f}", f'<i style="width:{12 * size / whole:.2f}rem"></i>')
-        for name, size in metrics["streams"].items()
+        (name, f"{size:,}", f"{8 * size / splats:.2f}", f'<i style="--share:{size / whole:.4f}"></i>')
+        for name, size in {**metrics["streams"], "whole file": whole}.items()
         if size
     ]
-    streams.append(("whole file", f"{whole:,}", f"{8 * whole / splats:.2f}", ""))
     codes = [
         (name, f"{book['codebook']:,}", f"{book['used']:,}", f"{book['entropy']:.2f}")
         for name, book in metrics["codes"].items()
@@ -143,25 +147,12 @@ def _times(history: Sequence[Mapping[str, Any]], seconds: Mapping[str, float]) -
     return {"Time": (("part", "iterations", "time", "ms an iteration"), rows)}
 
 
-def _figure(comparison: MatLike, caption: str) -> str:
-    """Photo and render under a slider, and their error, of the three side by side."""
-    width = comparison.shape[1] // 3
-    photo, render, error = (_jpeg(comparison[:, start : start + width]) for start in (0, width, 2 * width))
-    return (
-        f'<figure><div class="pair"><img alt="photo" src="{photo}"><img alt="render" src="{render}">'
-        '<span>photo</span><span>render</span></div><input type="range" aria-label="photo or render" value="50">'
-        f'<figcaption>{caption}<details><summary>error x 4</summary><img class="preview" alt="error" src="{error}">'
-        "</details></figcaption></figure>"
-    )
-
-
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table; nothing without rows."""
-    if not rows:
-        return ""
     lines = ["".join(f"<th>{cell}</th>" for cell in head)]
     lines += ["".join(f"<td>{cell}</td>" for cell in row) for row in rows]
-    return f'<div class="scroll"><table>{"".join(f"<tr>{line}</tr>" for line in lines)}</table></div>'
+    table = "".join(f"<tr>{line}</tr>" for line in lines)
+    return f'<div class="scroll"><table>{table}</table></div>' if rows else ""
 
 
 def _read(path: Path) -> MatLike:
@@ -174,14 +165,8 @@ def _read(path: Path) -> MatLike:
 def _jpeg(picture: MatLike) -> str:
     """A picture as an address that holds it."""
     factor = min(1.0, 1000 / max(picture.shape[:2]))
-    if factor < 1.0:
-        picture = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    return _address("jpeg", cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
-
-
-def _address(kind: str, data: bytes) -> str:
-    """The content of a picture file as an address that holds it."""
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+    picture = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    return data_address("jpeg", cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
 
 
 def _decibels(psnr: float | None) -> str:

@@ -15,7 +15,7 @@ import torch
 
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.atomic import write_text
-from nsvq_lightning.io.nsvq.header import read_header
+from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.rendering.camera import Camera, up_of
 
 
@@ -53,53 +53,46 @@ def write_viewer(
         FormatError: ``scene_file`` is damaged or not a ``.nsvq`` file.
         ValueError: There are no cameras, or ``background`` is no colour.
     """
-    page = viewer_page(cameras, title, background, scene_file)
+    page = viewer_page(scene_file, cameras, title, background)
     write_text(path, page)
     return len(page.encode())
 
 
 def viewer_page(
+    scene_file: str | os.PathLike[str],
     cameras: Mapping[str, Camera],
     title: str,
     background: Sequence[float] = (0.0, 0.0, 0.0),
-    scene_file: str | os.PathLike[str] | None = None,
-    live: float = 0.0,
+    live: float | None = None,
 ) -> str:
     """The page of :func:`write_viewer`; arguments and errors are the same.
 
     Args:
+        scene_file: See there; with ``live``, it may be yet to come.
         cameras: See there.
         title: See there.
         background: See there.
-        scene_file: The ``.nsvq`` file in the page; without one, it asks its server for ``scene.nsvq``.
-        live: Seconds after which a page without a file asks its server for ``version`` again, to show a new one;
-            0 for never.
+        live: None for a page that holds the file. Another one asks its server for ``scene.nsvq``, and after so many
+            seconds for ``version`` again, to show a new one; 0 for never.
     """
     if not cameras:
         raise ValueError("a page needs at least one camera to start from, got none")
     if len(background) != 3 or not all(0 <= value <= 1 for value in background):
         raise ValueError(f"background must be three numbers from 0 to 1, got {list(background)}")
+    about, source = "", f'<script data-seconds="{live}">\n{web_source("served.js")}</script>'
+    if live is None or Path(scene_file).is_file():
+        stored, file = read_nsvq(scene_file), Path(scene_file).read_bytes()
+        about = f"{len(stored):,} splats, {len(file) / 1e6:.2f} MB. "
+        if live is None:
+            source = f'<script id="file" type="text/plain">{base64.b64encode(file).decode()}</script>'
     scene = {
         "cameras": [{"name": name, **camera_entry(camera)} for name, camera in cameras.items()],
         "background": list(background),
         "up": up_of(list(cameras.values())).tolist(),
     }
-    if scene_file is None:
-        source = f'<script data-seconds="{live:g}">\n{web_source("served.js")}</script>'
-        connect = " connect-src 'self';"
-    else:
-        read_header(scene_file)  # verifies the file's checksum
-        file = base64.b64encode(Path(scene_file).read_bytes()).decode()
-        source, connect = f'<script id="file" type="text/plain">{file}</script>', ""
-    return Template(web_source("viewer.html")).substitute(
-        title=escape(title.encode("utf-8", "replace").decode()),
-        scene=json.dumps(scene, separators=(",", ":"), allow_nan=False).replace("<", r"\u003c"),
-        source=source,
-        connect=connect,
-        css=web_source("viewer.css"),
-        decoder=web_source("nsvq.js"),
-        viewer=web_source("viewer.js"),
-    )
+    name, connect = escape(title.encode("utf-8", "replace").decode()), "" if live is None else " connect-src 'self';"
+    parts = {"title": name, "about": about, "scene": script_json(scene), "source": source, "connect": connect}
+    return fill("viewer", decoder=web_source("nsvq.js"), **parts)
 
 
 def camera_entry(camera: Camera) -> dict[str, Any]:
@@ -143,6 +136,25 @@ def page_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
 def web_source(name: str) -> str:
     """Text of a file that pages are made of."""
     return files("nsvq_lightning.report").joinpath("web", name).read_text(encoding="utf-8")
+
+
+def fill(page: str, **parts: str) -> str:
+    """The page of this name, with its own style sheet and script, what all pages look like, and ``parts`` of it."""
+    mark = web_source("mark.svg").strip()
+    parts["css"], parts["script"] = web_source("look.css") + web_source(f"{page}.css"), web_source(f"{page}.js")
+    parts["icon"] = data_address("svg+xml", mark.encode())
+    parts["mark"] = mark.replace(' xmlns="http://www.w3.org/2000/svg"', "")  # HTML knows it
+    return Template(web_source(f"{page}.html")).substitute(parts)
+
+
+def data_address(kind: str, data: bytes) -> str:
+    """The content of a picture file as an address that holds it."""
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def script_json(value: Any) -> str:
+    """JSON for a ``<script>``."""
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", r"\u003c")
 
 
 # The splats of a running fit, while somebody looks.

@@ -40,9 +40,9 @@ def run(tmp_path: Path) -> Path:
 @pytest.fixture
 def address(run: Path, demo_scene: Path) -> Iterator[str]:
     """A server that follows the run."""
-    page = viewer.viewer_page(viewer.some_cameras(load_scene(demo_scene)), "run", live=0.2).encode()
+    page = viewer.viewer_page(run / "scene.nsvq", viewer.some_cameras(load_scene(demo_scene)), "run", live=0.2)
     files = {"file": run / "scene.nsvq", "live": run / viewer.LIVE_SCENE}
-    attributes = {"page": page, **files, "host": "127.0.0.1", "timeout": 0.5}
+    attributes = {"page": page.encode(), **files, "host": "127.0.0.1", "timeout": 0.5}
     with _Server(("127.0.0.1", 0), type("Handler", (_Handler,), attributes)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import math
 import re
 from html.parser import HTMLParser
@@ -11,10 +12,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from chromium import chromium, needs_chromium
 
 from nsvq_lightning.report.files import comparison, curve_figure, write_png
 from nsvq_lightning.report.page import write_page
-from nsvq_lightning.training.schedule import Schedule
+from nsvq_lightning.training.schedule import Phase, Schedule
 
 SCHEDULE = Schedule(total=450)
 VOID = {"meta", "img", "input", "link", "br"}
@@ -90,7 +92,9 @@ def test_page_of_a_finished_run_needs_no_other_file(run: Path) -> None:
     page = Tags(text)
     assert "http-equiv" not in text
     assert not re.search(r"https?://|url\(|@import", text)
-    _, photo, render, error, *same = map(_picture, page.addresses)
+    icon, *pictures = page.addresses
+    assert base64.b64decode(icon.removeprefix("data:image/svg+xml;base64,")).startswith(b"<svg ")
+    photo, render, error, *same = map(_picture, pictures)
     for picture, left, right in ((photo, (0, 0, 0), (0, 0, 255)), (render, (255,) * 3, (255,) * 3)):
         assert picture.shape == (30, 40, 3)
         assert np.abs(picture[15, 5].astype(int) - left).max() < 8
@@ -106,6 +110,34 @@ def test_page_of_a_finished_run_needs_no_other_file(run: Path) -> None:
         assert re.search(row, page.words)
     assert re.search(r"finetune +300 +1 min 0 s +200\.0", page.words)
     assert not re.search(r"means\.far|kernels compiled", page.words)
+    places = [text.index(words) for words in ("31.25 dB", 'class="views"', 'id="curve"', "<table>", "config.yaml")]
+    assert places == sorted(places)
+    curve = json.loads(text.split("const trained = ")[1].split(";</script>")[0])
+    assert curve["history"] == [[100, 20.0, 1000], [150, 21.0, 1000], [450, 31.0, 1000]]
+    assert curve["phases"] == [[phase.name.lower(), end] for phase, end in zip(Phase, SCHEDULE.ends, strict=True)]
+
+
+@needs_chromium
+def test_page_fits_a_phone_and_its_pictures_slide(run: Path, tmp_path: Path) -> None:
+    history = [*HISTORY, _entry(451, "finetune", math.inf, 68.0)]
+    path = write_page(run, history, SCHEDULE, {"kernels compiled": 1234.5}, METRICS, VIEWS)
+    with chromium(tmp_path / "profile") as tab:
+        tab.open(path.as_uri(), 390, 844, mobile=True)
+        tab.run("new Promise(resolve => requestAnimationFrame(() => setTimeout(resolve)))")  # the curve is drawn
+        assert tab.run("document.documentElement.scrollWidth") == 390
+        assert tab.run("[...document.querySelectorAll('.scroll')].every(e => e.scrollWidth <= e.clientWidth)")
+        words = tab.run("[...document.querySelectorAll('#curve text')].map(text => text.textContent)")
+        assert {"warmup", "prune", "quantize", "finetune", "iteration", "test PSNR, dB", "splats"} <= set(words)
+        assert tab.run("document.querySelectorAll('#curve circle').length") == len(HISTORY)
+        tab.run("document.querySelector('.pair input').focus()")
+        tab.send("Input.dispatchKeyEvent", type="keyDown", key="ArrowRight", windowsVirtualKeyCode=39)
+        assert tab.run("document.querySelector('.pair').style.getPropertyValue('--cut')") == "51%"
+        tab.run("document.querySelector('.pair').scrollIntoView({block: 'center'})")
+        box = tab.run("document.querySelector('.pair').getBoundingClientRect().toJSON()")
+        for kind in ("mousePressed", "mouseReleased"):
+            place = {"x": box["x"] + box["width"] / 4, "y": box["y"] + box["height"] / 2}
+            tab.send("Input.dispatchMouseEvent", type=kind, **place, button="left", buttons=1, clickCount=1)
+        assert round(float(tab.run("document.querySelector('.pair').style.getPropertyValue('--cut')")[:-1])) == 25
 
 
 def test_page_of_a_running_fit_shows_a_view_and_is_read_again(run: Path) -> None:
@@ -115,7 +147,7 @@ def test_page_of_a_running_fit_shows_a_view_and_is_read_again(run: Path) -> None
     assert '<meta http-equiv="refresh" content="5">' in text
     assert "150 of 450" in tags.words
     assert "21.00 dB" in tags.words
-    preview, _ = map(_picture, tags.addresses)
+    preview = _picture(tags.addresses[1])
     assert preview.shape[1] == 1000
     assert preview[:, 450].max() < 8
     assert preview[:, 550].min() > 247

@@ -24,7 +24,7 @@ from runs import (
 
 from nsvq_lightning.callbacks import OPTIONAL, STANDARD, DensityControl, MetricReport, RunCheckpoint, standard
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.report import files, page
+from nsvq_lightning.report import files
 from nsvq_lightning.training.module import SplatModule
 
 STEPS = 60
@@ -40,15 +40,16 @@ def one_curve(request: pytest.FixtureRequest) -> Iterator[None]:
     if request.path.parent.name not in ("commands", "runs", "training") or request.path.stem == "test_sweep":
         yield
         return
-    draw = files.figure_png
+    draw = files.write_figure
 
-    def draw_once(figure: Any) -> bytes:
-        DRAWN.extend([] if DRAWN else [draw(figure)])
-        return DRAWN[0]
+    def draw_once(path: Path, figure: Any) -> None:
+        if not DRAWN:
+            draw(path, figure)
+            DRAWN.append(path.read_bytes())
+        path.write_bytes(DRAWN[0])
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (files, page):
-            patch.setattr(module, "figure_png", draw_once)
+        patch.setattr(files, "write_figure", draw_once)
         yield
 
 
