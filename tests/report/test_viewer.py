@@ -122,6 +122,20 @@ def test_cameras_are_exact_in_the_conventions_of_nerfstudio(parsed: Parsed) -> N
         to_camera = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)) @ to_world.inverse()
         assert (to_camera - camera.viewmat).abs().max() < 1e-6
     assert scene["up"] == up_of(list(_cameras().values())).tolist()
+    assert scene["start"] == 0
+
+
+def test_the_best_view_has_the_splats_near_its_middle() -> None:
+    away = torch.diag(torch.tensor([-1.0, 1, -1, 1]))
+    front = front_camera(96, 64)
+    turned = torch.eye(4)
+    turned[:3, :3] = torch.tensor([[0.9, 0, -(0.19**0.5)], [0, 1, 0], [0.19**0.5, 0, 0.9]])
+    poses = away @ front.viewmat, turned @ front.viewmat, front.viewmat
+    cameras = [Camera(front.K, pose, front.width, front.height) for pose in poses]
+    assert viewer.best_view(_splats(), cameras) == 2
+    assert viewer.best_view(_splats(), cameras[:2]) == 1
+    faint = _splats()._replace(opacities=torch.full((600,), -200.0))
+    assert viewer.best_view(faint, cameras) == 0  # nothing to choose by
 
 
 def test_the_page_says_what_it_is(parsed: Parsed, scene_file: Path) -> None:
@@ -288,6 +302,44 @@ def test_a_drag_orbits_what_is_in_front_and_reset_returns(tab: Page, scene_file:
     assert (after[:3, 3] - before[:3, 3]) @ before[:3, 0] < 0  # the scene follows the hand: the camera goes left
     tab.run("document.getElementById('reset').click()")
     assert tab.run("nsvqViewer.camera()") == start
+
+
+@needs_chromium
+def test_it_orbits_until_somebody_takes_over(tab: Page, page: Path) -> None:
+    tab.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-reduced-motion", "value": "no-preference"}])
+    # The position at every frame, without a call that would end the orbit.
+    spy = "const seen = []; const draw = Renderer.prototype.draw; Renderer.prototype.draw = "
+    spy += "function (view, ...rest) { seen.push(view.position[0]); draw.call(this, view, ...rest); }; seen"
+    wait = "new Promise(resolve => setTimeout(resolve, %d))"
+    try:
+        _shown(tab, page.as_uri(), 96, 64)
+        tab.run(spy)
+        tab.run(wait % 2500)
+        assert len(set(tab.run("seen"))) > 3
+        tab.send("Input.dispatchKeyEvent", type="keyDown", key="Shift")
+        tab.run(wait % 1000)
+        drawn = tab.run("seen.length")
+        tab.run(wait % 500)
+        assert tab.run("seen.length") == drawn
+        tab.open("about:blank", 96, 64)
+        _shown(tab, f"{page.as_uri()}#camera=front", 96, 64)
+        tab.run(spy)
+        tab.run(wait % 2000)
+        assert tab.run("seen") == []
+    finally:
+        tab.send("Emulation.setEmulatedMedia", features=[])
+
+
+@needs_chromium
+def test_a_page_says_how_to_embed_it(tab: Page, page: Path) -> None:
+    _shown(tab, page.as_uri(), 400, 300)
+    tab.run("document.getElementById('embed').click()")
+    said = tab.run("document.getElementById('message').textContent")
+    (frame,) = Parsed(said[said.index("<") :]).elements
+    assert frame[1]["src"] == "viewer.html"
+    assert frame[1]["title"] == f"{NASTY}: a 3D scene"
+    tab.send("Input.dispatchKeyEvent", type="keyDown", key="Escape")
+    assert tab.run("document.getElementById('message').hidden")
 
 
 @needs_chromium

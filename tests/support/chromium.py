@@ -27,6 +27,7 @@ FLAGS = (
     "--enable-unsafe-swiftshader",
     "--force-color-profile=srgb",
     "--hide-scrollbars",
+    "--force-prefers-reduced-motion",  # or the viewer would turn its scene before a test looks at it
     "--remote-debugging-pipe",
 )
 

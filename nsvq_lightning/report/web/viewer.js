@@ -592,8 +592,8 @@ async function main() {
   let renderer = new Renderer(canvas, splats);
   const backgrounds = [scene.background, [0, 0, 0], [1, 1, 1], [0.5, 0.5, 0.5]];
   const keys = new Set(), keyframes = [], waiting = [];
-  let background = 0, current = 0, scheduled = false, sorting = false, sorted = null, last = 0, touched = 0, share = 1;
-  let portion = 1, sortedPortion = 1;
+  let background = 0, current = scene.start, scheduled = false, sorting = false, sorted = null, last = 0, touched = 0, share = 1;
+  let portion = 1, sortedPortion = 1, swaying, swayed = 0;
 
   // ---- frames, only when something changed
 
@@ -616,6 +616,7 @@ async function main() {
     scheduled = false;
     const elapsed = last && now - last;
     if (keys.size) fly(Math.min(elapsed, 200) / 1000);
+    if (swaying) sway(Math.min(elapsed, 200) / 1000);
     const moving = now - touched < 250;
     // A slow device shows fewer pixels while the view moves, then fewer splats, and takes up more in the other order.
     if (elapsed > 60) {
@@ -681,6 +682,24 @@ async function main() {
       schedule();
     });
 
+  // ---- a slow orbit to and fro, so that nothing comes into view that no photo has seen, until somebody takes over
+
+  const rest = () => (swaying = false);
+  for (const name of ["pointerdown", "wheel", "keydown", "hashchange", "visibilitychange"]) addEventListener(name, rest, true);
+
+  function sway(seconds) {
+    swayed += seconds;
+    view.orbit(0.1 * seconds * Math.cos(swayed / 3.5), 0);
+    touched = performance.now();
+    if (share < 0.45) rest(); // the device is too slow
+  }
+  function beginSway() {
+    if (swaying === undefined && !document.hidden) {
+      swaying = true;
+      moved();
+    }
+  }
+
   // ---- cameras
 
   /** Turn about what is in front at a place of the window, css pixels. */
@@ -733,6 +752,16 @@ async function main() {
     setTimeout(URL.revokeObjectURL, 60000, link.href);
   }
 
+  /** HTML that shows this page in another one, said and, where the browser allows it, copied. */
+  function embed() {
+    const src = location.protocol === "file:" ? location.pathname.split("/").pop() : location.href;
+    const frame = Object.assign(document.createElement("iframe"), { src, title: document.title, width: 800, height: 500 });
+    frame.style = "border: 0";
+    const html = frame.outerHTML;
+    say(html);
+    navigator.clipboard?.writeText(html).then(() => say(`Copied: ${html}`), () => {});
+  }
+
   // ---- hands
 
   const changeBackground = () => {
@@ -747,11 +776,12 @@ async function main() {
     keyframe: addKeyframe,
     undo: undoKeyframe,
     download,
+    embed,
   };
   for (const [id, action] of Object.entries(actions)) {
-    element(id).addEventListener("click", () => {
+    element(id).addEventListener("click", (event) => {
       action();
-      canvas.focus();
+      if (event.detail) canvas.focus(); // not for a key, which may be pressed again
     });
   }
   const commands = { f: "next", F: "previous", r: "reset", b: "background", k: "keyframe", K: "undo" };
@@ -776,6 +806,7 @@ async function main() {
       moved();
     } else if (event.repeat) return;
     else if (event.key in commands) actions[commands[event.key]]();
+    else if (name === "escape") say("");
     else if (name === "h") document.body.classList.toggle("bare");
     else return;
     event.preventDefault();
@@ -824,14 +855,15 @@ async function main() {
     show(Number(event.target.value));
     canvas.focus();
   });
-  element("more").open = !matchMedia("(pointer: coarse), (max-width: 640px), (max-height: 480px)").matches;
   addEventListener("hashchange", () => say(follow()));
   canvas.addEventListener("pointerdown", () => say(""));
+  element("embed").hidden = server;
   new ResizeObserver(resize).observe(canvas);
 
   window.nsvqViewer = {
     /** The present camera, or, given one of the same form, that one: a promise kept when it is drawn. */
     camera(next) {
+      rest();
       if (next === undefined) return view.camera(canvas.width, canvas.height);
       place(next);
       return settled();
@@ -840,6 +872,7 @@ async function main() {
     path,
     /** What is shown now, drawn again, as a data URL of a PNG. */
     picture() {
+      rest();
       draw(1);
       return canvas.toDataURL();
     },
@@ -849,6 +882,7 @@ async function main() {
   await settled();
   say(remark);
   if (server?.seconds) watch();
+  else if (!location.hash && !matchMedia("(prefers-reduced-motion: reduce)").matches) setTimeout(beginSway, 1000);
 }
 
 function fail(error) {
