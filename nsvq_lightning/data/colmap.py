@@ -80,10 +80,18 @@ def import_pycolmap() -> Any:
 
     The wheels bundle different copies of libpng and zlib. If pycolmap's are loaded first, writing a PNG with OpenCV or
     Pillow aborts the process; the imports at the top of this module ensure the right order.
+
+    Raises:
+        SceneError: It is not installed.
     """
     PIL.Image.preinit()  # loads Pillow's own image libraries, which a bare import leaves for later
-    import pycolmap
-
+    try:
+        import pycolmap
+    except ModuleNotFoundError as error:
+        raise SceneError(
+            "pycolmap, which reads and writes COLMAP models, is not installed (it has no wheel for Linux on ARM64): "
+            "build it, or give a folder with a transforms.json"
+        ) from error
     return pycolmap
 
 

@@ -144,7 +144,7 @@ def _times(history: Sequence[Mapping[str, Any]], seconds: Mapping[str, float]) -
         rows.append((last["phase"], f"{steps:,}", _duration(taken), f"{1000 * taken / steps:.1f}"))
         before, since = last["iteration"], last["seconds"]
     rows += [(name, "", _duration(taken), "") for name, taken in seconds.items() if taken]
-    return {"Time": (("part", "iterations", "time", "ms an iteration"), rows)}
+    return {"Time": (("part", "iterations", "time", "ms each"), rows)}
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
