@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 
 import nsvq_lightning
@@ -62,6 +63,26 @@ def test_constraints_start_with_torch_and_name_no_host() -> None:
     assert text.startswith("torch==")
     pattern = re.compile(r"[A-Za-z0-9_.-]+==[0-9][0-9a-z.]*")
     assert [line for line in text.splitlines() if not line.startswith("#") and not pattern.fullmatch(line)] == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="bash may be that of another system")
+def test_workflow_tests_every_python_with_readmes_command() -> None:
+    path = ROOT / ".github" / "workflows" / "ci.yml"
+    if not path.exists():
+        pytest.skip("a source distribution has no workflow beside the tests")
+    test = yaml.safe_load(path.read_text(encoding="utf-8"))["jobs"]["test"]
+    prefix = "Programming Language :: Python :: 3."
+    stated = {line.removeprefix(prefix) for line in _project()["project"]["classifiers"] if line.startswith(prefix)}
+    assert {f"3.{minor}" for minor in stated} <= set(test["strategy"]["matrix"]["python"])
+    script = test["steps"][-1]["run"].replace('eval "$command"', 'echo "$command"')
+    for system, folder in (("Linux", "bin"), ("Windows", "Scripts")):
+        environment = os.environ | {"RUNNER_OS": system}
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", script], cwd=ROOT, env=environment, capture_output=True, text=True
+        )
+        assert done.stdout.endswith(f'pip install -c constraints.txt -e ".[test]" && .venv/{folder}/pytest\n'), (
+            done.stderr
+        )
 
 
 @pytest.mark.parametrize("folder", TOP_LEVEL)
