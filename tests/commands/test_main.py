@@ -97,7 +97,7 @@ def test_options_that_the_readme_names_are_in_the_help(fit_help: str) -> None:
         for name in re.findall(r"--((?:callbacks|data|model|trainer)\.[\w.]*\w)", pages)
         if "quantizer." not in name
     }
-    assert {"data.root", "trainer.max_steps"} <= named
+    assert {"data.root", "data.factor"} <= named
     known = fit_help + "".join(class_help(f"callbacks.{key}", kind) for key, kind in STANDARD.items())
     assert {name for name in named if f"--{name}" not in known} == set()
 
