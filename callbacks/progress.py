@@ -21,9 +21,9 @@ SMOOTHING = 0.8
 class SplatProgressBar(TQDMProgressBar):
     """One bar for a whole run; plain lines if the output is not a terminal.
 
-    It counts all iterations, also those of earlier parts of a resumed run. After count and time it shows the phase, the
-    number of splats, the training PSNR of recent steps (exponential mean) and the latest test PSNR. It fits 80 columns.
-    The estimate of the remaining time excludes kernel compilation.
+    It counts all iterations, also those of earlier parts of a resumed run. After their number it shows the time that is
+    left, without the compilation of kernels, and the time of day at which that ends; then the phase, the number of
+    splats, the training PSNR of recent steps (exponential mean) and the latest test PSNR. It fits 80 columns.
 
     Args:
         refresh_rate: Iterations between two refreshes on a terminal; 0 turns the bar off.
@@ -36,7 +36,7 @@ class SplatProgressBar(TQDMProgressBar):
         True
     """
 
-    BAR_FORMAT = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} {elapsed}<{remaining}{postfix}"
+    BAR_FORMAT = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} {remaining} to {eta:%H:%M}{postfix}"
 
     def __init__(self, refresh_rate: int = 25) -> None:
         super().__init__(refresh_rate=refresh_rate)
@@ -87,8 +87,9 @@ class SplatProgressBar(TQDMProgressBar):
             total = trainer.max_steps
             seconds = time.time() - self._start - compile_seconds()
             left = seconds * (total - done) / max(1.0, done - self.train_progress_bar.initial)
-            elapsed, remaining = Tqdm.format_interval(seconds), Tqdm.format_interval(left)
-            progress = f"iteration {done} of {total} ({100 * done // total} %), {elapsed} elapsed, {remaining} left"
+            end = time.strftime("%H:%M", time.localtime(time.time() + left))
+            times = f"{Tqdm.format_interval(seconds)} elapsed, {Tqdm.format_interval(left)} left, until {end}"
+            progress = f"iteration {done} of {total} ({100 * done // total} %), {times}"
             sys.stdout.write(f"{progress}: {text}\n")
             sys.stdout.flush()
             return

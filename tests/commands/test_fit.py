@@ -114,7 +114,7 @@ def test_a_run_goes_on_with_the_options_given_and_counts_its_lines(
     rates = {group["name"]: group["lr"] for group in stored["optimizer_states"][0]["param_groups"]}
     assert rates["opacities"] == 0.0123
     out = capsys.readouterr().out
-    said = r"^iteration (\d+) of 22 \(\d+ %\), \S+ elapsed, \S+ left: finetune \d+ splats"
+    said = r"^iteration (\d+) of 22 \(\d+ %\), \S+ elapsed, \S+ left, until \d\d:\d\d: finetune \d+ splats"
     assert re.findall(said, out, re.MULTILINE) == ["21", "22"]
     assert "\r" not in out
 
