@@ -9,7 +9,9 @@ from nsvq_lightning.compute.devices import fast_backends
 from nsvq_lightning.compute.kernel_cache import kernel_folder
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.quality.loss import photometric_loss
+from nsvq_lightning.quantize.kmeans import lookup
 from nsvq_lightning.quantize.nearest import nearest, nearest_reference
+from nsvq_lightning.quantize.nsvq import noise_substitution
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render
@@ -24,7 +26,7 @@ TOLERANCE = 1e-3
 
 
 def kernel_errors(device: str) -> dict[str, dict[str, float]]:
-    """Relative L2 errors of image, loss, gradients and distances to codes by back-end, against plain torch in float64.
+    """Relative L2 errors of image, loss, gradients and quantization by back-end, against plain torch in float64.
 
     A device whose only back-end is plain torch has none.
     """
@@ -52,11 +54,20 @@ def _step(backend: str, device: str, dtype: torch.dtype) -> dict[str, Tensor]:
     image = render(splats, Camera(focal, view, 96, 72), backend=backend).image
     loss = photometric_loss(image, photo.to(device, dtype))
     loss.backward()  # type: ignore[no-untyped-call]
-    quats = splats.quats.detach()
+    quats, codebook = splats.quats.detach(), codebook.requires_grad_()
     codes = (nearest if dtype == torch.float32 else nearest_reference)(quats, codebook)
-    distances = (quats - codebook[codes]).norm(dim=1)
+    found = lookup(codebook, codes)
+    (found**2).sum().backward()  # type: ignore[no-untyped-call]
+    substituted = noise_substitution(quats, codebook, codes, draw).detach()
     gradients = {name: tensor.grad for name, tensor in splats._asdict().items()}
-    return {"image": image.detach(), "loss": loss.detach(), **gradients, "codes": distances}
+    return {
+        "image": image.detach(),
+        "loss": loss.detach(),
+        **gradients,
+        "codes": (quats - found.detach()).norm(dim=1),
+        "noise": (substituted - quats).norm(dim=1),  # as long as the error
+        "codebook": codebook.grad,
+    }
 
 
 def check_kernels(device: torch.device) -> None:

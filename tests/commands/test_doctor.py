@@ -47,7 +47,7 @@ def test_every_finding_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     text = findings["self-test"][3]
     assert text.startswith("cpu: relative errors against float64: image ")
     errors = [float(part.split()[-1]) for part in text.partition("image")[2].split(",")]
-    assert (findings["self-test"][1], len(errors)) == ("good", 9)
+    assert (findings["self-test"][1], len(errors)) == ("good", 11)
     assert 0 < max(errors) < 1e-4
 
 

@@ -13,7 +13,7 @@ from nsvq_lightning.training.self_check import TOLERANCE, check_kernels, kernel_
 
 def test_the_kernels_of_the_cpu_are_right() -> None:
     errors = kernel_errors("cpu")["cpu"]
-    assert {"image", "loss", "means", "shN", "codes"} <= set(errors)
+    assert {"image", "loss", "means", "shN", "codes", "noise", "codebook"} <= set(errors)
     assert max(errors.values()) < 1e-4
 
 
