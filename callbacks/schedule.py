@@ -15,6 +15,9 @@ from .forecast import iterations_within
 
 log = logging.getLogger(__name__)
 
+# Below so many, every minute more, or smaller photos, makes a scene visibly better.
+FEW_ITERATIONS = 1500
+
 
 @dataclass(eq=False)
 class PhaseSchedule(SplatCallback):
@@ -92,6 +95,8 @@ class PhaseSchedule(SplatCallback):
             steps = iterations_within(self.minutes, trainer, module, self.schedule(self.reference_total or 1))
             trainer.fit_loop.epoch_loop.max_steps = steps
             log.info("iterations: %d, as many as %g minutes are likely to allow", steps, self.minutes)
+            if steps < FEW_ITERATIONS:
+                log.warning("that is few: smaller photos (--data.factor=2) or fewer splats (--quality=0.5) give more")
         elif self.iterations_per_photo is not None and self.total is None:
             need = "a number of iterations for each photo needs the photos"
             photos = len(scene_module.needed_scene(trainer, need, "leave iterations_per_photo unset").train)
