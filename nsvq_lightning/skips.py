@@ -10,39 +10,12 @@ Switches hold for the whole process, so set them before work starts, not while a
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
-
-@dataclass(frozen=True)
-class Skip:
-    """One switch.
-
-    Attributes:
-        name: Its name.
-        work: The work that is skipped while it is on.
-        when: In which case that work is not needed.
-    """
-
-    name: str
-    work: str
-    when: str
-
-    @property
-    def summary(self) -> str:
-        """One line for the help of a command."""
-        return f"skip {self.work}: {self.when}"
-
-
-# All switches by name.
+# All switches by name: the work that is skipped while one is on, and when that work is not needed.
 SKIPS = {
-    skip.name: skip
-    for skip in (
-        # rendering
-        Skip("blocks", "4x4 blocks of pixels", "a splat cannot reach them"),
-        Skip("saturated", "blocks of pixels", "all their pixels are opaque"),
-        # quantization
-        Skip("distance_bounds", "the nearest code of a splat", "bounds prove that it is the last one"),
-    )
+    "blocks": "skip 4x4 blocks of pixels: a splat cannot reach them",
+    "saturated": "skip blocks of pixels: all their pixels are opaque",
+    "distance_bounds": "skip the nearest code of a splat: bounds prove that it is the last one",
 }
 
 _ON = dict.fromkeys(SKIPS, True)

@@ -170,8 +170,8 @@ class SplatCLI(LightningCLI):
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """Add the callbacks and the switches."""
-        for skip in SKIPS.values():
-            parser.add_argument(f"--skips.{skip.name}", type=bool, default=True, help=skip.summary)
+        for name, about in SKIPS.items():
+            parser.add_argument(f"--skips.{name}", type=bool, default=True, help=about)
         for name, kind in STANDARD.items():
             key = f"callbacks.{name}"
             default = None if name in OPTIONAL else {"class_path": f"{kind.__module__}.{kind.__qualname__}"}
