@@ -5,33 +5,9 @@ Here is only what is measured, and how thoroughly: arguments are refused before 
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 # Modules of this package; each has a function ``run(scope)``, which returns measurements.
 SUITES = ("render", "quantize", "codec", "train")
-
-
-class Size(NamedTuple):
-    """Splats, pixels across and down, and the median length of a splat's axes in scene units."""
-
-    splats: int
-    width: int
-    height: int
-    scale: float
-
-
-# The synthetic scenes by name: smaller splats where there are more, as training leaves them.
-SIZES = {
-    "A20k": Size(20_000, 400, 300, 0.0175),
-    "B100k": Size(100_000, 800, 533, 0.0100),
-    "C500k": Size(500_000, 800, 533, 0.0056),
-    "D1M": Size(1_000_000, 1600, 1060, 0.0044),
-    "E3M": Size(3_000_000, 1600, 1060, 0.0031),
-}
-
-
-# What --quick changes of a scope.
-QUICK = {"repeats": 3, "seconds": 0.5, "workloads": ("A20k",), "steps": 40}
 
 
 @dataclass(frozen=True)
@@ -70,3 +46,17 @@ class Scope:
     def codebooks(self) -> str:
         """The paper's codebook setting in the suites that quantize."""
         return "1k" if self.quick else "16k"
+
+
+# The synthetic scenes by name: splats, pixels across and down, and the median length of a splat's axes in scene units.
+# Splats are smaller where there are more, as training leaves them.
+SIZES = {
+    "A20k": (20_000, 400, 300, 0.0175),
+    "B100k": (100_000, 800, 533, 0.0100),
+    "C500k": (500_000, 800, 533, 0.0056),
+    "D1M": (1_000_000, 1600, 1060, 0.0044),
+    "E3M": (3_000_000, 1600, 1060, 0.0031),
+}
+
+# What --quick changes of a scope.
+QUICK = {"repeats": 3, "seconds": 0.5, "workloads": ("A20k",), "steps": 40}
