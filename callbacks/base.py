@@ -1,7 +1,7 @@
 """What callbacks share: the check of the module, acting once per step, the folder of the run, the search for NaN."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 from lightning.pytorch import Callback, Trainer
@@ -31,23 +31,22 @@ class SplatCallback(Callback):
     overrides ``setup``, or one of these hooks beside its method, calls it here first.
 
     A callback is a dataclass whose fields are its settings; those that :attr:`state` names are what it has reached, and
-    have ``init=False``.
+    have ``init=False``. One that overrides ``__post_init__`` calls it here, for the check of the settings.
+
+    Raises:
+        ValueError: A setting is out of its bounds, or not finite.
     """
 
+    bounds: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    """What settings must be unless they are None: each time one of :data:`BOUNDS`, then their names."""
     state: ClassVar[tuple[str, ...]] = ()
     """Attributes that checkpoints carry, and that have the values of the class when a fit starts."""
+    passing: ClassVar[tuple[str, ...]] = ()
+    """Attributes that have the values of the class when a fit starts, and that no checkpoint carries."""
     _acted: ClassVar[dict[str, int]] = {}
 
-    def check(self, bounds: dict[str, Sequence[str]]) -> None:
-        """Check settings that are not None.
-
-        Args:
-            bounds: Names of settings by one of :data:`BOUNDS`.
-
-        Raises:
-            ValueError: One is out of its bounds, or not finite.
-        """
-        for bound, names in bounds.items():
+    def __post_init__(self) -> None:
+        for bound, *names in self.bounds:
             for name in names:
                 value = getattr(self, name)
                 if value is not None and not (math.isfinite(value) and BOUNDS[bound](value)):
@@ -62,7 +61,7 @@ class SplatCallback(Callback):
         if not isinstance(module, SplatModule):
             raise TypeError(f"{type(self).__name__} needs a SplatModule: derive {type(module).__name__} from it")
         if stage == "fit":
-            for name in ("_acted", *self.state):
+            for name in ("_acted", *self.state, *self.passing):
                 vars(self).pop(name, None)
 
     def state_dict(self) -> dict[str, Any]:

@@ -123,6 +123,8 @@ class RunCheckpoint(WritingCallback, Checkpoint):
         [1000, 1500, 2000, 3000, 4000, 4200, 4500]
     """
 
+    bounds = (("at least 0", "every"),)
+
     every: int | None = None
     keep: bool = False
     best_model_path: str = field(default="", init=False)
@@ -131,7 +133,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     _training: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
-        self.check({"at least 0": ("every",)})
+        super().__post_init__()
         self._stop = GracefulStop()
 
     @property

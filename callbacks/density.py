@@ -45,6 +45,7 @@ class Densification(SplatCallback, ABC):
     """A pruning that would leave fewer splats is skipped with a warning."""
     finite_every: int
     """Iterations between two searches for non-finite splats; a step whose loss is not finite always causes one."""
+    passing = ("_warned",)
     _warned = _counts = False
 
     @abstractmethod
@@ -62,12 +63,6 @@ class Densification(SplatCallback, ABC):
     @abstractmethod
     def act(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Do what is due after a complete iteration; the same on every process."""
-
-    def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
-        """Forget an earlier fit."""
-        super().setup(trainer, module, stage)
-        if stage == "fit":
-            self._warned = False
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Remove splats if there are already too many.
@@ -223,6 +218,12 @@ class DensityControl(Densification):
 
     tables: ClassVar[tuple[str, ...]] = ("gradient_sum", "view_count")
     limit_name: ClassVar[str] = "max_splats"
+    bounds = (
+        ("at least 1", "start", "every", "reset_every", "min_splats", "finite_every"),
+        ("at least 0", "white_reset", "prune_every", "huge_after", "grad_threshold", "dense_fraction"),
+        ("above 0", "shrink", "huge_fraction"),
+        ("between 0 and 1", "min_opacity", "reset_opacity"),
+    )
 
     max_splats: int | None = None
     start: int = 600
@@ -245,14 +246,7 @@ class DensityControl(Densification):
     finite_every: int = 100
 
     def __post_init__(self) -> None:
-        self.check(
-            {
-                "at least 1": ("start", "every", "reset_every", "min_splats", "finite_every"),
-                "at least 0": ("white_reset", "prune_every", "huge_after", "grad_threshold", "dense_fraction"),
-                "above 0": ("shrink", "huge_fraction"),
-                "between 0 and 1": ("min_opacity", "reset_opacity"),
-            }
-        )
+        super().__post_init__()
         if self.max_splats is not None and self.max_splats < self.min_splats:
             raise ValueError(f"max_splats must be at least min_splats={self.min_splats}, got {self.max_splats}")
 

@@ -44,11 +44,13 @@ class ExposureCompensation(SplatCallback):
         0.001
     """
 
+    bounds = (("above 0", "rate", "final"),)
+
     rate: float = 0.001
     final: float = 0.1
 
     def __post_init__(self) -> None:
-        self.check({"above 0": ("rate", "final")})
+        super().__post_init__()
         self._changes = torch.zeros(0, 3, 4)
         self._adam: torch.optim.Adam | None = None
         self._row: dict[int, int] = {}

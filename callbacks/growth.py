@@ -54,13 +54,15 @@ class SplatBudget(SplatCallback):
         [100000]
     """
 
+    bounds = (("above 0", "quality", "splats", "bytes"), ("at least 0", "start"))
+
     quality: float = 1.0
     splats: int | None = None
     bytes: int | None = None
     start: float = 0.8
 
     def __post_init__(self) -> None:
-        self.check({"above 0": ("quality", "splats", "bytes"), "at least 0": ("start",)})
+        super().__post_init__()
         if self.splats is not None and self.bytes is not None:
             raise ValueError("splats and bytes both say how large the scene is to be: give one of them")
 
@@ -180,6 +182,12 @@ class BudgetedGrowth(Densification):
 
     tables: ClassVar[tuple[str, ...]] = ("gradient_sum", "view_count", "edge_sum")
     limit_name: ClassVar[str] = "the budget"
+    bounds = (
+        ("at least 1", "every", "reset_every", "recovery", "min_splats", "overshoot", "finite_every"),
+        ("at least 0", "start", "first_prune", "recoveries", "patience", "grad_threshold", "late_threshold"),
+        ("between 0 and 1", "min_opacity", "first_opacity", "reset_opacity"),
+        ("in [0, 1)", "recovery_share"),
+    )
 
     budget: int | None = None
     overshoot: float = 2.0
@@ -205,14 +213,7 @@ class BudgetedGrowth(Densification):
     """How many times in a row hardly a splat had to be split."""
 
     def __post_init__(self) -> None:
-        self.check(
-            {
-                "at least 1": ("every", "reset_every", "recovery", "min_splats", "overshoot", "finite_every"),
-                "at least 0": ("start", "first_prune", "recoveries", "patience", "grad_threshold", "late_threshold"),
-                "between 0 and 1": ("min_opacity", "first_opacity", "reset_opacity"),
-                "in [0, 1)": ("recovery_share",),
-            }
-        )
+        super().__post_init__()
         if self.full <= self.start:
             raise ValueError(f"growth must be full after its start={self.start}, got full={self.full}")
         if self.budget is not None and self.budget < self.min_splats:

@@ -37,10 +37,9 @@ class OpacityRegularization(SplatCallback):
         2e-06
     """
 
-    weight: float = 1e-7
+    bounds = (("at least 0", "weight"),)
 
-    def __post_init__(self) -> None:
-        self.check({"at least 0": ("weight",)})
+    weight: float = 1e-7
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Turn the term on and off."""
@@ -85,10 +84,9 @@ class SplatSelection(SplatCallback):
         [50000]
     """
 
-    budget: int | None = None
+    bounds = (("at least 1", "budget"),)
 
-    def __post_init__(self) -> None:
-        self.check({"at least 1": ("budget",)})
+    budget: int | None = None
 
     def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Select when the phase starts.

@@ -97,13 +97,15 @@ class CodebookInit(SplatCallback):
         ['none']
     """
 
+    bounds = (("above 0", "values_per_splat"),)
+
     weights: Literal["none", "contribution"] = "contribution"
     values_per_splat: float | None = None
 
     def __post_init__(self) -> None:
         if self.weights not in ("none", "contribution"):
             raise ValueError(f"weights must be 'none' or 'contribution', got {self.weights!r}")
-        self.check({"above 0": ("values_per_splat",)})
+        super().__post_init__()
 
     def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Fit when the quantize phase starts."""
@@ -162,6 +164,8 @@ class CodebookReplacement(SplatCallback):
         (2050, 2100, 3900)
     """
 
+    bounds = (("in (0, 1]", "jitter"), ("at least 1", "start", "early_every", "late_every"))
+
     start: int = 10_700
     early_end: int = 11_500
     early_every: int = 200
@@ -171,7 +175,7 @@ class CodebookReplacement(SplatCallback):
     reset_moments: bool = True
 
     def __post_init__(self) -> None:
-        self.check({"in (0, 1]": ("jitter",), "at least 1": ("start", "early_every", "late_every")})
+        super().__post_init__()
         if not self.start <= self.early_end <= self.end:
             raise ValueError(f"needs start <= early_end <= end, got {self.start}, {self.early_end} and {self.end}")
 
@@ -257,11 +261,10 @@ class CodebookRefit(SplatCallback):
         [25000, 30000, 35000, 40000]
     """
 
+    bounds = (("at least 1", "every", "steps"),)
+
     every: int = 100
     steps: int = 10
-
-    def __post_init__(self) -> None:
-        self.check({"at least 1": ("every", "steps")})
 
     def is_due(self, module: SplatModule, iteration: int) -> bool:
         """Whether codebooks are refitted in this iteration."""
@@ -328,13 +331,11 @@ class RateDistortion(SplatCallback):
     """
 
     state = ("prices",)
+    bounds = (("above 0", "strength"),)
 
     strength: float = 2.0
     prices: dict[str, Tensor] | None = field(default=None, init=False)
     """What a bit costs each splat ``[N]`` in squared error, by attribute."""
-
-    def __post_init__(self) -> None:
-        self.check({"above 0": ("strength",)})
 
     def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Measure, and choose the codes of all splats, when the phase starts and after splats were dropped.
@@ -412,10 +413,9 @@ class FiniteCodes(SplatCallback):
         ValueError: every must be at least 1, got 0
     """
 
-    every: int = 100
+    bounds = (("at least 1", "every"),)
 
-    def __post_init__(self) -> None:
-        self.check({"at least 1": ("every",)})
+    every: int = 100
 
     def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Search when due.
@@ -456,15 +456,11 @@ class FreezeCodes(SplatCallback):
         4201
     """
 
+    passing = ("_edits", "_codes", "_warned")
+
     _edits: int | None = field(default=None, init=False)
     _codes: dict[str, Tensor] | None = field(default=None, init=False)
     _warned: bool = field(default=False, init=False)
-
-    def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
-        """Forget an earlier fit of the same callback."""
-        super().setup(trainer, module, stage)
-        if stage == "fit":
-            self._edits, self._codes, self._warned = None, None, False
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Freeze when fine-tuning starts, and again where splats have changed.

@@ -83,13 +83,14 @@ class MetricReport(WritingCallback):
     """
 
     stages = ("fit", "test")
+    bounds = (("at least 0", "every"),)
 
     every: int | None = None
     lpips: bool = True
     pictures: bool = True
 
     def __post_init__(self) -> None:
-        self.check({"at least 0": ("every",)})
+        super().__post_init__()
         self._scene: CompressedScene | None = None
         self._paper_level: dict[str, Any] = {}
         self._scores: list[dict[str, Any]] = []

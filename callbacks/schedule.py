@@ -55,6 +55,8 @@ class PhaseSchedule(SplatCallback):
         (2000, 2120, 2520, 3000)
     """
 
+    bounds = (("at least 1", "iterations_per_photo", "least_iterations"), ("above 0", "minutes"))
+
     total: int | None = None
     reference_total: int | None = 15_000
     warmup_end: int = 8000
@@ -71,7 +73,7 @@ class PhaseSchedule(SplatCallback):
     _steps: int = field(default=-1, init=False)
 
     def __post_init__(self) -> None:
-        self.check({"at least 1": ("iterations_per_photo", "least_iterations"), "above 0": ("minutes",)})
+        super().__post_init__()
         if self.total is not None or self.reference_total is not None:
             # Report wrong settings at once, not after the scene is loaded.
             self.schedule(self.total or self.reference_total or 1)
@@ -167,10 +169,9 @@ class ShDegreeSchedule(SplatCallback):
         [0, 1, 2, 3, 3]
     """
 
-    every: int = 500
+    bounds = (("at least 1", "every"),)
 
-    def __post_init__(self) -> None:
-        self.check({"at least 1": ("every",)})
+    every: int = 500
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Set the degree of the iteration that starts."""
@@ -199,11 +200,10 @@ class LearningRateDecay(SplatCallback):
         [0.1]
     """
 
+    bounds = (("in (0, 1]", "final"), ("at least 0", "start"))
+
     final: float = 0.1
     start: int | None = 10_600
-
-    def __post_init__(self) -> None:
-        self.check({"in (0, 1]": ("final",), "at least 0": ("start",)})
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Scale the rates of this iteration."""
