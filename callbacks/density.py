@@ -120,6 +120,7 @@ class Densification(SplatCallback, ABC):
         lowered = module.splats.opacities.clamp(max=math.log(ceiling / (1.0 - ceiling)))
         row_ops.replace_attribute(module.splats, optimizer, "opacities", lowered)
         row_ops.reset_moments(optimizer, "opacities")
+        distributed.check_replicas(trainer, "the opacity reset")
 
     def _view(self, trainer: Trainer, module: SplatModule, outputs: dict[str, Any]) -> Render | None:
         """The step's rendering; None if there is none, its loss is not finite, or the splats have changed since."""
@@ -137,34 +138,32 @@ class Densification(SplatCallback, ABC):
             )
         return None
 
-    def add(self, tables: Sequence[Tensor], render: Render, micro_batches: int) -> None:
-        """Add a rendered view to the tables ``[N]``, in place.
-
-        Args:
-            tables: In the order of :attr:`tables`.
-            render: The rendering, after its backward pass.
-            micro_batches: Views in a step of this process, by which the loss was divided.
-        """
-        gradients = self.gradients(render)
-        if gradients is not None:
-            height, width = render.alpha.shape
-            # Each micro-batch is a separate view here.
-            add_view(tables, gradients, render.radii, width * micro_batches, height * micro_batches)
-
     def _observe(self, trainer: Trainer, module: SplatModule, render: Render | None) -> None:
         """Add one view (of each process) to the statistics; None, for a view without a loss, adds nothing."""
         tables = [module.splats.add_table(name) for name in self.tables]
-        micro_batches = trainer.accumulate_grad_batches
-        if trainer.world_size == 1:
-            if render is not None:
-                self.add(tables, render, micro_batches)
-            return
-        own = tables[0].new_zeros(len(tables), len(tables[0]))
-        if render is not None:
-            self.add(own.unbind(), render, micro_batches)
-        # A collective: every process must call it, even with nothing to add.
-        for table, total in zip(tables, distributed.sum_over_processes(trainer, own), strict=True):
-            table.add_(total)
+        several, own = trainer.world_size > 1, tables
+        if several:
+            own = [torch.zeros_like(table) for table in tables]
+        if render is not None and (gradients := self.gradients(render)) is not None:
+            # Each micro-batch is a separate view here; the loss was divided by their number.
+            height, width = (side * trainer.accumulate_grad_batches for side in render.alpha.shape)
+            add_view(own, gradients, render.radii, width, height)
+        if several:  # a collective: every process must call it, even with nothing to add
+            for table, total in zip(tables, distributed.sum_over_processes(trainer, torch.stack(own)), strict=True):
+                table.add_(total)
+
+    def divide(self, trainer: Trainer, module: SplatModule, divided: Tensor, new: RawSplats) -> int:
+        """Put new splats in place of those of ``divided [N]``, and begin the statistics anew.
+
+        Returns:
+            How many splats there are more.
+        """
+        splats, optimizer, before = module.splats, trainer.optimizers[0], len(module.splats)
+        row_ops.append_rows(splats, optimizer, new._asdict())
+        row_ops.keep_rows(splats, optimizer, torch.cat([~divided, divided.new_ones(len(splats) - before)]))
+        for name in self.tables:
+            splats.add_table(name).zero_()
+        return len(splats) - before
 
 
 @dataclass(eq=False)
@@ -276,7 +275,6 @@ class DensityControl(Densification):
             first = bool(on_white) and iteration == schedule.iteration(self.white_reset)
             if first or iteration in schedule.reset_times(self.reset_last, self.reset_every):
                 self.reset_opacities(trainer, module, self.reset_opacity)
-                distributed.check_replicas(trainer, "the opacity reset")
         prune_times = schedule.times(self.prune_start, self.prune_last, self.prune_every) if self.prune_every else ()
         if phase is Phase.PRUNE and iteration in prune_times:
             pruned = self._prune(trainer, module, huge=False)
@@ -287,7 +285,7 @@ class DensityControl(Densification):
     @torch.no_grad()
     def _grow(self, trainer: Trainer, module: SplatModule, iteration: int) -> int:
         """Clone and split; returns how many splats were added. Resets the statistics."""
-        splats, optimizer = module.splats, trainer.optimizers[0]
+        splats = module.splats
         gradient_sum, views = (splats.add_table(name) for name in self.tables)
         statistic = gradient_sum / views.clamp(min=1)
         large = splats.scales.amax(1).exp() > self.dense_fraction * module.extent
@@ -295,16 +293,11 @@ class DensityControl(Densification):
         if self.max_splats is not None:
             ranks = torch.where(grown, statistic, -torch.inf)
             grown &= most_contributing(ranks, max(0, self.max_splats - len(splats)))
-        divided, before = grown & large, len(splats)
-        chosen = grown & ~large, divided
+        chosen = grown & ~large, grown & large
         clones, parents = (RawSplats(*(tensor.detach()[mask] for tensor in splats.raw())) for mask in chosen)
         children = split(parents, self.shrink, generator(module.seed, iteration, "split"))
-        new = (torch.cat(pair) for pair in zip(clones, children, strict=True))
-        row_ops.append_rows(splats, optimizer, RawSplats(*new)._asdict())
-        row_ops.keep_rows(splats, optimizer, torch.cat([~divided, divided.new_ones(len(splats) - before)]))
-        for name in self.tables:
-            splats.add_table(name).zero_()
-        return len(splats) - before
+        new = RawSplats(*(torch.cat(pair) for pair in zip(clones, children, strict=True)))
+        return self.divide(trainer, module, grown & large, new)
 
     def _prune(self, trainer: Trainer, module: SplatModule, *, huge: bool) -> int:
         """Prune transparent splats, and huge ones if asked for; returns how many."""

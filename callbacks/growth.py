@@ -18,7 +18,7 @@ from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, codebook_bits
 from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training import distributed, row_ops, scene_module
+from nsvq_lightning.training import distributed, scene_module
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
@@ -269,7 +269,6 @@ class BudgetedGrowth(Densification):
         resets = schedule.reset_times(self.reset_last, self.reset_every)
         if iteration in resets:
             self.reset_opacities(trainer, module, self.reset_opacity)
-            distributed.check_replicas(trainer, "the opacity reset")
         if iteration in (reset + schedule.interval(self.recovery) for reset in resets[: self.recoveries]):
             transparency = -module.splats.opacities
             self.prune(trainer, module, most_contributing(transparency, int(self.recovery_share * len(transparency))))
@@ -288,13 +287,8 @@ class BudgetedGrowth(Densification):
         progress = min(max((reference - self.start) / (self.full - self.start), 0.0), 1.0)
         room = int(self.limit(module) * math.sqrt(progress)) - len(splats)
         divided = draw_rows(candidates, room, generator(module.seed, iteration, "grow"))
-        before = len(splats)
         parents = RawSplats(*(tensor.detach()[divided] for tensor in splats.raw()))
-        row_ops.append_rows(splats, trainer.optimizers[0], split_longest(parents)._asdict())
-        row_ops.keep_rows(splats, trainer.optimizers[0], torch.cat([~divided, divided.new_ones(len(splats) - before)]))
-        for name in self.tables:
-            splats.add_table(name).zero_()
-        return room, len(splats) - before
+        return room, self.divide(trainer, module, divided, split_longest(parents))
 
 
 # Fewest splats of a scene.
