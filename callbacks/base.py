@@ -2,14 +2,17 @@
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ClassVar
 
 from lightning.pytorch import Callback, Trainer
 
 from nsvq_lightning.data.scene import View
+from nsvq_lightning.report.files import file_stem
 from nsvq_lightning.training import row_ops
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import hold, is_fast_dev_run, let_go, run_folder
+from nsvq_lightning.training.scene_module import scene_of
 
 # What a setting may be, by how an error says it.
 BOUNDS: dict[str, Callable[[float], bool]] = {
@@ -135,6 +138,12 @@ class WritingCallback(SplatCallback):
         """Let go of the folder: nothing is written after this."""
         if stage in self.stages:
             let_go(run_folder(trainer))
+
+
+def picture_file(trainer: Trainer, folder: Path, view: str) -> Path:
+    """File for the picture of a view of the trainer's scene, by its name."""
+    scene = scene_of(trainer)
+    return folder / f"{file_stem(view, () if scene is None else scene.names)}.png"
 
 
 def finite_search_is_due(trainer: Trainer, every: int) -> bool:

@@ -20,7 +20,7 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 from nsvq_lightning.training.scene_module import scene_of
 
-from .base import WritingCallback
+from .base import WritingCallback, picture_file
 
 log = logging.getLogger(__name__)
 
@@ -114,9 +114,7 @@ class RenderWriter(BasePredictionWriter):
         """Write one picture."""
         if is_fast_dev_run(trainer):
             return
-        scene = scene_of(trainer)
-        stem = files.file_stem(prediction["name"], scene.names if scene is not None else ())
-        files.write_png(self._target / f"{stem}.png", prediction["image"])
+        files.write_png(picture_file(trainer, self._target, prediction["name"]), prediction["image"])
 
     def on_predict_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Say where the pictures are."""

@@ -5,7 +5,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -26,9 +25,8 @@ from nsvq_lightning.report import files, page
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
-from nsvq_lightning.training.scene_module import scene_of
 
-from .base import WritingCallback
+from .base import WritingCallback, picture_file
 
 
 def notify_monitors(trainer: Trainer, module: SplatModule) -> None:
@@ -94,7 +92,6 @@ class MetricReport(WritingCallback):
         self._scene: CompressedScene | None = None
         self._paper_level: dict[str, Any] = {}
         self._scores: list[dict[str, Any]] = []
-        self._folder = Path()
         self._lpips: Metric | None = None
         self._lpips_reason: str | None = None
         self._seconds: dict[str, float] = {}
@@ -191,9 +188,7 @@ class MetricReport(WritingCallback):
         self._scene, self._scores = None, []
         if is_fast_dev_run(trainer):
             return
-        # All processes call this hook; later ones differ, as some have fewer views than others.
-        self._folder = run_folder(trainer)
-        path = self._folder / "scene.nsvq"
+        path = run_folder(trainer) / "scene.nsvq"
         with self._timed("file written and read"):
             if trainer.is_global_zero:
                 scene = module.compressed()
@@ -224,14 +219,9 @@ class MetricReport(WritingCallback):
         score["cc_ssim"] = float(ssim(corrected, photo, batch.mask))
         self._scores.append(score)
         if self.pictures:
-            path = self._picture(trainer, batch.name)
+            path = picture_file(trainer, run_folder(trainer) / "renders", batch.name)
             path.parent.mkdir(exist_ok=True)
             files.write_png(path, files.comparison(image, photo))
-
-    def _picture(self, trainer: Trainer, view: str) -> Path:
-        """File of the picture of a view."""
-        scene = scene_of(trainer)
-        return self._folder / "renders" / f"{files.file_stem(view, scene.names if scene is not None else ())}.png"
 
     def on_test_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Write the figures."""
@@ -244,14 +234,12 @@ class MetricReport(WritingCallback):
             scores = [score for part in gathered for score in part]
         scores = sorted(scores, key=lambda score: score["name"])
         if trainer.is_global_zero and scores:
-            folder = self._folder
-            lpips: tuple[float | None, str | None] = (None, self._lpips_reason)
-            if self._lpips is not None:
-                lpips = fmean(score["lpips"] for score in scores), None
+            folder = run_folder(trainer)
+            lpips = None if self._lpips is None else fmean(score["lpips"] for score in scores), self._lpips_reason
             metrics = files.summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper_level)
             files.write_metrics(folder / "metrics.json", metrics)
             files.write_csv(folder / "views.csv", scores)
-            paths = [self._picture(trainer, score["name"]) for score in scores]
+            paths = [picture_file(trainer, folder / "renders", score["name"]) for score in scores]
             views = [score | {"picture": path.name} for score, path in zip(scores, paths, strict=True)]
             written = page.write_page(folder, module.history, module.schedule, self._other_seconds(), metrics, views)
             log.info(f"report: {written}")
