@@ -120,10 +120,12 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     parser = given.Parser(prog=f"nsvq {name}", description=about, epilog=more, formatter_class=form)
     command.add_arguments(parser)
     options, further = parser.parse_known_args(arguments)
-    if "further" in options:  # the command passes them on
-        options.further = further
-    elif further:
-        parser.error(f"unrecognized arguments: {' '.join(further)}")
+    if further:
+        if "further" not in options:
+            parser.error(f"unrecognized arguments: {' '.join(further)}")
+        if not further[0].startswith("-"):
+            parser.error(f"unknown argument {further[0]!r}; a list has commas between its entries, and no spaces")
+        options.further = further  # for the commands that pass them on
     logging.basicConfig(format="%(message)s")
     logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
     try:

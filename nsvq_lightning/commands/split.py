@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq split`` takes; what it does not know are options of ``nsvq fit``."""
     parser.usage = "nsvq split SCENE OUT [--blocks N] [options of nsvq fit]"
     parser.allow_abbrev = False
-    parser.set_defaults(further=[])
+    parser.set_defaults(further=())
     parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
     parser.add_argument("output", type=Path, metavar="OUT", help="new folder, with a folder for each part")
     parser.add_argument("--blocks", type=positive(int), default=4, metavar="N", help="number of parts; 4 by default")
@@ -31,12 +31,9 @@ def run(options: argparse.Namespace) -> int:
     """Write the parts, and print the commands that train them.
 
     Raises:
-        argparse.ArgumentError: There is an argument that is no option.
         ValueError: The scene cannot be used or has too little to see for so many parts.
         OSError: The output exists, or a file cannot be read or written.
     """
-    if options.further and not options.further[0].startswith("-"):
-        raise argparse.ArgumentError(None, f"unknown argument {options.further[0]!r}")
     from nsvq_lightning.data.blocks import cut, write_blocks
     from nsvq_lightning.data.scene import load_scene
 

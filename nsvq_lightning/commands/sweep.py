@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq sweep`` takes; what it does not know are options of ``nsvq fit``."""
     parser.usage = "nsvq sweep --output FOLDER [options] [options of nsvq fit]"
     parser.allow_abbrev = False
-    parser.set_defaults(further=[])
+    parser.set_defaults(further=())
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="where all results go")
     add = parser.add_argument_group("what is combined; lists have commas between their entries").add_argument
     listed: dict[str, Any] = {"type": given.names, "default": ()}
@@ -60,17 +60,13 @@ def run(options: argparse.Namespace) -> int:
         0, or 1 if a run has failed.
 
     Raises:
-        argparse.ArgumentError: There is an argument that is no option.
         ValueError: The scenes or configurations are wrong.
         OSError: Another sweep writes to the folder, or a file cannot be read or written.
         KeyboardInterrupt: After Ctrl-C or SIGTERM.
     """
     from nsvq_lightning.training.run_folder import hold, let_go
 
-    output, further = options.output, options.further
-    if further and not further[0].startswith("--"):
-        message = f"unknown argument {further[0]!r}; a list has commas between its entries, and no spaces"
-        raise argparse.ArgumentError(None, message)
+    output = options.output
     runs = plan(options)
     output.mkdir(parents=True, exist_ok=True)
     hold(output)
