@@ -46,8 +46,7 @@ def to_compressed(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> Com
 
 
 def _numpy(tensor: Tensor) -> NDArray[Any]:
-    array: NDArray[Any] = tensor.detach().cpu().numpy()
-    return array
+    return np.asarray(tensor.detach().cpu().numpy())
 
 
 @torch.no_grad()

@@ -341,8 +341,7 @@ def random_points(cameras: list[Camera]) -> NDArray[np.float64]:
     rays = np.stack([x, y, np.ones_like(x)], axis=1)
     points = centres[chosen] + np.einsum("pij,pj->pi", rotations[chosen], rays * depth[:, None])
     order = np.argsort(-_sightings(points, cameras), kind="stable")
-    chosen_points: NDArray[np.float64] = points[order[:RANDOM_POINTS]]
-    return chosen_points
+    return np.asarray(points[order[:RANDOM_POINTS]])
 
 
 def _sightings(points: NDArray[np.float64], cameras: list[Camera]) -> NDArray[np.int64]:

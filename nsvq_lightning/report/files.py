@@ -237,8 +237,7 @@ def comparison(image: Tensor, photo: Tensor, gain: float = 4.0) -> Tensor:
 
 def as_bytes(image: Tensor) -> NDArray[np.uint8]:
     """An image ``[H, W, 3]`` in [0, 1] with 8 bits."""
-    pixels: NDArray[np.uint8] = (image.clamp(0.0, 1.0) * 255).round().to(torch.uint8).cpu().numpy()
-    return pixels
+    return np.asarray((image.clamp(0.0, 1.0) * 255).round().to(torch.uint8).cpu().numpy())
 
 
 def write_png(path: Path, image: Tensor) -> None:

@@ -169,8 +169,7 @@ class Splats(nn.Module):
         if name not in self._tables:
             self._tables.append(name)
             self.register_buffer(name, torch.zeros(len(self), dtype=dtype, device=self.means.device))
-        table: Tensor = getattr(self, name)
-        return table
+        return self.get_buffer(name)
 
     def tables(self) -> dict[str, Tensor]:
         """The side tables by name."""

@@ -215,8 +215,7 @@ log = logging.getLogger(__name__)
 
 def scene_of(trainer: Trainer | None) -> Scene | None:
     """The scene of the trainer's data module; None if it has none."""
-    scene: Scene | None = getattr(getattr(trainer, "datamodule", None), "scene", None)
-    return scene
+    return cast("Scene | None", getattr(getattr(trainer, "datamodule", None), "scene", None))
 
 
 def needed_scene(trainer: Trainer, need: str, otherwise: str) -> Scene:

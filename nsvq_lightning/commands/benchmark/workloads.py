@@ -127,8 +127,7 @@ def _tensor(values: Floats) -> Tensor:
 def _directions(rng: np.random.Generator, count: int, dim: int) -> Floats:
     """Uniform unit vectors ``[count, dim]``."""
     vectors = rng.normal(size=(count, dim))
-    unit: Floats = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    return unit
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
 def _positions(count: int, rng: np.random.Generator) -> Floats:
