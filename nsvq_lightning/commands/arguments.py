@@ -54,17 +54,17 @@ def integers(text: str) -> tuple[int, ...]:
         raise argparse.ArgumentTypeError(f"expected whole numbers with commas between them, got {text!r}") from None
 
 
-def positive(kind: type[int] | type[float], zero: bool = False) -> Callable[[str], int | float]:
+def positive(kind: type[int] | type[float]) -> Callable[[str], int | float]:
     """A function that reads a number of this kind.
 
     Raises:
-        argparse.ArgumentTypeError: By the function: it is not above 0, or with ``zero`` not at least 0, or not finite.
+        argparse.ArgumentTypeError: By the function: it is not above 0, or not finite.
     """
 
     def parse(text: str) -> int | float:
         value = kind(text)
-        if not (0 < value < float("inf") or (zero and value == 0)):
-            raise argparse.ArgumentTypeError(f"must be {'at least' if zero else 'above'} 0, got {text}")
+        if not 0 < value < math.inf:
+            raise argparse.ArgumentTypeError(f"must be above 0, got {text}")
         return value
 
     parse.__name__ = kind.__name__  # argparse says "invalid float value"
