@@ -3,6 +3,7 @@
 import logging
 import signal
 import threading
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -217,9 +218,6 @@ class RunCheckpoint(WritingCallback, Checkpoint):
 def _write(trainer: Trainer, path: Path) -> None:
     """Write a checkpoint in one step; Lightning itself writes into the system's temporary folder and copies."""
     # weights_only=False here: save the optimiser's state too. The file holds plain data all the same.
-    if not trainer.is_global_zero:
-        trainer.save_checkpoint(path, weights_only=False)
-        return
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary:
-        trainer.save_checkpoint(temporary, weights_only=False)
+    with atomic_path(path) if trainer.is_global_zero else nullcontext(path) as target:
+        trainer.save_checkpoint(target, weights_only=False)
