@@ -166,7 +166,7 @@ class SplatCLI(LightningCLI):
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
         """Lightning's subcommands and ours, each with the arguments that are not options."""
-        return {**LightningCLI.subcommands(), "export": {"model"}}
+        return {**LightningCLI.subcommands(), "export": {"model", "datamodule"}}
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """Add the callbacks and the switches."""
@@ -223,12 +223,6 @@ class SplatCLI(LightningCLI):
             own = [argument for argument in self._arguments if argument.startswith(("--model.", "--model="))]
             self.config = self.parser.parse_args([self.config.subcommand, *own], namespace=self.config, defaults=False)
 
-    def _prepare_subcommand_kwargs(self, subcommand: str) -> dict[str, Any]:
-        kwargs = super()._prepare_subcommand_kwargs(subcommand)
-        if subcommand == "export":
-            kwargs.pop("datamodule", None)
-        return kwargs
-
     def instantiate_classes(self) -> None:
         """Make trainer, module and data.
 
@@ -251,9 +245,8 @@ class SplatCLI(LightningCLI):
         unwanted: list[type] = [NoneType]
         unwanted += [ProgressBar] if settings.enable_progress_bar is False else []
         unwanted += [Checkpoint] if settings.enable_checkpointing is False else []
-        parser.callback_keys = [
-            key for key in parser.callback_keys if not isinstance(self._get(self.config_init, key), tuple(unwanted))
-        ]
+        given_keys = {key: self._get(self.config_init, key) for key in parser.callback_keys}
+        parser.callback_keys = [key for key, each in given_keys.items() if not isinstance(each, tuple(unwanted))]
         if settings.logger in (None, True):
             kwargs["logger"] = False  # until the run has a folder: see RunStart
         if self.subcommand == "validate" and settings.limit_val_batches == 0:

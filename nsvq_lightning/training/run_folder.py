@@ -235,7 +235,7 @@ class SplatTrainer(Trainer):
         if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # Lightning's own
             self.strategy.checkpoint_io = PlainCheckpointIO()
 
-    def export(self, model: SplatModule, ckpt_path: str, output: str = "scene.nsvq") -> Path:
+    def export(self, model: SplatModule, ckpt_path: str, output: str = "scene.nsvq", datamodule: Any = None) -> Path:
         """Write the scene of a checkpoint as a file.
 
         Args:
@@ -243,6 +243,7 @@ class SplatTrainer(Trainer):
             ckpt_path: Checkpoint of a run.
             output: File to write; its suffix selects the format: .nsvq is the compressed scene, any other format holds
                 the decoded splats (.ply, .sog, .spz, .splat).
+            datamodule: As of the trainer's other methods; it is not needed.
 
         Raises:
             FileNotFoundError: No such checkpoint.
