@@ -104,7 +104,5 @@ def iterations_within(minutes: float, trainer: Trainer, module: SplatModule, sch
         parts = [(1.0, budget or round(PAPER_SPLATS * splats_for_photos(len(scene.train), detailed_pixels(scene))))]
     else:
         parts = stretches(schedule, growth, max(len(scene.points), module.first_points or 0), budget)
-    steps = (
-        60 * minutes / (trainer.accumulate_grad_batches * iteration_seconds(scene, parts, trainer.strategy.root_device))
-    )
-    return int(trainer.strategy.broadcast(max(1, round(steps))))
+    seconds = trainer.accumulate_grad_batches * iteration_seconds(scene, parts, trainer.strategy.root_device)
+    return int(trainer.strategy.broadcast(max(1, round(60 * minutes / seconds))))

@@ -80,9 +80,8 @@ class SplatBudget(SplatCallback):
         if self.bytes is not None:
             codebooks = {name: tuple(quantizer.codebook.shape) for name, quantizer in module.quantizers.items()}
             choices = [c.strength for c in trainer.callbacks if isinstance(c, RateDistortion)]  # type: ignore[attr-defined]
-            budget = splats_for_bytes(
-                self.bytes, codebooks, module.splats.sh_degree, module.storage.precision, max(choices, default=0.0)
-            )
+            stored = module.splats.sh_degree, module.storage.precision, max(choices, default=0.0)
+            budget = splats_for_bytes(self.bytes, codebooks, *stored)
             reason = f"for a file of {self.bytes} bytes"
         elif self.splats is None:
             advice = "give a number of splats (--splats) or bytes (--bytes)"

@@ -116,9 +116,8 @@ def run(options: argparse.Namespace) -> int:
         finest = scene if most == len(scene) else compressor.at(Setting(most, "none")).scene
         levels = [finest, *(compressor.at(setting).scene for setting in thinner)]
         size = save(levels[0], options.output, coarser=levels[1:])
-        sys.stdout.write(
-            f"{options.output}: levels of {', '.join(f'{len(x):,}' for x in levels)} splats, {size:,} bytes\n"
-        )
+        counts = ", ".join(f"{len(level):,}" for level in levels)
+        sys.stdout.write(f"{options.output}: levels of {counts} splats, {size:,} bytes\n")
         return 130 if compressor.stopped else 0
     if options.max_error is not None:
         candidate = compressor.smallest_within(options.max_error, most)

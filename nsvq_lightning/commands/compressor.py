@@ -124,14 +124,12 @@ class Compressor:
             ValueError: None was found.
         """
         best: Candidate | None = None
-        asked = float(target)
+        asked, near = float(target), (1 - SLACK) * target
         for _ in range(ESTIMATES):
             setting = setting_for(int(asked), splats, self._scene.sh_degree)
             if setting.codebooks == "none" and len((exact := self.at(replace(setting, step=0.0))).data) <= target:
                 return exact
-            found = self._between(
-                setting, True, lambda each: len(each.data) <= target, lambda size: size >= (1 - SLACK) * target
-            )
+            found = self._between(setting, True, lambda each: len(each.data) <= target, lambda size: size >= near)
             if found and (best is None or len(found.data) > len(best.data)):
                 best = found
             if self.stopped or (found and (setting.step or len(found.data) >= (1 - 2 * SLACK) * target)):

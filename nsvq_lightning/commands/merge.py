@@ -37,17 +37,15 @@ def run(options: argparse.Namespace) -> int:
     from nsvq_lightning.rendering.rasterize import render
 
     format_of(options.output)
-    folders = sorted(
-        (path.parent for path in options.parts.glob(f"*/{BLOCK}")), key=lambda path: (len(path.name), path)
-    )
+    found = (path.parent for path in options.parts.glob(f"*/{BLOCK}"))
+    folders = sorted(found, key=lambda path: (len(path.name), path))
     if not folders:
         raise ValueError(f"{options.parts} has no parts: make them with 'nsvq split'")
     blocks = [Block.read(folder) for folder in folders]
     files = [folder / RUN / "scene.nsvq" for folder in folders]
     if missing := [file for file in files if not file.is_file()]:
-        raise ValueError(
-            f"{len(missing)} of {len(files)} parts are not trained yet, first {missing[0]}: run their fits"
-        )
+        untrained = f"{len(missing)} of {len(files)} parts are not trained yet"
+        raise ValueError(f"{untrained}, first {missing[0]}: run their fits")
     parts = []
     for folder, block, file in zip(folders, blocks, files, strict=True):
         whole = read_scene(file)

@@ -50,8 +50,7 @@ class Block:
         """
         ground = points.astype(np.float64) @ np.array(self.axes).T
         low, high = (1 - share) * np.array(self.core) + share * np.array(self.around)
-        inside: NDArray[np.bool_] = ((ground >= low) & (ground < high)).all(1)
-        return inside
+        return np.asarray(((ground >= low) & (ground < high)).all(1))
 
     @classmethod
     def read(cls, folder: Path) -> "Block":
@@ -159,8 +158,7 @@ def _quantiles(
 ) -> NDArray[np.float64]:
     order = values.argsort()
     sums = weights[order].cumsum()
-    found: NDArray[np.float64] = values[order][np.searchsorted(sums, np.array(shares) * sums[-1])]
-    return found
+    return np.asarray(values[order][np.searchsorted(sums, np.array(shares) * sums[-1])])
 
 
 # What of the surroundings counts as at the seam.
@@ -208,9 +206,8 @@ def write_blocks(scene: Scene, blocks: Sequence[Block], folders: Sequence[Path])
             frames[number]["test" if index in scene.test else "train"].append(entry)
     for block, folder, some, found in zip(blocks, folders, inside, frames, strict=True):
         if not found["train"] or not found["test"]:
-            raise SceneError(
-                f"a part is in {len(found['train'])} train and {len(found['test'])} test photos: ask for fewer parts"
-            )
+            train, test = len(found["train"]), len(found["test"])
+            raise SceneError(f"a part is in {train} train and {test} test photos: ask for fewer parts")
         # Positions, then colours.
         columns = [*points[some].T, *np.rint(255 * scene.colors.numpy()[some]).T]
         write_elements(folder / "points.ply", {"vertex": np.rec.fromarrays(columns, dtype=_POINT)})

@@ -366,9 +366,8 @@ class Undistortion:
             ) from error
         self._camera = camera
         self._scale = (width / camera.width, height / camera.height)
-        self.pinhole = Pinhole(ideal.calibration_matrix(), ideal.width, ideal.height).resized(
-            max(1, round(ideal.width * self._scale[0])), max(1, round(ideal.height * self._scale[1]))
-        )
+        size = max(1, round(ideal.width * self._scale[0])), max(1, round(ideal.height * self._scale[1]))
+        self.pinhole = Pinhole(ideal.calibration_matrix(), ideal.width, ideal.height).resized(*size)
         self._size = (width, height)
         self._keep_maps = keep_maps
         self._maps: Maps | None = None

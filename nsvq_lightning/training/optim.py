@@ -47,9 +47,8 @@ class LearningRates:
             value = getattr(self, field.name)
             positive = field.name.startswith("means")  # interpolated in the logarithm
             if not (math.isfinite(value) and (value > 0 if positive else value >= 0)):
-                raise ValueError(
-                    f"rate {field.name} must be finite and {'above' if positive else 'at least'} 0, got {value}"
-                )
+                bound = "above" if positive else "at least"
+                raise ValueError(f"rate {field.name} must be finite and {bound} 0, got {value}")
 
 
 def position_lr(iteration: int, extent: float, rates: LearningRates, decay_end: int) -> float:
