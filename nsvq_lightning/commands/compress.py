@@ -17,7 +17,7 @@ from pathlib import Path
 
 from nsvq_lightning.commands.arguments import positive, views_of
 from nsvq_lightning.compression.setting import Setting, setting_for
-from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.atomic import write_bytes
 from nsvq_lightning.io.lod import NAME
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
 from nsvq_lightning.splats.attributes import SIZES
@@ -126,8 +126,7 @@ def run(options: argparse.Namespace) -> int:
     else:
         candidate = compressor.at(Setting(most, books))
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(options.output) as file:
-        file.write(candidate.data)
+    write_bytes(options.output, candidate.data)
     before, after, error = options.input.stat().st_size, len(candidate.data), compressor.error(candidate)
     books = "no codebooks" if candidate.setting.codebooks == "none" else f"codebooks {candidate.setting.codebooks}"
     views = "its own pictures" if photos is None else f"the photos of {photos.root}"

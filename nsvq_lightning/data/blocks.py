@@ -19,7 +19,7 @@ from scipy.ndimage import distance_transform_edt
 
 from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.scene import Scene
-from nsvq_lightning.io.atomic import atomic_write, write_text
+from nsvq_lightning.io.atomic import write_bytes, write_text
 from nsvq_lightning.io.compressed import turn_up
 from nsvq_lightning.io.ply import write_elements
 from nsvq_lightning.rendering.camera import Camera, up_of
@@ -252,8 +252,7 @@ def _write_photo(
     for name, pixels in zip(names.values(), (image[box][..., ::-1], 255 * mask[box].astype(np.uint8)), strict=True):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as file:
-            file.write(cv2.imencode(".png", np.ascontiguousarray(pixels))[1].tobytes())
+        write_bytes(path, cv2.imencode(".png", np.ascontiguousarray(pixels))[1].tobytes())
     fx, fy, cx, cy = camera.intrinsics
     height, width = mask[box].shape
     # The file has the inverse, y up, z backward.

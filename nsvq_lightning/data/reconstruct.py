@@ -19,7 +19,7 @@ from cv2.typing import MatLike
 
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
 from nsvq_lightning.data.images import DAMAGED, ORIENTATION, image_head
-from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.atomic import atomic_write, write_bytes
 
 
 @dataclass(frozen=True)
@@ -318,8 +318,7 @@ def write_frames(video: Path, folder: Path, count: int, done: Callable[[int], No
         if last is not None and float(np.abs(tiny - last).mean()) < STILL:
             continue
         path = folder / f"frame_{number:06d}.jpg"
-        with atomic_write(path) as file:
-            file.write(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())
+        write_bytes(path, cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())
         written.append(path)
         last = tiny
     return written

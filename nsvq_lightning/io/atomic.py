@@ -61,10 +61,15 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         yield file
 
 
+def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
+    """Write a file in one step, see :func:`atomic_write`."""
+    with atomic_write(path) as file:
+        file.write(content)
+
+
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write a text file as UTF-8 in one step, see :func:`atomic_write`."""
-    with atomic_write(path) as file:
-        file.write(text.encode())
+    write_bytes(path, text.encode())
 
 
 def remove_temporaries(folder: Path, process: str) -> None:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.io.atomic import atomic_path, atomic_write, write_text
+from nsvq_lightning.io.atomic import atomic_path, atomic_write, write_bytes, write_text
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import paper_header
 from nsvq_lightning.io.nsvq.header import read_header
@@ -242,9 +242,7 @@ def as_bytes(image: Tensor) -> NDArray[np.uint8]:
 
 def write_png(path: Path, image: Tensor) -> None:
     """Write an RGB image ``[H, W, 3]`` in [0, 1] as 8-bit PNG, atomically."""
-    data = cv2.imencode(".png", cv2.cvtColor(as_bytes(image), cv2.COLOR_RGB2BGR))[1]
-    with atomic_write(path) as file:
-        file.write(data.tobytes())
+    write_bytes(path, cv2.imencode(".png", cv2.cvtColor(as_bytes(image), cv2.COLOR_RGB2BGR))[1].tobytes())
 
 
 def log_pictures(loggers: Sequence[Logger], pictures: Sequence[Path], step: int) -> None:
