@@ -14,8 +14,6 @@ import argparse
 import logging
 import math
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,8 +22,6 @@ from tqdm import tqdm
 from nsvq_lightning.commands.arguments import cameras_of, positive, scene_file
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from nsvq_lightning.rendering.camera import Camera
     from nsvq_lightning.splats.splats import Splats
 
@@ -82,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
 
     from nsvq_lightning.io.formats import read_scene
     from nsvq_lightning.rendering.rasterize import render
-    from nsvq_lightning.report.files import VIDEO
+    from nsvq_lightning.report.files import VIDEO, frame_writer
 
     file = scene_file(options.scene)
     output = options.output or file.with_name("render.mp4")
@@ -98,9 +94,9 @@ def run(options: argparse.Namespace) -> int:
     raw, background = splats.to(device).raw(), torch.tensor(options.background, device=device)
     how = {"background": background, "antialiased": scene.antialiased, "backend": options.backend}
     width, height = cameras[0].width, cameras[0].height
-    with torch.no_grad(), _writer(output, width, height, fps) as write:
-        for index, camera in enumerate(tqdm(cameras, unit=" frames", mininterval=1)):
-            write(index, render(raw, camera, **how).image)
+    with torch.no_grad(), frame_writer(output, width, height, fps) as write:
+        for camera in tqdm(cameras, unit=" frames", mininterval=1):
+            write(render(raw, camera, **how).image)
     length = f", {len(cameras) / fps:.1f} s at {fps:g} frames per second" if is_video else ""
     sys.stdout.write(f"{output}: {len(cameras)} frames of {width}x{height}{length}\n")
     return 0
@@ -136,17 +132,3 @@ def _path(options: argparse.Namespace, splats: "Splats", is_video: bool) -> "tup
         every = min(3, math.ceil(len(given) / 2))  # photos are not evenly spaced
         return smooth_path([*given[:-1:every], given[-1]], frames), fps
     return given, fps
-
-
-@contextmanager
-def _writer(path: Path, width: int, height: int, fps: float) -> "Iterator[Callable[[int, Tensor], object]]":
-    """A function that writes the picture ``[H, W, 3]`` of a frame."""
-    from nsvq_lightning.report.files import as_bytes, video_writer, write_png
-
-    if path.suffix:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with video_writer(path, width, height, fps) as add:
-            yield lambda _, picture: add(as_bytes(picture))
-    else:
-        path.mkdir(parents=True, exist_ok=True)
-        yield lambda index, picture: write_png(path / f"{index:05d}.png", picture)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from functools import lru_cache
 from hashlib import sha256
-from itertools import cycle
+from itertools import count, cycle
 from pathlib import Path
 from typing import Any
 from unicodedata import normalize
@@ -165,7 +165,7 @@ def curve_figure(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> An
     """PSNR and number of splats over the iterations, with phases shaded, as a Matplotlib figure."""
     figure = new_figure(8, 4)
     quality = figure.add_subplot()
-    count = quality.twinx()
+    number = quality.twinx()
     iterations = [entry["iteration"] for entry in history]
     start, colours = 0, ("#dfe8f5", "#f8e6d0", "#dcefdc", "#efe0f0")
     for phase, end, colour in zip(Phase, schedule.ends, cycle(colours), strict=False):
@@ -173,11 +173,11 @@ def curve_figure(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> An
             quality.axvspan(start, end, color=colour, label=phase.name.lower(), linewidth=0)
         start = end
     quality.plot(iterations, [entry["psnr"] for entry in history], "o-", color="#1f4e9c", markersize=3)
-    count.plot(iterations, [entry["splats"] for entry in history], "-", color="#b5651d")
+    number.plot(iterations, [entry["splats"] for entry in history], "-", color="#b5651d")
     quality.set(xlabel="iteration", xlim=(0, max(schedule.ends[-1], 1)))
     quality.set_ylabel("test PSNR, dB", color="#1f4e9c")
-    count.set_ylabel("splats", color="#b5651d")
-    count.set_ylim(bottom=0)
+    number.set_ylabel("splats", color="#b5651d")
+    number.set_ylim(bottom=0)
     quality.legend(loc="lower right", fontsize="small")
     return figure
 
@@ -304,3 +304,23 @@ def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
             if ended.returncode:
                 raise OSError(f"ffmpeg could not write the video: {ended.stderr.decode(errors='replace').strip()}")
         file.replace(unfinished)
+
+
+@contextmanager
+def frame_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Callable[[Tensor], object]]:
+    """Write frames ``[H, W, 3]`` in [0, 1] into a video (:func:`video_writer`), or as PNGs into a folder.
+
+    Args:
+        path: A folder if it has no suffix.
+        width: Pixels.
+        height: Pixels.
+        fps: Frames per second.
+    """
+    if path.suffix:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with video_writer(path, width, height, fps) as add:
+            yield lambda picture: add(as_bytes(picture))
+    else:
+        path.mkdir(parents=True, exist_ok=True)
+        names = (path / f"{index:05d}.png" for index in count())
+        yield lambda picture: write_png(next(names), picture)
