@@ -13,18 +13,13 @@ import argparse
 import json
 import shutil
 import sys
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
 from nsvq_lightning.commands.arguments import positive
 from nsvq_lightning.io.atomic import write_text
-
-if TYPE_CHECKING:
-    from nsvq_lightning.data.reconstruct import Verdict
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -87,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     if len(names) < 2:
         raise ValueError(f"{source}: {len(names)} pictures are too few; a scene takes 50 to 300")
     verdict = reconstruct.reconstruct(scene, names, report, is_video, options.max_size, options.threads)
-    sys.stdout.writelines(f"{line}\n" for line in _told(verdict, images))
+    sys.stdout.writelines(f"{line}\n" for line in verdict.told(images))
     print(flush=True)
     problems = 0
     for finding in check_folder(scene):
@@ -101,8 +96,6 @@ def run(options: argparse.Namespace) -> int:
 
 # File that shows that a folder was made by this command, and from what.
 RECORD = "prepare.json"
-# Photos below which a scene is likely to look good only from where they were taken.
-MIN_PHOTOS = 20
 
 
 def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
@@ -124,36 +117,3 @@ def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
             shutil.rmtree(target) if target.is_dir() else target.unlink(missing_ok=True)
     (scene / "images").mkdir(parents=True, exist_ok=True)
     write_text(path, json.dumps(record, indent=2) + "\n")
-
-
-def _told(verdict: "Verdict", images: Path) -> Iterator[str]:
-    """What came out, and what to take again."""
-    from nsvq_lightning.data.images import read_image
-    from nsvq_lightning.data.reconstruct import sharpness
-
-    count, total = len(verdict.registered), len(verdict.registered) + len(verdict.missing)
-    yield (
-        f"{count} of {total} photos have found their place, {verdict.points:,} points, seen by {verdict.track:.1f} "
-        f"photos each, error {verdict.error:.2f} pixels"
-    )
-    if verdict.error > 1.5:
-        yield "  the error is large: was zoom or focus changing, or something moving?"
-    if count < MIN_PHOTOS:
-        yield f"  {count} photos are few: 50 and more make a scene that can be walked around"
-    if verdict.models > 1:
-        apart = f"  the photos fall apart into {verdict.models} scenes; sparse/0 is the largest: "
-        yield f"{apart}take more photos between"
-    if not verdict.missing:
-        return
-    some = verdict.registered[:: max(1, count // MIN_PHOTOS)]
-    usual = sorted(sharpness(read_image(images / name)) for name in some)[len(some) // 2]
-    yield "  without a place, better taken again:"
-    listed = 8
-    for name, partners in list(verdict.missing.items())[:listed]:
-        if sharpness(read_image(images / name)) < 0.3 * usual:
-            reason = "blurred"
-        else:
-            reason = f"shares enough with {partners} other photos" if partners else "overlaps no other"
-        yield f"    {name}: {reason}"
-    if len(verdict.missing) > listed:
-        yield f"    and {len(verdict.missing) - listed} more"

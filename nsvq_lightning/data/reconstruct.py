@@ -18,7 +18,7 @@ import PIL.ImageOps
 from cv2.typing import MatLike
 
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
-from nsvq_lightning.data.images import DAMAGED, ORIENTATION, image_head
+from nsvq_lightning.data.images import DAMAGED, ORIENTATION, image_head, read_image
 from nsvq_lightning.io.atomic import atomic_write, write_bytes
 
 
@@ -42,7 +42,38 @@ class Verdict:
     track: float
     models: int
 
+    def told(self, images: Path) -> Iterator[str]:
+        """What came out, and what to take again."""
+        count, total = len(self.registered), len(self.registered) + len(self.missing)
+        yield (
+            f"{count} of {total} photos have found their place, {self.points:,} points, seen by {self.track:.1f} "
+            f"photos each, error {self.error:.2f} pixels"
+        )
+        if self.error > 1.5:
+            yield "  the error is large: was zoom or focus changing, or something moving?"
+        if count < MIN_PHOTOS:
+            yield f"  {count} photos are few: 50 and more make a scene that can be walked around"
+        if self.models > 1:
+            apart = f"  the photos fall apart into {self.models} scenes; sparse/0 is the largest: "
+            yield f"{apart}take more photos between"
+        if not self.missing:
+            return
+        some = self.registered[:: max(1, count // MIN_PHOTOS)]
+        usual = sorted(sharpness(read_image(images / name)) for name in some)[len(some) // 2]
+        yield "  without a place, better taken again:"
+        listed = 8
+        for name, partners in list(self.missing.items())[:listed]:
+            if sharpness(read_image(images / name)) < 0.3 * usual:
+                reason = "blurred"
+            else:
+                reason = f"shares enough with {partners} other photos" if partners else "overlaps no other"
+            yield f"    {name}: {reason}"
+        if len(self.missing) > listed:
+            yield f"    and {len(self.missing) - listed} more"
 
+
+# Photos below which a scene is likely to look good only from where they were taken.
+MIN_PHOTOS = 20
 # Called with a step, how much of it is done, and how much there is.
 Report = Callable[[str, int, int], None]
 
