@@ -164,11 +164,11 @@ class Splats(nn.Module):
         """The six raw attributes, attached to the graph."""
         return RawSplats(*(getattr(self, name) for name in ATTRIBUTES))
 
-    def add_table(self, name: str, dtype: torch.dtype = torch.float32) -> Tensor:
+    def add_table(self, name: str) -> Tensor:
         """Add (or get) a side table ``[N]`` of zeros that follows the rows through every edit and checkpoint."""
         if name not in self._tables:
             self._tables.append(name)
-            self.register_buffer(name, torch.zeros(len(self), dtype=dtype, device=self.means.device))
+            self.register_buffer(name, torch.zeros(len(self), device=self.means.device))
         return self.get_buffer(name)
 
     def tables(self) -> dict[str, Tensor]:
@@ -185,11 +185,8 @@ class Splats(nn.Module):
                 current = getattr(self, name)
                 if current.shape != stored.shape:
                     setattr(self, name, nn.Parameter(current.new_zeros(stored.shape)))
-            elif name not in self._tables:
-                self._tables.append(name)
-                self.register_buffer(name, torch.zeros_like(stored, device=self.means.device))
-            elif getattr(self, name).shape != stored.shape:
-                setattr(self, name, getattr(self, name).new_zeros(stored.shape))
+            elif (table := self.add_table(name)).shape != stored.shape:
+                setattr(self, name, table.new_zeros(stored.shape))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 
