@@ -210,7 +210,9 @@ class CodebookReplacement(SplatCallback):
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Keep a checkpoint's counts on the first process only: they are the sum of all."""
         if not trainer.is_global_zero:
-            _forget_usage(module)
+            for quantizer in module.quantizers.values():
+                quantizer.usage.zero_()
+                quantizer.window.zero_()
 
     def on_save_checkpoint(self, trainer: Trainer, module: SplatModule, checkpoint: dict[str, Any]) -> None:
         """Sum the counts of all processes in the buffers of the first one, which the checkpoint holds."""
@@ -218,20 +220,13 @@ class CodebookReplacement(SplatCallback):
             return
         for quantizer in module.quantizers.values():
             _sum_usage(trainer, quantizer)
-        if not trainer.is_global_zero:
-            _forget_usage(module)
+        self.on_train_start(trainer, module)
 
 
 def _sum_usage(trainer: Trainer, quantizer: Quantizer) -> None:
     """Sum the counts of all processes in the buffers of each."""
     for counter in (quantizer.usage, quantizer.window):
         counter.copy_(distributed.sum_over_processes(trainer, counter))
-
-
-def _forget_usage(module: SplatModule) -> None:
-    for quantizer in module.quantizers.values():
-        quantizer.usage.zero_()
-        quantizer.window.zero_()
 
 
 @dataclass(eq=False)
