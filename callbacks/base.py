@@ -66,6 +66,10 @@ class SplatCallback(Callback):
         if stage == "fit":
             for name in ("_acted", *self.state, *self.passing):
                 vars(self).pop(name, None)
+            self.before_fit(trainer, module)
+
+    def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
+        """Act when a fit is set up, before its splats are made."""
 
     def state_dict(self) -> dict[str, Any]:
         """What :attr:`state` names, and the last iterations acted on."""
@@ -107,7 +111,7 @@ class WritingCallback(SplatCallback):
     """
 
     stages: ClassVar[tuple[str, ...]] = ("fit",)
-    """Stages in which it writes: ``fit``, ``test`` or both."""
+    """Stages in which it writes: ``fit``, or ``test``, too."""
 
     def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Check the module, and for a test take the folder.
@@ -116,8 +120,8 @@ class WritingCallback(SplatCallback):
             FileExistsError: It holds another run.
         """
         super().setup(trainer, module, stage)
-        if stage != "fit":
-            self._take_folder(trainer, stage)
+        if stage != "fit" and stage in self.stages:
+            self._take_folder(trainer)
 
     def on_fit_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Take the folder, now that the trainer knows which checkpoint it continues from.
@@ -125,11 +129,9 @@ class WritingCallback(SplatCallback):
         Raises:
             FileExistsError: It holds another run.
         """
-        self._take_folder(trainer, "fit")
+        self._take_folder(trainer)
 
-    def _take_folder(self, trainer: Trainer, stage: str) -> None:
-        if stage not in self.stages:
-            return
+    def _take_folder(self, trainer: Trainer) -> None:
         folder = run_folder(trainer)
         if trainer.is_global_zero and not is_fast_dev_run(trainer):
             hold(folder)  # again, if an earlier stage of the run has ended

@@ -125,6 +125,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     """
 
     bounds = (("at least 0", "every"),)
+    passing = ("best_model_path", "_saved")
 
     every: int | None = None
     keep: bool = False
@@ -151,13 +152,11 @@ class RunCheckpoint(WritingCallback, Checkpoint):
         return every > 0 and (iteration % every == 0 or iteration in schedule.ends)
 
     def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
-        """Forget an earlier fit; come after all other checkpoint callbacks, whose best one Lightning then finds."""
+        """Come after all other checkpoint callbacks, whose best one Lightning then finds."""
         super().setup(trainer, module, stage)
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
         # A new list: Lightning is going through the old one.
         trainer.callbacks = [*(each for each in callbacks if each is not self), self]  # type: ignore[attr-defined]
-        if stage == "fit":
-            self.best_model_path, self._saved = "", -1
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Start to hold back signals."""

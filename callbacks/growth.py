@@ -66,16 +66,13 @@ class SplatBudget(SplatCallback):
         if self.splats is not None and self.bytes is not None:
             raise ValueError("splats and bytes both say how large the scene is to be: give one of them")
 
-    def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
+    def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
         """Set the module's budget, and how many points it starts with.
 
         Raises:
             ValueError: The budget in bytes has no room for codebooks; or it is to come from photos, and the trainer has
                 no data module with a scene.
         """
-        super().setup(trainer, module, stage)
-        if stage != "fit":
-            return
         budget, reason = self.splats or 0, "as asked"
         if self.bytes is not None:
             codebooks = {name: tuple(quantizer.codebook.shape) for name, quantizer in module.quantizers.items()}

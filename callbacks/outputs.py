@@ -94,18 +94,12 @@ class RenderWriter(BasePredictionWriter):
         self.folder = folder
         self._target = Path()
 
-    def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
-        """Take the folder of the run.
+    def on_predict_start(self, trainer: Trainer, module: SplatModule) -> None:
+        """Make the folder in a hook that all processes call: some have fewer views than others.
 
         Raises:
-            FileExistsError: It holds another run.
+            FileExistsError: The folder of the run holds another one.
         """
-        super().setup(trainer, module, stage)
-        if stage == "predict" and self.folder is None:
-            run_folder(trainer)
-
-    def on_predict_start(self, trainer: Trainer, module: SplatModule) -> None:
-        """Make the folder in a hook that all processes call: some have fewer views than others."""
         self._target = run_folder(trainer) / "predictions" if self.folder is None else Path(self.folder)
         if not is_fast_dev_run(trainer):
             self._target.mkdir(parents=True, exist_ok=True)

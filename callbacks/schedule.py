@@ -83,16 +83,13 @@ class PhaseSchedule(SplatCallback):
         own = {each.name: getattr(self, each.name) for each in fields(Schedule) if hasattr(self, each.name)}
         return Schedule(**own | {"total": total, "reference_total": self.reference_total or total})
 
-    def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
+    def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
         """Set the module's schedule.
 
         Raises:
             ValueError: ``trainer.max_steps`` is not set and neither is ``total``; or the limit for each photo needs a
                 data module with a scene.
         """
-        super().setup(trainer, module, stage)
-        if stage != "fit":
-            return
         if self.minutes is not None:
             steps = iterations_within(self.minutes, trainer, module, self.schedule(self.reference_total or 1))
             trainer.fit_loop.epoch_loop.max_steps = steps
