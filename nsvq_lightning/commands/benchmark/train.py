@@ -24,7 +24,6 @@ from nsvq_lightning.commands.arguments import find_config
 from nsvq_lightning.commands.benchmark import Scope, timing
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.data.scene import View
 from nsvq_lightning.report.files import evaluate
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
@@ -53,9 +52,7 @@ class StepClock(Callback):
         """Start the first step."""
         self._since = time.perf_counter()
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: View, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *args: Any) -> None:
         """End a step, the work of a GPU included, and start the next; compare the test views after the last."""
         timing.finish()
         took, module = 1000 * (time.perf_counter() - self._since), cast(SplatModule, pl_module)
