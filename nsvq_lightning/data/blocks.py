@@ -25,6 +25,7 @@ from nsvq_lightning.io.ply import write_elements
 from nsvq_lightning.rendering.camera import Camera, up_of
 
 BLOCK = "block.json"
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ FRONT = 1.05
 _Front = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 
-def points_in_front(points: NDArray[np.float64], camera: Camera) -> _Front:
+def points_in_front(points: Floats, camera: Camera) -> _Front:
     """Rows of the points ``[P, 3]`` that no nearer ones hide from a camera, and the cell of its picture of each.
 
     Cells are numbered row by row.
@@ -125,9 +126,7 @@ def cut(scene: Scene, count: int) -> list[Block]:
     ground = points @ axes.T
     root = str(scene.root.resolve())
 
-    def parts(
-        some: NDArray[np.bool_], core: NDArray[np.float64], around: NDArray[np.float64], number: int
-    ) -> list[Block]:
+    def parts(some: NDArray[np.bool_], core: Floats, around: Floats, number: int) -> list[Block]:
         places, weights = ground[some], shown[some]
         if np.count_nonzero(weights) < 4 * number:
             raise SceneError(f"the photos show too few points of {scene.root} for {count} parts: ask for fewer")
@@ -153,9 +152,7 @@ def cut(scene: Scene, count: int) -> list[Block]:
     return parts(np.ones(len(points), bool), everywhere, everywhere, count)
 
 
-def _quantiles(
-    values: NDArray[np.float64], weights: NDArray[np.float64], shares: Sequence[float] | NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _quantiles(values: Floats, weights: Floats, shares: Sequence[float] | Floats) -> Floats:
     order = values.argsort()
     sums = weights[order].cumsum()
     return np.asarray(values[order][np.searchsorted(sums, np.array(shares) * sums[-1])])
@@ -165,7 +162,7 @@ def _quantiles(
 _SEAM = 0.3
 
 
-def near_seams(points: NDArray[np.float64], blocks: Sequence[Block]) -> NDArray[np.bool_]:
+def near_seams(points: Floats, blocks: Sequence[Block]) -> NDArray[np.bool_]:
     """Which points ``[P, 3]`` lie where two parts meet."""
     return np.asarray(sum(block.contains(points, _SEAM).astype(int) for block in blocks) > 1)
 

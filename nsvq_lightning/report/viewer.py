@@ -26,16 +26,14 @@ def some_cameras(scene: Scene) -> dict[str, Camera]:
     return dict(list(zip(scene.names, scene.cameras, strict=True))[:: -(-len(scene) // 300)])
 
 
+StrPath = str | os.PathLike[str]
+Color = Sequence[float]  # RGB in [0, 1]
 # RGB of the backgrounds that have names.
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 def write_viewer(
-    path: str | os.PathLike[str],
-    scene_file: str | os.PathLike[str],
-    cameras: Mapping[str, Camera],
-    title: str,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
+    path: StrPath, scene_file: StrPath, cameras: Mapping[str, Camera], title: str, background: Color = (0.0, 0.0, 0.0)
 ) -> int:
     """Write a page that holds a ``.nsvq`` file, its reader, a renderer and cameras; it loads nothing from elsewhere.
 
@@ -62,10 +60,10 @@ def write_viewer(
 
 
 def viewer_page(
-    scene_file: str | os.PathLike[str],
+    scene_file: StrPath,
     cameras: Mapping[str, Camera],
     title: str,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
+    background: Color = (0.0, 0.0, 0.0),
     live: float | None = None,
 ) -> str:
     """The page of :func:`write_viewer`; arguments and errors are the same.
@@ -133,7 +131,7 @@ def camera_entry(camera: Camera) -> dict[str, Any]:
     return {"camera_to_world": pose, "width": camera.width, "height": camera.height, **intrinsics}
 
 
-def page_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
+def page_cameras(path: StrPath) -> dict[str, Camera]:
     """The cameras that a page of :func:`write_viewer` lists, by name; none if it is another page.
 
     Raises:
