@@ -162,8 +162,7 @@ class LiveScene(WritingCallback):
             state = {"iteration": trainer.global_step, "of": trainer.max_steps, "phase": module.phase.name.lower()}
             if module.history:
                 state["psnr"] = f"{module.history[-1]['psnr']:.2f}"
-            config = {"antialiased": module.antialiased, "live": state}
-            scene = CompressedScene.from_splats(splats, config=config)
+            scene = CompressedScene.from_splats(splats, config={"antialiased": module.antialiased, "live": state})
             save(scene, folder / viewer.LIVE_SCENE, Storage("paper"))
         self._answered, ended = asked, time.monotonic()
         self._next = ended + (ended - began) / SHARE

@@ -257,8 +257,7 @@ def check_overlap(model: "ColmapModel") -> Iterator[Finding]:
     usual, least = float(np.median(best)), float(best.min())
     text = f"a photo shares {100 * usual:.0f} % of its points with its best partner, at least {100 * least:.0f} %"
     apart = groups > 1 and f"under 15 with the rest for {named}; take photos between them, or leave them out"
-    little = len(weak) > 0 and f"little for {named}; take photos in between"
-    yield judged("overlap", text, apart, little)
+    yield judged("overlap", text, apart, len(weak) > 0 and f"little for {named}; take photos in between")
 
 
 def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:

@@ -446,7 +446,6 @@ def rectify(camera: Any, width: int, height: int, keep_maps: bool = True) -> tup
     # Fisheye models without distortion are none.
     polynomial = camera.model_name in ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
     if (polynomial and camera.is_undistorted()) or camera.model_name in ("SIMPLE_PINHOLE", "PINHOLE"):
-        pinhole = Pinhole(camera.calibration_matrix(), camera.width, camera.height)
-        return pinhole.resized(width, height), None
+        return Pinhole(camera.calibration_matrix(), camera.width, camera.height).resized(width, height), None
     undistortion = Undistortion(camera, width, height, keep_maps)
     return undistortion.pinhole, undistortion

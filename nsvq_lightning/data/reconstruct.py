@@ -244,12 +244,12 @@ def _partners(database: Path) -> dict[str, int]:
     return counts
 
 
-def _rows(database: Path, query: str, *values: Any) -> list[tuple[Any, ...]]:
+def _rows(database: Path, query: str) -> list[tuple[Any, ...]]:
     """What a query finds in a database; nothing where there is none."""
     if not database.exists():
         return []
     with contextlib.closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)) as connection:
-        return connection.execute(query, values).fetchall()
+        return connection.execute(query).fetchall()
 
 
 # Suffixes of photos that both COLMAP and this package read.
@@ -304,8 +304,7 @@ def copy_photos(photos: Sequence[Path], folder: Path, done: Callable[[int], None
                             copy.write(path.read_bytes())
                         else:
                             upright = PIL.ImageOps.exif_transpose(image)
-                            exif = upright.getexif().tobytes()
-                            upright.save(copy, image.format, quality=JPEG_QUALITY, exif=exif)
+                            upright.save(copy, image.format, quality=JPEG_QUALITY, exif=upright.getexif().tobytes())
         except DAMAGED as error:
             damaged.append((path, str(error)))
         done(count)
