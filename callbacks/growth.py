@@ -277,8 +277,7 @@ class BudgetedGrowth(Densification):
         statistic = gradients / views.clamp(min=1)
         reference = iteration / schedule.scale
         late = reference > self.full
-        weight = statistic if late else edges
-        threshold = self.late_threshold if late else self.grad_threshold
+        weight, threshold = (statistic, self.late_threshold) if late else (edges, self.grad_threshold)
         candidates = torch.where(statistic >= threshold, weight, torch.zeros_like(weight))
         progress = min(max((reference - self.start) / (self.full - self.start), 0.0), 1.0)
         room = int(self.limit(module) * math.sqrt(progress)) - len(splats)
@@ -305,11 +304,7 @@ def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:
 
 
 def splats_for_bytes(
-    size: int,
-    codebooks: Mapping[str, Sequence[int]],
-    sh_degree: int,
-    precision: Precision | None = None,
-    strength: float = 0.0,
+    size: int, codebooks: Mapping[str, Sequence[int]], sh_degree: int, precision: Precision, strength: float
 ) -> int:
     """Number of splats in a file of level ``compact``, within a tenth; a fifth where codes are chosen by their rate.
 
@@ -318,12 +313,12 @@ def splats_for_bytes(
         codebooks: Codes and dimension of each codebook by attribute.
         sh_degree: Of the splats.
         precision: Largest errors of the file.
-        strength: Of the choice of codes by rate and distortion.
+        strength: Of the choice of codes by rate and distortion; 0 without it.
 
     Raises:
         ValueError: There is no room for splats beside the codebooks.
     """
-    usual, precision = Precision(), precision or Precision()
+    usual = Precision()
     position, opacity = precision.position / usual.position, precision.opacity / usual.opacity
     fixed = 8 * 2048.0  # the header
     # Position and opacity of a splat take 22 to 25 bits on the measured scenes.

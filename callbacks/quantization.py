@@ -67,8 +67,7 @@ class CanonicalCovariance(SplatCallback):
 
 def perplexity(usage: Tensor) -> float:
     """Number of equally used codes with the entropy of ``usage [K]``: exp(-Σ p·log p); 0 if none is used."""
-    p = usage.double() / usage.sum().clamp(min=1)
-    entropy = torch.special.entr(p).sum()
+    entropy = torch.special.entr(usage.double() / usage.sum().clamp(min=1)).sum()
     return float(entropy.exp()) if bool(usage.any()) else 0.0
 
 
