@@ -135,10 +135,7 @@ class LiveScene(WritingCallback):
         True
     """
 
-    def __init__(self) -> None:
-        self._running = False
-        self._answered = 0
-        self._next = 0.0
+    _running, _answered, _next = False, 0, 0.0
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Forget who asked an earlier part of the run."""
