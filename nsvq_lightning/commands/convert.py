@@ -17,23 +17,19 @@ import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from nsvq_lightning.commands.compress import share_or_number, splats_left
+from nsvq_lightning.commands.arguments import views_of
+from nsvq_lightning.commands.compress import VIEWS, share_or_number, splats_left
 from nsvq_lightning.io import compressed, formats, lod, spz
 from nsvq_lightning.io.compressed import UP_AXES, CompressedScene
 from nsvq_lightning.io.describe import attribute_errors
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.sog import PALETTE_LIMIT
-
-if TYPE_CHECKING:
-    import torch
-
-    from nsvq_lightning.data.scene import View
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -169,7 +165,7 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     import torch
 
     from nsvq_lightning.compression.importance import floaters
-    from nsvq_lightning.data.scene import load_scene
+    from nsvq_lightning.data.scene import View, load_scene
     from nsvq_lightning.rendering.rasterize import render
     from nsvq_lightning.report.files import evaluate
 
@@ -177,10 +173,10 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     splats = scene.decode().raw()
     look = partial(render, antialiased=scene.antialiased)
 
-    def views() -> "Iterator[View]":
+    def views() -> Iterator[View]:
         return (photos.view(index) for index in tqdm(photos.train, unit=" photos", mininterval=1))
 
-    def psnr(keep: "torch.Tensor") -> float:
+    def psnr(keep: torch.Tensor) -> float:
         kept = type(splats)(*(tensor[keep] for tensor in splats))
         tests = (photos.view(index) for index in photos.test)
         return evaluate(lambda camera: look(kept, camera).image, tests, torch.device("cpu"))[0]
@@ -195,8 +191,6 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
 
 def _thinned(scene: CompressedScene, count: int, options: argparse.Namespace) -> CompressedScene:
     """The splats that contribute most to photos of --data.root, or to the scene's own pictures."""
-    from nsvq_lightning.commands.arguments import views_of
-    from nsvq_lightning.commands.compress import VIEWS
     from nsvq_lightning.compression.importance import contributions, most_contributing, row_weights
     from nsvq_lightning.rendering.rasterize import render
 
@@ -208,7 +202,6 @@ def _thinned(scene: CompressedScene, count: int, options: argparse.Namespace) ->
 
 def _measure(source: Path, output: Path, root: Path | None) -> None:
     """Say how pictures of two files differ."""
-    from nsvq_lightning.commands.arguments import views_of
     from nsvq_lightning.compression.viewpoints import MEASURED, Measure, decibels
 
     original = formats.read_scene(source).finite()

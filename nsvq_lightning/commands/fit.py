@@ -14,7 +14,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import resolve_name
-from types import NoneType
 from typing import Any, ClassVar, NamedTuple, NoReturn
 
 from jsonargparse import Namespace
@@ -26,7 +25,6 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveCon
 from nsvq_lightning import callbacks, quantize
 from nsvq_lightning.callbacks.standard import OPTIONAL, STANDARD
 from nsvq_lightning.commands import arguments as given
-from nsvq_lightning.commands.arguments import SHORTHANDS
 from nsvq_lightning.commands.registry import COMMANDS
 from nsvq_lightning.data.colmap import check_name
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
@@ -242,7 +240,7 @@ class SplatCLI(LightningCLI):
         parser = self._parser(self.subcommand)
         settings = self._get(self.config_init, "trainer")
         # Lightning refuses such a callback if the flag disables it, and the default callbacks include one of each.
-        unwanted: list[type] = [NoneType]
+        unwanted: list[type] = [type(None)]
         unwanted += [ProgressBar] if settings.enable_progress_bar is False else []
         unwanted += [Checkpoint] if settings.enable_checkpointing is False else []
         given_keys = {key: self._get(self.config_init, key) for key in parser.callback_keys}
@@ -346,7 +344,7 @@ def command_help(parser: LightningArgumentParser, command: str) -> str:
         group = option.name.partition(".")[0] if "." in option.name else "run"
         if group in groups and option.name not in (*groups, "model.splats"):
             groups[group].append(option)
-    budget = [Option(name, inspect.Parameter.empty, text) for name, text in SHORTHANDS.items()]
+    budget = [Option(name, inspect.Parameter.empty, text) for name, text in given.SHORTHANDS.items()]
     explained = [option for option in groups["trainer"] if option.name.removeprefix("trainer.") in EXPLAINED]
     others = " ".join(f"--{each.name}{_default(each.default)}" for each in groups["trainer"] if each not in explained)
     return "\n".join(

@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
+from traceback import walk_tb
 from typing import TextIO
 
 from nsvq_lightning.commands import arguments as given
@@ -202,10 +203,8 @@ def _is_ours(error: BaseException) -> bool:
     """
     if not isinstance(error, ValueError | TypeError | OSError | RuntimeError | ArithmeticError | ImportError):
         return False
-    frame = error.__traceback__
-    while frame is not None and frame.tb_next is not None:
-        frame = frame.tb_next
-    return frame is not None and str(frame.tb_frame.f_globals.get("__name__")).startswith("nsvq_lightning.")
+    modules = [str(frame.f_globals.get("__name__")) for frame, _ in walk_tb(error.__traceback__)]
+    return bool(modules) and modules[-1].startswith("nsvq_lightning.")
 
 
 class BarHandler(logging.StreamHandler[TextIO]):

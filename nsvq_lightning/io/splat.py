@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.atomic import write_bytes
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, opacity_of
@@ -56,8 +56,7 @@ def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:
     records["colors"][:, 3] = np.rint(255 * opacity_of(scene.opacities))
     records["quats"] = scene.spread("quats", lambda rows, _: _packed_quats(rows))
     clamped.warn(path, len(scene))
-    with atomic_write(path) as file:
-        file.write(records.tobytes())
+    write_bytes(path, records.tobytes())
     return records.nbytes
 
 

@@ -28,8 +28,6 @@ from nsvq_lightning.report.files import evaluate
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
-QUICK_DEMO = ("--data.factor=4",)
-
 
 class StepClock(Callback):
     """Times the steps of all runs of a variant, from the end of one to the end of the next.
@@ -85,6 +83,7 @@ class _Run(SplatCLI):
         """Nothing: the steps are all that is asked for."""
 
 
+QUICK_DEMO = ("--data.factor=4",)
 # Callbacks of ``nsvq fit`` that write files or lines but train nothing; the benchmark measures by itself.
 WATCHING = ("report", "export", "predictions", "checkpoint", "progress")
 
