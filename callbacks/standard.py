@@ -3,31 +3,12 @@
 from importlib import import_module
 from typing import Any
 
+import yaml
 from lightning.pytorch import Callback
 
 from nsvq_lightning.top_level import folder_of
 
 from . import checkpoint, growth, outputs, progress, pruning, quantization, report, schedule
-
-
-def _callbacks_of(config: str) -> dict[str, Callback | None]:
-    """What a config says of callbacks: null, a class by name or with its settings, or settings of the standard one."""
-    import yaml
-
-    text = (folder_of("configs") / f"{config}.yaml").read_text(encoding="utf-8")
-    made: dict[str, Callback | None] = {}
-    for name, value in yaml.safe_load(text).get("callbacks", {}).items():
-        if value is None:
-            made[name] = None
-            continue
-        named: dict[str, Any] = {"class_path": value} if isinstance(value, str) else value
-        if "class_path" in named:
-            kind = getattr(import_module(__package__), named["class_path"])
-            made[name] = kind(**named.get("init_args", {}))
-        else:
-            made[name] = STANDARD[name](**named)
-    return made
-
 
 # Callback by name. The length of a run in minutes depends on the budget. Density control comes before the canonical
 # form, which may act after the same iteration; codebooks are placed, and codes replaced, before rate and distortion
@@ -83,7 +64,19 @@ def standard(config: str | None = None, /, **replaced: Callback | None) -> list[
     unknown = sorted(set(replaced) - set(STANDARD))
     if unknown:
         raise ValueError(f"there is no standard callback {', '.join(unknown)}; there are {', '.join(STANDARD)}")
-    settings = {} if config is None else _callbacks_of(config)
+    text = "{}" if config is None else (folder_of("configs") / f"{config}.yaml").read_text(encoding="utf-8")
+    settings = {name: _made(name, value) for name, value in yaml.safe_load(text).get("callbacks", {}).items()}
     given = dict.fromkeys(OPTIONAL) | settings | replaced
     chosen = (given[name] if name in given else kind() for name, kind in STANDARD.items())
     return [callback for callback in chosen if callback is not None]
+
+
+def _made(name: str, value: Any) -> Callback | None:
+    """What a config says of a callback: null, a class by name or with its settings, or settings of the standard one."""
+    if value is None:
+        return None
+    named: dict[str, Any] = {"class_path": value} if isinstance(value, str) else value
+    if "class_path" not in named:
+        return STANDARD[name](**named)
+    kind: type[Callback] = getattr(import_module(__package__), named["class_path"])
+    return kind(**named.get("init_args", {}))
