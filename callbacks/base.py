@@ -14,16 +14,6 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import hold, is_fast_dev_run, let_go, run_folder
 from nsvq_lightning.training.scene_module import scene_of
 
-# What a setting may be, by how an error says it.
-BOUNDS: dict[str, Callable[[float], bool]] = {
-    "at least 1": lambda value: value >= 1,
-    "at least 0": lambda value: value >= 0,
-    "above 0": lambda value: value > 0,
-    "between 0 and 1": lambda value: 0 < value < 1,
-    "in [0, 1)": lambda value: 0 <= value < 1,
-    "in (0, 1]": lambda value: 0 < value <= 1,
-}
-
 
 class SplatCallback(Callback):
     """Base of the callbacks that train a :class:`nsvq_lightning.SplatModule`.
@@ -102,6 +92,17 @@ class SplatCallback(Callback):
             return False
         vars(self)["_acted"] = self._acted | {hook: iteration}
         return True
+
+
+# What a setting may be, by how an error says it.
+BOUNDS: dict[str, Callable[[float], bool]] = {
+    "at least 1": lambda value: value >= 1,
+    "at least 0": lambda value: value >= 0,
+    "above 0": lambda value: value > 0,
+    "between 0 and 1": lambda value: 0 < value < 1,
+    "in [0, 1)": lambda value: 0 <= value < 1,
+    "in (0, 1]": lambda value: 0 < value <= 1,
+}
 
 
 class WritingCallback(SplatCallback):

@@ -34,9 +34,6 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.resume import check_settings, read_checkpoint
 from nsvq_lightning.training.run_folder import SplatTrainer, is_fast_dev_run, reserve, run_folder
 
-# Names that options take as they are: short class names resolve to what is imported.
-CLASSES = (*callbacks.__all__, *quantize.__all__, "ColmapDataModule", "DemoDataModule")
-
 
 class QuietParser(LightningArgumentParser):
     """Reports errors without the usage, which has about a hundred lines, and lists options without their classes."""
@@ -66,6 +63,10 @@ class QuietParser(LightningArgumentParser):
             message += given.unknown_option(message, options)
         sys.stderr.write(f"error: {message}\nAll options: {program} --help\n")
         self.exit(2)
+
+
+# Names that options take as they are: short class names resolve to what is imported.
+CLASSES = (*callbacks.__all__, *quantize.__all__, "ColmapDataModule", "DemoDataModule")
 
 
 def _drop_settings_of_another_class(_: Any, before: Any, value: Any) -> None:
