@@ -29,7 +29,7 @@ from nsvq_lightning.quantize.codebook import Quantizer
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, render
-from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, sh_degree_of
+from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, detached, sh_degree_of
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.row_ops import finite_splats
@@ -81,7 +81,7 @@ class SceneModule(LightningModule):
     @torch.no_grad()
     def hard_splats(self, phase: Phase) -> RawSplats:
         """The splats as a file written in ``phase`` would hold them, detached: hard codes from ``QUANTIZE`` on."""
-        raw = RawSplats(*(tensor.detach() for tensor in self.splats.raw()))
+        raw = detached(self.splats)
         return decoded(raw, self.quantizers) if phase >= Phase.QUANTIZE else raw
 
     def render_splats(self, splats: SplatTensors, camera: Camera, **options: Any) -> Render:

@@ -13,7 +13,7 @@ from nsvq_lightning.compression.viewpoints import look_at, middle_of
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.formats import read_scene
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.splats.splats import RawSplats, Splats
+from nsvq_lightning.splats.splats import RawSplats, Splats, detached
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +83,10 @@ def workloads(scope: Scope) -> list[Workload]:
         found = read_scene(file).finite()
         if len(found) == 0:
             raise ValueError(f"{file} holds no splat with finite numbers; there is nothing to measure")
-        splats = RawSplats(*(tensor.detach() for tensor in found.decode().raw()))
+        splats = detached(found.decode())
         name += f" {file.name}" if scene is not None else ""
     elif scene is not None:
-        raw = Splats.from_points(scene.points, scene.colors, sh_degree=3).raw()
-        splats = RawSplats(*(tensor.detach() for tensor in raw))
+        splats = detached(Splats.from_points(scene.points, scene.colors, sh_degree=3))
     if scene is not None:
         return [_seen_by(scene.cameras[scene.train[0]], splats, name)]
     centre, reach = middle_of(splats.means.numpy())
