@@ -5,7 +5,7 @@ import itertools
 import shutil
 import sqlite3
 import threading
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -236,12 +236,9 @@ def _registered(model: Any) -> set[str]:
 def _partners(database: Path) -> dict[str, int]:
     """For each photo by name, the number of others that it shares enough points with; none are left out."""
     names = dict(_rows(database, "select image_id, name from images"))
-    counts: defaultdict[str, int] = defaultdict(int)
-    for (pair,) in _rows(database, "select pair_id from two_view_geometries where rows >= 15"):
-        for image in (pair % 2147483647, pair // 2147483647):
-            if image in names:
-                counts[names[image]] += 1
-    return counts
+    pairs = _rows(database, "select pair_id from two_view_geometries where rows >= 15")
+    numbers = (number for (pair,) in pairs for number in (pair % 2147483647, pair // 2147483647))
+    return Counter(names[number] for number in numbers if number in names)
 
 
 def _rows(database: Path, query: str) -> list[tuple[Any, ...]]:
