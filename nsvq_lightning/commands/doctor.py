@@ -43,13 +43,19 @@ def run(options: argparse.Namespace) -> int:
         0, or 1 if there is a problem: the self-test fails or the folder cannot be used.
     """
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
-    counts: Counter[str] = Counter()
-    for finding in check_all(options.folder):
-        print(finding, flush=True)  # each check takes seconds
-        counts[finding.verdict] += 1
+    counts = shown(check_all(options.folder))
     problems, notes = counts["problem"], counts["note"]
     print(f"\n{problems or 'no'} problem{'s' * (problems != 1)}, {notes or 'no'} note{'s' * (notes != 1)}")
     return 1 if problems else 0
+
+
+def shown(findings: "Iterator[Finding]") -> Counter[str]:
+    """Print findings as they come, since each check takes seconds; returns how many there are of each verdict."""
+    counts: Counter[str] = Counter()
+    for finding in findings:
+        print(finding, flush=True)
+        counts[finding.verdict] += 1
+    return counts
 
 
 def check_all(folder: Path | None) -> "Iterator[Finding]":

@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
         ValueError: The photos do not make a scene, or the folder is somebody else's.
         OSError: There are none, or a file cannot be read or written.
     """
-    from nsvq_lightning.commands.doctor import check_folder
+    from nsvq_lightning.commands.doctor import check_folder, shown
     from nsvq_lightning.data import reconstruct
 
     source, scene = options.source, options.scene
@@ -84,11 +84,7 @@ def run(options: argparse.Namespace) -> int:
     verdict = reconstruct.reconstruct(scene, names, report, is_video, options.max_size, options.threads)
     sys.stdout.writelines(f"{line}\n" for line in verdict.told(images))
     print(flush=True)
-    problems = 0
-    for finding in check_folder(scene):
-        problems += finding.verdict == "problem"
-        print(finding, flush=True)
-    if problems:
+    if shown(check_folder(scene))["problem"]:
         return 1
     sys.stdout.write(f"\nnext: nsvq fit --config fast.yaml --data.root {scene}\n")
     return 0
