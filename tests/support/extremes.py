@@ -80,13 +80,13 @@ def stress_errors(scene: Extreme, backend: str) -> dict[str, float]:
     paint = beside(backend, scene.planted)
     traced = trace(scene.workload, paint, torch.float32)
     gradients = gradients_of(traced, scene.workload.image_gradient)
-    broken = _not_finite((traced.image, *gradients.values()))
+    broken = _not_finite((traced[0], *gradients.values()))
     values: dict[str, float] = {}
     if not broken:
         truth = trace(scene.workload, beside("reference", scene.planted), torch.float64)
         for errors in errors_of(scene.workload, paint, truth).values():
             values.update(errors)
-        values["largest value"] = float(traced.image.detach().abs().max())
+        values["largest value"] = float(traced[0].detach().abs().max())
     refused, named, lost = step(scene, backend)
     rows = max(named.values(), default=0)
     return values | {"not finite": broken, "step refused": refused, "rows named": rows, "other rows lost": lost}

@@ -8,7 +8,6 @@ left out of the other errors: they say nothing about the quality of the arithmet
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,13 +25,6 @@ from nsvq_lightning.splats.splats import RawSplats
 FORWARD, BOTH, LOSS = "forward", "forward + backward", "L1 + D-SSIM, forward + backward"
 
 
-class Traced(NamedTuple):
-    """An image with a graph behind it, and the splats at its other end."""
-
-    splats: RawSplats
-    image: Tensor
-
-
 def run(scope: Scope) -> Iterator[Measurement]:
     """Time every back-end of every device on every workload; errors once a workload."""
     for device in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
@@ -41,6 +33,8 @@ def run(scope: Scope) -> Iterator[Measurement]:
         yield from _loss_rows(scope, device)
 
 
+# An image with a graph behind it, and the splats at its other end.
+Traced = tuple[Tensor, RawSplats]
 # Renders splats as the camera of a workload sees them: image ``[H, W, 3]``.
 Painter = Callable[[RawSplats, Workload], Tensor]
 
@@ -94,7 +88,7 @@ def errors_of(crop: Workload, paint: Painter, truth: Traced) -> dict[str, dict[s
         truth: The same by the oracle.
     """
     found = trace(crop, paint, torch.float32)
-    image, usual = image_errors(found.image, truth.image)
+    image, usual = image_errors(found[0], truth[0])
     weights = crop.image_gradient * usual[..., None]
     expected = gradients_of(truth, weights.double())
     by_name = {name: relative_l2(value, expected[name]) for name, value in gradients_of(found, weights).items()}
@@ -104,12 +98,12 @@ def errors_of(crop: Workload, paint: Painter, truth: Traced) -> dict[str, dict[s
 def trace(crop: Workload, paint: Painter, dtype: torch.dtype) -> Traced:
     """Render copies of the splats in a type, to be differentiated."""
     splats = RawSplats(*(tensor.to(dtype, copy=True).requires_grad_() for tensor in crop.splats))
-    return Traced(splats, paint(splats, crop))
+    return paint(splats, crop), splats
 
 
 def gradients_of(traced: Traced, weights: Tensor) -> dict[str, Tensor]:
     """Gradient by attribute of Σ weights · image."""
-    gradients = torch.autograd.grad(traced.image, traced.splats, weights, retain_graph=True)
+    gradients = torch.autograd.grad(*traced, weights, retain_graph=True)
     return dict(zip(RawSplats._fields, gradients, strict=True))
 
 
