@@ -17,21 +17,17 @@ if sys.platform == "linux":
 # Names under which a user may have set the same.
 _OTHER_ALLOC_CONF = {"PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_HIP_ALLOC_CONF"}
 
-_came_late = False
+came_late = False
+"""Whether idle threads spin because torch was loaded before :func:`set_defaults`."""
 
 
 def set_defaults() -> None:
     """Set the variables that the user has not set; too late in a process that has already loaded torch."""
-    global _came_late
-    _came_late = "torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ
+    global came_late
+    came_late = "torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ
     for name, value in DEFAULTS.items():
         if name != "PYTORCH_ALLOC_CONF" or not _OTHER_ALLOC_CONF & os.environ.keys():
             os.environ.setdefault(name, value)
-
-
-def threads_spin() -> bool:
-    """Whether idle threads spin because torch was loaded before :func:`set_defaults`."""
-    return _came_late
 
 
 def usable_cores() -> int:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from nsvq_lightning.compression.importance import contributions, sensitivity
 from nsvq_lightning.compression.stored import to_compressed
-from nsvq_lightning.compute.environment import threads_spin
+from nsvq_lightning.compute.environment import came_late
 from nsvq_lightning.compute.jit import compile_seconds
 from nsvq_lightning.data.dense_start import dense_points
 from nsvq_lightning.data.scene import ONE_PLACE, Scene, View
@@ -341,7 +341,7 @@ def check_device(device: torch.device) -> None:
     """Check the kernels of a GPU at its first use; on a CPU, warn of other processes that want the same cores."""
     if device.type == "cuda":
         check_kernels(device)
-    elif threads_spin() and torch.get_num_threads() > 1 and hasattr(os, "getloadavg") and os.getloadavg()[0] > 1.0:
+    elif came_late and torch.get_num_threads() > 1 and hasattr(os, "getloadavg") and os.getloadavg()[0] > 1.0:
         log.warning(
             "other processes also need the cores, and idle threads occupy them: a run may take twice as long; "
             "import nsvq_lightning before torch, or set OMP_WAIT_POLICY=passive"

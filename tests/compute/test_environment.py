@@ -33,9 +33,7 @@ def test_the_environment_is_set_by_the_import_unless_the_user_has(
     [("torch", {}, True), ("torch", {"OMP_WAIT_POLICY": "passive"}, False)],
 )
 def test_who_imports_torch_first_is_known(first: str, given: dict[str, str], spin: bool) -> None:
-    code = (
-        f"import {first}, nsvq_lightning; from nsvq_lightning.compute import environment as e; print(e.threads_spin())"
-    )
+    code = f"import {first}, nsvq_lightning; from nsvq_lightning.compute import environment as e; print(e.came_late)"
     environment = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"} | given
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert done.stdout == f"{spin}\n"
