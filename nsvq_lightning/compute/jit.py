@@ -42,7 +42,12 @@ class _Compilations(event.Listener):
     def on_start(self, compilation: Any) -> None:
         if not self.levels:
             self.since = time.perf_counter()
-            self._announce()
+            if not self.announced:
+                self.announced = True
+                log.info("compiling kernels as they are needed, once on this machine: half a minute to two in all")
+            ready = sum(bool(dispatcher.overloads) for dispatcher in _kernels)  # compiled, or read from the disk
+            for watcher in self.watchers:
+                watcher(f"compiling kernels {ready + 1}/{len(_kernels)}, once on this machine")
         level = numba.config.OPT
         self.levels.append(level)
         if compilation.data["dispatcher"].targetoptions.get("forceinline"):
@@ -52,14 +57,6 @@ class _Compilations(event.Listener):
         numba.config.OPT = self.levels.pop()
         if not self.levels:
             self.seconds += time.perf_counter() - self.since
-
-    def _announce(self) -> None:
-        if not self.announced:
-            self.announced = True
-            log.info("compiling kernels as they are needed, once on this machine: half a minute to two in all")
-        ready = sum(bool(dispatcher.overloads) for dispatcher in _kernels)  # compiled, or read from the disk
-        for watcher in self.watchers:
-            watcher(f"compiling kernels {ready + 1}/{len(_kernels)}, once on this machine")
 
 
 # Every kernel of the modules that are loaded.
@@ -134,20 +131,15 @@ def kernel(function: Callable[..., Any], parallel: bool = True, allocates: bool 
     return dispatcher
 
 
-class _Threads(threading.local):
-    """What Numba was told last; it keeps the number of threads by calling thread."""
-
-    torch = count = 0
-
-
-_threads = _Threads()
+# What Numba was told last; it keeps the number of threads by calling thread.
+_told = threading.local()
 
 
 def thread_count() -> int:
     """Number of threads that kernels use: torch's setting, so that one setting controls both."""
     asked = torch.get_num_threads()
-    if asked != _threads.torch:
+    if asked != getattr(_told, "torch", 0):
         _start_threads()
-        _threads.torch, _threads.count = asked, max(1, min(asked, int(numba.config.NUMBA_NUM_THREADS)))
-        numba.set_num_threads(_threads.count)
-    return _threads.count
+        _told.torch, _told.count = asked, max(1, min(asked, int(numba.config.NUMBA_NUM_THREADS)))
+        numba.set_num_threads(_told.count)
+    return int(_told.count)
