@@ -120,8 +120,7 @@ class SplatProgressBar(TQDMProgressBar):
 
     def _text(self, trainer: Trainer, module: SplatModule) -> str:
         parts = [f"{module.phase.name.lower()} {Tqdm.format_sizeof(len(module.splats))} splats"]
-        psnr = trainer.callback_metrics.get("train/psnr")
-        if psnr is not None:
+        if (psnr := trainer.callback_metrics.get("train/psnr")) is not None:
             past = float(psnr) if self._psnr is None else self._psnr
             self._psnr = SMOOTHING * past + (1.0 - SMOOTHING) * float(psnr)
             parts.append(f"{self._psnr:.1f} dB")

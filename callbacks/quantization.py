@@ -360,9 +360,8 @@ class RateDistortion(SplatCallback):
         return all(len(price) == len(module.splats) for price in (self.prices or {}).values())
 
     def _measure(self, trainer: Trainer, module: SplatModule) -> None:
-        taking_part = [name for name, q in module.quantizers.items() if hasattr(q, "hold")]
-        splats = module.hard_splats(Phase.QUANTIZE)
-        shown = {name: torch.zeros_like(splats.opacities) for name in taking_part}
+        splats, quantizers = module.hard_splats(Phase.QUANTIZE), module.quantizers.items()
+        shown = {name: torch.zeros_like(splats.opacities) for name, each in quantizers if hasattr(each, "hold")}
         error = torch.zeros((), dtype=torch.float64, device=module.device)
         for view, squares, image in scene_module.train_sensitivities(trainer, module, splats, VIEWS):
             error += (apply_mask(image, view.mask) - eight_bit(view.image)).square().sum(dtype=torch.float64)

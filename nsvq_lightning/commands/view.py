@@ -108,8 +108,7 @@ def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.io.formats import load
 
-    cameras = list(cameras_of(options.scene, options.root).items())
-    if cameras:
+    if cameras := list(cameras_of(options.scene, options.root).items()):
         return dict(cameras[:: -(-len(cameras) // 300)])  # at most as many as the page of a run has
     if options.live:
         raise ValueError(f"{options.scene} does not say where its photos are: name their folder with --data.root")

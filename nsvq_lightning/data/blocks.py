@@ -25,7 +25,6 @@ from nsvq_lightning.io.ply import write_elements
 from nsvq_lightning.rendering.camera import Camera, up_of
 
 BLOCK = "block.json"
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -66,6 +65,7 @@ class Block:
             raise SceneError(f"{folder} is no part of a scene ({error}): make it anew with 'nsvq split'") from None
 
 
+Floats = NDArray[np.float64]
 # Points up to so many times as far as the nearest one in the cell count as in front, too.
 FRONT = 1.05
 # Rows of points, and the cell of a picture that each is in.

@@ -153,8 +153,7 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
     if not root.is_dir():
         raise SceneError(NO_FOLDER.format(root))
     folders = FOLDERS if chosen is None else (f"sparse/{chosen}" if chosen.isdecimal() else chosen,)
-    files = find_model(root, folders)
-    if files is None:
+    if (files := find_model(root, folders)) is None:
         raise _no_model(root, folders, chosen)
     reconstruction = _read(files)
     registered = [image for image in reconstruction.images.values() if image.has_pose]

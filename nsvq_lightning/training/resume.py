@@ -298,8 +298,7 @@ class ResumedModule(SceneModule):
         checkpoint["history"] = self.history
         checkpoint[QUANTIZER_SETTINGS] = self.quantizer_settings
         checkpoint["schedule"] = asdict(self.schedule)
-        scene = scene_of(self._trainer)
-        if scene is not None:
+        if (scene := scene_of(self._trainer)) is not None:
             checkpoint[SCENE] = scene_record(scene)
         if (stored := checkpoint.get(self.CHECKPOINT_HYPER_PARAMS_KEY)) is not None:
             # Without the photos nobody knows what "auto" was.

@@ -143,8 +143,7 @@ def hold(folder: Path) -> None:
 
 def let_go(folder: Path) -> None:
     """Let other processes write to a folder that this one holds; does nothing otherwise."""
-    lock = _HELD.pop(folder.resolve(), None)
-    if lock is not None:
+    if (lock := _HELD.pop(folder.resolve(), None)) is not None:
         for name in (MARKER, LOCK):
             with suppress(OSError):  # Windows removes no open file; an unlocked one does no harm
                 (folder / name).unlink()
