@@ -23,7 +23,7 @@ class SplatProgressBar(TQDMProgressBar):
 
     It counts all iterations, also those of earlier parts of a resumed run. After their number it shows the time that is
     left, without the compilation of kernels, and the time of day at which that ends; then the phase, the number of
-    splats, the training PSNR of recent steps (exponential mean) and the latest test PSNR. It fits 80 columns.
+    splats, the training PSNR of recent steps (exponential mean) and the latest test PSNR, in dB. It fits 80 columns.
 
     Args:
         refresh_rate: Iterations between two refreshes on a terminal; 0 turns the bar off.
@@ -36,7 +36,7 @@ class SplatProgressBar(TQDMProgressBar):
         True
     """
 
-    BAR_FORMAT = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} {remaining} to {eta:%H:%M}{postfix}"
+    BAR_FORMAT = "|{bar}| {n_fmt}/{total_fmt} {remaining} to {eta:%H:%M}{postfix}"
 
     def __init__(self, refresh_rate: int = 25) -> None:
         super().__init__(refresh_rate=refresh_rate)
@@ -123,7 +123,7 @@ class SplatProgressBar(TQDMProgressBar):
         if (psnr := trainer.callback_metrics.get("train/psnr")) is not None:
             past = float(psnr) if self._psnr is None else self._psnr
             self._psnr = SMOOTHING * past + (1.0 - SMOOTHING) * float(psnr)
-            parts.append(f"{self._psnr:.1f} dB")
+            parts.append(f"train {self._psnr:.1f}")
         if module.history:
             parts.append(f"test {module.history[-1]['psnr']:.2f}")
         return " ".join(parts)

@@ -93,7 +93,7 @@ class PhaseSchedule(SplatCallback):
         if self.minutes is not None:
             steps = iterations_within(self.minutes, trainer, module, self.schedule(self.reference_total or 1))
             trainer.fit_loop.epoch_loop.max_steps = steps
-            log.info("iterations: %d, as many as %g minutes are likely to allow", steps, self.minutes)
+            log.info("iterations: %d, about %g min of training; evaluations and test come on top", steps, self.minutes)
             if steps < FEW_ITERATIONS:
                 log.warning("that is few: smaller photos (--data.factor=2) or fewer splats (--quality=0.5) give more")
         elif self.iterations_per_photo is not None and self.total is None:

@@ -79,7 +79,7 @@ SHORTHANDS: dict[str, str] = {
     "quality": "Splats, as a multiple of the default for the photos; more look better and take more bytes and time",
     "splats": "Splats of the scene, instead of --quality",
     "bytes": "Size of the file, instead of --quality",
-    "minutes": "Time to train on this machine: as many iterations as measured steps are likely to allow",
+    "minutes": "Time to train on this machine, without evaluations: as many iterations as measured steps allow",
 }
 
 

@@ -289,24 +289,22 @@ def continuation(checkpoint: Path) -> str:
     """The shell command that continues from a checkpoint, with the settings of the run that wrote it."""
     as_module = Path(sys.argv[0]).parts[-2:] == ("nsvq_lightning", "__main__.py")
     program = ["python", "-m", "nsvq_lightning"] if as_module else ["nsvq"]
-    config = checkpoint.parents[1] / "config.yaml"
-    return shlex.join([*program, "fit", f"--config={config}", f"--ckpt_path={checkpoint}"])
+    folder = checkpoint.parents[1]
+    options = f"--config={folder / 'config.yaml'}", f"--ckpt_path={checkpoint}", f"--trainer.run_folder={folder}"
+    return shlex.join([*program, "fit", *options])
 
 
 def summary(folder: Path, metrics: dict[str, Any]) -> str:
     """The results of a run, in a few lines."""
-    before = metrics["before_quantization"]
-    lines = [
-        f"{folder}",
+    return (
+        f"{folder}\n"
         f"  PSNR {metrics['psnr'] or math.inf:.2f} dB, SSIM {metrics['ssim'] or math.nan:.4f} "
-        f"on {metrics['views']} test views, rendered from the decoded file",
+        f"on {metrics['views']} test views, rendered from the decoded file\n"
         f"  {metrics['num_splats']} splats in {metrics['file_bytes']} bytes (scene.nsvq), "
-        f"{metrics['ratio']:.1f} times smaller than the plain .ply",
-        f"  {metrics['train_seconds']:.0f} s of training",
-    ]
-    if before is not None:
-        lines.insert(2, f"  before quantization: PSNR {before['psnr'] or math.inf:.2f} dB")
-    return "\n".join(lines) + "\n"
+        f"{metrics['ratio']:.1f} times smaller than the plain .ply\n"
+        f"  {metrics['train_seconds']:.0f} s of training\n"
+        f"look at it: open {folder / 'viewer.html'}, or nsvq view {folder}\n"
+    )
 
 
 def default_loggers(folder: Path) -> list[loggers.Logger]:

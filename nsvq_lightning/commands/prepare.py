@@ -55,6 +55,8 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError(f"{source}: neither a folder of photos nor a video ({', '.join(reconstruct.VIDEOS)})")
     images = scene / "images"
     in_place = source.resolve() == images.resolve()
+    if not is_video:
+        reconstruct.photos_in(source)  # before anything is written
     _claim(options, is_video, in_place)
     bars: dict[str, tqdm] = {}
 
@@ -86,7 +88,7 @@ def run(options: argparse.Namespace) -> int:
     print(flush=True)
     if shown(check_folder(scene))["problem"]:
         return 1
-    sys.stdout.write(f"\nnext: nsvq fit --config fast.yaml --data.root {scene}\n")
+    sys.stdout.write(f"\nnext: nsvq fit --data.root {scene}\n")
     return 0
 
 
@@ -104,7 +106,7 @@ def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
     if path.is_file() and not options.again:
         found = json.loads(path.read_text(encoding="utf-8"))
         if found != record:
-            raise ValueError(f"{scene} was prepared from {found.get('source')} or with other options: add --again")
+            raise ValueError(f"{scene} was prepared from {found.get('source')} or otherwise: --again begins anew")
     elif scene.is_dir() and not path.is_file() and {each.name for each in scene.iterdir()} - own:
         raise ValueError(f"{scene} is not empty and was not made by this command: name a new folder")
     if options.again and path.is_file():

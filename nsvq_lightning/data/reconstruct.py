@@ -205,6 +205,7 @@ def _map(database: Path, scene: Path, count: int, report: Report, threads: int) 
             options=options,
             next_image_callback=lambda: report("placing cameras", min(next(placed), count), count),
         )
+        report("placing cameras", count, count)  # those without a place, too
         ordered = _adding(found.values())
         shutil.rmtree(work)
         if not ordered:
@@ -271,7 +272,11 @@ def photos_in(folder: Path) -> list[Path]:
         )
     photos = [path for path in files if path.suffix.lower() in PHOTOS]
     if not photos:
-        raise SceneError(f"{folder}: no photos; it must hold files that end in {', '.join(PHOTOS)}")
+        inside = next((path.parent for path in sorted(folder.glob("*/*")) if path.suffix.lower() in PHOTOS), None)
+        advice = f"it must hold files that end in {', '.join(PHOTOS)}"
+        if inside is not None:
+            advice = f"there are some in {inside}: give that folder"
+        raise SceneError(f"{folder}: no photos; {advice}")
     return photos
 
 

@@ -31,19 +31,30 @@ def color_corrected(image: Tensor, photo: Tensor, mask: Tensor | None = None) ->
     counting = torch.ones_like(colors[:, 0], dtype=torch.bool) if mask is None else mask.reshape(-1)
     dark, bright = 0.5 / 255, 1 - 0.5 / 255  # beyond these, a pixel is clipped and says nothing about the map
     seen = counting[:, None] & (target >= dark) & (target <= bright)
-    first, second = torch.triu_indices(3, 3)  # each pair of channels once
     for _ in range(5):
-        terms = torch.cat([colors[:, first] * colors[:, second], colors, torch.ones_like(colors[:, :1])], 1)
-        unclipped = seen & (colors >= dark) & (colors <= bright)
-        corrected = []
-        for channel in range(3):
-            rows = unclipped[:, channel]
-            normal = terms[rows].T @ terms[rows]
-            # A picture of few colours leaves coefficients open; the pseudo-inverse takes the smallest.
-            weights = torch.linalg.pinv(normal, hermitian=True) @ (terms[rows].T @ target[rows, channel])
-            corrected.append(terms @ weights if bool(rows.any()) else colors[:, channel])
-        colors = torch.stack(corrected, 1).clamp(0, 1)
+        normal, moment = colors.new_zeros(3, TERMS, TERMS), colors.new_zeros(3, TERMS)
+        for part, goal, counts in zip(*(each.split(AT_ONCE) for each in (colors, target, seen)), strict=True):
+            terms = _terms(part)
+            unclipped = counts & (part >= dark) & (part <= bright)
+            weighted = terms[:, None] * unclipped[..., None]  # [pixels, channel, term]
+            normal += (weighted.flatten(1).T @ terms).view_as(normal)
+            moment += (weighted * goal[..., None]).sum(0)
+        # A picture of few colours leaves coefficients open; the pseudo-inverse takes the smallest.
+        weights = torch.linalg.pinv(normal, hermitian=True) @ moment[..., None]
+        corrected = torch.cat([_terms(part) @ weights[..., 0].T for part in colors.split(AT_ONCE)])
+        colors = torch.where(normal[:, -1, -1] > 0, corrected, colors).clamp(0, 1)
     return colors.reshape(image.shape).to(image.dtype)
+
+
+# Terms of a polynomial of degree two in three colours, the constant last; pixels that fit the caches of a processor.
+TERMS = 10
+AT_ONCE = 1 << 14
+
+
+def _terms(colors: Tensor) -> Tensor:
+    """The terms ``[N, 10]`` of colours ``[N, 3]``."""
+    first, second = torch.triu_indices(3, 3)  # each pair of channels once
+    return torch.cat([colors[:, first] * colors[:, second], colors, torch.ones_like(colors[:, :1])], 1)
 
 
 def eight_bit(image: Tensor) -> Tensor:

@@ -73,10 +73,10 @@ def test_a_bar_of_the_longest_run_fits_80_columns(hours: int) -> None:
     bar = Tqdm(total=45_000, bar_format=SplatProgressBar.BAR_FORMAT, file=out, ncols=80, smoothing=0)
     bar.start_t -= 3600 * hours
     bar.n = 45_000 // 2
-    bar.set_postfix_str(f"quantize {progress.Tqdm.format_sizeof(1_234_567)} splats 31.3 dB test 31.64")
+    bar.set_postfix_str(f"quantize {progress.Tqdm.format_sizeof(1_234_567)} splats train 31.3 test 31.64")
     (line,) = [part for part in out.getvalue().split("\r") if "quantize" in part]
     assert len(line.rstrip()) <= 80
-    assert line.rstrip().endswith("quantize 1.23M splats 31.3 dB test 31.64")
+    assert line.rstrip().endswith("quantize 1.23M splats train 31.3 test 31.64")
     bar.close()
 
 

@@ -122,7 +122,7 @@ def test_cameras_are_found_and_a_killed_run_continues(
     assert (scene / "database.db").stat().st_size <= 1.1 * first
     assert "12 of 13 photos have found their place" in said.out
     assert "zz_odd.png: overlaps no other" in said.out
-    assert f"next: nsvq fit --config fast.yaml --data.root {scene}" in said.out
+    assert f"next: nsvq fit --data.root {scene}" in said.out
     true, found = load_scene(made), load_scene(scene)
     assert found.names == true.names[:12]
     here, there = (np.array([camera.position.numpy() for camera in each.cameras[:12]]) for each in (true, found))

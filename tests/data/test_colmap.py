@@ -181,4 +181,4 @@ def test_pycolmap_is_imported_in_one_place_and_late() -> None:
         for line in path.read_text().splitlines()
         if line.strip().startswith(("import pycolmap", "from pycolmap"))
     ]
-    assert importing == [("colmap.py", "    import pycolmap")]
+    assert importing == [("colmap.py", "        import pycolmap")]

@@ -295,10 +295,11 @@ def test_the_command_says_how_to_continue(
     program, *arguments = shlex.split(line.removeprefix("continue with: "))
     path = folder / demo_scene.name / "version_0" / "checkpoints" / "last.ckpt"
     config = path.parents[1] / "config.yaml"
-    assert (program, arguments) == ("nsvq", ["fit", f"--config={config}", f"--ckpt_path={path}"])
+    into = f"--trainer.run_folder={path.parents[1]}"
+    assert (program, arguments) == ("nsvq", ["fit", f"--config={config}", f"--ckpt_path={path}", into])
     assert iteration_of(path) == 4
     assert main(arguments) == 0
-    assert (folder / demo_scene.name / "version_1" / "scene.nsvq").read_bytes() == command_scene
+    assert (folder / demo_scene.name / "version_0" / "scene.nsvq").read_bytes() == command_scene
 
 
 def test_ctrl_c_is_the_status_130_of_every_command(
@@ -316,7 +317,8 @@ def test_ctrl_c_is_the_status_130_of_every_command(
 
 def test_the_command_that_continues_is_that_of_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
     checkpoint = Path("a b", "checkpoints", "last.ckpt")
-    rest = ["fit", f"--config={Path('a b', 'config.yaml')}", f"--ckpt_path={checkpoint}"]
+    options = f"--config={Path('a b', 'config.yaml')}", f"--ckpt_path={checkpoint}", "--trainer.run_folder=a b"
+    rest = ["fit", *options]
     assert shlex.split(continuation(checkpoint)) == ["nsvq", *rest]
     monkeypatch.setattr(sys, "argv", ["/somewhere/nsvq_lightning/__main__.py"])
     assert shlex.split(continuation(checkpoint)) == ["python", "-m", "nsvq_lightning", *rest]

@@ -331,7 +331,7 @@ def test_minutes_choose_the_iterations(
     points = forecast.stretches(module.schedule, BudgetedGrowth(full=ENDS["warmup_end"]), 100, BUDGET)[0][1]
     assert 100 < points < 2 * BUDGET
     assert 1 < trainer.global_step == trainer.max_steps == module.schedule.total
-    assert f"iterations: {trainer.max_steps}, as many as 0.5 minutes are likely to allow" in caplog.text
+    assert f"iterations: {trainer.max_steps}, about 0.5 min of training" in caplog.text
 
 
 def test_a_run_of_some_minutes_can_be_repeated(
