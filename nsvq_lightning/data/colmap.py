@@ -231,10 +231,7 @@ def _no_model(root: Path, folders: Sequence[str], chosen: str | None) -> SceneEr
         absent = [table + suffix for table in TABLES if not (root / folder / f"{table}{suffix}").is_file()]
         if len(absent) < len(TABLES):
             missing.append(f"{folder} has a {suffix} model without {', '.join(absent)}")
-    where, advice = (
-        root,
-        "nor is there a transforms.json. Of photos, nsvq prepare makes a scene; or copy the missing files",
-    )
+    where, advice = root, "nor is there a transforms.json: make a scene with nsvq prepare, or copy the missing files"
     if chosen is not None:
         others = sorted({str(path.parent.relative_to(root)) for path in (root / "sparse").glob("*/cameras.*")})
         where = root / folders[0]

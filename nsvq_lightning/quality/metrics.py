@@ -31,17 +31,18 @@ def color_corrected(image: Tensor, photo: Tensor, mask: Tensor | None = None) ->
     counting = torch.ones_like(colors[:, 0], dtype=torch.bool) if mask is None else mask.reshape(-1)
     dark, bright = 0.5 / 255, 1 - 0.5 / 255  # beyond these, a pixel is clipped and says nothing about the map
     seen = counting[:, None] & (target >= dark) & (target <= bright)
+    parts = [slice(start, start + AT_ONCE) for start in range(0, len(colors), AT_ONCE)]
     for _ in range(5):
         normal, moment = colors.new_zeros(3, TERMS, TERMS), colors.new_zeros(3, TERMS)
-        for part, goal, counts in zip(*(each.split(AT_ONCE) for each in (colors, target, seen)), strict=True):
-            terms = _terms(part)
-            unclipped = counts & (part >= dark) & (part <= bright)
+        for part in parts:
+            terms = _terms(colors[part])
+            unclipped = seen[part] & (colors[part] >= dark) & (colors[part] <= bright)
             weighted = terms[:, None] * unclipped[..., None]  # [pixels, channel, term]
             normal += (weighted.flatten(1).T @ terms).view_as(normal)
-            moment += (weighted * goal[..., None]).sum(0)
+            moment += (weighted * target[part][..., None]).sum(0)
         # A picture of few colours leaves coefficients open; the pseudo-inverse takes the smallest.
         weights = torch.linalg.pinv(normal, hermitian=True) @ moment[..., None]
-        corrected = torch.cat([_terms(part) @ weights[..., 0].T for part in colors.split(AT_ONCE)])
+        corrected = torch.cat([_terms(colors[part]) @ weights[..., 0].T for part in parts])
         colors = torch.where(normal[:, -1, -1] > 0, corrected, colors).clamp(0, 1)
     return colors.reshape(image.shape).to(image.dtype)
 
