@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from lightning.pytorch import Trainer
 
-from nsvq_lightning.compression.importance import below_cap, by_opacity, most_contributing
+from nsvq_lightning.compression.importance import below_cap, likely_effects, most_contributing
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.training import distributed, row_ops, scene_module
 from nsvq_lightning.training.module import SplatModule
@@ -53,9 +53,6 @@ log = logging.getLogger(__name__)
 
 # Most train views in which the effect of splats is measured.
 VIEWS = 64
-# Other views need what these do not show, and an estimate from few signs is noise: no effect counts as less than this
-# share of a splat's typical one, and what counts is this power of it, the typical one having the rest.
-LEAST_EFFECT, TRUST = 0.1, 0.75
 
 
 @dataclass(eq=False)
@@ -100,11 +97,7 @@ class SplatSelection(SplatCallback):
         splats = below_cap(module.splats.raw())
         views = scene_module.train_sensitivities(trainer, module, splats, VIEWS)
         squares = sum((found.opacities for _, found, _ in views), torch.zeros_like(splats.opacities))
-        effects = distributed.sum_over_processes(trainer, squares) * by_opacity(splats.opacities).square()
-        # An opaque splat shows more, a large one hardly: where splats are large, photos were taken from far away.
-        typical = splats.opacities.sigmoid().square() * (splats.scales.topk(2).values.sum(1) / 3).exp()
-        typical *= (effects / typical)[effects > 0].median()
-        effects = effects.fmax(LEAST_EFFECT * typical) ** TRUST * typical ** (1 - TRUST)
+        effects = likely_effects(splats, distributed.sum_over_processes(trainer, squares))
         row_ops.keep_rows(module.splats, trainer.optimizers[0], most_contributing(effects, budget))
         distributed.check_replicas(trainer, "the selection")
         log.info("iteration %d: the selection leaves %d of %d splats", iteration, budget, count)

@@ -13,7 +13,14 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nsvq_lightning.callbacks import LearningRateDecay, PhaseSchedule, SplatBudget, standard
-from nsvq_lightning.compression.importance import contributions, most_contributing, row_weights
+from nsvq_lightning.compression.importance import (
+    below_cap,
+    contributions,
+    likely_effects,
+    most_contributing,
+    row_weights,
+    sensitivity,
+)
 from nsvq_lightning.compression.setting import STEPS, Setting, setting_for
 from nsvq_lightning.compression.stored import components
 from nsvq_lightning.compression.viewpoints import Measure
@@ -23,6 +30,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import decode, encode
 from nsvq_lightning.io.nsvq.header import frame, unframe
 from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.attributes import SIZES, codebook_sizes
 from nsvq_lightning.splats.splats import Splats, detached
@@ -44,7 +52,7 @@ class Candidate:
         return decode(*unframe(self.data))
 
 
-# Shares of the trained splats that are stored: those that contribute least go where a file is too large.
+# Shares of the trained splats that are stored: those that are missed least go where a file is too large.
 KEPT = 1.0, 0.97
 # Most views in which contributions are measured.
 MOST_VIEWS = 96
@@ -94,6 +102,7 @@ class Compressor:
         self._render = partial(render, antialiased=scene.antialiased)
         self._steps, self._minutes = steps, minutes
         self._trained: dict[Setting, tuple[CompressedScene, Tensor]] = {}
+        self._effects: dict[Setting, Tensor] = {}
         self.stopped = False
 
     def at(self, setting: Setting) -> Candidate:
@@ -109,9 +118,20 @@ class Compressor:
             rows, basis = components(torch.from_numpy(scene.raw["shN"]), weights, setting.step)
             scene = replace(scene, raw={**scene.raw, "shN": rows}, bases={"shN": basis})
         if setting.kept < 1:
-            kept = most_contributing(weights, math.ceil(setting.kept * len(scene)))
+            if key not in self._effects:
+                self._effects[key] = self._likely_effects(scene)
+            kept = most_contributing(self._effects[key], math.ceil(setting.kept * len(scene)))
             scene = scene.take(kept.numpy()).in_use()
         return Candidate(setting, b"".join(frame(*encode(scene, self._storage))))
+
+    def _likely_effects(self, scene: CompressedScene) -> Tensor:
+        """How much pictures are likely to change without each splat ``[N]``."""
+        splats, views = below_cap(scene.decode()), self._data.scene
+        squares = torch.zeros_like(splats.opacities)
+        for index in views.some_train(MOST_VIEWS):
+            signs = generator(self._seed, 0, "signs", index)
+            squares += sensitivity(splats, views.cameras[index], self._render, signs)[0].opacities
+        return likely_effects(splats, squares)
 
     def error(self, candidate: Candidate) -> float:
         """Root mean square difference between its pictures and those of the original, for channels in [0, 1]."""

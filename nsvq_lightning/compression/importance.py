@@ -111,6 +111,25 @@ def by_opacity(opacities: Tensor) -> Tensor:
     return 1 / torch.sigmoid(-opacities)
 
 
+# Other views need what these do not show, and an estimate from few signs is noise: no effect counts as less than this
+# share of a splat's typical one, and what counts is this power of it, the typical one having the rest.
+LEAST_EFFECT, TRUST = 0.1, 0.75
+
+
+def likely_effects(splats: RawSplats, squares: Tensor) -> Tensor:
+    """How much pictures are likely to change without each splat, moved towards what is typical of it: ``[N]``.
+
+    Args:
+        splats: Raw attributes of N splats below the cap (:func:`below_cap`).
+        squares: Their :func:`sensitivity` to opacities ``[N]``, summed over pictures.
+    """
+    effects = squares * by_opacity(splats.opacities).square()
+    # An opaque splat shows more, a large one hardly: where splats are large, photos were taken from far away.
+    typical = splats.opacities.sigmoid().square() * (splats.scales.topk(2).values.sum(1) / 3).exp()
+    typical *= (effects / typical)[effects > 0].median()
+    return effects.fmax(LEAST_EFFECT * typical) ** TRUST * typical ** (1 - TRUST)
+
+
 log = logging.getLogger(__name__)
 
 
