@@ -58,8 +58,6 @@ class QuietParser(LightningArgumentParser):
             message = given.in_plain_words(message, CLASSES, self.arguments)
             parsers = getattr(self._subcommands_action, "_name_parser_map", {"": self}).values()
             options = [option for parser in parsers for option in parser._option_string_actions]
-            if program == "nsvq fit":
-                options += [f"--{name}" for name in given.SHORTHANDS]
             message += given.unknown_option(message, options)
         sys.stderr.write(f"error: {message}\nAll options: {program} --help\n")
         self.exit(2)
