@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import subprocess
@@ -54,6 +55,15 @@ def ctrl_c() -> None:
     """A shell starts what it puts into the background (``pytest &``) with SIGINT ignored; tests of Ctrl-C need it."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
+def log_level() -> Iterator[None]:
+    """A command sets the level of the package's log for its process; tests after it want their own."""
+    log = logging.getLogger("nsvq_lightning")
+    level = log.level
+    yield
+    log.setLevel(level)
 
 
 WHOLE_RUNS = {"benchmark", "training", "runs"}
