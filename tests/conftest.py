@@ -32,14 +32,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile kernels before test processes start, in two processes: both would compile the same ones otherwise."""
+    """Compile the kernels that many tests need before test processes start, which would wait for one another."""
     if hasattr(session.config, "workerinput") or not getattr(session.config.option, "numprocesses", None):
         return
-    warm = Path(__file__).parent / "support" / "warm.py"
-    halves = [subprocess.Popen([sys.executable, str(warm), half]) for half in ("rendering", "quantizing")]
-    results = [half.wait() for half in halves]
-    if any(results):
-        raise pytest.UsageError(f"{warm} failed, see above")
+    command = [sys.executable, "-m", "nsvq_lightning.compute.ahead"]
+    if any(process.wait() for process in [subprocess.Popen(command) for _ in range(2)]):
+        raise pytest.UsageError(f"{' '.join(command)} failed, see above")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

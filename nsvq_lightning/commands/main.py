@@ -169,6 +169,10 @@ def _run_lightning(arguments: list[str]) -> int:
     from lightning.fabric.utilities.exceptions import MisconfigurationException
     from lightning.pytorch.utilities.exceptions import SIGTERMException
 
+    if arguments[0] == "fit":
+        from nsvq_lightning.compute import ahead
+
+        ahead.start()
     from nsvq_lightning.commands.fit import SplatCLI
 
     _quiet_lightning()

@@ -85,12 +85,12 @@ class _Cache(KernelCache):
     """Its first question to the disk is the first that happens when a kernel is called."""
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
-        _start_threads()
+        start_threads()
         return super()._load_overload(sig, target_context)
 
 
 @functools.cache
-def _start_threads() -> None:
+def start_threads() -> None:
     """Start Numba's threads, which tells OpenMP to use all cores, and give torch its own setting back."""
     count = torch.get_num_threads()
     numba.set_num_threads(numba.get_num_threads())
@@ -115,16 +115,21 @@ def inline(function: Callable[..., Any]) -> Any:
     return numba.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)(function)
 
 
-def kernel(function: Callable[..., Any], parallel: bool = True, allocates: bool = True) -> Any:
+def part(function: Callable[..., Any]) -> Any:
+    """Compile a function that threads call (:mod:`nsvq_lightning.compute.parallel`)."""
+    return numba.njit(no_cpython_wrapper=True, **_OPTIONS)(function)
+
+
+def kernel(function: Callable[..., Any], allocates: bool = True) -> Any:
     """Compile a kernel once per machine, and keep it on the disk (:mod:`nsvq_lightning.compute.kernel_cache`).
 
-    Small kernels pass ``parallel=False``: waking the threads costs more than they take. A kernel that allocates no
-    arrays may pass ``allocates=False``: the arrays that it passes to inlined helpers are then not reference-counted,
-    with atomic operations, at every call, and a loop of few instructions becomes seven times as fast.
+    A kernel that allocates no arrays may pass ``allocates=False``: the arrays that it passes to inlined helpers are
+    then not reference-counted, with atomic operations, at every call, and a loop of few instructions becomes seven
+    times as fast.
 
     It is compiled again when its module, or one that this imports, has changed.
     """
-    dispatcher = numba.njit(parallel=parallel, _nrt=allocates, **_OPTIONS)(function)
+    dispatcher = numba.njit(_nrt=allocates, **_OPTIONS)(function)
     with contextlib.suppress(RuntimeError):  # nowhere to keep it
         dispatcher._cache = _Cache(function)
     _kernels.append(dispatcher)
@@ -139,7 +144,7 @@ def thread_count() -> int:
     """Number of threads that kernels use: torch's setting, so that one setting controls both."""
     asked = torch.get_num_threads()
     if asked != getattr(_told, "torch", 0):
-        _start_threads()
+        start_threads()
         _told.torch, _told.count = asked, max(1, min(asked, int(numba.config.NUMBA_NUM_THREADS)))
         numba.set_num_threads(_told.count)
     return int(_told.count)

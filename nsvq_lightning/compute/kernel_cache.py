@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from filelock import FileLock, Timeout
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.misc.appdirs import AppDirs
 
@@ -115,6 +116,19 @@ class _Layout(CompileResultCacheImpl):
     _locator_classes = (_Locator,)
 
 
+def constants(function: Any) -> tuple[Any, ...]:
+    """What a function knows from the functions around it; of a compiled one among that, what that knows."""
+    known = (cell.cell_contents for cell in function.__closure__ or ())
+    return tuple(constants(value.py_func) if hasattr(value, "py_func") else value for value in known)
+
+
+class BusyError(Exception):
+    """Another process compiles the kernel."""
+
+
+# Whether to wait for a kernel that another process compiles, and how many seconds at most.
+waits = True
+PATIENCE = 60
 # So many folders are kept; those of a few checkouts, between which one may change.
 MAX_FOLDERS = 64
 
@@ -122,14 +136,41 @@ MAX_FOLDERS = 64
 class KernelCache(FunctionCache):
     """Numba's disk cache of one kernel, in a folder of :func:`kernel_folder` named after its :func:`source_digest`.
 
+    A process that finds no kernel there holds its lock until it has compiled it.
+
     Raises:
         RuntimeError: There is no such folder.
     """
 
     _impl_class = _Layout
 
+    def _index_key(self, sig: Any, codegen: Any) -> Any:
+        return sig, codegen.magic_tuple(), constants(self._py_func)
+
+    def is_there(self) -> bool:
+        """Whether the kernel was compiled, for whatever arguments."""
+        return Path(self._cache_file._index_path).exists()
+
+    def _load_overload(self, sig: Any, target_context: Any) -> Any:
+        if (found := super()._load_overload(sig, target_context)) is not None:
+            return found
+        self._lock = FileLock(f"{self._cache_file._index_path}.lock")
+        try:
+            Path(self._cache_path).mkdir(exist_ok=True)
+            self._lock.acquire(timeout=PATIENCE if waits else 0)
+        except Timeout:
+            if not waits:
+                raise BusyError from None
+        except OSError:  # a folder that knows no locks
+            return None
+        found = super()._load_overload(sig, target_context)
+        if found is not None:
+            self._lock.release()
+        return found
+
     def _save_overload(self, sig: Any, data: Any) -> None:
         super()._save_overload(sig, data)
+        self._lock.release()
         folders = (path for path in Path(self._cache_path).parent.iterdir() if path.is_dir())
         for outdated in sorted(folders, key=lambda path: path.stat().st_mtime)[:-MAX_FOLDERS]:
             shutil.rmtree(outdated, ignore_errors=True)  # another process may be removing it, too

@@ -1,7 +1,6 @@
 """Positions as integers on a grid, in Morton order, each only as fine as necessary."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Self
 
 import numpy as np
@@ -106,7 +105,7 @@ _MASKS = tuple(
 _SHIFTS = tuple(map(np.uint64, (2, 4, 8, 16, 32)))
 
 
-@partial(kernel, parallel=False)
+@kernel
 def _interleave(cells, depths, keys):  # type: ignore[no-untyped-def]
     for i in range(len(keys)):
         shift = AXIS_BITS - depths[i]
@@ -120,7 +119,7 @@ def _interleave(cells, depths, keys):  # type: ignore[no-untyped-def]
         keys[i] = key
 
 
-@partial(kernel, parallel=False)
+@kernel
 def _separate(keys, cells):  # type: ignore[no-untyped-def]
     for i in range(len(keys)):
         for axis in range(3):
@@ -156,7 +155,7 @@ _WINDOW = 16
 _BLOCK = 256
 
 
-@partial(kernel, parallel=False)
+@kernel
 def _search_before(axes, found):  # type: ignore[no-untyped-def]
     count = len(found)
     for block in range(-(-count // _BLOCK)):

@@ -1,6 +1,5 @@
 """A palette for many rows: cells of similar rows, found by always splitting the cell where that gains most."""
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -87,7 +86,7 @@ class _Cells:
         return float(gains[best]) or -1.0, start + 1 + best  # equal rows gain nothing
 
 
-@partial(kernel, parallel=False)
+@kernel
 def _place_along(rows, weight, numbers, along):  # type: ignore[no-untyped-def]
     """Positions of some rows along the direction in which they differ most; 0 if they are equal."""
     dim = rows.shape[1]

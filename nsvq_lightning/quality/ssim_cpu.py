@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import prange
 from torch import Tensor
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
+from nsvq_lightning.compute.jit import F, inline, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat_checked, recycled
+from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
 
 # The taps of the window, from the middle outwards.
@@ -192,18 +192,17 @@ def sweep(
             sums[2 * done + 1] = apart
 
 
-@kernel
+@parallel
 def sweep_image(
-    threads, image, target, white, gradient, height, length, pitch, l1_step, ssim_step, images, moments, derivatives,
-    ring, lanes, sums,
+    thread, threads, image, target, white, gradient, height, length, pitch, l1_step, ssim_step, images, moments,
+    derivatives, ring, lanes, sums,
 ):  # fmt: skip
     """Every thread sweeps a band of rows; a row's result does not depend on the band it is in."""
-    for thread in prange(threads):
-        sweep(
-            image, target, white, gradient, height * thread // threads, height * (thread + 1) // threads, height,
-            length, pitch, l1_step, ssim_step, images[thread], moments[thread], derivatives[thread], ring[thread],
-            lanes, sums,
-        )  # fmt: skip
+    sweep(
+        image, target, white, gradient, height * thread // threads, height * (thread + 1) // threads, height,
+        length, pitch, l1_step, ssim_step, images[thread], moments[thread], derivatives[thread], ring[thread],
+        lanes, sums,
+    )  # fmt: skip
 
 
 def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float) -> tuple[float, Tensor]:

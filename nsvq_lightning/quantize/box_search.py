@@ -11,15 +11,15 @@ second-nearest code was then. As long as the distance to its code and the distan
 moved add up to less, the code is still the nearest (:mod:`tracking`).
 """
 
-from functools import cache, partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import prange
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, INT32, INT64, Array, aligned_empty, check_array, check_table, outside
+from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.compute.rows import count_outside
 
 
@@ -89,7 +89,7 @@ def _split(values, order, start, stop, middle):
             return
 
 
-@partial(kernel, parallel=False)
+@kernel
 def _sort_into_leaves(points, order):
     """Split by medians at multiples of 256 codes (a node), then of 16 (a leaf)."""
     stack = np.empty((64, 2), np.int64)
@@ -128,30 +128,29 @@ def _points(codebook: Array) -> Array:
     return points
 
 
-@kernel
-def _pack(points, order, codes, labels, leaves, nodes):
+@parallel
+def _pack(node, _, points, order, codes, labels, leaves, nodes):
     """Put codes and the corners of their boxes into the arrays of :func:`_boxes`."""
     dim, count = points.shape
-    for node in prange(leaves.shape[0]):
-        for j in range(dim):
-            node_low, node_high = F(np.inf), F(-np.inf)
-            for child in range(16):
-                leaf = node * 16 + child
-                low, high = F(np.inf), F(-np.inf)
-                for lane in range(16):
-                    place = leaf * 16 + lane
-                    value, label = F(np.inf), _NO_CODE
-                    if place < count:
-                        label = order[place]
-                        value = points[j, label]
-                        low, high = min(low, value), max(high, value)
-                    codes[leaf, j, lane] = value
-                    labels[leaf, lane] = label
-                leaves[node, j, 0, child] = low
-                leaves[node, j, 1, child] = high
-                node_low, node_high = min(node_low, low), max(node_high, high)
-            nodes[node // 16, j, 0, node % 16] = node_low
-            nodes[node // 16, j, 1, node % 16] = node_high
+    for j in range(dim):
+        node_low, node_high = F(np.inf), F(-np.inf)
+        for child in range(16):
+            leaf = node * 16 + child
+            low, high = F(np.inf), F(-np.inf)
+            for lane in range(16):
+                place = leaf * 16 + lane
+                value, label = F(np.inf), _NO_CODE
+                if place < count:
+                    label = order[place]
+                    value = points[j, label]
+                    low, high = min(low, value), max(high, value)
+                codes[leaf, j, lane] = value
+                labels[leaf, lane] = label
+            leaves[node, j, 0, child] = low
+            leaves[node, j, 1, child] = high
+            node_low, node_high = min(node_low, low), max(node_high, high)
+        nodes[node // 16, j, 0, node % 16] = node_low
+        nodes[node // 16, j, 1, node % 16] = node_high
 
 
 def _boxes(codebook: Array, order: Array) -> tuple[Any, ...]:
@@ -164,7 +163,7 @@ def _boxes(codebook: Array, order: Array) -> tuple[Any, ...]:
     nodes = -(-count // 4096) * 16
     codes, labels = aligned_empty((nodes * 16, dim, 16)), np.empty((nodes * 16, 16), np.int32)
     corners = aligned_empty((nodes, dim, 2, 16)), aligned_empty((nodes // 16, dim, 2, 16))
-    _pack(_points(codebook), order, codes, labels, *corners)
+    _pack(nodes, _points(codebook), order, codes, labels, *corners)
     return codes.ravel(), labels.ravel(), corners[0].ravel(), corners[1].ravel()
 
 
@@ -311,44 +310,42 @@ def _search_kernel(dim: int) -> Any:
     """The search for one dimension, a compile-time constant, so that short loops over it are unrolled."""
     largest = np.finfo(np.float32).max
 
-    def search(x, rows, codebook, codes, labels, leaves, nodes, memory, travelled, result):
+    def search(block, _, x, rows, codebook, codes, labels, leaves, nodes, memory, travelled, result):
         last_codes, anchors, clearance = memory
-        total, bounded, missing = result.shape[0], last_codes.shape[0] > 0, 0
-        for block in prange((total + _ROWS - 1) // _ROWS):
-            best, label, second = np.empty(_ROWS, np.float32), np.empty(_ROWS, np.int32), np.empty(_ROWS, np.float32)
-            guess, tasks = np.empty(_ROWS, np.int64), np.empty(2 * _TASKS, np.int64)
-            state = best, label, second, guess, tasks, np.empty(16, np.float32), bounded
-            tree, queries = (codes, labels, leaves, nodes), np.empty(_ROWS * dim, np.float32)
-            places = np.empty(_ROWS, np.int64)
-            count, first, stop = 0, block * _ROWS, min(total, (block + 1) * _ROWS)
-            found_outside = count_outside(rows, first, stop, x.shape[0] // dim)
-            missing += found_outside
-            for i in range(first, stop if found_outside == 0 else first):
-                row = simd.get(rows, i)
-                last = np.int64(simd.get(last_codes, row)) if bounded else np.int64(-1)
-                simd.put(result, i, last)
-                simd.put(places, count, i)
-                known = last >= 0 and last < codebook.shape[0] // dim
-                count += not (known and _prove(dim, codebook, x, row, last, memory, travelled))
-            for i in range(count):
-                row = simd.get(rows, simd.get(places, i))
+        total, bounded = result.shape[0], last_codes.shape[0] > 0
+        best, label, second = np.empty(_ROWS, np.float32), np.empty(_ROWS, np.int32), np.empty(_ROWS, np.float32)
+        guess, tasks = np.empty(_ROWS, np.int64), np.empty(2 * _TASKS, np.int64)
+        state = best, label, second, guess, tasks, np.empty(16, np.float32), bounded
+        tree, queries = (codes, labels, leaves, nodes), np.empty(_ROWS * dim, np.float32)
+        places = np.empty(_ROWS, np.int64)
+        count, first, stop = 0, block * _ROWS, min(total, (block + 1) * _ROWS)
+        found_outside = count_outside(rows, first, stop, x.shape[0] // dim)
+        for i in range(first, stop if found_outside == 0 else first):
+            row = simd.get(rows, i)
+            last = np.int64(simd.get(last_codes, row)) if bounded else np.int64(-1)
+            simd.put(result, i, last)
+            simd.put(places, count, i)
+            known = last >= 0 and last < codebook.shape[0] // dim
+            count += not (known and _prove(dim, codebook, x, row, last, memory, travelled))
+        for i in range(count):
+            row = simd.get(rows, simd.get(places, i))
+            for j in range(dim):
+                simd.put(queries, i * dim + j, simd.get(x, row * dim + j))
+        _guess(dim, tree, queries, count, state)
+        _visit_near(dim, tree, queries, count, state)
+        for i in range(count):
+            nearest = simd.get(label, i) if simd.get(label, i) != _NO_CODE else np.int32(0)
+            simd.put(result, simd.get(places, i), np.int64(nearest))
+            if bounded:
+                # Keep where the row was searched; there may still be codes beyond the largest float32 number.
+                row, away = simd.get(rows, simd.get(places, i)), min(simd.get(second, i), largest)
+                simd.put(last_codes, row, nearest)
                 for j in range(dim):
-                    simd.put(queries, i * dim + j, simd.get(x, row * dim + j))
-            _guess(dim, tree, queries, count, state)
-            _visit_near(dim, tree, queries, count, state)
-            for i in range(count):
-                nearest = simd.get(label, i) if simd.get(label, i) != _NO_CODE else np.int32(0)
-                simd.put(result, simd.get(places, i), np.int64(nearest))
-                if bounded:
-                    # Keep where the row was searched; there may still be codes beyond the largest float32 number.
-                    row, away = simd.get(rows, simd.get(places, i)), min(simd.get(second, i), largest)
-                    simd.put(last_codes, row, nearest)
-                    for j in range(dim):
-                        simd.put(anchors, row * dim + j, simd.get(queries, i * dim + j))
-                    simd.put(clearance, row, np.sqrt(np.float64(away)) / ROUNDING + travelled)
-        return missing
+                    simd.put(anchors, row * dim + j, simd.get(queries, i * dim + j))
+                simd.put(clearance, row, np.sqrt(np.float64(away)) / ROUNDING + travelled)
+        return found_outside
 
-    return kernel(search)
+    return parallel(search)
 
 
 def box_search(
@@ -392,6 +389,7 @@ def box_search(
     result = np.empty(len(rows), np.int64)
     thread_count()
     flat = known.last, known.anchors.ravel(), known.clearance
-    if _search_kernel(dim)(x.ravel(), rows, codebook.ravel(), *_boxes(codebook, order), flat, float(travelled), result):
+    blocks, boxes = -(-len(rows) // _ROWS), _boxes(codebook, order)
+    if _search_kernel(dim)(blocks, x.ravel(), rows, codebook.ravel(), *boxes, flat, float(travelled), result):
         raise outside("rows", rows, count)
     return result

@@ -7,27 +7,26 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.compute.jit import kernel, thread_count
+from nsvq_lightning.compute.jit import thread_count
 from nsvq_lightning.compute.memory import INT64, flat_checked
+from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.compute.rows import put_rows
 from nsvq_lightning.quantize.nearest import nearest
 
 
-@kernel
-def _sum_rows(values, codes, sums, parts):
+@parallel
+def _sum_rows(part, parts, values, codes, sums):
     """Each part owns a range of codes and scans all rows, so the order of the threads cannot change a sum."""
-    for part in prange(parts):
-        first, last = part * sums.shape[0] // parts, (part + 1) * sums.shape[0] // parts
-        for i in range(codes.shape[0]):
-            code = codes[i]
-            if first <= code < last:
-                for j in range(values.shape[1]):
-                    sums[code, j] += values[i, j]
+    first, last = part * sums.shape[0] // parts, (part + 1) * sums.shape[0] // parts
+    for i in range(codes.shape[0]):
+        code = codes[i]
+        if first <= code < last:
+            for j in range(values.shape[1]):
+                sums[code, j] += values[i, j]
 
 
 def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype | None = None) -> Tensor:
@@ -57,7 +56,7 @@ def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtyp
         return sum_rows(values.contiguous(), codes, num_codes, dtype)
     sums = torch.zeros(num_codes, values.shape[1], dtype=dtype)
     numbers = flat_checked("codes", codes.cpu().contiguous(), (len(values),), INT64)
-    _sum_rows(values.cpu().contiguous().numpy(), numbers, sums.numpy(), thread_count())
+    _sum_rows(thread_count(), values.cpu().contiguous().numpy(), numbers, sums.numpy())
     return sums.to(values.device)
 
 

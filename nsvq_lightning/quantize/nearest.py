@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import prange
 from torch import Tensor
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.compute.jit import kernel, thread_count
+from nsvq_lightning.compute.jit import thread_count
 from nsvq_lightning.compute.memory import Array
+from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.quantize.box_search import MAX_DIM, box_search, place_of_least
 from nsvq_lightning.quantize.scores import score_search
 
@@ -131,9 +131,8 @@ def cheapest(x: Tensor, codebook: Tensor, rates: Tensor, prices: Tensor) -> Tens
         return cheapest_reference(x, codebook, rates, prices)
     table = _blocks(codebook.numpy(), rates.float().numpy())
     result = np.empty(len(x), np.int64)
-    thread_count()
-    dim = x.shape[1]
-    _search_kernel(dim)(x.contiguous().numpy().ravel(), prices.float().contiguous().numpy(), table, result)
+    queries, dearness = x.contiguous().numpy().ravel(), prices.float().contiguous().numpy()
+    _search_kernel(x.shape[1])(thread_count(), queries, dearness, table, result)
     return torch.from_numpy(result)
 
 
@@ -157,9 +156,9 @@ def _blocks(codebook: Array, rates: Array) -> Array:
 def _search_kernel(dim: int) -> Any:
     """The search for one dimension, a compile-time constant."""
 
-    def search(x, prices, table, result):
+    def search(thread, threads, x, prices, table, result):
         blocks = table.shape[0] // (16 * (dim + 1))
-        for i in prange(result.shape[0]):
+        for i in range(result.shape[0] * thread // threads, result.shape[0] * (thread + 1) // threads):
             price = simd.get(prices, i)
             best, block_of = simd.broadcast(np.inf), simd.broadcast(0)
             for block in range(blocks):
@@ -174,4 +173,4 @@ def _search_kernel(dim: int) -> Any:
                 block_of = simd.select(cheaper, block, block_of)
             simd.put(result, i, place_of_least(best, block_of))
 
-    return kernel(search)
+    return parallel(search)

@@ -12,32 +12,31 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import prange
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
+from nsvq_lightning.compute.jit import F, inline, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, Array, aligned_empty, check_array, check_table
+from nsvq_lightning.compute.parallel import parallel
 
 
-@kernel
-def _lay_out(codebook, centre, blocks, halves):
+@parallel
+def _lay_out(block, _, codebook, centre, blocks, halves):
     """Write blocks of centred codes and half their squared norms; a non-finite code becomes 0 with an infinite norm."""
     count, dim = codebook.shape
-    for block in prange(blocks.shape[0]):
-        for lane in range(32):
-            code, total = block * 32 + lane, np.float64(np.inf)
-            if code < count:
-                total = np.float64(0.0)
-                for j in range(dim):
-                    value = codebook[code, j] - centre[j]
-                    blocks[block, j, lane] = value
-                    total += np.float64(value) * np.float64(value)
-            if total < np.inf:
-                halves[code] = 0.5 * total
-                continue
-            halves[code] = np.inf
+    for lane in range(32):
+        code, total = block * 32 + lane, np.float64(np.inf)
+        if code < count:
+            total = np.float64(0.0)
             for j in range(dim):
-                blocks[block, j, lane] = 0
+                value = codebook[code, j] - centre[j]
+                blocks[block, j, lane] = value
+                total += np.float64(value) * np.float64(value)
+        if total < np.inf:
+            halves[code] = 0.5 * total
+            continue
+        halves[code] = np.inf
+        for j in range(dim):
+            blocks[block, j, lane] = 0
 
 
 def _centred(codebook: Array) -> tuple[Array, Array, Array, np.float32]:
@@ -50,7 +49,7 @@ def _centred(codebook: Array) -> tuple[Array, Array, Array, np.float32]:
     finite = np.isfinite(codebook).all(1)
     centre = (codebook[finite] if finite.any() else np.zeros((1, dim))).mean(0, dtype=np.float64).astype(np.float32)
     blocks, halves = aligned_empty((-(-count // 32), dim, 32)), np.empty(-(-count // 32) * 32, np.float32)
-    _lay_out(codebook, centre, blocks, halves)
+    _lay_out(len(blocks), codebook, centre, blocks, halves)
     longest = float(halves[np.isfinite(halves)].max(initial=0.0))
     return centre, blocks.ravel(), halves, F(np.sqrt(2.0 * longest))
 
@@ -203,46 +202,45 @@ def _compare_all(dim, x, row, codebook):
 def _search_kernel(dim: int) -> Any:
     """The search for one dimension, a compile-time constant."""
 
-    def search(x, codebook, centre, blocks, halves, longest, result, lists, distances):
+    def search(tile, _, x, codebook, centre, blocks, halves, longest, result, lists, distances):
         count = result.shape[0]
         with_lists = lists.shape[0] > 0
         kept = _BEST if with_lists else _FEW
         rounding = F(2.0 * (dim + 8) * 2.0**-24)
-        for tile in prange((count + _TILE - 1) // _TILE):
-            rows, squared = np.empty(_TILE * dim, np.float32), np.zeros(_TILE, np.float32)
-            scores, codes = np.empty(_TILE * _BEST, np.float32), np.empty(_TILE * _BEST, np.int32)
-            limits, slack = np.empty(_TILE, np.float32), np.empty(_TILE, np.float32)
-            state = scores, codes, limits, slack, np.empty(32 * _GROUP, np.float32)
-            start, valid = tile * _TILE, min(_TILE, count - tile * _TILE)
-            for i in range(_TILE):
-                for j in range(dim):
-                    value = x[(start + min(i, valid - 1)) * dim + j] - centre[j]
-                    rows[i * dim + j] = value
-                    squared[i] += value * value
-                reach = np.sqrt(squared[i]) + longest
-                # Without a list, only codes that may be nearest after rounding are kept.
-                slack[i] = F(np.inf) if with_lists else F(2.0) * rounding * reach * reach
-            _score_tile(dim, blocks, halves, rows, (valid + _GROUP - 1) // _GROUP * _GROUP, kept, state)
-            for i in range(valid):
-                at, row = i * _BEST, start + i
-                reach = np.sqrt(squared[i]) + longest
-                margin = rounding * reach * reach
-                limit, others = scores[at] + margin, scores[at + kept - 1]
-                if others > limit:
-                    result[row] = _settle(dim, x, row, codebook, scores, codes, at, kept, limit)
-                else:
-                    result[row] = _compare_all(dim, x, row, codebook)
-                if with_lists:
-                    for k in range(LIST):
-                        lists[row * LIST + k] = codes[at + k] if scores[at + k] < F(np.inf) else codes[at]
-                    distances[row] = np.sqrt(max(F(0.0), squared[i] + F(2.0) * (others - margin)))
-                    second = scores[at + 1]
-                    clearance = F(0.0)
-                    if second > limit:
-                        clearance = np.sqrt(max(F(0.0), squared[i] + F(2.0) * (second - margin)))
-                    distances[count + row] = clearance
+        rows, squared = np.empty(_TILE * dim, np.float32), np.zeros(_TILE, np.float32)
+        scores, codes = np.empty(_TILE * _BEST, np.float32), np.empty(_TILE * _BEST, np.int32)
+        limits, slack = np.empty(_TILE, np.float32), np.empty(_TILE, np.float32)
+        state = scores, codes, limits, slack, np.empty(32 * _GROUP, np.float32)
+        start, valid = tile * _TILE, min(_TILE, count - tile * _TILE)
+        for i in range(_TILE):
+            for j in range(dim):
+                value = x[(start + min(i, valid - 1)) * dim + j] - centre[j]
+                rows[i * dim + j] = value
+                squared[i] += value * value
+            reach = np.sqrt(squared[i]) + longest
+            # Without a list, only codes that may be nearest after rounding are kept.
+            slack[i] = F(np.inf) if with_lists else F(2.0) * rounding * reach * reach
+        _score_tile(dim, blocks, halves, rows, (valid + _GROUP - 1) // _GROUP * _GROUP, kept, state)
+        for i in range(valid):
+            at, row = i * _BEST, start + i
+            reach = np.sqrt(squared[i]) + longest
+            margin = rounding * reach * reach
+            limit, others = scores[at] + margin, scores[at + kept - 1]
+            if others > limit:
+                result[row] = _settle(dim, x, row, codebook, scores, codes, at, kept, limit)
+            else:
+                result[row] = _compare_all(dim, x, row, codebook)
+            if with_lists:
+                for k in range(LIST):
+                    lists[row * LIST + k] = codes[at + k] if scores[at + k] < F(np.inf) else codes[at]
+                distances[row] = np.sqrt(max(F(0.0), squared[i] + F(2.0) * (others - margin)))
+                second = scores[at + 1]
+                clearance = F(0.0)
+                if second > limit:
+                    clearance = np.sqrt(max(F(0.0), squared[i] + F(2.0) * (second - margin)))
+                distances[count + row] = clearance
 
-    return kernel(search)
+    return parallel(search)
 
 
 def score_search(x: Array, codebook: Array, with_lists: bool = False) -> tuple[Array, Array, Array]:
@@ -269,5 +267,6 @@ def score_search(x: Array, codebook: Array, with_lists: bool = False) -> tuple[A
     lists = np.empty((count if with_lists else 0, LIST), np.int32)
     distances = np.empty((2, count if with_lists else 0), np.float32)
     thread_count()
-    _search_kernel(dim)(x.ravel(), codebook.ravel(), *_centred(codebook), result, lists.ravel(), distances.ravel())
+    found = result, lists.ravel(), distances.ravel()
+    _search_kernel(dim)(-(-len(x) // _TILE), x.ravel(), codebook.ravel(), *_centred(codebook), *found)
     return result, lists, distances

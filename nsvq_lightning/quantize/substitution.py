@@ -17,12 +17,12 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import prange
 from torch import Tensor
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
+from nsvq_lightning.compute.jit import F, inline, thread_count
 from nsvq_lightning.compute.memory import INT64, Array, flat_checked, outside, recycled
+from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside
 from nsvq_lightning.quantize.scores import squares
 
@@ -114,151 +114,141 @@ def _inverse(squared):
 
 
 def _short_forward(dim: int) -> Any:
-    def forward(seed, aim, spread, x, rows, codebook, codes, out):
-        count, missing = codes.shape[0], 0
-        for block in prange((count + _ROWS - 1) // _ROWS):
-            begin, stop = block * _ROWS, min(count, (block + 1) * _ROWS)
-            found = _outside(dim, x, rows, codebook, codes, begin, stop)
-            missing += found
-            noise, radius, angle = np.empty(_ROWS * dim, np.float32), np.empty(16, np.float32), np.empty(16, np.float32)
-            values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
-            fill_normal(seed, begin // 16 * dim, _ROWS // 16 * dim, noise, radius, angle)
-            for first in range(begin, stop if found == 0 else begin, 16):
-                valid = min(16, count - first)
-                _copy_in(dim, x, rows, first, valid, values)
-                _copy_in(dim, codebook, codes, first, valid, chosen)
-                at = (first - begin) * dim
-                error, squared = simd.broadcast(0), simd.broadcast(0)
+    def forward(block, _, seed, aim, spread, x, rows, codebook, codes, out):
+        count = codes.shape[0]
+        begin, stop = block * _ROWS, min(count, (block + 1) * _ROWS)
+        found = _outside(dim, x, rows, codebook, codes, begin, stop)
+        noise, radius, angle = np.empty(_ROWS * dim, np.float32), np.empty(16, np.float32), np.empty(16, np.float32)
+        values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
+        fill_normal(seed, begin // 16 * dim, _ROWS // 16 * dim, noise, radius, angle)
+        for first in range(begin, stop if found == 0 else begin, 16):
+            valid = min(16, count - first)
+            _copy_in(dim, x, rows, first, valid, values)
+            _copy_in(dim, codebook, codes, first, valid, chosen)
+            at = (first - begin) * dim
+            error, squared = simd.broadcast(0), simd.broadcast(0)
+            for j in range(dim):
+                residual = simd.load(chosen, 16 * j) - simd.load(values, 16 * j)
+                direction = simd.fma(aim, residual, spread * simd.load(noise, at + 16 * j))
+                simd.store(noise, at + 16 * j, direction)
+                error, squared = simd.fma(residual, residual, error), simd.fma(direction, direction, squared)
+            length = simd.vsqrt(error * _inverses(squared))
+            for j in range(dim):
+                simd.store(values, 16 * j, simd.fma(length, simd.load(noise, at + 16 * j), simd.load(values, 16 * j)))
+            for lane in range(valid):
                 for j in range(dim):
-                    residual = simd.load(chosen, 16 * j) - simd.load(values, 16 * j)
-                    direction = simd.fma(aim, residual, spread * simd.load(noise, at + 16 * j))
-                    simd.store(noise, at + 16 * j, direction)
-                    error, squared = simd.fma(residual, residual, error), simd.fma(direction, direction, squared)
-                length = simd.vsqrt(error * _inverses(squared))
-                for j in range(dim):
-                    simd.store(
-                        values, 16 * j, simd.fma(length, simd.load(noise, at + 16 * j), simd.load(values, 16 * j))
-                    )
-                for lane in range(valid):
-                    for j in range(dim):
-                        simd.put(out, (first + lane) * dim + j, simd.get(values, j * 16 + lane))
-        return missing
+                    simd.put(out, (first + lane) * dim + j, simd.get(values, j * 16 + lane))
+        return found
 
-    return kernel(forward)
+    return parallel(forward)
 
 
 def _long_forward(dim: int) -> Any:
     vectors = -(-dim // 16)
 
-    def forward(seed, aim, spread, x, rows, codebook, codes, out):
-        count, missing = codes.shape[0], 0
-        for block in prange((count + _ROWS - 1) // _ROWS):
-            begin, stop = block * _ROWS, min(count, (block + 1) * _ROWS)
-            found = _outside(dim, x, rows, codebook, codes, begin, stop)
-            missing += found
-            radius, angle, keep = np.empty(16, np.float32), np.empty(16, np.float32), np.ones(16, np.float32)
-            keep[: vectors * 16 - dim] = 0
-            noise, direction = np.empty(2 * vectors * 16, np.float32), np.empty(vectors * 16, np.float32)
-            for i in range(begin, stop if found == 0 else begin):
-                start = i % 2 * vectors * 16
-                if start == 0:
-                    fill_normal(seed, i * vectors, 2 * vectors, noise, radius, angle)
-                at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
-                error, squared = simd.broadcast(0), simd.broadcast(0)
-                for j in range(vectors):
-                    place = min(16 * j, dim - 16)
-                    residual = simd.load(codebook, code + place) - simd.load(x, at + place)
-                    way = simd.fma(aim, residual, spread * simd.load(noise, start + place))
-                    simd.store(direction, place, way)
-                    if j == vectors - 1:
-                        residual, way = residual * simd.load(keep, 0), way * simd.load(keep, 0)
-                    error, squared = simd.fma(residual, residual, error), simd.fma(way, way, squared)
-                length = np.sqrt(simd.lane_sum(error) * _inverse(simd.lane_sum(squared)))
-                for j in range(vectors):
-                    place = min(16 * j, dim - 16)
-                    simd.store(
-                        out, i * dim + place, simd.fma(length, simd.load(direction, place), simd.load(x, at + place))
-                    )
-        return missing
+    def forward(block, _, seed, aim, spread, x, rows, codebook, codes, out):
+        count = codes.shape[0]
+        begin, stop = block * _ROWS, min(count, (block + 1) * _ROWS)
+        found = _outside(dim, x, rows, codebook, codes, begin, stop)
+        radius, angle, keep = np.empty(16, np.float32), np.empty(16, np.float32), np.ones(16, np.float32)
+        keep[: vectors * 16 - dim] = 0
+        noise, direction = np.empty(2 * vectors * 16, np.float32), np.empty(vectors * 16, np.float32)
+        for i in range(begin, stop if found == 0 else begin):
+            start = i % 2 * vectors * 16
+            if start == 0:
+                fill_normal(seed, i * vectors, 2 * vectors, noise, radius, angle)
+            at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
+            error, squared = simd.broadcast(0), simd.broadcast(0)
+            for j in range(vectors):
+                place = min(16 * j, dim - 16)
+                residual = simd.load(codebook, code + place) - simd.load(x, at + place)
+                way = simd.fma(aim, residual, spread * simd.load(noise, start + place))
+                simd.store(direction, place, way)
+                if j == vectors - 1:
+                    residual, way = residual * simd.load(keep, 0), way * simd.load(keep, 0)
+                error, squared = simd.fma(residual, residual, error), simd.fma(way, way, squared)
+            length = np.sqrt(simd.lane_sum(error) * _inverse(simd.lane_sum(squared)))
+            for j in range(vectors):
+                place = min(16 * j, dim - 16)
+                simd.store(
+                    out, i * dim + place, simd.fma(length, simd.load(direction, place), simd.load(x, at + place))
+                )
+        return found
 
-    return kernel(forward)
+    return parallel(forward)
 
 
 def _short_backward(dim: int) -> Any:
-    def backward(grad, x, rows, codebook, codes, out, grad_x, sums):
-        count, parts, missing = codes.shape[0], sums.shape[0], 0
-        for part in prange(parts):
-            values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
-            moved, slope = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
-            total = sums[part]
-            clear(total, 0, total.shape[0])
-            begin, stop = count * part // parts, count * (part + 1) // parts
-            found = _outside(dim, x, rows, codebook, codes, begin, stop)
-            missing += found
-            for first in range(begin, stop if found == 0 else begin, 16):
-                valid = min(16, stop - first)
-                _copy_in(dim, x, rows, first, valid, values)
-                _copy_in(dim, codebook, codes, first, valid, chosen)
-                for lane in range(valid):
-                    for j in range(dim):
-                        simd.put(moved, j * 16 + lane, simd.get(out, (first + lane) * dim + j))
-                        simd.put(slope, j * 16 + lane, simd.get(grad, (first + lane) * dim + j))
-                dots, squared = simd.broadcast(0), simd.broadcast(0)
+    def backward(part, parts, grad, x, rows, codebook, codes, out, grad_x, sums):
+        count = codes.shape[0]
+        values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
+        moved, slope = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
+        total = sums[part]
+        clear(total, 0, total.shape[0])
+        begin, stop = count * part // parts, count * (part + 1) // parts
+        found = _outside(dim, x, rows, codebook, codes, begin, stop)
+        for first in range(begin, stop if found == 0 else begin, 16):
+            valid = min(16, stop - first)
+            _copy_in(dim, x, rows, first, valid, values)
+            _copy_in(dim, codebook, codes, first, valid, chosen)
+            for lane in range(valid):
                 for j in range(dim):
-                    value = simd.load(values, 16 * j)
-                    dots = simd.fma(simd.load(slope, 16 * j), simd.load(moved, 16 * j) - value, dots)
-                    residual = value - simd.load(chosen, 16 * j)
-                    squared = simd.fma(residual, residual, squared)
-                scale = dots * _inverses(squared)
+                    simd.put(moved, j * 16 + lane, simd.get(out, (first + lane) * dim + j))
+                    simd.put(slope, j * 16 + lane, simd.get(grad, (first + lane) * dim + j))
+            dots, squared = simd.broadcast(0), simd.broadcast(0)
+            for j in range(dim):
+                value = simd.load(values, 16 * j)
+                dots = simd.fma(simd.load(slope, 16 * j), simd.load(moved, 16 * j) - value, dots)
+                residual = value - simd.load(chosen, 16 * j)
+                squared = simd.fma(residual, residual, squared)
+            scale = dots * _inverses(squared)
+            for j in range(dim):
+                radial = scale * (simd.load(values, 16 * j) - simd.load(chosen, 16 * j))
+                simd.store(chosen, 16 * j, radial)
+                simd.store(slope, 16 * j, simd.load(slope, 16 * j) + radial)
+            for lane in range(valid):
+                i = first + lane
+                clear_between(rows, i, dim, grad_x)
+                at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
                 for j in range(dim):
-                    radial = scale * (simd.load(values, 16 * j) - simd.load(chosen, 16 * j))
-                    simd.store(chosen, 16 * j, radial)
-                    simd.store(slope, 16 * j, simd.load(slope, 16 * j) + radial)
-                for lane in range(valid):
-                    i = first + lane
-                    clear_between(rows, i, dim, grad_x)
-                    at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
-                    for j in range(dim):
-                        simd.put(grad_x, at + j, simd.get(slope, j * 16 + lane))
-                        simd.put(total, code + j, simd.get(total, code + j) - simd.get(chosen, j * 16 + lane))
-            if part == parts - 1 and found == 0:
-                clear_between(rows, count, dim, grad_x)
-        return missing
+                    simd.put(grad_x, at + j, simd.get(slope, j * 16 + lane))
+                    simd.put(total, code + j, simd.get(total, code + j) - simd.get(chosen, j * 16 + lane))
+        if part == parts - 1 and found == 0:
+            clear_between(rows, count, dim, grad_x)
+        return found
 
-    return kernel(backward)
+    return parallel(backward)
 
 
 def _long_backward(dim: int) -> Any:
     vectors = -(-dim // 16)
 
-    def backward(grad, x, rows, codebook, codes, out, grad_x, sums):
-        count, parts, missing = codes.shape[0], sums.shape[0], 0
-        for part in prange(parts):
-            keep = np.ones(16, np.float32)
-            keep[: vectors * 16 - dim] = 0
-            total = sums[part]
-            clear(total, 0, total.shape[0])
-            begin, stop = count * part // parts, count * (part + 1) // parts
-            found = _outside(dim, x, rows, codebook, codes, begin, stop)
-            missing += found
-            for i in range(begin, stop if found == 0 else begin):
-                at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
-                scale = _dot_difference(dim, grad, i * dim, out, i * dim, x, at, keep)
-                scale *= _inverse(simd.lane_sum(squares(dim, x, at, codebook, code, keep)))
-                clear_between(rows, i, dim, grad_x)
-                # The last two vectors overlap, so the last sums are read before any are written.
-                last = simd.load(total, code + dim - 16)
-                for j in range(vectors):
-                    place = min(16 * j, dim - 16)
-                    radial = scale * (simd.load(x, at + place) - simd.load(codebook, code + place))
-                    simd.store(grad_x, at + place, simd.load(grad, i * dim + place) + radial)
-                    before = last if j == vectors - 1 else simd.load(total, code + place)
-                    simd.store(total, code + place, before - radial)
-            if part == parts - 1 and found == 0:
-                clear_between(rows, count, dim, grad_x)
-        return missing
+    def backward(part, parts, grad, x, rows, codebook, codes, out, grad_x, sums):
+        count = codes.shape[0]
+        keep = np.ones(16, np.float32)
+        keep[: vectors * 16 - dim] = 0
+        total = sums[part]
+        clear(total, 0, total.shape[0])
+        begin, stop = count * part // parts, count * (part + 1) // parts
+        found = _outside(dim, x, rows, codebook, codes, begin, stop)
+        for i in range(begin, stop if found == 0 else begin):
+            at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
+            scale = _dot_difference(dim, grad, i * dim, out, i * dim, x, at, keep)
+            scale *= _inverse(simd.lane_sum(squares(dim, x, at, codebook, code, keep)))
+            clear_between(rows, i, dim, grad_x)
+            # The last two vectors overlap, so the last sums are read before any are written.
+            last = simd.load(total, code + dim - 16)
+            for j in range(vectors):
+                place = min(16 * j, dim - 16)
+                radial = scale * (simd.load(x, at + place) - simd.load(codebook, code + place))
+                simd.store(grad_x, at + place, simd.load(grad, i * dim + place) + radial)
+                before = last if j == vectors - 1 else simd.load(total, code + place)
+                simd.store(total, code + place, before - radial)
+        if part == parts - 1 and found == 0:
+            clear_between(rows, count, dim, grad_x)
+        return found
 
-    return kernel(backward)
+    return parallel(backward)
 
 
 @cache
@@ -288,7 +278,8 @@ def substitute(
     inputs = _checked(x, rows, codebook, codes)
     out = recycled((len(rows), x.shape[1]))
     thread_count()
-    if _kernels(x.shape[1])[0](seed, F(aim), F(spread), *inputs, out.numpy().reshape(-1)):
+    blocks, chosen = -(-len(rows) // _ROWS), (seed, F(aim), F(spread))
+    if _kernels(x.shape[1])[0](blocks, *chosen, *inputs, out.numpy().reshape(-1)):
         raise _missing(x, rows, codebook, codes)
     return out
 
@@ -328,7 +319,7 @@ def substitute_backward(
     parts = max(4, min(64, len(rows) // (4 * len(codebook))))
     sums = recycled((parts, codebook.numel())).numpy()
     thread_count()
-    if _kernels(x.shape[1])[1](slope, *inputs, moved, grad_x.numpy().reshape(-1), sums):
+    if _kernels(x.shape[1])[1](parts, slope, *inputs, moved, grad_x.numpy().reshape(-1), sums):
         raise _missing(x, rows, codebook, codes)
     np.add.reduce(sums, axis=0, out=grad_codebook.numpy().reshape(-1))
     return grad_x, grad_codebook

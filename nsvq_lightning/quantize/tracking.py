@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import prange
 from torch import Tensor
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
+from nsvq_lightning.compute.jit import F, inline, thread_count
 from nsvq_lightning.compute.memory import INT64, Array, check_array
+from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, Memory, box_search, sort_into_leaves
 from nsvq_lightning.quantize.nearest import check_rows, nearest
 from nsvq_lightning.quantize.scores import LIST, score_search, squares, true_distance
@@ -71,43 +71,42 @@ _BLOCK = 256  # rows per unit of parallel work
 def _check_kernel(dim: int) -> Any:
     """The check for one dimension, a compile-time constant."""
 
-    def check(x, rows, codebook, memory, keep, travelled, drift, result):
+    def check(block, _, x, rows, codebook, memory, keep, travelled, drift, result):
         last, lists, anchors, clearance, limits = memory
         way = travelled + drift
-        for block in prange((rows.shape[0] + _BLOCK - 1) // _BLOCK):
-            unused, scratch = np.zeros(16, np.float32), np.empty(16, np.float32)
-            unused[LIST:] = np.inf
-            for i in range(block * _BLOCK, min(rows.shape[0], (block + 1) * _BLOCK)):
-                row = simd.get(rows, i)
-                at, start, code = row * dim, row * LIST, np.int64(simd.get(last, row))
-                simd.put(result, i, np.int64(-1))
-                if code < 0:
-                    continue
-                moved = np.float64(np.sqrt(simd.lane_sum(squares(dim, x, at, anchors, at, keep)))) * ROUNDING
-                distance = np.sqrt(simd.lane_sum(squares(dim, x, at, codebook, code * dim, keep)))
-                if np.float64(distance) * ROUNDING + moved < simd.get(clearance, row) - way:
-                    simd.put(result, i, code)
-                    continue
-                squared = _list_squared(dim, x, at, codebook, lists, start, keep) + simd.load(unused, 0)
-                best = simd.lane_min(squared)
-                distance = np.sqrt(best)
-                if np.float64(distance) * ROUNDING + moved < simd.get(limits, row) - way:
-                    near = simd.mask_bits(squared <= best * F(ROUNDING))
-                    code = _settle(dim, x, row, codebook, lists, start, near)
-                    simd.put(result, i, code)
-                    simd.put(last, row, np.int32(code))
-                    simd.store(scratch, 0, squared)
-                    simd.put(scratch, simd.lowest_bit(near), F(np.inf))
-                    second = np.float64(np.sqrt(simd.lane_min(simd.load(scratch, 0))))
-                    if near & (near - 1) == 0 and second - distance > moved:
-                        # The gap to the second code now exceeds how far the row has moved, so a new anchor pays.
-                        for j in range(dim):
-                            simd.put(anchors, at + j, simd.get(x, at + j))
-                        limit = simd.get(limits, row) - moved
-                        simd.put(limits, row, limit)
-                        simd.put(clearance, row, min(limit, second / ROUNDING - drift + travelled))
+        unused, scratch = np.zeros(16, np.float32), np.empty(16, np.float32)
+        unused[LIST:] = np.inf
+        for i in range(block * _BLOCK, min(rows.shape[0], (block + 1) * _BLOCK)):
+            row = simd.get(rows, i)
+            at, start, code = row * dim, row * LIST, np.int64(simd.get(last, row))
+            simd.put(result, i, np.int64(-1))
+            if code < 0:
+                continue
+            moved = np.float64(np.sqrt(simd.lane_sum(squares(dim, x, at, anchors, at, keep)))) * ROUNDING
+            distance = np.sqrt(simd.lane_sum(squares(dim, x, at, codebook, code * dim, keep)))
+            if np.float64(distance) * ROUNDING + moved < simd.get(clearance, row) - way:
+                simd.put(result, i, code)
+                continue
+            squared = _list_squared(dim, x, at, codebook, lists, start, keep) + simd.load(unused, 0)
+            best = simd.lane_min(squared)
+            distance = np.sqrt(best)
+            if np.float64(distance) * ROUNDING + moved < simd.get(limits, row) - way:
+                near = simd.mask_bits(squared <= best * F(ROUNDING))
+                code = _settle(dim, x, row, codebook, lists, start, near)
+                simd.put(result, i, code)
+                simd.put(last, row, np.int32(code))
+                simd.store(scratch, 0, squared)
+                simd.put(scratch, simd.lowest_bit(near), F(np.inf))
+                second = np.float64(np.sqrt(simd.lane_min(simd.load(scratch, 0))))
+                if near & (near - 1) == 0 and second - distance > moved:
+                    # The gap to the second code now exceeds how far the row has moved, so a new anchor pays.
+                    for j in range(dim):
+                        simd.put(anchors, at + j, simd.get(x, at + j))
+                    limit = simd.get(limits, row) - moved
+                    simd.put(limits, row, limit)
+                    simd.put(clearance, row, min(limit, second / ROUNDING - drift + travelled))
 
-    return kernel(check)
+    return parallel(check)
 
 
 class NearestTracker:
@@ -201,7 +200,8 @@ class NearestTracker:
         keep = np.zeros(16, np.float32)
         keep[-(dim % 16) if dim > 16 else -1 :] = 1
         thread_count()
-        _check_kernel(dim)(x.ravel(), rows, codebook.ravel(), memory, keep, self._travelled, drift, result)
+        blocks, known = -(-len(rows) // _BLOCK), (memory, keep, self._travelled, drift)
+        _check_kernel(dim)(blocks, x.ravel(), rows, codebook.ravel(), *known, result)
         unsure = np.flatnonzero(result < 0)
         if 2 * len(unsure) > len(rows):  # codes have jumped; a new snapshot spares the next searches the cost
             drift = self._take_snapshot(codebook, drift)

@@ -35,13 +35,13 @@ def total(table):
         found += scaled(table[i])
     return found
 
-total = kernel(total, parallel=False)
+total = kernel(total)
 
 def made(power):
     def powers(x):
         return scaled(x) ** power
 
-    return kernel(powers, parallel=False)
+    return kernel(powers)
 """,
     "unrelated": "VALUE = 1\n",
 }
@@ -88,7 +88,7 @@ def is_kept(kernel: Any) -> bool:
         ("SCALE = 2.0", "SCALE = 3.0", 14.0),
         ("* x +", "* x -", 6.0),
         ("found = 0.0", "found = 1.0", 11.0),
-        ("parallel=False", "parallel=False, allocates=False", 10.0),
+        ("kernel(total)", "kernel(total, allocates=False)", 10.0),
     ],
     ids=["constant two modules away", "code of a helper", "own constant", "options"],
 )

@@ -9,7 +9,6 @@ from typing import Any
 import cross_compile
 import llvmlite.binding as llvm
 import pytest
-from cross_compile import SIGNATURES
 
 ARM, INTEL = "aarch64-unknown-linux-gnu", "x86_64-unknown-linux-gnu"
 PROCESSORS = {"generic": ARM, "apple-m1": ARM, "haswell": INTEL, "nehalem": INTEL, "skylake-avx512": INTEL}
@@ -20,6 +19,12 @@ LONGEST = 20_000
 """Instructions; a kernel that takes its vectors apart, lane by lane, has several times as many."""
 
 MAIN = ("rendering.cpu.blend.blend", "rendering.cpu.blend.blend_backward")
+ALL = (
+    *MAIN,
+    "rendering.cpu.projection.project_splats",
+    "rendering.cpu.projection_backward.project_backward",
+    "quality.ssim_cpu.sweep_image",
+)
 
 
 def _compiled(processor: str, *kernels: str) -> dict[str, Any]:
@@ -39,7 +44,7 @@ def _compiled(processor: str, *kernels: str) -> dict[str, Any]:
     [
         pytest.param("generic", MAIN, marks=pytest.mark.slow),
         pytest.param("nehalem", MAIN[:1], marks=pytest.mark.slow),
-        *(pytest.param(processor, tuple(SIGNATURES), marks=pytest.mark.long) for processor in PROCESSORS),
+        *(pytest.param(processor, ALL, marks=pytest.mark.long) for processor in PROCESSORS),
     ],
 )
 def test_kernels_stay_vectors_and_call_no_library(processor: str, kernels: tuple[str, ...]) -> None:

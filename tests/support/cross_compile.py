@@ -6,30 +6,15 @@ its stack, and the names of what it calls. Loops run on one thread here, as only
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 import sys
 from typing import Any
 
 import llvmlite.binding as llvm
+from kernel_list import module_of, name_of, own_part
 
-SIGNATURES = {
-    "rendering.cpu.blend.blend": "void("
-    "i8, f4[::1], i4[::1], i8[::1], i8, UniTuple(i8, 2), f4[::1], f4[::1], u2[::1], i8[::1], UniTuple(f4[::1], 3), "
-    "f4[:, ::1], UniTuple(b1, 2), i8[::1])",
-    "rendering.cpu.blend.blend_backward": "void("
-    "i8, f4[::1], i4[::1], i4[::1], i8[::1], i8[::1], i8, UniTuple(i8, 2), f4[::1], u2[::1], UniTuple(f4[::1], 3), "
-    "UniTuple(f4[::1], 3), f4[::1], UniTuple(b1, 3), f4[::1], i8, f4[:, ::1], i8[::1])",
-    "rendering.cpu.projection.project_splats": "void("
-    "i8, f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], i4[::1], i4[::1], i8[::1], i8[::1], f4[:, ::1])",
-    "rendering.cpu.projection_backward.project_backward": "void("
-    "i8, f4[::1], UniTuple(f4[::1], 4), f4[::1], UniTuple(i8, 2), i4[::1], i8, f4[::1], i4[::1], f4[::1], f4[::1], "
-    "UniTuple(f4[::1], 6), f4[:, ::1])",
-    "quality.ssim_cpu.sweep_image": "void("
-    "i8, f4[::1], u1[::1], f4, f4[::1], i8, i8, i8, f4, f4, f4[:, ::1], f4[:, ::1], "
-    "f4[:, ::1], f4[:, ::1], f4[::1], f8[::1])",
-}
+from nsvq_lightning.compute.ahead import kernels
 
 
 def aim_at(triple: str, processor: str) -> None:
@@ -43,18 +28,19 @@ def aim_at(triple: str, processor: str) -> None:
 
 
 def assembly(name: str) -> str:
-    """Assembly of a kernel."""
-    from numba.core import compiler, compiler_lock, sigutils
+    """Assembly of what a thread does of a kernel."""
+    from numba import types
+    from numba.core import compiler, compiler_lock
     from numba.core.registry import cpu_target
 
-    module, _, function = name.rpartition(".")
-    kernel: Any = getattr(importlib.import_module(f"nsvq_lightning.{module}"), function)
+    kernel, (_, arguments) = next(found for found in kernels() if name == f"{module_of(found[0])}.{name_of(found[0])}")
+    part = own_part(kernel)
     flags = compiler.Flags()
-    cpu_target.options.parse_as_flags(flags, {**kernel.targetoptions, "parallel": False})
+    cpu_target.options.parse_as_flags(flags, part.targetoptions)
     flags.no_compile = True
-    arguments, result = sigutils.normalize_signature(SIGNATURES[name])
     contexts = cpu_target.typing_context, cpu_target.target_context
-    library = compiler.compile_extra(*contexts, kernel.py_func, arguments, result, flags, {}).library
+    given = types.int64, types.int64, *arguments
+    library = compiler.compile_extra(*contexts, part.py_func, given, types.none, flags, {}).library
     with compiler_lock.global_compiler_lock:
         library._ensure_finalized()
     return str(library.get_asm_str())

@@ -28,14 +28,18 @@ from guards import guarded
 from kernel_entries import entry_points, stand_in_for_a_gpu
 from splat_scenes import front_camera, random_splats, some_pixel_weights
 from torch import Tensor
-from warm import compile_kernels
 
+from nsvq_lightning.compression.importance import row_weights
 from nsvq_lightning.io import formats
+from nsvq_lightning.io.formats import load, save
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quantize import NSVQ, QUANTIZED, TrainedStraightThrough
+from nsvq_lightning.quantize.attributes import decoded, noisy_rows
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render, visible
 from nsvq_lightning.splats.splats import RawSplats, Splats
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.schedule import Phase
 
 TIMEOUT = 500
 """Seconds after which a call that hangs is reported."""
@@ -45,6 +49,37 @@ WORDS = 0xA5, 0x5A
 
 
 # What calls every entry point
+
+
+def compile_kernels(settings: dict[str, Any]) -> None:
+    """Place the codebooks, train a step with noise and one with frozen codes, write the file and read it back.
+
+    Args:
+        settings: Arguments of the module.
+    """
+    module = SplatModule(**settings)
+    # So many that some search trees have more than one level.
+    module.splats = Splats.from_tensors(*random_splats(600, sh_degree=module.splats.sh_degree))
+    module.phase = Phase.QUANTIZE
+    for name, quantizer in module.quantizers.items():
+        weight = None if name == "scales" else row_weights(torch.ones(600))
+        quantizer.fit(module.rows(name), weight, generator(0, 0, name))
+    raw = module.splats.raw()
+    rows = visible(raw, front_camera())
+    for _ in range(2):  # the second search has something to remember
+        _backward(noisy_rows(raw, rows, module.quantizers, lambda name: generator(0, 1, name)))
+    for name, quantizer in module.quantizers.items():
+        quantizer.freeze(quantizer.encode(module.rows(name)))
+    module.phase = Phase.FINETUNE
+    _backward(decoded(raw, module.quantizers))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.nsvq"
+        save(module.compressed(), path, module.storage)
+        load(path)
+
+
+def _backward(splats: RawSplats) -> None:
+    torch.stack([tensor.sum() for tensor in splats]).sum().backward()  # type: ignore[no-untyped-call]
 
 
 def use_cpu() -> None:

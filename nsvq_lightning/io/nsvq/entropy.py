@@ -210,7 +210,7 @@ def _context(first, second, path, left, bits):  # type: ignore[no-untyped-def]
     return _RELATIONS * node + 3 * _way(first, path, left) + _way(second, path, left)
 
 
-@partial(kernel, parallel=False, allocates=False)
+@partial(kernel, allocates=False)
 def _write_paths(paths, bits, neighbours, words, contexts):  # type: ignore[no-untyped-def]
     low, width, used = uint64(0), _START, 0
     plain = max(0, bits - _MODELLED_BITS)
@@ -226,7 +226,7 @@ def _write_paths(paths, bits, neighbours, words, contexts):  # type: ignore[no-u
     return rc.encode_end(low, words, used)
 
 
-@partial(kernel, parallel=False, allocates=False)
+@partial(kernel, allocates=False)
 def _read_paths(words, bits, neighbours, paths, contexts):  # type: ignore[no-untyped-def]
     code, width, used = rc.decode_start(words)
     plain = max(0, bits - _MODELLED_BITS)
@@ -303,7 +303,7 @@ def _key_context(depth, before):  # type: ignore[no-untyped-def]
     return (depth * _BEFORE + before // 6) << _LENGTH_BITS
 
 
-@partial(kernel, parallel=False, allocates=False)
+@partial(kernel, allocates=False)
 def _write_keys(keys, depths, words, contexts):  # type: ignore[no-untyped-def]
     low, width, used = uint64(0), _START, 0
     last, before = uint64(0), 0
@@ -318,7 +318,7 @@ def _write_keys(keys, depths, words, contexts):  # type: ignore[no-untyped-def]
     return rc.encode_end(low, words, used)
 
 
-@partial(kernel, parallel=False, allocates=False)
+@partial(kernel, allocates=False)
 def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
     code, width, used = rc.decode_start(words)
     last, before = uint64(0), 0
@@ -352,7 +352,7 @@ def _bit_lengths(values: NDArray[np.int64]) -> NDArray[np.int64]:
     return exponents
 
 
-@partial(kernel, parallel=False, allocates=False)
+@partial(kernel, allocates=False)
 def _write_integers(values, words, contexts):  # type: ignore[no-untyped-def]
     low, width, used = uint64(0), _START, 0
     for i in range(values.shape[0]):
@@ -371,7 +371,7 @@ def _write_integers(values, words, contexts):  # type: ignore[no-untyped-def]
     return rc.encode_end(low, words, used)
 
 
-@partial(kernel, parallel=False, allocates=False)
+@partial(kernel, allocates=False)
 def _read_integers(words, by_steps, values, contexts):  # type: ignore[no-untyped-def]
     code, width, used = rc.decode_start(words)
     for i in range(values.shape[0]):

@@ -6,7 +6,6 @@ again without another error.
 
 import math
 from collections.abc import Mapping
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -191,7 +190,7 @@ def sibling_distance(ordered: NDArray[np.float32]) -> float:
 _ITERATIONS = 4
 
 
-@partial(kernel, parallel=False)
+@kernel
 def _cut(rows, order):  # type: ignore[no-untyped-def]
     # Plain loops: every expression of whole arrays would be a kernel of its own, compiled for a second.
     dim = rows.shape[1]

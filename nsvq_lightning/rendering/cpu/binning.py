@@ -1,14 +1,35 @@
 """Which splats touch which tile, front to back: one radix sort by depth, then a stable counting sort into tiles."""
 
 import numpy as np
-from numba import prange
 
-from nsvq_lightning.compute.jit import inline, kernel
+from nsvq_lightning.compute.jit import inline, kernel, part
+from nsvq_lightning.compute.parallel import in_parallel, parallel
 from nsvq_lightning.compute.simd import get, prefetch, put
 from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES
 
 DIGIT_BITS = 11
 DIGITS = 1 << DIGIT_BITS
+
+
+@part
+def _count_digits(thread, threads, count, source, low, shift, histogram):
+    row = histogram[thread]
+    row[:] = 0
+    for i in range(count * thread // threads, count * (thread + 1) // threads):
+        row[((np.int64(get(source, i)) - low) >> shift) & (DIGITS - 1)] += 1
+
+
+@part
+def _move(thread, threads, count, source, from_ids, target, to_ids, low, shift, histogram):
+    """Move keys and what belongs to them to where their digits belong."""
+    row = histogram[thread]
+    for i in range(count * thread // threads, count * (thread + 1) // threads):
+        key = get(source, i)
+        digit = ((np.int64(key) - low) >> shift) & (DIGITS - 1)
+        place = row[digit]
+        row[digit] = place + 1
+        put(target, place, key)
+        put(to_ids, place, get(from_ids, i))
 
 
 @kernel
@@ -25,26 +46,14 @@ def sort_by_depth(threads, count, keys, ids, keys2, ids2, histogram):
     while (high - low) >> shift != 0:
         source, target = (keys2, keys) if swapped else (keys, keys2)
         from_ids, to_ids = (ids2, ids) if swapped else (ids, ids2)
-        for thread in prange(threads):
-            row = histogram[thread]
-            row[:] = 0
-            for i in range(count * thread // threads, count * (thread + 1) // threads):
-                row[((np.int64(get(source, i)) - low) >> shift) & (DIGITS - 1)] += 1
+        in_parallel(_count_digits, threads, (count, source, low, shift, histogram))
         total = 0
         for digit in range(DIGITS):
             for thread in range(threads):
                 here = histogram[thread, digit]
                 histogram[thread, digit] = total
                 total += here
-        for thread in prange(threads):
-            row = histogram[thread]
-            for i in range(count * thread // threads, count * (thread + 1) // threads):
-                key = get(source, i)
-                digit = ((np.int64(key) - low) >> shift) & (DIGITS - 1)
-                place = row[digit]
-                row[digit] = place + 1
-                put(target, place, key)
-                put(to_ids, place, get(from_ids, i))
+        in_parallel(_move, threads, (count, source, from_ids, target, to_ids, low, shift, histogram))
         swapped = not swapped
         shift += DIGIT_BITS
     return swapped
@@ -70,6 +79,21 @@ def tile_range(boxes, place):
 AHEAD = 16
 
 
+@part
+def _count_tiles(thread, threads, count, order, boxes, group_columns, histogram):
+    row = histogram[thread]
+    row[:] = 0
+    last = count * (thread + 1) // threads
+    for i in range(count * thread // threads, last):
+        if i + AHEAD < last:
+            prefetch(boxes, np.int64(get(order, i + AHEAD)))
+        x0, y0, x1, y1 = tile_range(boxes, np.int64(get(order, i)))
+        for y in range(y0, y1):
+            for x in range(x0, x1):
+                tile = tile_index(x, y, group_columns)
+                put(row, tile, get(row, tile) + 1)
+
+
 @kernel
 def count_tiles(threads, count, order, boxes, group_columns, histogram, offsets):
     """Count the splats that touch each tile: the list of tile t begins at ``offsets[t]``; returns the total length.
@@ -78,19 +102,8 @@ def count_tiles(threads, count, order, boxes, group_columns, histogram, offsets)
     row, number of columns and rows, 16 bits each. ``histogram`` [threads, tiles] becomes the position of each thread's
     first entry in every tile.
     """
+    in_parallel(_count_tiles, threads, (count, order, boxes, group_columns, histogram))
     tiles = offsets.shape[0] - 1
-    for thread in prange(threads):
-        row = histogram[thread]
-        row[:] = 0
-        last = count * (thread + 1) // threads
-        for i in range(count * thread // threads, last):
-            if i + AHEAD < last:
-                prefetch(boxes, np.int64(get(order, i + AHEAD)))
-            x0, y0, x1, y1 = tile_range(boxes, np.int64(get(order, i)))
-            for y in range(y0, y1):
-                for x in range(x0, x1):
-                    tile = tile_index(x, y, group_columns)
-                    put(row, tile, get(row, tile) + 1)
     total = 0
     for tile in range(tiles):
         offsets[tile] = total
@@ -102,22 +115,21 @@ def count_tiles(threads, count, order, boxes, group_columns, histogram, offsets)
     return total
 
 
-@kernel
-def fill_tiles(threads, count, order, boxes, group_columns, histogram, ids, entries):
+@parallel
+def fill_tiles(thread, threads, count, order, boxes, group_columns, histogram, ids, entries):
     """Write the row of every splat (``ids``, by place) into the lists of its tiles, keeping the order."""
-    for thread in prange(threads):
-        row = histogram[thread]
-        last = count * (thread + 1) // threads
-        for i in range(count * thread // threads, last):
-            if i + AHEAD < last:
-                prefetch(boxes, np.int64(get(order, i + AHEAD)))
-                prefetch(ids, np.int64(get(order, i + AHEAD)))
-            place = np.int64(get(order, i))
-            x0, y0, x1, y1 = tile_range(boxes, place)
-            splat_row = get(ids, place)
-            for y in range(y0, y1):
-                for x in range(x0, x1):
-                    tile = tile_index(x, y, group_columns)
-                    entry = get(row, tile)
-                    put(row, tile, entry + 1)
-                    put(entries, entry, splat_row)
+    row = histogram[thread]
+    last = count * (thread + 1) // threads
+    for i in range(count * thread // threads, last):
+        if i + AHEAD < last:
+            prefetch(boxes, np.int64(get(order, i + AHEAD)))
+            prefetch(ids, np.int64(get(order, i + AHEAD)))
+        place = np.int64(get(order, i))
+        x0, y0, x1, y1 = tile_range(boxes, place)
+        splat_row = get(ids, place)
+        for y in range(y0, y1):
+            for x in range(x0, x1):
+                tile = tile_index(x, y, group_columns)
+                entry = get(row, tile)
+                put(row, tile, entry + 1)
+                put(entries, entry, splat_row)

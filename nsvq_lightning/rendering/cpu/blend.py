@@ -10,10 +10,10 @@ with d = g·colour and ``rest`` = what this splat and all after it (and the back
 """
 
 import numpy as np
-from numba import prange
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline, kernel
+from nsvq_lightning.compute.jit import F, inline
+from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.cpu import records as rec
 
@@ -274,10 +274,10 @@ def tile_corner(tile, group_columns):
     return x * rec.TILE, y * rec.TILE
 
 
-@kernel
+@parallel
 def blend(
-    threads, records, entries, offsets, group_columns, size, background, grid, touched, ends, planes, scratch, skips,
-    counter,
+    thread, threads, records, entries, offsets, group_columns, size, background, grid, touched, ends, planes, scratch,
+    skips, counter,
 ):  # fmt: skip
     """Blend all tiles, scheduled dynamically; a pixel depends only on its own tile.
 
@@ -285,20 +285,19 @@ def blend(
     blocks that a splat cannot reach, and those whose pixels are all closed.
     """
     tiles = offsets.shape[0] - 1
-    for thread in prange(threads):
-        while True:
-            tile = simd.fetch_add(counter, 0, 1)
-            if tile >= tiles:
-                break
-            corner = tile_corner(tile, group_columns)
-            if corner[0] < size[0] and corner[1] < size[1]:
-                begin, end = np.int64(offsets[tile]), np.int64(offsets[tile + 1])
-                ends[tile] = blend_tile(
-                    records, entries, begin, end, corner, size, background, grid, touched, planes, scratch[thread],
-                    skips,
-                )  # fmt: skip
-            else:
-                ends[tile] = offsets[tile]
+    while True:
+        tile = simd.fetch_add(counter, 0, 1)
+        if tile >= tiles:
+            break
+        corner = tile_corner(tile, group_columns)
+        if corner[0] < size[0] and corner[1] < size[1]:
+            begin, end = np.int64(offsets[tile]), np.int64(offsets[tile + 1])
+            ends[tile] = blend_tile(
+                records, entries, begin, end, corner, size, background, grid, touched, planes, scratch[thread],
+                skips,
+            )  # fmt: skip
+        else:
+            ends[tile] = offsets[tile]
 
 
 @inline
@@ -435,10 +434,10 @@ def tile_backward(records, integers, entries, begin, end, corner, group, wanted,
         simd.store(sums, slot, simd.load(sums, slot) + here)
 
 
-@kernel
+@parallel
 def blend_backward(
-    threads, records, integers, entries, offsets, ends, group_columns, size, grid, touched, planes, gradients,
-    pixel_weights, wanted, sums, slots, scratch, counter,
+    thread, threads, records, integers, entries, offsets, ends, group_columns, size, grid, touched, planes, gradients,
+    pixel_weights, wanted, sums, scratch, counter,
 ):  # fmt: skip
     """Write the sums of every (splat, group) pair to its slot; groups are scheduled dynamically, each in one order.
 
@@ -447,56 +446,50 @@ def blend_backward(
     """
     tiles = offsets.shape[0] - 1
     groups = tiles // rec.GROUP_TILES
-    for thread in prange(threads):
-        first, last = slots * thread // threads, slots * (thread + 1) // threads
-        for slot in range(first, last):
-            simd.store(sums, rec.RECORD * slot, 0)
-    for thread in prange(threads):
-        state = scratch[thread]
-        while True:
-            group = simd.fetch_add(counter, 0, 1)
-            if group >= groups:
-                break
-            for tile in range(rec.GROUP_TILES * group, rec.GROUP_TILES * (group + 1)):
-                begin, end = np.int64(offsets[tile]), np.int64(ends[tile])
-                if end <= begin:
-                    continue
-                corner = tile_corner(tile, group_columns)
-                for block in range(BLOCKS):
-                    start_block(block, corner, size, planes, gradients, pixel_weights, wanted, grid, state)
-                place = group % group_columns, group // group_columns
-                tile_backward(records, integers, entries, begin, end, corner, place, wanted, touched, sums, state)
+    state = scratch[thread]
+    while True:
+        group = simd.fetch_add(counter, 0, 1)
+        if group >= groups:
+            break
+        for tile in range(rec.GROUP_TILES * group, rec.GROUP_TILES * (group + 1)):
+            begin, end = np.int64(offsets[tile]), np.int64(ends[tile])
+            if end <= begin:
+                continue
+            corner = tile_corner(tile, group_columns)
+            for block in range(BLOCKS):
+                start_block(block, corner, size, planes, gradients, pixel_weights, wanted, grid, state)
+            place = group % group_columns, group // group_columns
+            tile_backward(records, integers, entries, begin, end, corner, place, wanted, touched, sums, state)
 
 
 TWO_LN2 = F(2 * np.log(2.0))
 
 
-@kernel
-def total_slots(threads, ids, count, slots, records, integers, sums, g_means2d, with_absgrad, absgrad):
+@parallel
+def total_slots(thread, threads, ids, count, slots, records, integers, sums, g_means2d, with_absgrad, absgrad):
     """Add up the slots of each splat into its first one, and derive the gradient of the projected centre ``[N·2]``.
 
     ``with_absgrad`` also writes sums over the pixels ``[N·3]``: Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · pixel weight.
     """
-    for thread in prange(threads):
-        last = count * (thread + 1) // threads
-        for i in range(count * thread // threads, last):
-            row = np.int64(simd.get(ids, i))
-            r = rec.RECORD * row
-            slot = np.int64(simd.get(integers, r + rec.SLOT))
-            end = np.int64(slots)
-            if i + 1 < count:
-                end = np.int64(simd.get(integers, rec.RECORD * np.int64(simd.get(ids, i + 1)) + rec.SLOT))
-            o = rec.RECORD * slot
-            if end > slot + 1:
-                total = simd.load(sums, o)
-                for other in range(slot + 1, end):
-                    total = total + simd.load(sums, rec.RECORD * other)
-                simd.store(sums, o, total)
-            u, v = simd.get(sums, o + rec.SUM_U), simd.get(sums, o + rec.SUM_V)
-            simd.put(g_means2d, 2 * row, TWO_LN2 * simd.get(records, r + rec.A) * u)
-            b, c = simd.get(records, r + rec.B), simd.get(records, r + rec.C)
-            simd.put(g_means2d, 2 * row + 1, TWO_LN2 * (b * u + c * v))
-            if with_absgrad:
-                simd.put(absgrad, 3 * row, abs(TWO_LN2 * simd.get(records, r + rec.A)) * simd.get(sums, o + rec.ABS_X))
-                simd.put(absgrad, 3 * row + 1, TWO_LN2 * simd.get(sums, o + rec.ABS_Y))
-                simd.put(absgrad, 3 * row + 2, simd.get(sums, o + rec.SUM_WEIGHT))
+    last = count * (thread + 1) // threads
+    for i in range(count * thread // threads, last):
+        row = np.int64(simd.get(ids, i))
+        r = rec.RECORD * row
+        slot = np.int64(simd.get(integers, r + rec.SLOT))
+        end = np.int64(slots)
+        if i + 1 < count:
+            end = np.int64(simd.get(integers, rec.RECORD * np.int64(simd.get(ids, i + 1)) + rec.SLOT))
+        o = rec.RECORD * slot
+        if end > slot + 1:
+            total = simd.load(sums, o)
+            for other in range(slot + 1, end):
+                total = total + simd.load(sums, rec.RECORD * other)
+            simd.store(sums, o, total)
+        u, v = simd.get(sums, o + rec.SUM_U), simd.get(sums, o + rec.SUM_V)
+        simd.put(g_means2d, 2 * row, TWO_LN2 * simd.get(records, r + rec.A) * u)
+        b, c = simd.get(records, r + rec.B), simd.get(records, r + rec.C)
+        simd.put(g_means2d, 2 * row + 1, TWO_LN2 * (b * u + c * v))
+        if with_absgrad:
+            simd.put(absgrad, 3 * row, abs(TWO_LN2 * simd.get(records, r + rec.A)) * simd.get(sums, o + rec.ABS_X))
+            simd.put(absgrad, 3 * row + 1, TWO_LN2 * simd.get(sums, o + rec.ABS_Y))
+            simd.put(absgrad, 3 * row + 2, simd.get(sums, o + rec.SUM_WEIGHT))

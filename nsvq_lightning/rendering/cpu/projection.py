@@ -4,10 +4,10 @@ Equations: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting 
 """
 
 import numpy as np
-from numba import prange
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline, kernel
+from nsvq_lightning.compute.jit import F, inline
+from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import color_range
@@ -187,21 +187,21 @@ def project_range(camera, means, quats, scales, logits, first, last, records, in
     return visible, slots
 
 
-@kernel
-def project_splats(threads, camera, means, quats, scales, logits, records, integers, found, counts, slots, scratch):
+@parallel
+def project_splats(
+    thread, threads, camera, means, quats, scales, logits, records, integers, found, counts, slots, scratch
+):
     """Write the records of all visible splats; ``found`` gets a run of rows for each thread's range."""
-    for thread in prange(threads):
-        first, last = rec.vector_range(logits.shape[0], thread, threads)
-        counts[thread], slots[thread] = project_range(
-            camera, means, quats, scales, logits, first, last, records, integers, found, scratch[thread]
-        )
+    first, last = rec.vector_range(logits.shape[0], thread, threads)
+    counts[thread], slots[thread] = project_range(
+        camera, means, quats, scales, logits, first, last, records, integers, found, scratch[thread]
+    )
 
 
-@kernel
-def finish_records(threads, camera, means, colors, bands, runs, records, integers, listed, means2d, radii, scratch):
-    """Join the runs of all threads into ``ids`` (ascending rows, padded by 16), number the slots and add the colours.
+@parallel
+def join_runs(thread, threads, runs, records, integers, listed, means2d, radii):
+    """Join the runs of all threads into ``ids`` (ascending rows, padded by 16), and number the slots.
 
-    ``colors`` are sh0 and shN, ``bands`` the floats in a row of shN and the degree that counts;
     ``runs`` are what :func:`project_splats` found, ``listed`` ids, keys, order and boxes.
 
     Also writes, by place in ``ids``, the depths as ``keys``, the places themselves as ``order`` and the tiles that a
@@ -211,28 +211,34 @@ def finish_records(threads, camera, means, colors, bands, runs, records, integer
     found, counts, slots = runs
     ids, keys, order, boxes = listed
     total = counts.sum()
-    for thread in prange(threads):
-        first, _ = rec.vector_range(records.shape[0] // rec.RECORD, thread, threads)
-        start, slot = counts[:thread].sum(), slots[:thread].sum()
-        for k in range(counts[thread]):
-            row = np.int64(simd.get(found, first + k))
-            simd.put(ids, start + k, row)
-            place = rec.RECORD * row + rec.SLOT
-            simd.put(integers, place, np.int64(simd.get(integers, place)) + slot)
-            # Depths are positive, so their bits sort as integers.
-            simd.put(keys, start + k, simd.get(integers, rec.RECORD * row + rec.DEPTH))
-            simd.put(order, start + k, start + k)
-            extent = np.int64(simd.get(integers, rec.RECORD * row + rec.EXTENT))
-            simd.put(boxes, start + k, np.int64(simd.get(integers, rec.RECORD * row + rec.ORIGIN)) | (extent << 32))
-            simd.put(means2d, 2 * row, simd.get(records, rec.RECORD * row + rec.X))
-            simd.put(means2d, 2 * row + 1, simd.get(records, rec.RECORD * row + rec.Y))
-            simd.put(radii, row, simd.get(integers, rec.RECORD * row + rec.RADIUS))
-        if start + counts[thread] == total and counts[thread] > 0:
-            for k in range(16):
-                simd.put(ids, total + k, simd.get(ids, total - 1))
-    for thread in prange(threads):
-        first, last = rec.vector_range(total, thread, threads)
-        color_range(camera, means, colors, bands, ids, first, last, records, scratch[thread])
+    first, _ = rec.vector_range(records.shape[0] // rec.RECORD, thread, threads)
+    start, slot = counts[:thread].sum(), slots[:thread].sum()
+    for k in range(counts[thread]):
+        row = np.int64(simd.get(found, first + k))
+        simd.put(ids, start + k, row)
+        place = rec.RECORD * row + rec.SLOT
+        simd.put(integers, place, np.int64(simd.get(integers, place)) + slot)
+        # Depths are positive, so their bits sort as integers.
+        simd.put(keys, start + k, simd.get(integers, rec.RECORD * row + rec.DEPTH))
+        simd.put(order, start + k, start + k)
+        extent = np.int64(simd.get(integers, rec.RECORD * row + rec.EXTENT))
+        simd.put(boxes, start + k, np.int64(simd.get(integers, rec.RECORD * row + rec.ORIGIN)) | (extent << 32))
+        simd.put(means2d, 2 * row, simd.get(records, rec.RECORD * row + rec.X))
+        simd.put(means2d, 2 * row + 1, simd.get(records, rec.RECORD * row + rec.Y))
+        simd.put(radii, row, simd.get(integers, rec.RECORD * row + rec.RADIUS))
+    if start + counts[thread] == total and counts[thread] > 0:
+        for k in range(16):
+            simd.put(ids, total + k, simd.get(ids, total - 1))
+
+
+@parallel
+def add_colors(thread, threads, camera, means, colors, bands, ids, count, records, scratch):
+    """Write the colours of the visible splats to their records.
+
+    ``colors`` are sh0 and shN, ``bands`` the floats in a row of shN and the degree that counts.
+    """
+    first, last = rec.vector_range(count, thread, threads)
+    color_range(camera, means, colors, bands, ids, first, last, records, scratch[thread])
 
 
 @inline
@@ -245,13 +251,12 @@ def light(u, v):
     return simd.vmax(squared, LEAST_LIGHT), area, size, added, n
 
 
-@kernel
-def keep_light(threads, camera, means, quats, scales, ids, count, factors):
+@parallel
+def keep_light(thread, threads, camera, means, quats, scales, ids, count, factors):
     """Factors ``[count]`` of the splats ``ids``; both arrays have room for a last, incomplete vector."""
-    for thread in prange(threads):
-        first, last = rec.vector_range(count, thread, threads)
-        for start in range(first, last, 16):
-            _, _, _, t0, t1 = affine(camera, simd.gather_rows3(means, ids, start))
-            _, _, _, m = axes_of(simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start))
-            squared, _, _, _, _ = light(image_axes(t0, m), image_axes(t1, m))
-            simd.store(factors, start, simd.vsqrt(squared))
+    first, last = rec.vector_range(count, thread, threads)
+    for start in range(first, last, 16):
+        _, _, _, t0, t1 = affine(camera, simd.gather_rows3(means, ids, start))
+        _, _, _, m = axes_of(simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start))
+        squared, _, _, _, _ = light(image_axes(t0, m), image_axes(t1, m))
+        simd.store(factors, start, simd.vsqrt(squared))

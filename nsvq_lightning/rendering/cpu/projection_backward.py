@@ -1,10 +1,10 @@
 """The backward passes of the projection and of anti-aliasing, 16 splats at a time, to gradients of the attributes."""
 
 import numpy as np
-from numba import prange
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline, kernel
+from nsvq_lightning.compute.jit import F, inline
+from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.compute.rows import clear
 from nsvq_lightning.rendering.cpu import projection
 from nsvq_lightning.rendering.cpu import records as rec
@@ -100,9 +100,9 @@ def geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y):
     return g_mean, g_quat, g_scale
 
 
-@kernel
+@parallel
 def project_backward(
-    threads, camera, geometry, shN, bands, ids, count, records, integers, sums, g_means2d, gradients, scratch
+    thread, threads, camera, geometry, shN, bands, ids, count, records, integers, sums, g_means2d, gradients, scratch
 ):
     """Gradients of all raw attributes from the sums of the slots of the visible splats; 0 for the others.
 
@@ -112,81 +112,81 @@ def project_backward(
     means, quats, scales, logits = geometry
     g_means, g_quats, g_scales, g_logits, g_sh0, g_shN = gradients
     stride, coefficients = bands[0], coefficients_of(bands[1])
-    for thread in prange(threads):
-        work = scratch[thread]
-        slot = work[2048:].view(np.int32)
-        # Between its first and last visible splat, every thread clears the rows that it skips.
-        begin, end = rec.vector_range(count, thread, threads)
-        row = np.int64(simd.get(ids, begin - 1)) + 1 if begin > 0 else 0
-        for i in range(begin, end):
-            here = np.int64(simd.get(ids, i))
-            if here > row:
-                clear_rows(row, here, stride, gradients)
-            row = here + 1
-        if thread == threads - 1:
-            clear_rows(row, logits.shape[0], stride, gradients)
-        for start in range(begin, end, 16):
-            prefetch_sh(shN, ids, start + AHEAD, end, stride, coefficients)
-            prefetch_sh(g_shN, ids, start + AHEAD, end, stride, stride)
-            if start + AHEAD < end:
-                for lane in range(16):
-                    row = rec.RECORD * np.int64(simd.get(ids, start + AHEAD + lane))
-                    simd.prefetch(sums, rec.RECORD * np.int64(simd.get(integers, row + rec.SLOT)))
+    work = scratch[thread]
+    slot = work[2048:].view(np.int32)
+    # Between its first and last visible splat, every thread clears the rows that it skips.
+    begin, end = rec.vector_range(count, thread, threads)
+    row = np.int64(simd.get(ids, begin - 1)) + 1 if begin > 0 else 0
+    for i in range(begin, end):
+        here = np.int64(simd.get(ids, i))
+        if here > row:
+            clear_rows(row, here, stride, gradients)
+        row = here + 1
+    if thread == threads - 1:
+        clear_rows(row, logits.shape[0], stride, gradients)
+    for start in range(begin, end, 16):
+        prefetch_sh(shN, ids, start + AHEAD, end, stride, coefficients)
+        prefetch_sh(g_shN, ids, start + AHEAD, end, stride, stride)
+        if start + AHEAD < end:
             for lane in range(16):
-                row = np.int64(simd.get(ids, start + lane))
-                simd.put(slot, lane, simd.get(integers, rec.RECORD * row + rec.SLOT))
-                simd.put(work, lane, simd.get(g_means2d, 2 * row))
-                simd.put(work, 16 + lane, simd.get(g_means2d, 2 * row + 1))
-            g2x, g2y = simd.load(work, 0), simd.load(work, 16)
-            total = simd.gather_columns(sums, slot, 0, rec.RECORD, 0)
-            record = simd.gather_columns(records, ids, start, rec.RECORD, 0)
-            mean = simd.gather_rows3(means, ids, start)
-            quat, scale = simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start)
-            g_mean, g_quat, g_scale = geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y)
-            # A colour below 0 was clamped.
-            red = simd.select(record[rec.RED] > 0, total[rec.SUM_RED], 0)
-            green = simd.select(record[rec.GREEN] > 0, total[rec.SUM_GREEN], 0)
-            blue = simd.select(record[rec.BLUE] > 0, total[rec.SUM_BLUE], 0)
-            rgb = red, green, blue
-            gx, gy, gz = color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, work)
-            simd.scatter_rows3(g_means, ids, start, (g_mean[0] + gx, g_mean[1] + gy, g_mean[2] + gz))
-            simd.scatter_rows4(g_quats, ids, start, g_quat)
-            simd.scatter_rows3(g_scales, ids, start, g_scale)
-            logit = simd.gather_rows1(logits, ids, start)[0]
-            transparent = 1 / (1 + simd.exp2_clamped(logit * rec.LOG2_E))
-            simd.scatter_rows1(g_logits, ids, start, (total[rec.SUM_H] * transparent,))
+                row = rec.RECORD * np.int64(simd.get(ids, start + AHEAD + lane))
+                simd.prefetch(sums, rec.RECORD * np.int64(simd.get(integers, row + rec.SLOT)))
+        for lane in range(16):
+            row = np.int64(simd.get(ids, start + lane))
+            simd.put(slot, lane, simd.get(integers, rec.RECORD * row + rec.SLOT))
+            simd.put(work, lane, simd.get(g_means2d, 2 * row))
+            simd.put(work, 16 + lane, simd.get(g_means2d, 2 * row + 1))
+        g2x, g2y = simd.load(work, 0), simd.load(work, 16)
+        total = simd.gather_columns(sums, slot, 0, rec.RECORD, 0)
+        record = simd.gather_columns(records, ids, start, rec.RECORD, 0)
+        mean = simd.gather_rows3(means, ids, start)
+        quat, scale = simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start)
+        g_mean, g_quat, g_scale = geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y)
+        # A colour below 0 was clamped.
+        red = simd.select(record[rec.RED] > 0, total[rec.SUM_RED], 0)
+        green = simd.select(record[rec.GREEN] > 0, total[rec.SUM_GREEN], 0)
+        blue = simd.select(record[rec.BLUE] > 0, total[rec.SUM_BLUE], 0)
+        rgb = red, green, blue
+        gx, gy, gz = color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, work)
+        simd.scatter_rows3(g_means, ids, start, (g_mean[0] + gx, g_mean[1] + gy, g_mean[2] + gz))
+        simd.scatter_rows4(g_quats, ids, start, g_quat)
+        simd.scatter_rows3(g_scales, ids, start, g_scale)
+        logit = simd.gather_rows1(logits, ids, start)[0]
+        transparent = 1 / (1 + simd.exp2_clamped(logit * rec.LOG2_E))
+        simd.scatter_rows1(g_logits, ids, start, (total[rec.SUM_H] * transparent,))
 
 
-@kernel
-def keep_light_backward(threads, camera, means, quats, scales, ids, count, gradient, g_means, g_quats, g_scales):
+@parallel
+def keep_light_backward(
+    thread, threads, camera, means, quats, scales, ids, count, gradient, g_means, g_quats, g_scales
+):
     """Gradients of the rows ``ids`` of all means, quaternions and log-scales from that of their factors ``[count]``.
 
     With A = det Σ, S the sum of the variances and D = A + b·S + b², the factor is ρ = √(A/D), and
     dρ = ½·ρ·((b·S + b²)/(A·D)·dA − b/D·dS), where dA = 2·((v × n)·du + (n × u)·dv) with n = u × v.
     """
-    for thread in prange(threads):
-        first, last = rec.vector_range(count, thread, threads)
-        for start in range(first, last, 16):
-            view = projection.affine(camera, simd.gather_rows3(means, ids, start))
-            axes = projection.axes_of(simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start))
-            _, _, _, t0, t1 = view
-            _, _, _, m = axes
-            u, v = projection.image_axes(t0, m), projection.image_axes(t1, m)
-            squared, area, size, added, n = projection.light(u, v)
-            # At the floor, and where the blur does not count, the factor is constant.
-            free = (size < projection.HUGE_FOOTPRINT) & (squared > projection.LEAST_LIGHT)
-            # A huge splat's v × n would overflow, and 0 · ∞ is not 0.
-            u = simd.select(free, u[0], 0), simd.select(free, u[1], 0), simd.select(free, u[2], 0)
-            v = simd.select(free, v[0], 0), simd.select(free, v[1], 0), simd.select(free, v[2], 0)
-            whole = area + added
-            g = simd.select(free, simd.load(gradient, start) * simd.vsqrt(squared) / whole, 0)
-            by_area = simd.select(free, g * added / area, 0)
-            by_size = g * projection.BLUR
-            vn, nu = rec.cross(v, n), rec.cross(n, u)
-            gu = by_area * vn[0] - by_size * u[0], by_area * vn[1] - by_size * u[1], by_area * vn[2] - by_size * u[2]
-            gv = by_area * nu[0] - by_size * v[0], by_area * nu[1] - by_size * v[1], by_area * nu[2] - by_size * v[2]
-            g_mean, g_quat = axes_backward(camera, view, axes, gu, gv, 0, 0, 0)
-            simd.scatter_rows3(g_means, ids, start, g_mean)
-            simd.scatter_rows4(g_quats, ids, start, g_quat)
-            g_scale = gu[0] * u[0] + gv[0] * v[0], gu[1] * u[1] + gv[1] * v[1], gu[2] * u[2] + gv[2] * v[2]
-            simd.scatter_rows3(g_scales, ids, start, g_scale)
+    first, last = rec.vector_range(count, thread, threads)
+    for start in range(first, last, 16):
+        view = projection.affine(camera, simd.gather_rows3(means, ids, start))
+        axes = projection.axes_of(simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start))
+        _, _, _, t0, t1 = view
+        _, _, _, m = axes
+        u, v = projection.image_axes(t0, m), projection.image_axes(t1, m)
+        squared, area, size, added, n = projection.light(u, v)
+        # At the floor, and where the blur does not count, the factor is constant.
+        free = (size < projection.HUGE_FOOTPRINT) & (squared > projection.LEAST_LIGHT)
+        # A huge splat's v × n would overflow, and 0 · ∞ is not 0.
+        u = simd.select(free, u[0], 0), simd.select(free, u[1], 0), simd.select(free, u[2], 0)
+        v = simd.select(free, v[0], 0), simd.select(free, v[1], 0), simd.select(free, v[2], 0)
+        whole = area + added
+        g = simd.select(free, simd.load(gradient, start) * simd.vsqrt(squared) / whole, 0)
+        by_area = simd.select(free, g * added / area, 0)
+        by_size = g * projection.BLUR
+        vn, nu = rec.cross(v, n), rec.cross(n, u)
+        gu = by_area * vn[0] - by_size * u[0], by_area * vn[1] - by_size * u[1], by_area * vn[2] - by_size * u[2]
+        gv = by_area * nu[0] - by_size * v[0], by_area * nu[1] - by_size * v[1], by_area * nu[2] - by_size * v[2]
+        g_mean, g_quat = axes_backward(camera, view, axes, gu, gv, 0, 0, 0)
+        simd.scatter_rows3(g_means, ids, start, g_mean)
+        simd.scatter_rows4(g_quats, ids, start, g_quat)
+        g_scale = gu[0] * u[0] + gv[0] * v[0], gu[1] * u[1] + gv[1] * v[1], gu[2] * u[2] + gv[2] * v[2]
+        simd.scatter_rows3(g_scales, ids, start, g_scale)

@@ -68,10 +68,10 @@ class _Frame:
         order = self.work.array("order", self.count, np.int32)
         self.boxes = self.work.array("boxes", self.count, np.int64)
         listed = self.ids, keys, order, self.boxes
-        projection.finish_records(
-            self.threads, self.camera, self.geometry[0], colors, bands, (found, counts, slots), self.records,
-            self.integers, listed, means2d, radii, self.scratch,
-        )  # fmt: skip
+        projection.join_runs(self.threads, (found, counts, slots), self.records, self.integers, listed, means2d, radii)
+        projection.add_colors(
+            self.threads, self.camera, self.geometry[0], colors, bands, self.ids, self.count, self.records, self.scratch
+        )
         if self.count:
             other = self.work.array("order2", self.count, np.int32)
             keys2 = self.work.array("keys2", self.count + 1, np.int32)
@@ -95,6 +95,11 @@ class _Frame:
         binning.fill_tiles(*listed, self.ids, self.entries)
         self.touched = self.work.array("touched", total + blending.BATCH, np.uint16)
         self.ends = self.work.array("ends", self.tiles, np.int64)
+
+    def clear_sums(self) -> None:
+        """A slot of zeros for each pair of a splat and a group."""
+        self.sums = self.work.array("sums", rec.RECORD * self.slots)
+        torch.from_numpy(self.sums).zero_()
 
 
 _GRID = blending.pixel_grid()
@@ -138,8 +143,7 @@ class _Project(torch.autograd.Function):
         frame: _Frame = ctx.frame
         if g_token is None:
             # Only the centres were differentiated, so no blend has written sums.
-            frame.sums = frame.work.array("sums", rec.RECORD * frame.slots)
-            frame.sums.fill(0)
+            frame.clear_sums()
         g_means2d = torch.zeros(frame.n, 2) if g_means2d is None else g_means2d
         *_, sh0, shN = ctx.saved_tensors
         _check_kept(ctx.saved_tensors, ctx.shapes)
@@ -186,12 +190,12 @@ class _Blend(torch.autograd.Function):
         g_alpha = transmittance if g_alpha is None else g_alpha
         g_depth = depth if g_depth is None else g_depth
         work = frame.work
-        frame.sums = work.array("sums", rec.RECORD * frame.slots)
+        frame.clear_sums()
         g_means2d, g_absgrad = torch.zeros(frame.n, 2), torch.zeros(frame.n if with_absgrad else 0, 3)
         blending.blend_backward(
             frame.threads, frame.records, frame.integers, frame.entries, frame.offsets, frame.ends,
             frame.group_columns, frame.size, _GRID, frame.touched, (flat(image), flat(transmittance), flat(depth)),
-            (flat(g_image), flat(g_alpha), flat(g_depth)), pixel_weights, wanted, frame.sums, frame.slots,
+            (flat(g_image), flat(g_alpha), flat(g_depth)), pixel_weights, wanted, frame.sums,
             work.rows("blend_backward", frame.threads, blending.BACKWARD_SCRATCH), np.zeros(1, np.int64),
         )  # fmt: skip
         blending.total_slots(

@@ -1,0 +1,45 @@
+"""The lines of ``kernels.txt`` that a process has come to need: :func:`used` after whatever it has done."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from nsvq_lightning.compute import jit
+from nsvq_lightning.compute.parallel import parallel
+
+
+def used() -> list[str]:
+    """A line for each kernel and types of arguments, in the order in which they were needed."""
+    return [
+        f"{module_of(kernel)} {name_of(kernel)} {_types(arguments)}"
+        for kernel in jit._kernels
+        for arguments in kernel.overloads
+    ]
+
+
+def own_part(kernel: Any) -> Any:
+    """The compiled function of one part, where a kernel has such, else the kernel."""
+    is_whole = kernel.py_func.__code__.co_filename == parallel.__code__.co_filename
+    return kernel.py_func.__closure__[0].cell_contents if is_whole else kernel
+
+
+def module_of(kernel: Any) -> str:
+    return kernel.py_func.__module__.removeprefix("nsvq_lightning.")
+
+
+def name_of(kernel: Any) -> str:
+    """What makes the kernel in its module: its name, or a call of the function around it."""
+    maker, _, inner = kernel.py_func.__qualname__.partition(".<locals>.")
+    if not inner:
+        return maker
+    function = own_part(kernel).py_func
+    known = dict(zip(function.__code__.co_freevars, function.__closure__, strict=True))
+    return f"{maker}({known['dim'].cell_contents})"
+
+
+def _types(arguments: Any) -> str:
+    """Types as Numba's own names, arrays as ``float32[:, ::1]``."""
+    text = re.sub(r"Array\((\w+), 1, 'C', False, aligned=True\)", r"\1[::1]", repr(arguments))
+    text = re.sub(r"Array\((\w+), 2, 'C', False, aligned=True\)", r"\1[:, ::1]", text)
+    return re.sub(r"Array\((\w+), 3, 'C', False, aligned=True\)", r"\1[:, :, ::1]", text).replace("bool", "boolean")
