@@ -2,14 +2,13 @@
 
 import sys
 import time
-from contextlib import ExitStack
 from typing import Any
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.callbacks.progress.tqdm_progress import Tqdm
 
-from nsvq_lightning.compute.jit import compile_seconds, compile_watcher
+from nsvq_lightning.compute.jit import compile_seconds
 from nsvq_lightning.training.module import SplatModule
 
 # Lines of a run if the output is not a terminal.
@@ -43,7 +42,6 @@ class SplatProgressBar(TQDMProgressBar):
         self._psnr: float | None = None
         self._is_plain = False
         self._start = 0.0  # of the clock that stops while kernels are compiled
-        self._watching = ExitStack()
 
     @property
     def total_train_batches(self) -> int | float:
@@ -71,7 +69,6 @@ class SplatProgressBar(TQDMProgressBar):
         self.train_progress_bar.reset(total=self.total_train_batches)
         self.train_progress_bar.initial = self.train_progress_bar.n = done  # (n - initial) / time is the speed
         self._start = time.time() - compile_seconds()
-        self._watching.enter_context(compile_watcher(self._show_compilation))
 
     def on_train_epoch_start(self, trainer: Trainer, *args: Any) -> None:
         """Leave the bar unchanged: there is only one epoch, and a resumed run is in the middle of it."""
@@ -101,14 +98,8 @@ class SplatProgressBar(TQDMProgressBar):
     def on_train_epoch_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Leave the bar unchanged; the end of the run is the end of its only epoch."""
 
-    def on_train_end(self, *args: Any) -> None:
-        """Close the bar."""
-        super().on_train_end(*args)
-        self._watching.close()
-
     def on_exception(self, *args: Any) -> None:
         """Close the bar, so that the error starts on a new line."""
-        self._watching.close()
         if self._train_progress_bar is not None:
             self._train_progress_bar.close()
 
@@ -127,8 +118,3 @@ class SplatProgressBar(TQDMProgressBar):
         if module.history:
             parts.append(f"test {module.history[-1]['psnr']:.2f}")
         return " ".join(parts)
-
-    def _show_compilation(self, line: str) -> None:
-        bar = self._train_progress_bar
-        if bar is not None and not bar.disable:
-            bar.set_postfix_str(line)  # the next refresh removes it

@@ -167,7 +167,8 @@ def check_early(arguments: Sequence[str]) -> None:
             raise argparse.ArgumentError(None, f"there is no config {config}{meant}")
     options = [argument[2:].partition("=") for argument in arguments if argument.startswith("--")]
     root = next((value for name, _, value in reversed(options) if name in ("data.root", "data.init_args.root")), None)
-    if root and not Path(root).exists() and not any(name == "print_config" for name, _, _ in options):
+    asks = any(name == "print_config" or name.endswith("help") for name, _, _ in options)
+    if root and not Path(root).exists() and not asks:
         raise FileNotFoundError(NO_FOLDER.format(root))
     if arguments[0] != "fit":
         return
@@ -182,6 +183,21 @@ def check_early(arguments: Sequence[str]) -> None:
         if not (nested or name.endswith((".help", ".class_path")) or any(each.startswith(name) for each in known)):
             meant = nearest(f"--{name}", (f"--{each}" for each in known))
             raise argparse.ArgumentError(None, f"there is no option --{name}{meant}")
+    if not (asks or other_data):
+        _check_scene(settings)
+
+
+def _check_scene(settings: Iterable[str]) -> None:
+    """Refuse to train on no folder, or on one that says nothing of cameras."""
+    from nsvq_lightning.data import colmap
+
+    named = {name.replace(".init_args", ""): value for name, _, value in (each.partition("=") for each in settings)}
+    root = named.get("--data.root")
+    if root is None:
+        raise argparse.ArgumentError(None, "which scene? Name its folder: --data.root=path/to/scene")
+    folder = Path(root)
+    if "--data.model" not in named and not any(folder.glob("transforms*.json")) and colmap.find_model(folder) is None:
+        raise colmap.no_model(folder, colmap.FOLDERS, None)
 
 
 def in_plain_words(message: str, classes: Iterable[str], arguments: Iterable[str]) -> str:
@@ -335,7 +351,8 @@ def scene_file(path: Path) -> Path:
     if path.is_dir():
         file = path / "scene.nsvq"
         if not file.is_file():
-            raise ValueError(f"{path} holds no scene.nsvq: name a scene file, or the folder of a finished run")
+            newest = "".join(f", such as {each.parent}" for each in sorted(path.glob("version_*/scene.nsvq"))[-1:])
+            raise ValueError(f"{path} holds no scene.nsvq: name a scene file, or the folder of a finished run{newest}")
         return file
     if path.suffix == ".ckpt":
         raise ValueError(f"{path} is a checkpoint; 'nsvq export --ckpt_path {path}' writes its scene as a file")

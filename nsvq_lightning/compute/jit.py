@@ -1,39 +1,37 @@
 """How kernels are compiled, cached and run in parallel, and how long compiling has taken.
 
 A kernel is compiled at its first call on a machine and read from the disk cache from then on. Compiling is not
-training, so clocks leave it out, and it can look like a hang, so the progress display says what is going on.
+training, so clocks leave it out.
 """
 
 import contextlib
 import functools
 import logging
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numba
 import numpy as np
 import torch
-from numba.core import event
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils, event
+from numba.extending import intrinsic
 
-from nsvq_lightning.compute.kernel_cache import KernelCache
+from nsvq_lightning.compute import kernel_cache
 
 log = logging.getLogger(__name__)
 
-# Called when a compilation begins, with a line that says how many kernels there are and how many are ready.
-Watcher = Callable[[str], None]
-
 
 class _Compilations(event.Listener):
-    """Times Numba's compilations, tells watchers when they begin, and has LLVM optimise helpers at a low level.
+    """Times Numba's compilations, says so of the first, and has LLVM optimise helpers at a low level.
 
     LLVM optimises helpers again, with the kernel they are inlined into, whose level decides about speed. Helpers are
     most of what is compiled: at this level, and without a wrapper for Python, all takes half of the time.
     """
 
     def __init__(self) -> None:
-        self.watchers: list[Watcher] = []
         self.announced = False
         self.seconds = self.since = 0.0
         # LLVM's level before each compilation in progress, of a kernel and its helpers.
@@ -44,10 +42,7 @@ class _Compilations(event.Listener):
             self.since = time.perf_counter()
             if not self.announced:
                 self.announced = True
-                log.info("compiling kernels as they are needed, once on this machine: half a minute to two in all")
-            ready = sum(bool(dispatcher.overloads) for dispatcher in _kernels)  # compiled, or read from the disk
-            for watcher in self.watchers:
-                watcher(f"compiling kernels {ready + 1}/{len(_kernels)}, once on this machine")
+                log.info("compiling kernels, once on this machine: a quarter of a minute to one")
         level = numba.config.OPT
         self.levels.append(level)
         if compilation.data["dispatcher"].targetoptions.get("forceinline"):
@@ -59,38 +54,26 @@ class _Compilations(event.Listener):
             self.seconds += time.perf_counter() - self.since
 
 
-# Every kernel of the modules that are loaded.
-_kernels: list[Any] = []
 _compilations = _Compilations()
 event.register("numba:compile", _compilations)
 
 
 def compile_seconds() -> float:
-    """Seconds spent compiling CPU kernels in this process so far; cached kernels take none."""
+    """Seconds spent compiling CPU kernels in this process so far, or waiting for one that compiles them."""
     in_progress = time.perf_counter() - _compilations.since if _compilations.levels else 0.0
-    return _compilations.seconds + in_progress
+    return _compilations.seconds + in_progress + kernel_cache.seconds_waited
 
 
-@contextlib.contextmanager
-def compile_watcher(watcher: Watcher) -> Iterator[None]:
-    """Call ``watcher`` whenever a compilation begins within the block."""
-    _compilations.watchers.append(watcher)
-    try:
-        yield
-    finally:
-        _compilations.watchers.remove(watcher)
-
-
-class _Cache(KernelCache):
+class _Cache(kernel_cache.KernelCache):
     """Its first question to the disk is the first that happens when a kernel is called."""
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
-        start_threads()
+        _start_threads()
         return super()._load_overload(sig, target_context)
 
 
 @functools.cache
-def start_threads() -> None:
+def _start_threads() -> None:
     """Start Numba's threads, which tells OpenMP to use all cores, and give torch its own setting back."""
     count = torch.get_num_threads()
     numba.set_num_threads(numba.get_num_threads())
@@ -116,7 +99,7 @@ def inline(function: Callable[..., Any]) -> Any:
 
 
 def part(function: Callable[..., Any]) -> Any:
-    """Compile a function that threads call (:mod:`nsvq_lightning.compute.parallel`)."""
+    """Compile a function that threads call (:func:`in_parallel`)."""
     return numba.njit(no_cpython_wrapper=True, **_OPTIONS)(function)
 
 
@@ -132,19 +115,84 @@ def kernel(function: Callable[..., Any], allocates: bool = True) -> Any:
     dispatcher = numba.njit(_nrt=allocates, **_OPTIONS)(function)
     with contextlib.suppress(RuntimeError):  # nowhere to keep it
         dispatcher._cache = _Cache(function)
-    _kernels.append(dispatcher)
     return dispatcher
 
 
-# What Numba was told last; it keeps the number of threads by calling thread.
-_told = threading.local()
+_byte_p, _i64 = ir.IntType(8).as_pointer(), ir.IntType(64)
+# What Numba's threads call, with where a range of parts begins and how many it has.
+_RANGE = ir.FunctionType(ir.VoidType(), [_byte_p.as_pointer(), _i64.as_pointer(), _i64.as_pointer(), _byte_p])
+_PARALLEL_FOR = ir.FunctionType(ir.VoidType(), [_byte_p] * 5 + [_i64] * 3)
+
+
+@intrinsic
+def in_parallel(typingctx: Any, function: Any, parts: Any, arguments: Any) -> Any:
+    """``in_parallel(function, parts, arguments)``: call ``function(part, parts, *arguments)`` for every part.
+
+    Returns the sum of what the calls return where that is an integer, else 0. Numba's own ``prange`` finds out by
+    itself what may run in parallel, and makes a function of each loop: half of the time of a compilation.
+
+    Raises:
+        MemoryError: A call failed, for which there is no other reason.
+    """
+    given = types.int64, types.int64, *arguments
+    typingctx.resolve_function_type(function, given, {})  # compiles it
+    _start_threads()
+
+    def emit(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+        compiled = function.dispatcher.overloads[given]
+        context.active_code_library.add_linking_library(compiled.library)
+        # What all threads see: number of parts, sum of what the calls return, number of those that failed, arguments.
+        state = cgutils.alloca_once(builder, ir.LiteralStructType([_i64, _i64, _i64, values[2].type]))
+        for place, value in enumerate((values[1], _i64(0), _i64(0), values[2])):
+            builder.store(value, cgutils.gep_inbounds(builder, state, 0, place))
+        share = ir.Function(builder.module, _RANGE, f"{compiled.fndesc.mangled_name}.share")
+        share.linkage = "internal"
+        _emit_share(context, ir.IRBuilder(share.append_basic_block()), compiled, state.type, arguments)
+        # A base address of 0 that moves by 1 from part to part: the number of the part.
+        base, moves = cgutils.alloca_once_value(builder, _byte_p(None)), cgutils.alloca_once_value(builder, _i64(1))
+        count = cgutils.alloca_once_value(builder, values[1])
+        pointers = [builder.bitcast(pointer, _byte_p) for pointer in (share, base, count, moves, state)]
+        run = cgutils.get_or_insert_function(builder.module, _PARALLEL_FOR, "numba_parallel_for")
+        threads = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_i64, []), "get_num_threads")
+        builder.call(run, [*pointers, _i64(0), _i64(1), builder.call(threads, [])])
+        failures = builder.load(cgutils.gep_inbounds(builder, state, 0, 2))
+        with builder.if_then(builder.icmp_signed("!=", failures, _i64(0)), likely=False):
+            context.call_conv.return_user_exc(builder, MemoryError, ("a kernel could not allocate memory",))
+        return builder.load(cgutils.gep_inbounds(builder, state, 0, 1))
+
+    return types.int64(function, parts, arguments), emit
+
+
+def _emit_share(context: Any, builder: Any, compiled: Any, state_type: Any, arguments: Any) -> None:
+    """The calls for a range of parts, by one thread."""
+    bases, counts, _, data = builder.function.args
+    state = builder.bitcast(data, state_type)
+    first = builder.ptrtoint(builder.load(bases), _i64)
+    parts, _, _, packed = (builder.load(cgutils.gep_inbounds(builder, state, 0, place)) for place in range(4))
+    values = cgutils.unpack_tuple(builder, packed, len(arguments))
+    with cgutils.for_range(builder, builder.load(counts)) as loop:
+        given = [builder.add(first, loop.index), parts, *values]
+        status, result = context.call_internal_no_propagate(builder, compiled.fndesc, compiled.signature, given)
+        found = result if compiled.signature.return_type == types.int64 else _i64(0)
+        for place, value in ((1, found), (2, builder.zext(status.is_error, _i64))):
+            builder.atomic_rmw("add", cgutils.gep_inbounds(builder, state, 0, place), value, "monotonic")
+    builder.ret_void()
+
+
+def parallel(function: Callable[..., Any]) -> Any:
+    """Make a kernel, called ``kernel(parts, *arguments)``, of a function ``(part, parts, *arguments)`` of one part."""
+    one = part(function)
+
+    def whole(parts, *arguments):
+        return in_parallel(one, parts, arguments)
+
+    whole.__module__, whole.__name__, whole.__qualname__ = function.__module__, function.__name__, function.__qualname__
+    return kernel(whole)
 
 
 def thread_count() -> int:
     """Number of threads that kernels use: torch's setting, so that one setting controls both."""
-    asked = torch.get_num_threads()
-    if asked != getattr(_told, "torch", 0):
-        start_threads()
-        _told.torch, _told.count = asked, max(1, min(asked, int(numba.config.NUMBA_NUM_THREADS)))
-        numba.set_num_threads(_told.count)
-    return int(_told.count)
+    _start_threads()
+    count = min(torch.get_num_threads(), int(numba.config.NUMBA_NUM_THREADS))
+    numba.set_num_threads(count)  # which it keeps by calling thread
+    return count

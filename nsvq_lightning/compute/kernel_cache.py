@@ -11,6 +11,7 @@ import re
 import shutil
 import sys
 import tempfile
+import time
 from importlib.util import resolve_name
 from pathlib import Path
 from typing import Any
@@ -129,6 +130,7 @@ class BusyError(Exception):
 # Whether to wait for a kernel that another process compiles, and how many seconds at most.
 waits = True
 PATIENCE = 60
+seconds_waited = 0.0
 # So many folders are kept; those of a few checkouts, between which one may change.
 MAX_FOLDERS = 64
 
@@ -154,7 +156,8 @@ class KernelCache(FunctionCache):
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
         if (found := super()._load_overload(sig, target_context)) is not None:
             return found
-        self._lock = FileLock(f"{self._cache_file._index_path}.lock")
+        global seconds_waited
+        begin, self._lock = time.perf_counter(), FileLock(f"{self._cache_file._index_path}.lock")
         try:
             Path(self._cache_path).mkdir(exist_ok=True)
             self._lock.acquire(timeout=PATIENCE if waits else 0)
@@ -163,6 +166,7 @@ class KernelCache(FunctionCache):
                 raise BusyError from None
         except OSError:  # a folder that knows no locks
             return None
+        seconds_waited += time.perf_counter() - begin
         found = super()._load_overload(sig, target_context)
         if found is not None:
             self._lock.release()

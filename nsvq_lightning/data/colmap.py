@@ -154,7 +154,7 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
         raise SceneError(NO_FOLDER.format(root))
     folders = FOLDERS if chosen is None else (f"sparse/{chosen}" if chosen.isdecimal() else chosen,)
     if (files := find_model(root, folders)) is None:
-        raise _no_model(root, folders, chosen)
+        raise no_model(root, folders, chosen)
     reconstruction = _read(files)
     registered = [image for image in reconstruction.images.values() if image.has_pose]
     try:
@@ -224,7 +224,7 @@ def _is_finite(values: NDArray[np.float64]) -> bool:
     return bool((np.abs(values) <= LARGEST).all())
 
 
-def _no_model(root: Path, folders: Sequence[str], chosen: str | None) -> SceneError:
+def no_model(root: Path, folders: Sequence[str], chosen: str | None) -> SceneError:
     """What to say of a folder without a complete model."""
     missing = []
     for folder, suffix in itertools.product(folders, (".bin", ".txt")):

@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline, thread_count
+from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat_checked, recycled
-from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
 
 # The taps of the window, from the middle outwards.

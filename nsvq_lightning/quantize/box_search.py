@@ -17,9 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline, kernel, thread_count
+from nsvq_lightning.compute.jit import F, inline, kernel, parallel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, INT32, INT64, Array, aligned_empty, check_array, check_table, outside
-from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.compute.rows import count_outside
 
 

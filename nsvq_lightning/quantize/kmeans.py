@@ -11,9 +11,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.compute.jit import thread_count
+from nsvq_lightning.compute.jit import parallel, thread_count
 from nsvq_lightning.compute.memory import INT64, flat_checked
-from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.compute.rows import put_rows
 from nsvq_lightning.quantize.nearest import nearest
 

@@ -18,9 +18,8 @@ from torch import Tensor
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.compute.jit import thread_count
+from nsvq_lightning.compute.jit import parallel, thread_count
 from nsvq_lightning.compute.memory import Array
-from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.quantize.box_search import MAX_DIM, box_search, place_of_least
 from nsvq_lightning.quantize.scores import score_search
 

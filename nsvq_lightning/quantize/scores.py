@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline, thread_count
+from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, Array, aligned_empty, check_array, check_table
-from nsvq_lightning.compute.parallel import parallel
 
 
 @parallel

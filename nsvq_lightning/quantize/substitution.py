@@ -20,9 +20,8 @@ import numpy as np
 from torch import Tensor
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline, thread_count
+from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import INT64, Array, flat_checked, outside, recycled
-from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside
 from nsvq_lightning.quantize.scores import squares
 

@@ -18,9 +18,8 @@ from torch import Tensor
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.compute.jit import F, inline, thread_count
+from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import INT64, Array, check_array
-from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, Memory, box_search, sort_into_leaves
 from nsvq_lightning.quantize.nearest import check_rows, nearest
 from nsvq_lightning.quantize.scores import LIST, score_search, squares, true_distance

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import gc
 import re
 from typing import Any
 
-from nsvq_lightning.compute import jit
-from nsvq_lightning.compute.parallel import parallel
+from numba.core.registry import CPUDispatcher
+
+from nsvq_lightning.compute.jit import parallel
+from nsvq_lightning.compute.kernel_cache import KernelCache
 
 
 def used() -> list[str]:
-    """A line for each kernel and types of arguments, in the order in which they were needed."""
+    """A line for each kernel and types of arguments."""
     return [
         f"{module_of(kernel)} {name_of(kernel)} {_types(arguments)}"
-        for kernel in jit._kernels
+        for kernel in gc.get_objects()
+        if isinstance(kernel, CPUDispatcher) and isinstance(kernel._cache, KernelCache)
         for arguments in kernel.overloads
     ]
 

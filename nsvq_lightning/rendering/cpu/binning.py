@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from nsvq_lightning.compute.jit import inline, kernel, part
-from nsvq_lightning.compute.parallel import in_parallel, parallel
+from nsvq_lightning.compute.jit import in_parallel, inline, kernel, parallel, part
 from nsvq_lightning.compute.simd import get, prefetch, put
 from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES
 

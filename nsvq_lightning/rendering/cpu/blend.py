@@ -12,8 +12,7 @@ with d = g·colour and ``rest`` = what this splat and all after it (and the back
 import numpy as np
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline
-from nsvq_lightning.compute.parallel import parallel
+from nsvq_lightning.compute.jit import F, inline, parallel
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.cpu import records as rec
 

@@ -6,8 +6,7 @@ Equations: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting 
 import numpy as np
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline
-from nsvq_lightning.compute.parallel import parallel
+from nsvq_lightning.compute.jit import F, inline, parallel
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import color_range

@@ -3,8 +3,7 @@
 import numpy as np
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline
-from nsvq_lightning.compute.parallel import parallel
+from nsvq_lightning.compute.jit import F, inline, parallel
 from nsvq_lightning.compute.rows import clear
 from nsvq_lightning.rendering.cpu import projection
 from nsvq_lightning.rendering.cpu import records as rec

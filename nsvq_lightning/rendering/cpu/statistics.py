@@ -5,9 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
-from nsvq_lightning.compute.jit import F, thread_count
+from nsvq_lightning.compute.jit import F, parallel, thread_count
 from nsvq_lightning.compute.memory import INT32, flat_checked
-from nsvq_lightning.compute.parallel import parallel
 from nsvq_lightning.compute.simd import get, put
 
 
