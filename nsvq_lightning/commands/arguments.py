@@ -158,6 +158,7 @@ def check_early(arguments: Sequence[str]) -> None:
     Raises:
         argparse.ArgumentError: There is no such config, or no such option.
         FileNotFoundError: There is no such scene folder.
+        ValueError: A config cannot be read, or the folder says nothing of cameras.
     """
     configs = configs_among(arguments)
     for config in configs:
@@ -165,39 +166,39 @@ def check_early(arguments: Sequence[str]) -> None:
             shipped = shipped_configs()
             meant = f"{nearest(Path(config).stem, shipped)}\nShipped ones: {', '.join(shipped)}"
             raise argparse.ArgumentError(None, f"there is no config {config}{meant}")
-    options = [argument[2:].partition("=") for argument in arguments if argument.startswith("--")]
-    root = next((value for name, _, value in reversed(options) if name in ("data.root", "data.init_args.root")), None)
-    asks = any(name == "print_config" or name.endswith("help") for name, _, _ in options)
+    own = _values_by_name(arguments[1:])
+    given = _values_by_name(settings_of(configs)) | own
+    asks = any(name == "print_config" or name.endswith("help") for name in given)
+    root = given.get("data.root")
     if root and not Path(root).exists() and not asks:
         raise FileNotFoundError(NO_FOLDER.format(root))
     if arguments[0] != "fit":
         return
     known = {name for name in re.findall(r"--([\w.]+)", FIT_HELP.read_text(encoding="utf-8")) if name[-5:] != ".help"}
     parents = {name.rpartition(".")[0] for name in known}
-    settings = (*arguments, *settings_of(configs))
-    other_data = any(setting.startswith(("--data=", "--data.class_path")) for setting in settings)
-    for option, _, _ in options:
-        name = option.removesuffix("+").replace(".init_args", "")
+    other_data = not {"data", "data.class_path"}.isdisjoint(given)
+    for name in own:
         # Options of a class that an option names are known to Lightning's parser only.
         nested = any(name.startswith(f"{leaf}.") for leaf in (*(known - parents), *["data"] * other_data))
         if not (nested or name.endswith((".help", ".class_path")) or any(each.startswith(name) for each in known)):
             meant = nearest(f"--{name}", (f"--{each}" for each in known))
             raise argparse.ArgumentError(None, f"there is no option --{name}{meant}")
-    if not (asks or other_data):
-        _check_scene(settings)
-
-
-def _check_scene(settings: Iterable[str]) -> None:
-    """Refuse to train on no folder, or on one that says nothing of cameras."""
-    from nsvq_lightning.data import colmap
-
-    named = {name.replace(".init_args", ""): value for name, _, value in (each.partition("=") for each in settings)}
-    root = named.get("--data.root")
+    if asks or other_data:
+        return
     if root is None:
         raise argparse.ArgumentError(None, "which scene? Name its folder: --data.root=path/to/scene")
-    folder = Path(root)
-    if "--data.model" not in named and not any(folder.glob("transforms*.json")) and colmap.find_model(folder) is None:
+    from nsvq_lightning.data import colmap
+
+    folder, has_transforms = Path(root), any(Path(root).glob("transforms*.json"))
+    if "data.model" not in given and not has_transforms and colmap.find_model(folder) is None:
         raise colmap.no_model(folder, colmap.FOLDERS, None)
+
+
+def _values_by_name(options: Iterable[str]) -> dict[str, str]:
+    return {
+        name.removeprefix("--").removesuffix("+").replace(".init_args", ""): value
+        for name, _, value in (option.partition("=") for option in options)
+    }
 
 
 def in_plain_words(message: str, classes: Iterable[str], arguments: Iterable[str]) -> str:

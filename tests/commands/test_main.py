@@ -114,9 +114,10 @@ def test_one_callback_says_what_it_takes(capsys: pytest.CaptureFixture[str]) -> 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["fit"], "error: which scene? Name its folder: --data.root=path/to/scene\n"),
         (["fit", "--data", "{folder}"], "the folder of a scene is --data.root=path/to/scene"),
         (["fit", "--data", "no.Such"], "no.Such"),
-        (["fit", "--bytes=abc"], "error: bytes: expected a whole number or null, got 'abc'\n"),
+        (["fit", "--data.root={folder}", "--bytes=abc"], "error: bytes: expected a whole number or null, got 'abc'\n"),
         (
             ["fit", "--data.root={folder}", "--data.factor", "3"],
             "error: data.factor: expected 1, 2, 4, 8 or null, got '3'\n",
@@ -169,6 +170,7 @@ def test_one_callback_says_what_it_takes(capsys: pytest.CaptureFixture[str]) -> 
 def test_wrong_arguments_are_explained(
     arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (tmp_path / "transforms.json").touch()
     with pytest.raises(SystemExit) as stop:
         main([argument.format(folder=tmp_path) for argument in arguments])
     assert stop.value.code == 2
@@ -193,7 +195,7 @@ def test_a_missing_opencv_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: p
     assert capsys.readouterr().err.startswith("error: OpenCV (cv2) is missing: pip install opencv-")
 
 
-SCENE = ["--data.root=.", "--callbacks.progress=null"]
+SCENE = ["--config=demo", "--callbacks.progress=null"]
 
 
 @pytest.mark.parametrize(

@@ -20,31 +20,9 @@ def _add(thread, threads, gradients, columns, radii, x_factor, y_factor, sums, v
             put(views, i, get(views, i) + F(1))
 
 
-# Parts of the splats whose weights are summed one by one: as many for any number of threads, so with the same bits.
-CHUNKS = 64
-
-
 @parallel
-def _sum_weights(chunk, chunks, gradients, partial):
-    count = gradients.shape[0] // 3
-    total, positive = 0.0, 0.0
-    for i in range(count * chunk // chunks, count * (chunk + 1) // chunks):
-        weight = get(gradients, 3 * i + 2)
-        if weight > 0:
-            total += weight
-            positive += 1.0
-    put(partial, 2 * chunk, total)
-    put(partial, 2 * chunk + 1, positive)
-
-
-@parallel
-def _add_weights(thread, threads, gradients, radii, partial, weights):
+def _add_weights(thread, threads, gradients, radii, scale, weights):
     count = radii.shape[0]
-    total, positive = 0.0, 0.0
-    for chunk in range(CHUNKS):
-        total += get(partial, 2 * chunk)
-        positive += get(partial, 2 * chunk + 1)
-    scale = F(positive / total) if total > 0 else F(0)
     for i in range(count * thread // threads, count * (thread + 1) // threads):
         weight = get(gradients, 3 * i + 2)
         if get(radii, i) > 0 and weight > 0:
@@ -71,6 +49,7 @@ def add_view(tables: Sequence[Tensor], gradients: Tensor, radii: Tensor, factors
     sums, views, *weights = (flat_checked("a table", table, rows) for table in tables)
     _add(thread_count(), given, columns, seen, F(factors[0]), F(factors[1]), sums, views)
     for total in weights:
-        partial = np.empty(2 * CHUNKS)
-        _sum_weights(CHUNKS, given, partial)
-        _add_weights(thread_count(), given, seen, partial, total)
+        # Added up by one thread, and so to the same bits for any number of them.
+        positive = np.maximum(given[2::3], 0)
+        mean = positive.sum(dtype=np.float64) / max(1, np.count_nonzero(positive))
+        _add_weights(thread_count(), given, seen, F(1 / mean if mean > 0 else 0), total)
