@@ -1,6 +1,8 @@
 """The ``nsvq`` command. Kept light: ``nsvq info`` must answer without importing torch."""
 
 import argparse
+import functools
+import gc
 import inspect
 import io
 import logging
@@ -12,7 +14,7 @@ import warnings
 from collections.abc import Sequence
 from importlib import import_module
 from traceback import walk_tb
-from typing import TextIO
+from typing import Any, TextIO
 
 from nsvq_lightning.commands import arguments as given
 from nsvq_lightning.commands.registry import COMMANDS, overview
@@ -166,14 +168,13 @@ def _run_lightning(arguments: list[str]) -> int:
     )
     for message in not_actionable:
         warnings.filterwarnings("ignore", f".*{message}.*")
-    from lightning.fabric.utilities.exceptions import MisconfigurationException
-    from lightning.pytorch.utilities.exceptions import SIGTERMException
-
     if arguments[0] == "fit":
         from nsvq_lightning.compute import ahead
 
         ahead.start()
-    from nsvq_lightning.commands.fit import SplatCLI
+    run_cli = _import_cli()
+    from lightning.fabric.utilities.exceptions import MisconfigurationException
+    from lightning.pytorch.utilities.exceptions import SIGTERMException
 
     _quiet_lightning()
     if os.getcwd() not in sys.path:  # last, unlike `python -m`: for the user's own quantizers and callbacks
@@ -181,7 +182,7 @@ def _run_lightning(arguments: list[str]) -> int:
     given.limit_aliases()
     configs = given.configs_among(arguments)
     try:
-        SplatCLI(arguments)
+        run_cli(arguments)
     except SIGTERMException:  # a kind of SystemExit
         return 128 + signal.SIGTERM  # Lightning itself would exit with the status of success
     except SystemExit as end:
@@ -198,6 +199,17 @@ def _run_lightning(arguments: list[str]) -> int:
         sys.stderr.write(f"error: {error}\n({TRACEBACK}=1 shows where)\n")
         return 1
     return 0
+
+
+@functools.cache
+def _import_cli() -> Any:
+    """Our :class:`LightningCLI`; to look for garbage among what it imports would take a second here, two at the end."""
+    gc.disable()
+    from nsvq_lightning.commands.fit import SplatCLI
+
+    gc.freeze()
+    gc.enable()
+    return SplatCLI
 
 
 def _is_ours(error: BaseException) -> bool:
