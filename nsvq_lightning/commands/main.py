@@ -247,6 +247,6 @@ def _quiet_lightning() -> None:
         handler.addFilter(lambda record: record.levelno >= logging.WARNING or getattr(rank_zero_only, "rank", 0) == 0)
 
     # Fragments of Lightning's messages that advertise, or repeat the progress bar in the middle of its line.
-    not_ours = ("Tip:", "TPU available", "HPU available", "litlogger", "litmodels", "`Trainer.fit` stopped")
+    not_ours = ("Tip:", "PU available: False", "litlogger", "litmodels", "`Trainer.fit` stopped")
     for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
         logging.getLogger(name).addFilter(lambda record: not any(part in record.getMessage() for part in not_ours))

@@ -20,8 +20,6 @@ from nsvq_lightning.compute import kernel_cache
 from nsvq_lightning.compute.environment import usable_cores
 
 LIST = Path(__file__).with_name("kernels.txt")
-# More processes would wait for one another's last kernels.
-MOST = 4
 
 
 def kernels() -> Iterator[tuple[Any, Any]]:
@@ -33,30 +31,22 @@ def kernels() -> Iterator[tuple[Any, Any]]:
 
 def start() -> None:
     """Start a process for each further core, unless the first kernel is on the disk; they end with this one."""
-    first, _ = next(kernels())
-    cache = first._cache
+    cache = next(kernels())[0]._cache
     if not isinstance(cache, kernel_cache.KernelCache) or cache.is_there():
         return
     # They find the package where this process has found it.
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    for _ in range(min(MOST, usable_cores() - 1)):
+    silent: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+    for _ in range(min(4, usable_cores() - 1)):  # more would wait for one another
         with suppress(OSError):
-            process = subprocess.Popen(
-                [sys.executable, "-m", __name__],
-                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment,
-            )  # fmt: skip
+            process = subprocess.Popen([sys.executable, "-m", __name__], env=environment, **silent)
             atexit.register(process.terminate)
-
-
-def compile_all() -> None:
-    """Compile what no other process compiles."""
-    kernel_cache.waits = False
-    for kernel, arguments in kernels():
-        with suppress(kernel_cache.BusyError):
-            kernel.compile(arguments)
 
 
 if __name__ == "__main__":
     if hasattr(os, "nice"):
         os.nice(19)  # the run itself comes first
-    compile_all()
+    kernel_cache.waits = False
+    for kernel, arguments in kernels():
+        with suppress(kernel_cache.BusyError):
+            kernel.compile(arguments)

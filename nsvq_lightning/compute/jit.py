@@ -98,11 +98,6 @@ def inline(function: Callable[..., Any]) -> Any:
     return numba.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)(function)
 
 
-def part(function: Callable[..., Any]) -> Any:
-    """Compile a function that threads call (:func:`in_parallel`)."""
-    return numba.njit(no_cpython_wrapper=True, **_OPTIONS)(function)
-
-
 def kernel(function: Callable[..., Any], allocates: bool = True) -> Any:
     """Compile a kernel once per machine, and keep it on the disk (:mod:`nsvq_lightning.compute.kernel_cache`).
 
@@ -125,8 +120,8 @@ _PARALLEL_FOR = ir.FunctionType(ir.VoidType(), [_byte_p] * 5 + [_i64] * 3)
 
 
 @intrinsic
-def in_parallel(typingctx: Any, function: Any, parts: Any, arguments: Any) -> Any:
-    """``in_parallel(function, parts, arguments)``: call ``function(part, parts, *arguments)`` for every part.
+def in_parallel(typingctx: Any, helper: Any, parts: Any, arguments: Any) -> Any:
+    """``in_parallel(helper, parts, arguments)``: call ``helper(part, parts, *arguments)`` for every part.
 
     Returns the sum of what the calls return where that is an integer, else 0. Numba's own ``prange`` finds out by
     itself what may run in parallel, and makes a function of each loop: half of the time of a compilation.
@@ -135,11 +130,11 @@ def in_parallel(typingctx: Any, function: Any, parts: Any, arguments: Any) -> An
         MemoryError: A call failed, for which there is no other reason.
     """
     given = types.int64, types.int64, *arguments
-    typingctx.resolve_function_type(function, given, {})  # compiles it
+    typingctx.resolve_function_type(helper, given, {})  # compiles it
     _start_threads()
 
     def emit(context: Any, builder: Any, sig: Any, values: Any) -> Any:
-        compiled = function.dispatcher.overloads[given]
+        compiled = helper.dispatcher.overloads[given]
         context.active_code_library.add_linking_library(compiled.library)
         # What all threads see: number of parts, sum of what the calls return, number of those that failed, arguments.
         state = cgutils.alloca_once(builder, ir.LiteralStructType([_i64, _i64, _i64, values[2].type]))
@@ -160,7 +155,7 @@ def in_parallel(typingctx: Any, function: Any, parts: Any, arguments: Any) -> An
             context.call_conv.return_user_exc(builder, MemoryError, ("a kernel could not allocate memory",))
         return builder.load(cgutils.gep_inbounds(builder, state, 0, 1))
 
-    return types.int64(function, parts, arguments), emit
+    return types.int64(helper, parts, arguments), emit
 
 
 def _emit_share(context: Any, builder: Any, compiled: Any, state_type: Any, arguments: Any) -> None:
@@ -181,7 +176,7 @@ def _emit_share(context: Any, builder: Any, compiled: Any, state_type: Any, argu
 
 def parallel(function: Callable[..., Any]) -> Any:
     """Make a kernel, called ``kernel(parts, *arguments)``, of a function ``(part, parts, *arguments)`` of one part."""
-    one = part(function)
+    one = inline(function)
 
     def whole(parts, *arguments):
         return in_parallel(one, parts, arguments)

@@ -119,8 +119,8 @@ class _Layout(CompileResultCacheImpl):
 
 def constants(function: Any) -> tuple[Any, ...]:
     """What a function knows from the functions around it; of a compiled one among that, what that knows."""
-    known = (cell.cell_contents for cell in function.__closure__ or ())
-    return tuple(constants(value.py_func) if hasattr(value, "py_func") else value for value in known)
+    known = [cell.cell_contents for cell in function.__closure__ or ()]
+    return tuple(constants(each.py_func) if hasattr(each, "py_func") else each for each in known)
 
 
 class BusyError(Exception):

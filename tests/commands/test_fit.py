@@ -362,6 +362,7 @@ def test_a_config_that_a_config_names_may_not_explode_either(
 
 def test_wrong_settings_name_the_file_they_came_from(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "mine.yaml"
+    (tmp_path / "transforms.json").touch()
     for settings, said in (
         ("model: {nonsense: 3}", "nonsense"),
         ("callbacks: {density: {init_args: {budget: abc}}}", "callbacks.density.init_args.budget: expected"),

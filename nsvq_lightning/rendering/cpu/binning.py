@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nsvq_lightning.compute.jit import in_parallel, inline, kernel, parallel, part
+from nsvq_lightning.compute.jit import in_parallel, inline, kernel, parallel
 from nsvq_lightning.compute.simd import get, prefetch, put
 from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES
 
@@ -10,7 +10,7 @@ DIGIT_BITS = 11
 DIGITS = 1 << DIGIT_BITS
 
 
-@part
+@inline
 def _count_digits(thread, threads, count, source, low, shift, histogram):
     row = histogram[thread]
     row[:] = 0
@@ -18,7 +18,7 @@ def _count_digits(thread, threads, count, source, low, shift, histogram):
         row[((np.int64(get(source, i)) - low) >> shift) & (DIGITS - 1)] += 1
 
 
-@part
+@inline
 def _move(thread, threads, count, source, from_ids, target, to_ids, low, shift, histogram):
     """Move keys and what belongs to them to where their digits belong."""
     row = histogram[thread]
@@ -78,7 +78,7 @@ def tile_range(boxes, place):
 AHEAD = 16
 
 
-@part
+@inline
 def _count_tiles(thread, threads, count, order, boxes, group_columns, histogram):
     row = histogram[thread]
     row[:] = 0

@@ -11,22 +11,15 @@ from nsvq_lightning.compute.simd import get, put
 
 
 @parallel
-def _add(thread, threads, gradients, columns, radii, x_factor, y_factor, sums, views):
+def _add(thread, threads, gradients, columns, radii, x_factor, y_factor, factor, sums, views, weights):
     count = radii.shape[0]
     for i in range(count * thread // threads, count * (thread + 1) // threads):
         if get(radii, i) > 0:
             x, y = x_factor * get(gradients, columns * i), y_factor * get(gradients, columns * i + 1)
             put(sums, i, get(sums, i) + np.sqrt(x * x + y * y))
             put(views, i, get(views, i) + F(1))
-
-
-@parallel
-def _add_weights(thread, threads, gradients, radii, scale, weights):
-    count = radii.shape[0]
-    for i in range(count * thread // threads, count * (thread + 1) // threads):
-        weight = get(gradients, 3 * i + 2)
-        if get(radii, i) > 0 and weight > 0:
-            put(weights, i, get(weights, i) + scale * weight)
+            if columns == 3 and get(gradients, 3 * i + 2) > 0:
+                put(weights, i, get(weights, i) + factor * get(gradients, 3 * i + 2))
 
 
 def add_view(tables: Sequence[Tensor], gradients: Tensor, radii: Tensor, factors: tuple[float, float]) -> None:
@@ -46,10 +39,10 @@ def add_view(tables: Sequence[Tensor], gradients: Tensor, radii: Tensor, factors
     rows, columns = tuple(radii.shape[:1]), len(tables)
     given = flat_checked("gradients", gradients.contiguous(), (*rows, columns))
     seen = flat_checked("radii", radii, rows, INT32)
-    sums, views, *weights = (flat_checked("a table", table, rows) for table in tables)
-    _add(thread_count(), given, columns, seen, F(factors[0]), F(factors[1]), sums, views)
-    for total in weights:
-        # Added up by one thread, and so to the same bits for any number of them.
-        positive = np.maximum(given[2::3], 0)
-        mean = positive.sum(dtype=np.float64) / max(1, np.count_nonzero(positive))
-        _add_weights(thread_count(), given, seen, F(1 / mean if mean > 0 else 0), total)
+    x_factor, y_factor, factor = F(factors[0]), F(factors[1]), F(0)
+    if columns == 3:  # one thread adds up, and so to the same bits for any number of them
+        positive = np.fmax(given[2::3], 0)
+        total = positive.sum(dtype=np.float64)
+        factor = F(np.count_nonzero(positive) / total) if total > 0 else F(0)
+    changed = [flat_checked("a table", table, rows) for table in (tables if columns == 3 else [*tables, tables[0]])]
+    _add(thread_count(), given, columns, seen, x_factor, y_factor, factor, *changed)
