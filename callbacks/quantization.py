@@ -62,7 +62,7 @@ class CanonicalCovariance(SplatCallback):
         new = canonical(splats.scales.detach(), splats.quats.detach())
         row_ops.change_coordinates(splats, optimizer, "scales", new.scales, new.scale_maps)
         row_ops.change_coordinates(splats, optimizer, "quats", new.quats, new.quat_maps)
-        log.info("iteration %d: canonical covariances", iteration)
+        log.info("iteration %d: each covariance as one of its 48 pairs of scale and rotation", iteration)
 
 
 def perplexity(usage: Tensor) -> float:

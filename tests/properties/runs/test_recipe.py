@@ -219,7 +219,7 @@ def test_a_run_that_starts_with_codebooks_starts_canonical(
     phases = PhaseSchedule(warmup_end=0, prune_end=0)
     with caplog.at_level("INFO"):
         run(recipe(phases=phases, canonical=CanonicalCovariance()).values(), max_steps=4)
-    assert caplog.text.count("iteration 0: canonical covariances") == 1
+    assert caplog.text.count("iteration 0: each covariance") == 1
 
 
 class Recording(NSVQ):
