@@ -45,7 +45,7 @@ def start() -> None:
 
 if __name__ == "__main__":
     if hasattr(os, "nice"):
-        os.nice(19)  # the run itself comes first
+        os.nice(5)  # the run comes first, but may wait for this on a busy machine
     kernel_cache.waits = False
     for kernel, arguments in kernels():
         with suppress(kernel_cache.BusyError):

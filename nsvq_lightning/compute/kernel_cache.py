@@ -129,7 +129,7 @@ class BusyError(Exception):
 
 # Whether to wait for a kernel that another process compiles, and how many seconds at most.
 waits = True
-PATIENCE = 60
+PATIENCE = 30
 seconds_waited = 0.0
 # So many folders are kept; those of a few checkouts, between which one may change.
 MAX_FOLDERS = 64

@@ -3,7 +3,10 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+
+from nsvq_lightning.compute.jit import parallel, thread_count
 
 SCRIPT = """
 import sys
@@ -22,3 +25,25 @@ def test_numba_leaves_the_number_of_threads_as_it_was(threads: int) -> None:
     in_torch, in_kernels = map(int, ran.stdout.split())
     assert in_torch == threads
     assert 1 <= in_kernels <= threads
+
+
+@parallel
+def _add_up(part, parts, values, room):
+    _ = np.empty(room)
+    total = 0
+    for value in values[len(values) * part // parts : len(values) * (part + 1) // parts]:
+        total += value
+    return total
+
+
+@pytest.mark.parametrize("parts", [1, 2, 7, 100])
+def test_every_part_is_called_once_and_results_are_added(parts: int) -> None:
+    thread_count()
+    values = np.arange(50)
+    assert _add_up(parts, values, 1) == values.sum()
+
+
+def test_a_part_that_gets_no_memory_is_an_error() -> None:
+    thread_count()
+    with pytest.raises(MemoryError, match="a kernel could not allocate memory"):
+        _add_up(2, np.arange(50), 1 << 60)
