@@ -14,6 +14,7 @@ from nsvq_lightning.compute.kernel_cache import KernelCache
 
 def used() -> list[str]:
     """A line for each kernel and types of arguments."""
+    gc.unfreeze()  # what the command line has imported
     return [
         f"{module_of(kernel)} {name_of(kernel)} {_types(arguments)}"
         for kernel in gc.get_objects()
