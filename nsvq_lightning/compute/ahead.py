@@ -44,9 +44,9 @@ def start() -> None:
 
 
 if __name__ == "__main__":
-    if hasattr(os, "nice"):
-        os.nice(5)  # the run comes first, but may wait for this on a busy machine
     kernel_cache.waits = False
     for kernel, arguments in kernels():
         with suppress(kernel_cache.BusyError):
             kernel.compile(arguments)
+        if hasattr(os, "nice"):
+            os.nice(1)  # the run waits for the first ones, and trains while the last ones are compiled
