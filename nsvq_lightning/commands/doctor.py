@@ -14,6 +14,7 @@ import os
 import platform
 import re
 import shutil
+import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -45,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
     counts = shown(check_all(options.folder))
     problems, notes = counts["problem"], counts["note"]
-    print(f"\n{problems or 'no'} problem{'s' * (problems != 1)}, {notes or 'no'} note{'s' * (notes != 1)}")
+    sys.stdout.write(f"\n{problems or 'no'} problem{'s' * (problems != 1)}, {notes or 'no'} note{'s' * (notes != 1)}\n")
     return 1 if problems else 0
 
 
@@ -53,7 +54,7 @@ def shown(findings: "Iterator[Finding]") -> Counter[str]:
     """Print findings as they come, since each check takes seconds; returns how many there are of each verdict."""
     counts: Counter[str] = Counter()
     for finding in findings:
-        print(finding, flush=True)
+        sys.stdout.write(f"{finding}\n")
         counts[finding.verdict] += 1
     return counts
 

@@ -43,8 +43,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments[0] == "--version":
         sys.stdout.write(f"nsvq {__version__}\n")
         return 0
-    if isinstance(sys.stdout, io.TextIOWrapper):  # for example, a pipe on Windows accepts only the locale's characters
-        sys.stdout.reconfigure(errors="replace")
+    # A pipe, too, shows lines as they come; on Windows it accepts only the locale's characters.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace", line_buffering=True)
     try:
         if arguments[0] in COMMANDS and COMMANDS[arguments[0]].module is not None:
             return run_command(arguments[0], arguments[1:])

@@ -85,7 +85,7 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError(f"{source}: {len(names)} pictures are too few; a scene takes 50 to 300")
     verdict = reconstruct.reconstruct(scene, names, report, is_video, options.max_size, options.threads)
     sys.stdout.writelines(f"{line}\n" for line in verdict.told(images))
-    print("\nchecking the scene; every photo is read once", flush=True)
+    sys.stdout.write("\nchecking the scene; every photo is read once\n")
     if shown(check_folder(scene))["problem"]:
         return 1
     sys.stdout.write(f"\nnext: nsvq fit --data.root {scene}   (its database.db has served, and may be deleted)\n")

@@ -77,7 +77,7 @@ def run(options: argparse.Namespace) -> int:
             raise OSError(f"cannot listen on {options.host}:{options.port} ({error}); choose another --port") from None
         with server:
             address = f"http://{options.host}:{server.server_port}/"
-            print(f"{title} is at {address} until Ctrl-C", flush=True)
+            sys.stdout.write(f"{title} is at {address} until Ctrl-C\n")
             if options.open:
                 webbrowser.open(address)
             server.serve_forever()

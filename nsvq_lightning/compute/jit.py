@@ -137,9 +137,8 @@ def in_parallel(typingctx: Any, helper: Any, parts: Any, arguments: Any) -> Any:
         compiled = helper.dispatcher.overloads[given]
         context.active_code_library.add_linking_library(compiled.library)
         # What all threads see: number of parts, sum of what the calls return, number of those that failed, arguments.
-        state = cgutils.alloca_once(builder, ir.LiteralStructType([_i64, _i64, _i64, values[2].type]))
-        for place, value in enumerate((values[1], _i64(0), _i64(0), values[2])):
-            builder.store(value, cgutils.gep_inbounds(builder, state, 0, place))
+        packed = cgutils.pack_struct(builder, [values[1], _i64(0), _i64(0), values[2]])
+        state = cgutils.alloca_once_value(builder, packed)
         share = ir.Function(builder.module, _RANGE, f"{compiled.fndesc.mangled_name}.share")
         share.linkage = "internal"
         _emit_share(context, ir.IRBuilder(share.append_basic_block()), compiled, state.type, arguments)
@@ -163,7 +162,7 @@ def _emit_share(context: Any, builder: Any, compiled: Any, state_type: Any, argu
     bases, counts, _, data = builder.function.args
     state = builder.bitcast(data, state_type)
     first = builder.ptrtoint(builder.load(bases), _i64)
-    parts, _, _, packed = (builder.load(cgutils.gep_inbounds(builder, state, 0, place)) for place in range(4))
+    parts, packed = (builder.load(cgutils.gep_inbounds(builder, state, 0, place)) for place in (0, 3))
     values = cgutils.unpack_tuple(builder, packed, len(arguments))
     with cgutils.for_range(builder, builder.load(counts)) as loop:
         given = [builder.add(first, loop.index), parts, *values]

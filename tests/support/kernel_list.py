@@ -45,6 +45,6 @@ def name_of(kernel: Any) -> str:
 
 def _types(arguments: Any) -> str:
     """Types as Numba's own names, arrays as ``float32[:, ::1]``."""
-    text = re.sub(r"Array\((\w+), 1, 'C', False, aligned=True\)", r"\1[::1]", repr(arguments))
-    text = re.sub(r"Array\((\w+), 2, 'C', False, aligned=True\)", r"\1[:, ::1]", text)
-    return re.sub(r"Array\((\w+), 3, 'C', False, aligned=True\)", r"\1[:, :, ::1]", text).replace("bool", "boolean")
+    arrays = r"Array\((\w+), (\d), 'C', False, aligned=True\)"
+    text = re.sub(arrays, lambda found: f"{found[1]}[{':, ' * (int(found[2]) - 1)}::1]", repr(arguments))
+    return text.replace("bool", "boolean")

@@ -438,10 +438,10 @@ def blend_backward(
     thread, threads, records, integers, entries, offsets, ends, group_columns, size, grid, touched, planes, gradients,
     pixel_weights, wanted, sums, scratch, counter,
 ):  # fmt: skip
-    """Write the sums of every (splat, group) pair to its slot; groups are scheduled dynamically, each in one order.
+    """Add the sums of every (splat, group) pair to its slot; groups are scheduled dynamically, each in one order.
 
-    ``size`` and ``planes`` are those of :func:`blend`, ``gradients`` those of image, alpha and depth; ``wanted`` says
-    whether alpha and depth have one, and whether there is a map.
+    ``sums`` must be 0. ``size`` and ``planes`` are those of :func:`blend`, ``gradients`` those of image, alpha and
+    depth; ``wanted`` says whether alpha and depth have one, and whether there is a map.
     """
     tiles = offsets.shape[0] - 1
     groups = tiles // rec.GROUP_TILES

@@ -44,5 +44,6 @@ def add_view(tables: Sequence[Tensor], gradients: Tensor, radii: Tensor, factors
         positive = np.fmax(given[2::3], 0)
         total = positive.sum(dtype=np.float64)
         factor = F(np.count_nonzero(positive) / total) if total > 0 else F(0)
+    # The first table stands in for that of the weights, which is then not touched.
     changed = [flat_checked("a table", table, rows) for table in (tables if columns == 3 else [*tables, tables[0]])]
     _add(thread_count(), given, columns, seen, x_factor, y_factor, factor, *changed)
