@@ -160,9 +160,13 @@ def finite_search_is_due(trainer: Trainer, every: int) -> bool:
         trainer: The trainer.
         every: Iterations between two searches; a step without an update always causes one.
     """
+    return trainer.global_step % every == 0 or not has_gradients(trainer)
+
+
+def has_gradients(trainer: Trainer) -> bool:
+    """Whether any parameter has a gradient, which none has on any process if a loss of theirs was not finite."""
     groups = trainer.optimizers[0].param_groups
-    updated = any(parameter.grad is not None for group in groups for parameter in group["params"])
-    return trainer.global_step % every == 0 or not updated
+    return any(parameter.grad is not None for group in groups for parameter in group["params"])
 
 
 def keep_finite_splats(trainer: Trainer, module: SplatModule) -> None:

@@ -148,7 +148,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
 
         Ends of phases are due, as the next step (placing codebooks, freezing codes) takes longest and cannot be undone.
         """
-        every = max(1, schedule.total // 10) if self.every is None else self.every
+        every = schedule.part(10) if self.every is None else self.every
         return every > 0 and (iteration % every == 0 or iteration in schedule.ends)
 
     def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:

@@ -12,7 +12,7 @@ from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.training import distributed, scene_module
 from nsvq_lightning.training.module import LossTerm, SplatModule
 
-from .base import SplatCallback
+from .base import SplatCallback, has_gradients
 
 log = logging.getLogger(__name__)
 
@@ -89,14 +89,15 @@ class ExposureCompensation(SplatCallback):
         return rendered._replace(image=flat.reshape(image.shape))
 
     def on_before_optimizer_step(self, trainer: Trainer, module: SplatModule, optimizer: Any) -> None:
-        """Take a step; a loss that is not finite changes nothing."""
+        """Take a step with the gradients averaged over all processes, unless the iteration is to change nothing."""
         if self._adam is None:
             return
-        share = (trainer.global_step + 1) / max(1, module.schedule.total)
-        self._adam.param_groups[0]["lr"] = self.rate * self.final ** min(1.0, share)
-        gradient = torch.zeros_like(self._changes) if self._changes.grad is None else self._changes.grad
-        self._changes.grad = distributed.sum_over_processes(trainer, gradient.nan_to_num_(0.0, 0.0, 0.0))
-        self._adam.step()
+        if module.updates and has_gradients(trainer):
+            share = module.schedule.share(module.schedule.reference(trainer.global_step + 1))
+            self._adam.param_groups[0]["lr"] = self.rate * self.final ** min(1.0, share)
+            gradient = torch.zeros_like(self._changes) if self._changes.grad is None else self._changes.grad
+            self._changes.grad = distributed.sum_over_processes(trainer, gradient).div_(trainer.world_size)
+            self._adam.step()
         self._adam.zero_grad()
 
     def on_train_end(self, trainer: Trainer, module: SplatModule) -> None:

@@ -77,8 +77,9 @@ def stretches(schedule: Schedule, growth: BudgetedGrowth, first: int, budget: in
         first: Splats at the start.
         budget: Splats at the end.
     """
-    warmup = schedule.warmup_end / schedule.reference_total
-    full, most = min(growth.full / schedule.reference_total, warmup), round(growth.overshoot * budget)
+    warmup = schedule.share(schedule.warmup_end)
+    full = min(schedule.share(growth.full), warmup)
+    most = round(growth.overshoot * budget)
     grows = round(first + (most - first) * 2 / 3)  # along the root of the time
     return [(full, grows), (warmup - full, most), (1 - warmup, budget)]
 

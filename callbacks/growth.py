@@ -4,6 +4,7 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -83,7 +84,7 @@ class SplatBudget(SplatCallback):
         elif self.splats is None:
             advice = "give a number of splats (--splats) or bytes (--bytes)"
             scene = scene_module.needed_scene(trainer, "a budget from the photos needs them", advice)
-            detail = detailed_pixels(scene)
+            detail = distributed.on_first_process(trainer, partial(detailed_pixels, scene))
             budget = splats_for_photos(len(scene.train), detail, self.quality)
             reason = (
                 f"quality {self.quality:g} times what {len(scene.train)} photos with {detail:,.0f} detailed pixels "
@@ -247,7 +248,7 @@ class BudgetedGrowth(Densification):
         if self.first_prune and iteration == schedule.iteration(self.first_prune):
             self.prune(trainer, module, module.splats.opacities.sigmoid() < self.first_opacity)
         last = schedule.ends[Phase.WARMUP]
-        times = schedule.density_times(self.start + self.every, round(last / schedule.scale), self.every)
+        times = schedule.density_times(self.start + self.every, round(schedule.reference(last)), self.every)
         if iteration in times:
             room, added = self._grow(trainer, module, iteration)
             pruned = 0
@@ -275,7 +276,7 @@ class BudgetedGrowth(Densification):
         splats, schedule = module.splats, module.schedule
         gradients, views, edges = (splats.add_table(name) for name in self.tables)
         statistic = gradients / views.clamp(min=1)
-        reference = iteration / schedule.scale
+        reference = schedule.reference(iteration)
         late = reference > self.full
         weight, threshold = (statistic, self.late_threshold) if late else (edges, self.grad_threshold)
         candidates = torch.where(statistic >= threshold, weight, torch.zeros_like(weight))

@@ -100,7 +100,7 @@ class MetricReport(WritingCallback):
 
     def is_due(self, module: SplatModule, iteration: int) -> bool:
         """Whether the scene is evaluated after this iteration."""
-        every = max(1, module.schedule.total // 20) if self.every is None else self.every
+        every = module.schedule.part(20) if self.every is None else self.every
         # By default between the round numbers: opacities are reset at those, and evaluating right then is misleading.
         offset = every // 2 if self.every is None else 0
         return iteration > 0 and (iteration in module.schedule.ends or bool(every and iteration % every == offset))

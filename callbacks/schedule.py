@@ -83,6 +83,13 @@ class PhaseSchedule(SplatCallback):
         own = {each.name: getattr(self, each.name) for each in fields(Schedule) if hasattr(self, each.name)}
         return Schedule(**own | {"total": total, "reference_total": self.reference_total or total})
 
+    def limited(self, max_steps: int, photos: int) -> int:
+        """Iterations of a run of at most ``max_steps`` (negative for no limit) with so many train photos."""
+        if self.iterations_per_photo is None:
+            return max_steps
+        limit = max(self.iterations_per_photo * photos, self.least_iterations)
+        return max_steps if 0 <= max_steps <= limit else limit
+
     def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
         """Set the module's schedule.
 
@@ -99,10 +106,10 @@ class PhaseSchedule(SplatCallback):
         elif self.iterations_per_photo is not None and self.total is None:
             need = "a number of iterations for each photo needs the photos"
             photos = len(scene_module.needed_scene(trainer, need, "leave iterations_per_photo unset").train)
-            limit = max(self.iterations_per_photo * photos, self.least_iterations)
-            if not 0 <= trainer.max_steps <= limit:
-                trainer.fit_loop.epoch_loop.max_steps = limit
-                log.info(f"iterations: {limit} for {photos} photos; --callbacks.phases.iterations_per_photo changes it")
+            steps = self.limited(trainer.max_steps, photos)
+            if steps != trainer.max_steps:
+                trainer.fit_loop.epoch_loop.max_steps = steps
+                log.info(f"iterations: {steps} for {photos} photos; --callbacks.phases.iterations_per_photo changes it")
         self._steps = trainer.max_steps
         total = self.total if self.total is not None else trainer.max_steps
         if total < 1:
@@ -207,9 +214,9 @@ class LearningRateDecay(SplatCallback):
         if self.final == 1.0:
             return
         iteration = trainer.global_step + 1
-        ends = module.schedule.ends
-        start = ends[Phase.QUANTIZE] if self.start is None else self.start * module.schedule.scale
-        end = ends[Phase.FINETUNE]
+        schedule = module.schedule
+        start = schedule.ends[Phase.QUANTIZE] if self.start is None else schedule.iteration(self.start)
+        end = schedule.ends[Phase.FINETUNE]
         progress = min(max((iteration - start) / max(end - start, 1), 0.0), 1.0)
         if progress > 0.0:
             for group in trainer.optimizers[0].param_groups:

@@ -17,6 +17,7 @@ _HOME = {
     "ColmapDataModule": "nsvq_lightning.data.datamodule",
     "Render": "nsvq_lightning.rendering.rasterize",
     "SplatModule": "nsvq_lightning.training.module",
+    "SplatTrainer": "nsvq_lightning.training.trainer",
     "Splats": "nsvq_lightning.splats.splats",
     "load": "nsvq_lightning.io.formats",
     "render": "nsvq_lightning.rendering.rasterize",
@@ -30,8 +31,9 @@ if TYPE_CHECKING:
     from nsvq_lightning.rendering.rasterize import Render, render
     from nsvq_lightning.splats.splats import Splats
     from nsvq_lightning.training.module import SplatModule
+    from nsvq_lightning.training.trainer import SplatTrainer
 
-__all__ = ["Camera", "ColmapDataModule", "Render", "SplatModule", "Splats", "load", "render", "save"]
+__all__ = ["Camera", "ColmapDataModule", "Render", "SplatModule", "SplatTrainer", "Splats", "load", "render", "save"]
 
 find_callbacks()
 

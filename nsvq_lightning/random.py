@@ -43,7 +43,7 @@ def draw_rows(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """
     uniform = torch.rand(weight.shape[0], generator=generator, dtype=torch.float64)
     tiny = torch.finfo(torch.float64).tiny
-    key = weight.detach().double().cpu().log() - (-uniform.clamp_min(tiny).log()).clamp_min(tiny).log()
+    key = weight.detach().cpu().double().log() - (-uniform.clamp_min(tiny).log()).clamp_min(tiny).log()
     chosen = torch.zeros(weight.shape[0], dtype=torch.bool)
     count = min(max(count, 0), int((weight > 0).sum()))
     chosen[key.argsort(descending=True, stable=True)[:count]] = True

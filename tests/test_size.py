@@ -13,7 +13,7 @@ import nsvq_lightning
 
 PACKAGE = Path(nsvq_lightning.__file__).parent
 ROOT = PACKAGE.parent
-# To be lowered with what the code loses. What a reader has to hold are the tokens: what a feature adds above the ceiling,
+# To be lowered with what the code loses. What a reader has to hold are the tokens: what a feature adds above the limit,
 # it has to remove. Lines are there to breathe, so tokens a line have a limit, too.
 LIMITS = {
     "tokens": 200_000,

@@ -18,6 +18,7 @@ from pathlib import Path
 from nsvq_lightning.commands.arguments import positive, views_of
 from nsvq_lightning.compression.setting import Setting, setting_for
 from nsvq_lightning.io.atomic import write_bytes
+from nsvq_lightning.io.formats import FORMATS
 from nsvq_lightning.io.lod import NAME
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
 from nsvq_lightning.splats.attributes import SIZES
@@ -51,7 +52,7 @@ VIEWS = 96
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq compress`` takes."""
     add, aim = parser.add_argument, parser.add_mutually_exclusive_group().add_argument
-    add("input", type=Path, metavar="SCENE", help="splat file: .ply, .nsvq, .sog, .spz or .splat")
+    add("input", type=Path, metavar="SCENE", help=f"splat file: {', '.join(FORMATS)}")
     add("output", type=Path, metavar="OUT.nsvq", help=f"file to write; {NAME} for a streamed SOG")
     aim("--codebooks", choices=(*SIZES, "none"), help=f"codebook sizes; {DEFAULT_SIZE} by default")
     aim("--max-error", type=positive(float), metavar="E", help="the smallest file with an error of at most E")

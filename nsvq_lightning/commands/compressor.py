@@ -6,10 +6,8 @@ import timeit
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
 
 import torch
-from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nsvq_lightning.callbacks import LearningRateDecay, PhaseSchedule, SplatBudget, standard
@@ -24,6 +22,7 @@ from nsvq_lightning.compression.importance import (
 from nsvq_lightning.compression.setting import STEPS, Setting, setting_for
 from nsvq_lightning.compression.stored import components
 from nsvq_lightning.compression.viewpoints import Measure
+from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.datamodule import SceneDataModule
 from nsvq_lightning.io.compressed import CompressedScene
@@ -37,6 +36,7 @@ from nsvq_lightning.splats.splats import Splats, detached
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.training.trainer import SplatTrainer
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,8 +235,7 @@ class Compressor:
             chatter = logging.getLogger("lightning.pytorch")
             level = chatter.level
             chatter.setLevel(logging.WARNING)
-            off: dict[str, Any] = dict.fromkeys(("logger", "enable_checkpointing", "enable_model_summary"), False)
-            trainer = Trainer(max_steps=steps, max_epochs=-1, limit_val_batches=0, callbacks=callbacks, **off)
+            trainer = SplatTrainer(max_steps=steps, callbacks=callbacks, enable_checkpointing=False)
             try:
                 trainer.fit(module, self._data)
             except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
@@ -258,9 +257,11 @@ class Compressor:
     @cached_property
     def _affordable(self) -> int:
         """How many steps the minutes are enough for."""
-        leaves = type(self._splats)(*(tensor.clone().requires_grad_() for tensor in self._splats))
+        device = best_device()
+        leaves = type(self._splats)(*(tensor.to(device).clone().requires_grad_() for tensor in self._splats))
 
         def step() -> None:
             self._render(leaves, self._measure.cameras[0]).image.sum().backward()  # type: ignore[no-untyped-call]
+            torch.get_device_module(device).synchronize()
 
         return int(min(60 * self._minutes / (2 * min(timeit.repeat(step, number=1, repeat=3))), 1e9))

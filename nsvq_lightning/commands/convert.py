@@ -151,7 +151,7 @@ def _up(options: argparse.Namespace) -> NDArray[np.float64]:
     """Where up is in the input, a unit vector ``[3]``."""
     if options.up_from is None:
         from nsvq_lightning.data.scene import load_scene
-        from nsvq_lightning.rendering.camera import up_of
+        from nsvq_lightning.rendering.poses import up_of
 
         return up_of(load_scene(options.root).cameras)
     up = np.array(options.up_from)

@@ -25,6 +25,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
+from nsvq_lightning.commands import arguments as given
+
 # Each check imports what it needs: --help answers at once, and a package that is missing or broken fails only the
 # checks that need it.
 if TYPE_CHECKING:
@@ -108,11 +110,14 @@ def check_machine() -> Iterator[Finding]:
     import torch
 
     from nsvq_lightning.commands.benchmark import timing
+    from nsvq_lightning.compute.devices import best_device
 
     machine, versions = timing.describe_machine()
     built = torch.version.cuda or torch.version.hip
     advice = "check nvidia-smi and CUDA_VISIBLE_DEVICES" if built else "for an NVIDIA GPU install a CUDA build"
-    yield judged("machine", machine, not torch.cuda.is_available() and f"torch finds no GPU: {advice}")
+    none = not (torch.cuda.is_available() or torch.backends.mps.is_available()) and f"torch finds no GPU: {advice}"
+    idle = best_device().type == "cpu" and "runs use the CPU, as its GPU has no kernels here (NVIDIA's on Linux have)"
+    yield judged("machine", machine, none, idle)
     yield judged("versions", versions)
 
 
@@ -170,17 +175,12 @@ def check_room(folder: Path) -> Iterator[Finding]:
 
 def check_backends() -> Iterator[Finding]:
     """Every usable back-end against plain torch in float64, which takes seconds."""
-    import torch
-
+    from nsvq_lightning.compute.devices import devices_with_kernels
     from nsvq_lightning.compute.kernel_cache import kernel_folder
     from nsvq_lightning.training.self_check import TOLERANCE, kernel_errors, written
 
-    for device in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
-        found = kernel_errors(device)
-        if not found:
-            advice = "this version renders on it in plain torch, slower than on the CPU; use the CPU"
-            yield judged("self-test", f"{device} has no back-end", advice)
-        for backend, errors in found.items():
+    for device in devices_with_kernels():
+        for backend, errors in kernel_errors(device).items():
             text = f"{backend}: relative errors against float64: {written(errors)}"
             if all(error < TOLERANCE for error in errors.values()):
                 yield judged("self-test", text)
@@ -345,13 +345,16 @@ CACHE_BYTES = 4 << 30
 
 def check_budget(scene: "Scene") -> Iterator[Finding]:
     """Memory against what is available; time from steps with as many splats as two recipes make of the scene."""
-    from nsvq_lightning.callbacks import BudgetedGrowth, PhaseSchedule
+    from nsvq_lightning.callbacks import BudgetedGrowth, PhaseSchedule, SplatBudget
     from nsvq_lightning.callbacks.forecast import PAPER_SPLATS, iteration_seconds, stretches
     from nsvq_lightning.callbacks.growth import splats_for_photos
+    from nsvq_lightning.compute.devices import best_device
     from nsvq_lightning.data.scene import detailed_pixels
 
-    default = splats_for_photos(len(scene.train), detailed_pixels(scene))
-    budget, paper = round(0.9 * default), round(PAPER_SPLATS * default)
+    fast, whole = (given.check_config(given.find_config(name)) for name in ("fast", "paper"))
+    phases, wanted = PhaseSchedule(**fast["callbacks"]["phases"]), SplatBudget(**fast["callbacks"]["budget"])
+    default, growth = splats_for_photos(len(scene.train), detailed_pixels(scene)), BudgetedGrowth()
+    budget, paper = round(wanted.quality * default), round(PAPER_SPLATS * default)
     photos, free = scene.images.nbytes, available_memory()
     needed = 1.2e9 + min(photos, CACHE_BYTES)  # Python, torch, Lightning, compiled kernels and evaluations
     needed += 59 * 4 * 6 * paper  # float32 of a splat, each with gradient, two moments, and copies while editing
@@ -363,11 +366,14 @@ def check_budget(scene: "Scene") -> Iterator[Finding]:
         text += f" (all would take {readable_bytes(photos)}; the others are decoded each time)"
     advice = f"{readable_bytes(free or 0)} are available; lower --data.max_width or --data.cache_bytes"
     yield judged("run memory", text, free is not None and needed > free and advice)
-    parts = stretches(PhaseSchedule().schedule(15_000), BudgetedGrowth(), round(0.8 * budget), budget)
-    step, paper_step = (iteration_seconds(scene, each) for each in (parts, [(1.0, paper)]))
-    steps = min(max(20 * len(scene.train), 2500), 4500)
-    text = f"about {steps * step / 60:.0f} min for fast.yaml ({steps:,} steps, up to {2 * budget:,} splats), "
-    text += f"{45_000 * paper_step / 3600:.1f} h for the paper's run (45,000, {paper:,}), on a machine as busy as now"
+    steps = phases.limited(fast["trainer"]["max_steps"], len(scene.train))
+    all_steps, device = whole["trainer"]["max_steps"], best_device()
+    parts = stretches(phases.schedule(steps), growth, round(wanted.start * budget), budget)
+    minutes = steps * iteration_seconds(scene, parts, device) / 60
+    hours = all_steps * iteration_seconds(scene, [(1.0, paper)], device) / 3600
+    most = round(growth.overshoot * budget)
+    text = f"about {minutes:.0f} min for fast.yaml ({steps:,} steps, up to {most:,} splats), "
+    text += f"{hours:.1f} h for the paper's run ({all_steps:,}, {paper:,}), on a machine as busy as now"
     yield judged("run time", text)
 
 

@@ -32,7 +32,8 @@ from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.skips import SKIPS, switch, switched
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.resume import check_settings, read_checkpoint
-from nsvq_lightning.training.run_folder import SplatTrainer, is_fast_dev_run, reserve, run_folder
+from nsvq_lightning.training.run_folder import is_fast_dev_run, reserve, run_folder
+from nsvq_lightning.training.trainer import TRAINER_DEFAULTS, SplatTrainer
 
 
 class QuietParser(LightningArgumentParser):
@@ -116,17 +117,6 @@ PARSER_SETTINGS: dict[str, Any] = {
     **{name: {"description": command.summary} for name, command in COMMANDS.items() if command.module is None},
 }
 PARSER_SETTINGS["fit"]["default_config_files"] = [given.find_config("fast")]
-
-
-TRAINER_DEFAULTS: dict[str, Any] = {
-    "max_epochs": -1,  # the sampler is endless: steps end the run
-    "limit_val_batches": 0,  # MetricReport evaluates, outside the training time
-    "num_sanity_val_steps": 0,
-    "devices": 1,  # more must be requested, because they change what a step is
-    "use_distributed_sampler": False,  # the sampler knows its rank
-    "enable_model_summary": False,
-    "default_root_dir": "runs",
-}
 
 
 class SplatCLI(LightningCLI):

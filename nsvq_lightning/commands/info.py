@@ -1,4 +1,4 @@
-"""Describe a scene file: .nsvq, .ply, .sog, .spz or .splat."""
+"""Describe a scene file of any format."""
 
 import argparse
 import json
@@ -12,7 +12,7 @@ from nsvq_lightning.io.describe import describe
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq info`` takes."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="scene file")
+    parser.add_argument("file", type=Path, metavar="FILE", help="file of any format that convert reads")
     parser.add_argument("--json", action="store_true", help="print the description as JSON")
 
 

@@ -1,6 +1,6 @@
 """Render pictures or a video along a path of cameras.
 
-SCENE is a .nsvq, .ply, .sog, .spz or .splat file, or the folder of a run. PATH is 'through' (smoothly through the
+SCENE is a scene file of any format, or the folder of a run. PATH is 'through' (smoothly through the
 cameras of the photos), 'cameras' (just these), 'orbit' (around what they look at; also without photos), or a camera
 path in nerfstudio's JSON, as the viewer saves it.
 
@@ -33,7 +33,7 @@ FPS, SECONDS = 24.0, 10.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq render`` takes."""
     add = parser.add_argument
-    add("scene", type=Path, metavar="SCENE", help="scene file, or the folder of a run")
+    add("scene", type=Path, metavar="SCENE", help="file of any format that convert reads, or the folder of a run")
     help_ = ".mp4 file, or a folder for PNGs; by default render.mp4 beside the scene"
     add("-o", "--output", type=Path, metavar="OUT", help=help_)
     help_ = "folder of the photos, whose cameras the path follows; that of the run by default"
@@ -76,6 +76,7 @@ def run(options: argparse.Namespace) -> int:
     """
     import torch
 
+    from nsvq_lightning.compute.devices import best_device
     from nsvq_lightning.io.formats import read_scene
     from nsvq_lightning.rendering.rasterize import render
     from nsvq_lightning.report.files import VIDEO, frame_writer
@@ -90,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
     if len(splats) == 0:
         raise ValueError(f"{file} holds no splat; there is nothing to render")
     cameras, fps = _path(options, splats, is_video)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = best_device()
     raw, background = splats.to(device).raw(), torch.tensor(options.background, device=device)
     how = {"background": background, "antialiased": scene.antialiased, "backend": options.backend}
     width, height = cameras[0].width, cameras[0].height
@@ -105,7 +106,7 @@ def run(options: argparse.Namespace) -> int:
 def _path(options: argparse.Namespace, splats: "Splats", is_video: bool) -> "tuple[list[Camera], float]":
     """The cameras and frames per second that the options ask for."""
     from nsvq_lightning.compression.viewpoints import likely_cameras
-    from nsvq_lightning.rendering.camera import orbit, read_camera_path, reframed, smooth_path
+    from nsvq_lightning.rendering.camera_paths import orbit, read_camera_path, reframed, smooth_path
 
     fps, kind = options.fps or FPS, options.path
     if kind not in (None, "through", "cameras", "orbit"):

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq view`` takes."""
     add = parser.add_argument
-    add("scene", type=Path, metavar="SCENE", help="scene file, or the folder of a run")
+    add("scene", type=Path, metavar="SCENE", help="file of any format that convert reads, or the folder of a run")
     add("--live", action="store_true", help="follow a fit that is running, given its folder")
     help_ = "folder of the photos, whose cameras are offered; that of the run by default"
     add("--data.root", dest="root", type=Path, metavar="FOLDER", help=help_)

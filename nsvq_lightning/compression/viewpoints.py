@@ -12,8 +12,9 @@ from torch import Tensor
 
 from nsvq_lightning.data.images import ImageStore, Picture
 from nsvq_lightning.data.scene import Scene
-from nsvq_lightning.rendering.camera import Camera, view_towards
+from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
+from nsvq_lightning.rendering.poses import view_towards
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import SplatTensors
 

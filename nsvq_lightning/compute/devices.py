@@ -27,11 +27,45 @@ def kernels_for(like: Tensor) -> Literal["cpu", "cuda"] | None:
     None is for any other dtype or device, and for CUDA without Triton. Under Triton's interpreter, tensors on the CPU
     still go to Numba: the interpreter is for tests, which call the Triton kernels directly.
     """
-    if like.dtype != torch.float32:
-        return None
-    if like.device.type == "cpu":
+    return _kernels_of(like.device.type) if like.dtype == torch.float32 else None
+
+
+def _kernels_of(device: str) -> Literal["cpu", "cuda"] | None:
+    """What :func:`kernels_for` gives for float32 on a type of device."""
+    if device == "cpu":
         return "cpu"
-    return "cuda" if like.is_cuda and _has_triton() else None
+    return "cuda" if device == "cuda" and _has_triton() else None
+
+
+def best_device() -> torch.device:
+    """The fastest device that has kernels here: CUDA where Triton is installed, else the CPU.
+
+    Lightning's own choice may be one without any, Apple's MPS or, on Windows, CUDA: plain torch is slower than the CPU.
+    """
+    return torch.device("cuda" if torch.cuda.is_available() and _has_triton() else "cpu")
+
+
+def devices_with_kernels() -> list[str]:
+    """Types of device that have kernels here: ``cpu`` and, where it is the best one, ``cuda``."""
+    return list(dict.fromkeys(("cpu", best_device().type)))
+
+
+def check_can_train(device: torch.device, backend: str) -> None:
+    """Refuse a device without kernels, on which a run of minutes would take days.
+
+    Args:
+        device: Where the splats are.
+        backend: The rasterizer; ``reference`` asks for plain torch, which trains anywhere but on Apple's MPS.
+
+    Raises:
+        ValueError: It has none.
+    """
+    if _kernels_of(device.type) is None and (backend != "reference" or device.type == "mps"):
+        raise ValueError(
+            f"there are no kernels for {device.type} here, and training without them takes days: train on the CPU. "
+            'Write nsvq_lightning.SplatTrainer(…), which chooses by itself, or Trainer(accelerator="cpu", …); for '
+            "nsvq fit leave out --trainer.accelerator"
+        )
 
 
 def _obstacle(kernels: str, like: Tensor) -> str | None:

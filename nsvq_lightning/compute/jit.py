@@ -7,6 +7,7 @@ training, so clocks leave it out.
 import contextlib
 import functools
 import logging
+import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -72,12 +73,30 @@ class _Cache(kernel_cache.KernelCache):
         return super()._load_overload(sig, target_context)
 
 
+# The process that has started threads.
+_started: list[int] = []
+
+
 @functools.cache
 def _start_threads() -> None:
     """Start Numba's threads, which tells OpenMP to use all cores, and give torch its own setting back."""
+    _started.append(os.getpid())
     count = torch.get_num_threads()
     numba.set_num_threads(numba.get_num_threads())
     torch.set_num_threads(count)
+
+
+def check_threads() -> None:
+    """Refuse a process that was forked from one that had run kernels, and has none of its threads.
+
+    Raises:
+        RuntimeError: It is such a process.
+    """
+    if _started and os.getpid() not in _started:
+        raise RuntimeError(
+            "kernels have run in this notebook before, and a process that is started now would lack their threads: "
+            "restart it and fit before anything is rendered, or fit on one device (devices=1)"
+        )
 
 
 # Type of the numeric literals in kernels; Python floats would promote their operands to float64.

@@ -22,7 +22,8 @@ from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.atomic import write_bytes, write_text
 from nsvq_lightning.io.compressed import turn_up
 from nsvq_lightning.io.ply import write_elements
-from nsvq_lightning.rendering.camera import Camera, up_of
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.poses import up_of
 
 BLOCK = "block.json"
 

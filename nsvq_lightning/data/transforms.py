@@ -21,7 +21,8 @@ from nsvq_lightning.data.images import image_head
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.ply import read_ply_columns, read_ply_header
 from nsvq_lightning.random import generator
-from nsvq_lightning.rendering.camera import Camera, looked_at, poses
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.poses import looked_at, poses
 
 log = logging.getLogger(__name__)
 

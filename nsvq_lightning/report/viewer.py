@@ -16,8 +16,9 @@ import torch
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.nsvq.file import read_nsvq
-from nsvq_lightning.rendering.camera import Camera, up_of
+from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
+from nsvq_lightning.rendering.poses import up_of
 from nsvq_lightning.splats.splats import SplatTensors
 
 

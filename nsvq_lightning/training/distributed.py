@@ -1,8 +1,9 @@
 """Training on several devices: one view each, equal replicas, and what they exchange."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TypeVar, cast
 
 import torch
 import torch.distributed
@@ -12,6 +13,8 @@ from torch import Tensor, nn
 from torch.distributed import all_reduce
 
 from nsvq_lightning.compute.devices import to_device
+
+T = TypeVar("T")
 
 
 def check_strategy(strategy: Strategy) -> None:
@@ -23,8 +26,9 @@ def check_strategy(strategy: Strategy) -> None:
     if isinstance(strategy, DDPStrategy) and not isinstance(strategy, ViewParallelStrategy):
         raise ValueError(
             "DistributedDataParallel binds gradient hooks to the parameters it finds at the start: after the first "
-            "clone it crashes or silently stops averaging. Train with --trainer.strategy=view_parallel, or on one "
-            "device (--trainer.devices=1)"
+            "clone it crashes or silently stops averaging. Write nsvq_lightning.SplatTrainer(…), which chooses by "
+            'itself, or Trainer(devices=1, …), or Trainer(strategy="view_parallel", …), in a notebook '
+            '"view_parallel_notebook"; for nsvq fit --trainer.devices=1 or --trainer.strategy=view_parallel'
         )
 
 
@@ -71,6 +75,29 @@ def check_replicas(trainer: Trainer, event: str) -> None:
             "differently: pass it through sum_over_processes or from_first_process of "
             "nsvq_lightning.training.distributed, and train on machines of one kind"
         )
+
+
+def on_first_process(trainer: Trainer, make: Callable[[], T]) -> T:
+    """What the first process makes, on every process: what enters a decision and comes from a library or a file.
+
+    Another version of it, or another processor, may make something else of the same input. This is a collective.
+
+    Args:
+        trainer: The trainer.
+        make: Called on the first process alone; what it raises is raised on all.
+    """
+    if trainer.world_size == 1:
+        return make()
+    made: T | Exception | None = None
+    if trainer.is_global_zero:
+        try:
+            made = make()
+        except Exception as error:  # the others would wait for it
+            made = error
+    made = trainer.strategy.broadcast(made)
+    if isinstance(made, Exception):
+        raise made
+    return cast(T, made)
 
 
 def from_first_process(trainer: Trainer, tensor: Tensor) -> Tensor:
@@ -151,6 +178,9 @@ class ViewParallelStrategy(DDPStrategy):
             gradient.div_(self.world_size)  # not every backend has an average
 
 
-StrategyRegistry.register(
-    "view_parallel", ViewParallelStrategy, description="A replica on each device, one view each per step", override=True
-)
+# How its processes start, by its name: as commands of their own or, from a notebook, as copies of this process.
+for _suffix, _start in {"": "popen", "_spawn": "spawn", "_fork": "fork", "_notebook": "fork"}.items():
+    _about = f"A replica on each device, one view each per step; processes start by {_start}"
+    StrategyRegistry.register(
+        f"view_parallel{_suffix}", ViewParallelStrategy, _about, override=True, start_method=_start
+    )

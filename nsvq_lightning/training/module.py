@@ -3,12 +3,14 @@
 import logging
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from nsvq_lightning.compute.devices import AsyncScalar, to_device
+from nsvq_lightning.compute.devices import AsyncScalar, check_can_train, to_device
+from nsvq_lightning.compute.jit import check_threads
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.quality.loss import photometric_loss
@@ -112,7 +114,8 @@ class SplatModule(resume.ResumedModule):
         self.history: list[dict[str, Any]] = []
         self._step_factor = 1.0
         self._rate_factors: dict[str, float] = {}
-        self._updates = True
+        self.updates = True
+        """Whether this iteration is to change anything: False once a loss of this process is not finite."""
         self._late_loss: tuple[str, AsyncScalar] | None = None
         self._micro_batch = 0
 
@@ -158,9 +161,10 @@ class SplatModule(resume.ResumedModule):
         """Set the background and the extent of the scene.
 
         Raises:
-            ValueError: The trainer has another precision than ``32-true`` or, for a fit, no scene or a strategy that
-                loses replaced parameters.
+            ValueError: The trainer has another precision than ``32-true``, a device without kernels or, for a fit, no
+                scene or a strategy that loses replaced parameters.
         """
+        check_can_train(self.trainer.strategy.root_device, self.backend)
         if self.trainer.precision != "32-true":
             raise ValueError(
                 f"splats train in float32, trainer.precision is {self.trainer.precision}: kernels compute in float32 "
@@ -171,12 +175,15 @@ class SplatModule(resume.ResumedModule):
             self.background = scene_module.background_of(scene, self.background)
         if stage == "fit":
             distributed.check_strategy(self.trainer.strategy)
-            self.extent = self.extent or scene_module.extent_of(self.trainer)
+            check_threads()
+            extent = partial(scene_module.extent_of, self.trainer)
+            self.extent = self.extent or distributed.on_first_process(self.trainer, extent)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """One Adam optimiser with a named group for each attribute and codebook; first splats, if there are none."""
         if len(self.splats) == 0:
-            self.splats = scene_module.first_splats(self).to(self.device)
+            splats = distributed.on_first_process(self.trainer, partial(scene_module.first_splats, self))
+            self.splats = splats.to(self.device)
             self.active_sh_degree = 0 if self.init_from is None else self.splats.sh_degree
         return optim.build_adam(optim.param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
 
@@ -192,7 +199,7 @@ class SplatModule(resume.ResumedModule):
         """Set the learning rates of this iteration."""
         self._micro_batch = batch_idx % self.trainer.accumulate_grad_batches
         if self._micro_batch == 0:
-            self._updates = True
+            self.updates = True
         end = self.schedule.iteration(self.schedule.position_decay)
         for group in self.trainer.optimizers[0].param_groups:
             rate = optim.group_lr(group["name"], self.rates, self.extent)
@@ -236,7 +243,7 @@ class SplatModule(resume.ResumedModule):
         if math.isfinite(loss.read()):
             return True
         log.warning("step %d: the loss of %s is %s, no update", self.global_step + 1, view, loss.read())
-        self._updates = False
+        self.updates = False
         return False
 
     def on_after_backward(self) -> None:
@@ -247,7 +254,7 @@ class SplatModule(resume.ResumedModule):
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Drop the gradients of a step that must not update; with several processes the strategy has done so."""
-        if not self._updates:
+        if not self.updates:
             optimizer.zero_grad()
 
     def on_train_end(self) -> None:

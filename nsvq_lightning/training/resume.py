@@ -103,7 +103,13 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         FormatError: The file is damaged or truncated, holds more than tensors and plain data, or is not a checkpoint of
             a :class:`nsvq_lightning.SplatModule`.
     """
-    path = Path(path)
+    checkpoint = _plain_content(Path(path))
+    _check_contents(path, checkpoint)
+    return checkpoint  # type: ignore[no-any-return]  # checked
+
+
+def _plain_content(path: Path) -> Any:
+    """What a file of torch holds; raises as :func:`read_checkpoint` does where that is damaged or more than data."""
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such checkpoint; {WAY_OUT}")
     try:
@@ -111,7 +117,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
             damaged = archive.testzip()
         if damaged is not None:
             raise FormatError(f"{path}: damaged, its part {damaged} is not what was written", WAY_OUT)
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        return torch.load(path, map_location="cpu", weights_only=True)
     except (PermissionError, FormatError):
         raise
     except BadZipFile as error:
@@ -123,11 +129,9 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     except Exception as error:  # damage can make torch's archive and pickle readers raise anything
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise FormatError(f"{path}: damaged, or not a checkpoint ({reason})", WAY_OUT) from error
-    _check_contents(path, checkpoint)
-    return checkpoint  # type: ignore[no-any-return]  # checked
 
 
-def _check_contents(path: Path, checkpoint: Any) -> None:
+def _check_contents(path: str | Path, checkpoint: Any) -> None:
     state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
     if not isinstance(state, dict) or "pytorch-lightning_version" not in checkpoint:
         raise FormatError(f"{path}: not a checkpoint of Lightning", WAY_OUT)
@@ -226,7 +230,10 @@ class PlainCheckpointIO(TorchCheckpointIO):
         """
         if "://" in str(path):
             return super().load_checkpoint(path, weights_only=True)
-        return read_checkpoint(path)
+        content = _plain_content(Path(path))
+        if not (isinstance(content, dict) and "splats.means" in content):
+            _check_contents(path, content)
+        return content  # of processes started from a notebook, the first hands back the weights alone
 
 
 def plain(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -309,7 +316,7 @@ class ResumedModule(SceneModule):
 
         Raises:
             ValueError: A fit cannot continue from the checkpoint, or it is of another scene than the trainer's, which
-                ``allow_other_scene`` of :class:`nsvq_lightning.training.run_folder.SplatTrainer` lets pass.
+                ``allow_other_scene`` of :class:`nsvq_lightning.training.trainer.SplatTrainer` lets pass.
         """
         scene = scene_of(self._trainer)
         if scene is not None and SCENE in checkpoint and not getattr(self._trainer, "allow_other_scene", False):

@@ -1,29 +1,20 @@
-"""Where a run writes: a folder of its own, which never overwrites another run; and the trainer that knows it."""
+"""Where a run writes: a folder of its own, which never overwrites another run."""
 
 import atexit
-import logging
 import os
 import platform
-from contextlib import nullcontext, suppress
+from contextlib import suppress
+from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any
 from weakref import WeakKeyDictionary
 
 from filelock import FileLock, Timeout
-from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
-from lightning.pytorch.profilers import PassThroughProfiler
-from lightning.pytorch.strategies import DDPStrategy
 
 from nsvq_lightning.io.atomic import remove_temporaries, write_text
-from nsvq_lightning.io.formats import save
-from nsvq_lightning.training.distributed import ViewParallelStrategy  # noqa: F401  registers its name
-from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.resume import PlainCheckpointIO, read_checkpoint
-
-log = logging.getLogger(__name__)
+from nsvq_lightning.training.distributed import on_first_process
 
 _FOLDERS: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
 _RESERVED: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
@@ -32,8 +23,8 @@ _RESERVED: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
 def run_folder(trainer: Trainer) -> Path:
     """Folder of the trainer's run, which exists; the same one for everything that this trainer does.
 
-    It is the first of these that is given: the trainer's ``run_folder`` (:class:`nsvq_lightning.training.run_folder.
-    SplatTrainer`), the folder of a logger that has one for each run (CSV, TensorBoard), or a new
+    It is the first of these that is given: the trainer's ``run_folder`` (:class:`nsvq_lightning.SplatTrainer`), the
+    folder of a logger that has one for each run (CSV, TensorBoard), or a new
     ``<default_root_dir>/<scene>/version_<n>``. The first process chooses: the first call is a collective, which every
     process must make.
 
@@ -43,16 +34,7 @@ def run_folder(trainer: Trainer) -> Path:
     """
     folder = _FOLDERS.get(trainer)
     if folder is None:
-        chosen: Path | str | None = None
-        if trainer.is_global_zero:
-            try:
-                chosen = _choose(trainer)
-            except OSError as error:
-                chosen = str(error)
-        chosen = trainer.strategy.broadcast(chosen)
-        if not isinstance(chosen, Path):
-            raise FileExistsError(chosen)  # on every process, so that none waits for another
-        folder = _FOLDERS[trainer] = chosen
+        folder = _FOLDERS[trainer] = on_first_process(trainer, partial(_choose, trainer))
     return folder
 
 
@@ -194,66 +176,3 @@ def _choose(trainer: Trainer) -> Path:
         return folder
     take(folder, trainer.ckpt_path if trainer.state.fn == "fit" else None)
     return folder
-
-
-log = logging.getLogger(__name__)
-
-
-class _NoProfiler(PassThroughProfiler):
-    """Lightning's default, without the generator that it makes for each of the hundred hooks and actions of a step."""
-
-    _nothing: Any = nullcontext()
-
-    def profile(self, action_name: str) -> Any:
-        return self._nothing
-
-
-class SplatTrainer(Trainer):
-    """:class:`lightning.pytorch.Trainer`; every public method below is a subcommand of ``nsvq``.
-
-    Checkpoints are read by :class:`~nsvq_lightning.training.resume.PlainCheckpointIO` unless a plugin does it.
-
-    If several devices or machines are requested but no strategy, it uses ``view_parallel``: DDP, which Lightning would
-    choose, cannot handle a changing number of splats.
-
-    Args:
-        run_folder: Folder for all files of the run; None uses that of the logger if it has one for each run, else a new
-            ``<default_root_dir>/<scene>/version_<n>``. An existing run is not overwritten.
-        allow_other_scene: Use a checkpoint on another scene than the one it was trained on.
-    """
-
-    def __init__(
-        self, *args: Any, run_folder: str | None = None, allow_other_scene: bool = False, **kwargs: Any
-    ) -> None:
-        if kwargs.get("profiler") is None:
-            kwargs["profiler"] = _NoProfiler()
-        super().__init__(*args, **kwargs)
-        if kwargs.get("strategy", "auto") == "auto" and isinstance(self.strategy, DDPStrategy):
-            super().__init__(*args, **(kwargs | {"strategy": "view_parallel"}))
-        self.run_folder, self.allow_other_scene = run_folder, allow_other_scene
-        if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # Lightning's own
-            self.strategy.checkpoint_io = PlainCheckpointIO()
-
-    def export(self, model: SplatModule, ckpt_path: str, output: str = "scene.nsvq", datamodule: Any = None) -> Path:
-        """Write the scene of a checkpoint as a file.
-
-        Args:
-            model: Module that the checkpoint is loaded into.
-            ckpt_path: Checkpoint of a run.
-            output: File to write; its suffix selects the format: .nsvq is the compressed scene, any other format holds
-                the decoded splats (.ply, .sog, .spz, .splat).
-            datamodule: As of the trainer's other methods; it is not needed.
-
-        Raises:
-            FileNotFoundError: No such checkpoint.
-            FormatError: It is damaged.
-        """
-        checkpoint = read_checkpoint(ckpt_path)
-        model.on_load_checkpoint(checkpoint)
-        model.load_state_dict(checkpoint["state_dict"])
-        path = Path(output)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        scene = model.compressed()
-        save(scene, path, model.storage)
-        log.info("wrote %s: %d splats, %d bytes", path, len(scene), path.stat().st_size)
-        return path

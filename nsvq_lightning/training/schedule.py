@@ -162,6 +162,18 @@ class Schedule:
         """How many iterations of this run correspond to ``reference`` of the reference run, at least 1."""
         return max(1, round(reference * self.scale))
 
+    def reference(self, iteration: int) -> float:
+        """The iteration of the reference run that corresponds to an iteration of this run."""
+        return (iteration + (self.saved if iteration > self.ends[Phase.WARMUP] else 0)) / self.scale
+
+    def share(self, reference: float) -> float:
+        """The share of a run that is over after iteration ``reference`` of the reference run."""
+        return reference / self.reference_total
+
+    def part(self, parts: int) -> int:
+        """How many iterations of this run are one of so many equal parts of it, at least 1."""
+        return max(1, self.total // parts)
+
     def stride(self, reference: int, minimum: int) -> float:
         """The interval ``reference``, in reference iterations, but at least ``minimum`` iterations of this run."""
         return max(reference, minimum / self.scale) if self.scale < 1 else reference

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,8 +16,11 @@ from lightning.pytorch import Callback, Trainer
 
 from nsvq_lightning.callbacks import ExposureCompensation, PhaseSchedule
 from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.metrics import color_corrected, psnr
+from nsvq_lightning.training import distributed
 from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.schedule import Schedule
 
 STOPS = (0.0, 0.4, -0.4, 0.3, -0.3, 0.2, -0.2, 0.0, 0.0)
 """Of the nine photos, the first and the last of which are test views."""
@@ -89,3 +95,54 @@ def test_colour_correction_undoes_a_map_of_colours() -> None:
     grey = image.mean(-1, keepdim=True).expand(-1, -1, 3)
     assert float(psnr(color_corrected(grey, photo), photo)) > float(psnr(grey, photo))
     assert torch.equal(color_corrected(torch.ones(4, 5, 3), torch.ones(4, 5, 3)), torch.ones(4, 5, 3))
+
+
+class OneBadLoss(Callback):
+    """Spoils the loss of one iteration, and notes the exposures around it."""
+
+    def __init__(self, compensation: ExposureCompensation, iteration: int) -> None:
+        self.compensation, self.iteration = compensation, iteration
+        self.changes: dict[int, torch.Tensor] = {}
+
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:  # type: ignore[override]
+        if trainer.global_step + 1 == self.iteration:
+            batch.image[:] = float("nan")
+
+    def on_train_batch_end(self, trainer: Trainer, *_: object) -> None:
+        self.changes[trainer.global_step] = self.compensation.state_dict()["changes"].clone()
+
+
+def test_a_step_that_changes_nothing_moves_no_exposure(uneven_scene: Path, tmp_path: Path) -> None:
+    compensation = ExposureCompensation()
+    spoiled = OneBadLoss(compensation, 6)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ColmapDataModule, "transfer_batch_to_device", float_photos)
+        fit(uneven_scene, tmp_path, [compensation, spoiled], 8)
+    assert not torch.equal(spoiled.changes[4], spoiled.changes[5])
+    assert torch.equal(spoiled.changes[5], spoiled.changes[6])
+    assert not torch.equal(spoiled.changes[6], spoiled.changes[7])
+
+
+def float_photos(self: ColmapDataModule, batch: View, device: torch.device, dataloader_idx: int) -> View:
+    """Photos that can be NaN."""
+    return replace(batch, image=batch.image.float() / 255)
+
+
+def test_gradients_of_several_processes_are_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for processes in (1, 2):
+        compensation = ExposureCompensation(rate=0.1)
+        compensation._changes = torch.zeros(2, 3, 4, requires_grad=True)
+        compensation._changes.grad = torch.full((2, 3, 4), 0.5)
+        compensation._adam = torch.optim.SGD([compensation._changes], lr=0.1)  # type: ignore[assignment]
+        # The other process has the same gradient.
+        monkeypatch.setattr(distributed, "sum_over_processes", lambda _, tensor, times=processes: tensor.mul_(times))
+        group = {"params": [SimpleNamespace(grad=1)]}
+        trainer: Any = SimpleNamespace(
+            world_size=processes, global_step=0, optimizers=[SimpleNamespace(param_groups=[group])]
+        )
+        module: Any = SimpleNamespace(updates=True, schedule=Schedule(total=100))
+        compensation.on_before_optimizer_step(trainer, module, None)
+        found.append(compensation._changes.detach().clone())
+    assert torch.equal(*found)
+    assert found[0].abs().max() > 0

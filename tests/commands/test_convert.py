@@ -17,7 +17,7 @@ from nsvq_lightning.io import CompressedScene, read_scene, save
 from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.spz import read_spz_header
-from nsvq_lightning.rendering.camera import up_of
+from nsvq_lightning.rendering.poses import up_of
 from nsvq_lightning.splats.splats import Splats
 from tests.support.splat_scenes import ball
 

@@ -18,7 +18,6 @@ from nsvq_lightning.commands.main import main
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.run_folder import SplatTrainer
 from nsvq_lightning.training.schedule import Phase
 
 CODES = ["--model.quantizer=NSVQ", "--model.codebooks.scales=16", "--model.codebooks.sh0=8"]
@@ -406,10 +405,3 @@ def test_a_quantizer_of_the_current_folder_trains(
     assert main(fit(demo_scene, tmp_path, *CODES[1:], "--model.quantizer=my_quantizers.Halfway", steps=4)) == 0
     stored = read_nsvq(tmp_path / demo_scene.name / "version_0" / "scene.nsvq")
     assert stored.config["quantizers"] == {"scales": "Halfway", "sh0": "Halfway"}
-
-
-def test_several_devices_are_view_parallel_unless_told_otherwise(tmp_path: Path) -> None:
-    settings = {"accelerator": "cpu", "logger": False, "enable_checkpointing": False, "default_root_dir": tmp_path}
-    assert type(SplatTrainer(devices=2, **settings).strategy).__name__ == "ViewParallelStrategy"
-    assert type(SplatTrainer(devices=2, strategy="ddp", **settings).strategy).__name__ == "DDPStrategy"
-    assert type(SplatTrainer(devices=1, **settings).strategy).__name__ == "SingleDeviceStrategy"

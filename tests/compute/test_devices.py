@@ -1,9 +1,18 @@
-"""Copies that nobody waits for; what a GPU does is played by a stand-in."""
+"""Which device trains, and copies that nobody waits for; what a GPU does is played by a stand-in."""
+
+from contextlib import nullcontext
 
 import pytest
 import torch
 
-from nsvq_lightning.compute.devices import AsyncScalar, to_device
+from nsvq_lightning.compute import devices
+from nsvq_lightning.compute.devices import (
+    AsyncScalar,
+    best_device,
+    check_can_train,
+    devices_with_kernels,
+    to_device,
+)
 
 
 def test_a_tensor_that_is_there_stays_itself() -> None:
@@ -44,3 +53,36 @@ def test_a_number_of_a_gpu_is_read_after_its_own_copy() -> None:
     value.fill_(3.0)
     assert not number.is_here
     assert number.read() == 2.5
+
+
+@pytest.mark.parametrize(
+    ("cuda", "triton", "best"),
+    [(True, True, "cuda"), (True, False, "cpu"), (False, True, "cpu"), (False, False, "cpu")],
+)
+def test_the_best_device_is_one_with_kernels(
+    monkeypatch: pytest.MonkeyPatch, cuda: bool, triton: bool, best: str
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
+    monkeypatch.setattr(devices, "_has_triton", lambda: triton)
+    assert best_device() == torch.device(best)
+    assert devices_with_kernels() == list(dict.fromkeys(["cpu", best]))
+
+
+@pytest.mark.parametrize(
+    ("device", "backend", "fits"),
+    [
+        ("cpu", "auto", True),
+        ("mps", "auto", False),
+        ("mps", "reference", False),  # it has no float64
+        ("cuda", "auto", False),
+        ("cuda", "reference", True),
+        ("meta", "auto", False),
+    ],
+)
+def test_without_kernels_only_plain_torch_that_was_asked_for_trains(
+    monkeypatch: pytest.MonkeyPatch, device: str, backend: str, fits: bool
+) -> None:
+    monkeypatch.setattr(devices, "_has_triton", lambda: False)
+    with nullcontext() if fits else pytest.raises(ValueError, match=rf'{device} here.*accelerator="cpu"'):
+        check_can_train(torch.device(device), backend)

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.compression.viewpoints import look_at
 from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, cropped, rotated, turn_up
-from nsvq_lightning.rendering.camera import Camera, up_of
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.poses import up_of
 from nsvq_lightning.rendering.rasterize import render
 from tests.support.splat_scenes import ball
 

@@ -21,7 +21,8 @@ from splat_scenes import front_camera, random_splats
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.formats import read_scene, save
-from nsvq_lightning.rendering.camera import Camera, up_of
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.poses import up_of
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.report import viewer
 from nsvq_lightning.report.viewer import write_viewer

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from lightning.pytorch import LightningModule
-from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
+from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy, StrategyRegistry
 from torch import Tensor, nn
 
 import nsvq_lightning.training.distributed as strategies
@@ -20,6 +21,7 @@ from nsvq_lightning.training.distributed import (
     check_strategy,
     checksum,
     follow_first,
+    on_first_process,
 )
 
 LOSS = torch.tensor(1.0)
@@ -178,3 +180,30 @@ def test_ddp_is_refused_with_the_reason() -> None:
         check_strategy(DDPStrategy())
     check_strategy(SingleDeviceStrategy())
     check_strategy(ViewParallelStrategy())
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+@pytest.mark.parametrize("fails", [False, True])
+def test_only_the_first_process_makes_what_all_get(rank: int, fails: bool) -> None:
+    made: list[int] = []
+
+    def make() -> str:
+        made.append(rank)
+        if fails:
+            raise ValueError("a photo is damaged")
+        return "of 0"
+
+    def broadcast(value: object) -> object:
+        return value if rank == 0 else ValueError("a photo is damaged") if fails else "of 0"
+
+    two: Any = SimpleNamespace(world_size=2, is_global_zero=rank == 0, strategy=SimpleNamespace(broadcast=broadcast))
+    with pytest.raises(ValueError, match="damaged") if fails else nullcontext():
+        assert on_first_process(two, make) == "of 0"
+    assert made == [0] * (rank == 0)
+
+
+def test_every_start_method_has_a_name() -> None:
+    for name, start in {"": "popen", "_spawn": "spawn", "_fork": "fork", "_notebook": "fork"}.items():
+        strategy = StrategyRegistry.get(f"view_parallel{name}")
+        assert isinstance(strategy, ViewParallelStrategy)
+        assert strategy._start_method == start

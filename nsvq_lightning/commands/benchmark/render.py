@@ -15,7 +15,7 @@ from torch import Tensor
 from nsvq_lightning.commands.benchmark import Scope
 from nsvq_lightning.commands.benchmark.timing import Measurement, compare
 from nsvq_lightning.commands.benchmark.workloads import Workload, relative_l2, workloads
-from nsvq_lightning.compute.devices import fast_backends
+from nsvq_lightning.compute.devices import devices_with_kernels, fast_backends
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quality.ssim import in_range, plain_ssim
 from nsvq_lightning.random import generator
@@ -27,7 +27,7 @@ FORWARD, BOTH, LOSS = "forward", "forward + backward", "L1 + D-SSIM, forward + b
 
 def run(scope: Scope) -> Iterator[Measurement]:
     """Time every back-end of every device on every workload; errors once a workload."""
-    for device in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
+    for device in devices_with_kernels():
         for workload in workloads(scope):
             yield from _render_rows(workload.to(device), scope, device)
         yield from _loss_rows(scope, device)

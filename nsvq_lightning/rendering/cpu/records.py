@@ -43,8 +43,8 @@ ROTATION, TRANSLATION, POSITION, FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, W
 )  # fmt: skip
 # Largest image side in pixels: a record has 16 bits, one of them the sign, for a tile's column or row.
 MAX_SIDE = TILE * (2**15 - 1)
-# Cameras as kernels read them, and the version of the matrix that it was made from.
-_packed: WeakKeyDictionary[Camera, tuple[int, Array]] = WeakKeyDictionary()
+# Cameras as kernels read them.
+_packed: WeakKeyDictionary[Camera, Array] = WeakKeyDictionary()
 
 
 def pack_camera(camera: Camera) -> Array:
@@ -53,13 +53,13 @@ def pack_camera(camera: Camera) -> Array:
     Raises:
         ValueError: The image is too large.
     """
-    version, packed = _packed.get(camera, (-1, np.empty(0)))
-    if version != camera.viewmat._version:
+    packed = _packed.get(camera)
+    if packed is None:
         size = camera.width, camera.height
         if max(size) > MAX_SIDE:
             raise ValueError(f"an image side may have {MAX_SIDE} pixels, got {size[0]}x{size[1]}; render it in parts")
         packed = np.array([*camera.packed_view, *camera.intrinsics, *camera.slope_limits, *size], np.float32)
-        _packed[camera] = camera.viewmat._version, packed
+        _packed[camera] = packed
     return packed
 
 

@@ -316,16 +316,16 @@ class Lens(NamedTuple):
     @classmethod
     def of(cls, camera: Camera, device: torch.device) -> "Lens":
         """Pack a camera; for one that has been packed for the device before, nothing is copied."""
-        version, lens = _lenses.get(camera, {}).get(device, (-1, None))
-        if lens is None or version != camera.viewmat._version:
+        lens = _lenses.get(camera, {}).get(device)
+        if lens is None:
             view = to_device(torch.tensor(camera.packed_view, dtype=torch.float32), device)
             lens = cls(view, *camera.intrinsics, camera.width, camera.height)
-            _lenses.setdefault(camera, {})[device] = camera.viewmat._version, lens
+            _lenses.setdefault(camera, {})[device] = lens
         return lens
 
 
-# Packed cameras by device, with the version of the matrix that each was made from.
-_lenses: WeakKeyDictionary[Camera, dict[torch.device, tuple[int, Lens]]] = WeakKeyDictionary()
+# Packed cameras by device.
+_lenses: WeakKeyDictionary[Camera, dict[torch.device, Lens]] = WeakKeyDictionary()
 
 
 class Projected(NamedTuple):

@@ -1,0 +1,155 @@
+"""Cameras along a path: through given ones, around what they look at, or from nerfstudio's JSON."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import RotationSpline
+
+from nsvq_lightning.rendering.camera import Camera, camera_of
+from nsvq_lightning.rendering.poses import looked_at, poses, up_of, view_from, view_towards
+
+
+def reframed(camera: Camera, width: int, height: int) -> Camera:
+    """The camera with another picture size: all that it sees stays in view, centred."""
+    fx, fy, cx, cy = camera.intrinsics
+    factor = min(width / camera.width, height / camera.height)
+    centre = width / 2 + factor * (cx - camera.width / 2), height / 2 + factor * (cy - camera.height / 2)
+    return camera_of(camera.viewmat, (factor * fx, factor * fy, *centre), width, height)
+
+
+def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """A smooth path through cameras, in their order, at even speed.
+
+    Positions follow a cubic spline and rotations one with continuous angular acceleration; speed counts both, a turn by
+    one radian as much as the typical distance between the cameras and the middle of them.
+
+    Args:
+        cameras: At least one, all of the same size; those that repeat the one before are left out.
+        frames: Number of cameras to return, the first and the last of which are the first and the last given.
+
+    Raises:
+        ValueError: There are no cameras, or they have different sizes.
+    """
+    if not cameras or frames < 1:
+        raise ValueError(f"a path needs at least one camera and one frame, got {len(cameras)} and {frames}")
+    width, height = cameras[0].width, cameras[0].height
+    if any((camera.width, camera.height) != (width, height) for camera in cameras):
+        raise ValueError("cameras of a path must have one size; reframe them first")
+    positions, rotations = poses(cameras)
+    unit = float(np.median(np.linalg.norm(positions - positions.mean(0), axis=1))) or 1.0
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1) / unit
+    steps += (rotations[:-1].inv() * rotations[1:]).magnitude() if len(cameras) > 1 else 0.0
+    kept = np.concatenate([[True], steps > 1e-6])
+    positions, rotations = positions[kept], rotations[kept]
+    intrinsics = np.array([camera.intrinsics for camera in cameras])[kept]
+    if len(positions) == 1:
+        return [cameras[0]] * frames
+    at = np.concatenate([[0.0], np.cumsum(steps[kept[1:]])])
+    place = CubicSpline(at, positions, bc_type="natural")
+    turn = RotationSpline(at, rotations)
+    fine = np.linspace(0.0, at[-1], 16 * frames + 1)  # where the speed is measured
+    moved = np.linalg.norm(np.diff(place(fine), axis=0), axis=1) / unit
+    turned = turn(fine)
+    moved += (turned[:-1].inv() * turned[1:]).magnitude()
+    way = np.concatenate([[0.0], np.cumsum(moved)])
+    times = np.interp(np.linspace(0.0, way[-1], frames), way, fine)
+    lenses = np.stack([np.interp(times, at, column) for column in intrinsics.T], axis=1)
+    matrices = turn(times).as_matrix()
+    return [
+        camera_of(view_from(matrix, position), tuple(lens), width, height)
+        for matrix, position, lens in zip(matrices, place(times), lenses, strict=True)
+    ]
+
+
+def orbit(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """A closed path around the point that cameras look at, at their median distance, height and focal length.
+
+    Cameras that leave a gap of more than a quarter of the circle have not seen that side: the path then swings along
+    the arc that they fill instead of going all the way round.
+
+    Args:
+        cameras: At least one, most of them held level.
+        frames: Number of cameras to return, evenly spaced in time on the loop.
+
+    Raises:
+        ValueError: There are no cameras.
+    """
+    if not cameras or frames < 1:
+        raise ValueError(f"an orbit needs at least one camera and one frame, got {len(cameras)} and {frames}")
+    positions, _ = poses(cameras)
+    middle, up = looked_at(cameras), up_of(cameras)
+    across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    across /= np.linalg.norm(across)
+    ahead = np.cross(up, across)
+    arms = positions - middle
+    height, radius = float(np.median(arms @ up)), float(np.median(np.hypot(arms @ across, arms @ ahead)))
+    start, arc = _arc(np.arctan2(arms @ ahead, arms @ across))
+    share = np.arange(frames) / frames
+    swing = 0.5 + 0.5 * np.sin(2 * math.pi * share)
+    angles = start + (2 * math.pi * share if arc >= math.radians(270) else arc * swing)
+    lens = tuple(np.median([camera.intrinsics for camera in cameras], axis=0))
+    path = []
+    for angle in angles:
+        eye = middle + height * up + radius * (math.cos(angle) * across + math.sin(angle) * ahead)
+        path.append(camera_of(view_towards(middle, eye, up), lens, cameras[0].width, cameras[0].height))
+    return path
+
+
+def read_camera_path(path: Path, width: int | None = None, height: int | None = None) -> tuple[list[Camera], float]:
+    """The cameras of nerfstudio's camera path, and its frames per second.
+
+    Of a file that has only ``keyframes``, these are the cameras. Poses are those of the scene: nerfstudio's own files
+    fit where it has neither moved nor scaled the scene.
+
+    Args:
+        path: JSON with ``camera_path`` (``camera_to_world``, 16 numbers row by row; ``fov``, vertical, degrees), or
+            ``keyframes`` (``matrix``, row by row or column by column).
+        width: Pixels; by default the file's.
+        height: Pixels; by default the file's.
+
+    Raises:
+        ValueError: It is not such a file, or has no size and none is given.
+        OSError: It cannot be read.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        entries = content.get("camera_path") or content["keyframes"]
+        width, height = width or int(content["render_width"]), height or int(content["render_height"])
+        cameras = [_entry_camera(entry, width, height) for entry in entries]
+        if not cameras:
+            raise ValueError("it has no cameras")
+        return cameras, float(content.get("fps", 24))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{path} is not a camera path as nerfstudio and the viewer write them: {reason}") from None
+
+
+def _entry_camera(entry: Mapping[str, Any], width: int, height: int) -> Camera:
+    numbers = entry["camera_to_world"] if "camera_to_world" in entry else entry["matrix"]
+    pose = np.array(json.loads(numbers) if isinstance(numbers, str) else numbers, np.float64).reshape(4, 4)
+    if np.abs(pose[3, :3]).max() > np.abs(pose[:3, 3]).max():
+        pose = pose.T
+    rotation, field = pose[:3, :3], float(entry["fov"])
+    if not (np.isfinite(pose).all() and np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6)):
+        raise ValueError("a pose is not a rigid matrix of 4x4")
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise ValueError("a pose is not a rotation and a position")
+    if not 0 < field < 180:
+        raise ValueError(f"a field of view is {field} degrees")
+    focal = 0.5 * height / math.tan(math.radians(field) / 2)
+    rotation = rotation * [1, -1, -1]  # from y up, looking along -z, to y down, looking along z
+    return camera_of(view_from(rotation, pose[:3, 3]), (focal, focal, width / 2, height / 2), width, height)
+
+
+def _arc(angles: NDArray[np.float64]) -> tuple[float, float]:
+    """Start and length of the arc that angles fill: the circle without their largest gap."""
+    ordered = np.sort(angles)
+    gaps = np.diff(np.concatenate([ordered, ordered[:1] + 2 * math.pi]))
+    widest = int(np.argmax(gaps))
+    return float(ordered[(widest + 1) % len(ordered)]), float(2 * math.pi - gaps[widest])

@@ -1,0 +1,68 @@
+"""Where cameras are, and what several have in common: what they look at, and where up is."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from nsvq_lightning.rendering.camera import Camera
+
+# Weight of what decides where cameras that all look the same way leave a direction open.
+LITTLE = 1e-5
+
+
+def poses(cameras: Sequence[Camera]) -> tuple[NDArray[np.float64], Rotation]:
+    """Positions ``[N, 3]``, and rotations from camera to world."""
+    packed = np.array([camera.packed_view for camera in cameras])
+    return packed[:, 12:], Rotation.from_matrix(packed[:, :9].reshape(-1, 3, 3).transpose(0, 2, 1))
+
+
+def looked_at(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    """The point ``[3]`` nearest to all lines of sight; where they are parallel, one in front of the cameras."""
+    positions, rotations = poses(cameras)
+    forward = rotations.as_matrix()[:, :, 2]
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    spread = np.linalg.norm(positions - positions.mean(0), axis=1).max() or 1.0
+    ahead = positions.mean(0) + 2 * spread * forward.mean(0)
+    weight = LITTLE * len(positions)
+    total = across.sum(0) + weight * np.eye(3)
+    return np.linalg.solve(total, np.einsum("nij,nj->i", across, positions) + weight * ahead)
+
+
+def up_of(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    """The direction ``[3]`` that is up for cameras most of which are held level, unit length.
+
+    It is at right angles to where their right is, the sum of the sines of their rolls being least, so that a minority
+    of photos in portrait format or askew does not count; where that leaves a choice, it is near their upper edges.
+    Looking up or down does not matter.
+    """
+    axes = poses(cameras)[1].as_matrix()
+    right, upper = axes[:, :, 0], -axes[:, :, 1].mean(0)
+    if np.linalg.norm(upper) < 0.1:  # they are turned in all directions
+        return np.asarray(-axes[0, :, 1])
+    weights = np.ones(len(axes))
+    for _ in range(20):  # weighted again by how level they are
+        level = (weights * right.T) @ right / weights.sum()
+        up = np.linalg.solve(level + LITTLE * np.eye(3), upper)
+        up /= np.linalg.norm(up)
+        weights = 1 / np.maximum(np.abs(right @ up), 0.02)  # sine of the roll below which a camera counts as level
+    return up
+
+
+def view_towards(target: NDArray[np.float64], eye: NDArray[np.float64], up: NDArray[np.float64]) -> Tensor:
+    """World to camera ``[4, 4]`` float32: from ``eye [3]`` a camera looks at ``target [3]``, with ``up [3]`` above."""
+    forward = (target - eye) / (np.linalg.norm(target - eye) or 1.0)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right) or 1.0
+    return view_from(np.stack([right, np.cross(forward, right), forward], axis=1), eye)
+
+
+def view_from(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> Tensor:
+    """World to camera ``[4, 4]`` float32, from the rotation to the world and the position in it."""
+    view = np.eye(4)
+    view[:3, :3] = rotation.T
+    view[:3, 3] = -rotation.T @ position
+    return torch.from_numpy(view.astype(np.float32))

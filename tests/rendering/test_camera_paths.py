@@ -1,0 +1,191 @@
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.camera_paths import orbit, read_camera_path, reframed, smooth_path
+
+
+def camera(position: Any, rotation: Rotation | None = None, focal: float = 100.0) -> Camera:
+    """A camera of 80x60 whose rotation leads from its axes to those of the world."""
+    matrix = np.eye(3) if rotation is None else rotation.as_matrix()
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = matrix.T, -matrix.T @ np.asarray(position, float)
+    intrinsics = torch.tensor([[focal, 0.0, 41.0], [0.0, focal, 30.0], [0.0, 0.0, 1.0]])
+    return Camera(intrinsics, torch.from_numpy(view).float(), 80, 60)
+
+
+def around(angles: Any, radius: float = 2.0) -> list[Camera]:
+    """Cameras on a level circle about (1, 2, 3) that look at it; y is down."""
+    made = []
+    for angle in angles:
+        arm = radius * np.array([math.sin(angle), -0.5, -math.cos(angle)])
+        tilt = -math.atan(0.5)
+        made.append(camera(np.array([1.0, 2.0, 3.0]) + arm, Rotation.from_euler("YX", [-angle, tilt])))
+    return made
+
+
+def pose(seen: Camera) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    packed = np.array(seen.packed_view)
+    return packed[12:], packed[:9].reshape(3, 3)
+
+
+def test_a_path_passes_every_camera_at_even_speed() -> None:
+    generator = np.random.default_rng(3)
+    places = generator.normal(size=(5, 3)) + 3 * np.arange(5)[:, None] * [1, 0, 0]
+    turns = Rotation.from_rotvec(0.3 * generator.normal(size=(5, 3)))
+    given = [camera(place, turn, 100 + 10 * k) for k, (place, turn) in enumerate(zip(places, turns, strict=True))]
+    path = smooth_path(given, 400)
+    assert len(path) == 400
+    positions = np.array([pose(seen)[0] for seen in path])
+    for key in given:
+        place, rotation = pose(key)
+        nearest = int(np.argmin(np.linalg.norm(positions - place, axis=1)))
+        assert np.linalg.norm(positions[nearest] - place) < 0.05
+        assert pose(path[nearest])[1] == pytest.approx(rotation, abs=0.05)
+        assert path[nearest].intrinsics[0] == pytest.approx(key.intrinsics[0], abs=0.5)
+    for end, key in ((path[0], given[0]), (path[-1], given[-1])):
+        assert end.viewmat.numpy() == pytest.approx(key.viewmat.numpy(), abs=1e-4)
+    unit = np.median(np.linalg.norm(places - places.mean(axis=0), axis=1))
+    rotations = Rotation.from_matrix([pose(seen)[1].T for seen in path])
+    turned = (rotations[:-1].inv() * rotations[1:]).magnitude()
+    speed = np.linalg.norm(np.diff(positions, axis=0), axis=1) / unit + turned
+    assert speed.max() < 1.1 * speed.min()
+    for seen in path:
+        matrix = seen.viewmat[:3, :3].double().numpy()
+        assert matrix @ matrix.T == pytest.approx(np.eye(3), abs=1e-5)
+        assert np.linalg.det(matrix) > 0
+
+
+def test_cameras_at_one_place_are_passed_once() -> None:
+    one, other = around([0.0, 0.5])
+    path = smooth_path([one, one, one, other], 11)
+    positions = np.array([pose(seen)[0] for seen in path])
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    assert steps.max() < 1.2 * steps.min()
+    assert [seen.viewmat.tolist() for seen in smooth_path([one, one], 3)] == [one.viewmat.tolist()] * 3
+
+
+def test_a_path_needs_cameras_of_one_size() -> None:
+    with pytest.raises(ValueError, match="at least one camera and one frame, got 0 and 5"):
+        smooth_path([], 5)
+    with pytest.raises(ValueError, match="one size; reframe them first"):
+        smooth_path([camera([0, 0, 0]), reframed(camera([1, 0, 0]), 40, 30)], 5)
+
+
+@pytest.mark.parametrize(("count", "most"), [(12, 2 * math.pi), (5, math.radians(120))])
+def test_an_orbit_looks_at_what_the_cameras_look_at(count: int, most: float) -> None:
+    given = around(np.linspace(0.3, 0.3 + most, count, endpoint=most < 6))
+    path = orbit(given, 48)
+    middle, angles = np.array([1.0, 2.0, 3.0]), []
+    for seen in path:
+        position, rotation = pose(seen)
+        arm = position - middle
+        assert np.hypot(arm[0], arm[2]) == pytest.approx(2.0, abs=0.02)
+        assert arm[1] == pytest.approx(-1.0, abs=0.02)
+        assert rotation[2] @ -arm / np.linalg.norm(arm) == pytest.approx(1.0, abs=1e-3)
+        assert rotation[0, 1] == pytest.approx(0.0, abs=1e-2)  # level: the picture's right is not up or down
+        assert rotation[1, 1] > 0.8  # and upright: its down is the world's
+        angles.append(math.atan2(arm[0], -arm[2]))
+    turned = np.ptp(np.unwrap(angles))
+    assert turned == pytest.approx(2 * math.pi * 47 / 48 if most > 6 else most, abs=0.02)
+    if most < 6:
+        assert min(angles) == pytest.approx(0.3, abs=0.02)
+
+
+def test_cameras_that_look_one_way_have_an_orbit() -> None:
+    path = orbit([camera([x, 0, 0]) for x in (-1.0, 0.0, 1.0)], 8)
+    assert all(torch.isfinite(seen.viewmat).all() for seen in path)
+    assert all(pose(seen)[1][2][2] > 0 for seen in path)
+
+
+def test_a_frame_of_another_shape_shows_all_of_the_photo() -> None:
+    given = around([0.4])[0]
+    for width, height in ((160, 120), (300, 60), (30, 200)):
+        made = reframed(given, width, height)
+        assert (made.width, made.height) == (width, height)
+        fx, fy, cx, cy = made.intrinsics
+        gx, gy, dx, dy = given.intrinsics
+        factor = min(width / 80, height / 60)
+        assert (fx, fy) == pytest.approx((factor * gx, factor * gy))
+        left, right = (0 - dx) / gx * fx + cx, (80 - dx) / gx * fx + cx
+        top, bottom = (0 - dy) / gy * fy + cy, (60 - dy) / gy * fy + cy
+        assert -1e-4 <= left < right <= width + 1e-4
+        assert -1e-4 <= top < bottom <= height + 1e-4
+        assert (left + right) / 2 == pytest.approx(width / 2, abs=1e-3)
+
+
+def _written(path: Path, entries: list[dict[str, Any]], key: str = "camera_path", **more: Any) -> Path:
+    head = {"camera_type": "perspective", "render_width": 80, "render_height": 60}
+    path.write_text(json.dumps({**head, key: entries, **more}))
+    return path
+
+
+def _opengl(seen: Camera) -> np.ndarray[Any, Any]:
+    """Camera to world with y up, looking along -z."""
+    position, rotation = pose(seen)
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation.T * [1, -1, -1]
+    matrix[:3, 3] = position
+    return matrix
+
+
+@pytest.mark.parametrize("form", ["rows", "columns", "text of columns"])
+def test_nerfstudio_paths_are_read(tmp_path: Path, form: str) -> None:
+    given = around([0.0, 0.7])
+    field = math.degrees(2 * math.atan(30 / 100))
+    entries: list[dict[str, Any]] = []
+    for seen in given:
+        matrix = _opengl(seen)
+        numbers = (matrix if form == "rows" else matrix.T).ravel().tolist()
+        stored = json.dumps(numbers) if form.startswith("text") else numbers
+        entries.append({"camera_to_world" if form == "rows" else "matrix": stored, "fov": field, "aspect": 4 / 3})
+    path = _written(tmp_path / "a.json", entries, "camera_path" if form == "rows" else "keyframes", fps=30)
+    cameras, fps = read_camera_path(path)
+    assert fps == 30
+    for found, seen in zip(cameras, given, strict=True):
+        assert found.viewmat.numpy() == pytest.approx(seen.viewmat.numpy(), abs=1e-5)
+        assert found.intrinsics == pytest.approx((100, 100, 40, 30), abs=1e-3)
+        assert (found.width, found.height) == (80, 60)
+    assert read_camera_path(path, 160, 120)[0][0].intrinsics == pytest.approx((200, 200, 80, 60), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("nothing", "Expecting value"),
+        ("[1]", "no attribute 'get'"),
+        ('{"camera_path": []}', "lacks 'keyframes'"),
+        ('{"keyframes": [], "render_width": 4, "render_height": 3}', "it has no cameras"),
+        ('{"keyframes": [{}], "render_width": 4, "render_height": 3}', "lacks 'matrix'"),
+        ('{"keyframes": [{}]}', "lacks 'render_width'"),
+        ('{"keyframes": [{"matrix": [1], "fov": 50}], "render_width": 4, "render_height": 3}', "reshape"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(ValueError, match=f"a.json is not a camera path .*{words}"):
+        read_camera_path(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"scale": 2.0}, "not a rotation and a position"),
+        ({"fov": 180.0}, "field of view is 180"),
+        ({"last": 2.0}, "rigid"),
+    ],
+)
+def test_poses_that_cannot_be_are_refused(tmp_path: Path, change: dict[str, float], words: str) -> None:
+    matrix = _opengl(around([0.0])[0])
+    matrix[:3, :3] *= change.get("scale", 1.0)
+    matrix[3, 3] = change.get("last", 1.0)
+    entry = {"camera_to_world": matrix.ravel().tolist(), "fov": change.get("fov", 50.0)}
+    with pytest.raises(ValueError, match=words):
+        read_camera_path(_written(tmp_path / "a.json", [entry]))

@@ -1,0 +1,78 @@
+"""The trainer chooses devices that have kernels, and a strategy that keeps replicas equal."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning.pytorch import Trainer
+from lightning.pytorch.accelerators import CUDAAccelerator, MPSAccelerator
+from lightning.pytorch.trainer.connectors import accelerator_connector
+
+from nsvq_lightning.compute import devices
+from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.training.distributed import ViewParallelStrategy, check_strategy
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.trainer import SplatTrainer
+
+
+def test_several_devices_are_view_parallel_unless_told_otherwise(tmp_path: Path) -> None:
+    settings = {"accelerator": "cpu", "logger": False, "enable_checkpointing": False, "default_root_dir": tmp_path}
+    assert type(SplatTrainer(devices=2, **settings).strategy).__name__ == "ViewParallelStrategy"
+    assert type(SplatTrainer(devices=2, strategy="ddp", **settings).strategy).__name__ == "DDPStrategy"
+    assert type(SplatTrainer(devices=1, **settings).strategy).__name__ == "SingleDeviceStrategy"
+
+
+def test_a_notebook_gets_processes_that_it_can_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
+    monkeypatch.setattr(accelerator_connector, "_IS_INTERACTIVE", True)  # read when it was imported
+    settings = {"accelerator": "cpu", "devices": 2, "enable_checkpointing": False, "default_root_dir": tmp_path}
+    for asked in ("auto", "view_parallel", "view_parallel_notebook"):
+        strategy = SplatTrainer(strategy=asked, **settings).strategy
+        assert isinstance(strategy, ViewParallelStrategy)
+        assert strategy.launcher is not None
+        assert strategy.launcher.is_interactive_compatible
+    # A trainer of Lightning's own is told a name that it takes, too.
+    with pytest.raises(ValueError, match="view_parallel_notebook") as refusal:
+        check_strategy(Trainer(strategy="ddp_notebook", **settings).strategy)
+    assert "nsvq_lightning.SplatTrainer" in str(refusal.value)
+
+
+@pytest.mark.parametrize("accelerator", [MPSAccelerator, CUDAAccelerator])
+def test_a_gpu_without_kernels_is_left_alone(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, demo_scene: Path, accelerator: type[Any]
+) -> None:
+    name = accelerator.name()
+    monkeypatch.setattr(accelerator, "is_available", staticmethod(lambda: True))
+    monkeypatch.setattr(accelerator, "parse_devices", staticmethod(lambda _: [0]))
+    monkeypatch.setattr(accelerator, "setup_device", lambda *_: None)
+    monkeypatch.setattr(devices, "_has_triton", lambda: False)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: accelerator is CUDAAccelerator)
+    monkeypatch.setattr(accelerator_connector, "_select_auto_accelerator", lambda: name)
+    settings: dict[str, Any] = {"max_steps": 2, "enable_checkpointing": False, "default_root_dir": tmp_path}
+    assert SplatTrainer(**settings).strategy.root_device.type == "cpu"
+    plain = Trainer(logger=False, accelerator="auto", **settings)
+    assert plain.strategy.root_device.type == name
+    with pytest.raises(ValueError, match=f"no kernels for {name} here"):
+        plain.fit(SplatModule(), ColmapDataModule(str(demo_scene)))
+
+
+def in_a_notebook(*arguments: object) -> subprocess.CompletedProcess[str]:
+    script = Path(__file__).parents[1] / "support" / "notebook_fit.py"
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(script.parents[2])}
+    command = [sys.executable, str(script), *map(str, arguments)]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+@pytest.mark.slow
+def test_two_processes_of_a_notebook_hand_back_what_they_trained(demo_scene: Path, tmp_path: Path) -> None:
+    ended = in_a_notebook(demo_scene, tmp_path)
+    assert "trained 1500 splats" in ended.stdout, ended.stderr
+    refused = in_a_notebook(demo_scene, tmp_path, "render")
+    assert "restart it and fit before anything is rendered" in refused.stderr
