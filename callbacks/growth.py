@@ -12,7 +12,9 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nsvq_lightning.compression.importance import most_contributing
-from nsvq_lightning.data.scene import View, detailed_pixels, edge_strength
+from nsvq_lightning.data.edges import edges_of
+from nsvq_lightning.data.images import ImageStore
+from nsvq_lightning.data.scene import View, detailed_pixels
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.random import draw_rows, generator
 from nsvq_lightning.rendering.rasterize import Render
@@ -208,6 +210,7 @@ class BudgetedGrowth(Densification):
     state = ("idle",)
     idle: int = field(default=0, init=False)
     """How many times in a row hardly a splat had to be split."""
+    _photos: ImageStore | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -215,6 +218,11 @@ class BudgetedGrowth(Densification):
             raise ValueError(f"growth must be full after its start={self.start}, got full={self.full}")
         if self.budget is not None and self.budget < self.min_splats:
             raise ValueError(f"budget must be at least min_splats={self.min_splats}, got {self.budget}")
+
+    def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
+        """Find the photos of the scene, which know their edges."""
+        scene = scene_module.scene_of(trainer)
+        self._photos = None if scene is None else scene.images
 
     def limit(self, module: SplatModule) -> int:
         """How many splats growth may reach.
@@ -233,7 +241,11 @@ class BudgetedGrowth(Densification):
     def ask(self, module: SplatModule, iteration: int, batch: View) -> bool:
         """Ask for absolute gradients and edge weights during warm-up."""
         growing = module.schedule.phase_at(iteration) is Phase.WARMUP
-        module.pixel_weights = edge_strength(batch.image, batch.mask) if growing else None
+        module.pixel_weights = None
+        if growing:
+            known = self._photos
+            edges = edges_of(batch.image, batch.mask) if known is None else known.edges(batch.index)
+            module.pixel_weights = edges.strength(batch.image.device)
         return growing
 
     def gradients(self, render: Render) -> Tensor | None:

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.compute.memory import trim
+from nsvq_lightning.data.edges import edges_of
 from nsvq_lightning.data.images import resized_mask
-from nsvq_lightning.data.scene import Scene, edge_strength
+from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.random import draw_rows, generator
 
 Floats = NDArray[np.float64]
@@ -128,11 +129,11 @@ def _photo(scene: Scene, index: int, known: Floats) -> _Photo:
     size = np.array([width / camera.width, height / camera.height])
     fx, fy, cx, cy = camera.intrinsics
     depths = known @ rotation[2] + translation[2]
-    strength = edge_strength(torch.from_numpy(pixels), None if counts is None else torch.from_numpy(counts))
+    edges = edges_of(torch.from_numpy(pixels), None if counts is None else torch.from_numpy(counts))
     return _Photo(
         image=pixels,
         grey=np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8),
-        detail=np.asarray(cv2.GaussianBlur((strength * 255).byte().numpy(), (0, 0), 1.5), np.uint8),
+        detail=np.asarray(cv2.GaussianBlur((edges.strength() * 255).byte().numpy(), (0, 0), 1.5), np.uint8),
         counts=counts,
         focal=size * (fx, fy),
         centre=size * (cx, cy),

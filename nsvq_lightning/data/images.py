@@ -18,6 +18,7 @@ from PIL.PngImagePlugin import PngImageFile
 from torch import Tensor
 
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap
+from nsvq_lightning.data.edges import Edges, edges_of
 
 
 def _undecodable(path: Path, reason: str) -> SceneError:
@@ -279,7 +280,9 @@ class ImageStore:
         self.nbytes = sum(source.nbytes for source in self.sources)
         """Bytes of all pictures, decoded."""
         self._free = cache_bytes
+        self._free_for_edges = cache_bytes - self.nbytes  # a picture takes longer to decode again
         self._kept: dict[int, Picture] = {}
+        self._edges: dict[int, Edges] = {}
         self._coming: dict[int, Future[Picture]] = {}
 
     def __getitem__(self, index: int) -> Picture:
@@ -296,6 +299,20 @@ class ImageStore:
             self._kept[index] = picture
             self._free -= picture.nbytes
         return picture
+
+    def edges(self, index: int) -> Edges:
+        """Edges of picture ``index``, kept while the budget has room beside all pictures.
+
+        Raises:
+            SceneError: The file cannot be decoded.
+        """
+        if (kept := self._edges.get(index)) is not None:
+            return kept
+        found = edges_of(*self[index])
+        if found.values.nbytes <= self._free_for_edges:
+            self._edges[index] = found
+            self._free_for_edges -= found.values.nbytes
+        return found
 
     def prefetch(self, index: int) -> None:
         """Start decoding picture ``index`` in the background; errors are raised when it is requested."""

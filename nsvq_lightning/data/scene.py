@@ -15,6 +15,7 @@ from torch import Tensor
 
 from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, larger_models
+from nsvq_lightning.data.edges import high_pass
 from nsvq_lightning.data.images import ON_ITS_SIDE, ROUNDED, ImageSource, ImageStore, image_head, rectify
 from nsvq_lightning.data.reconstruct import PHOTOS
 from nsvq_lightning.data.transforms import random_points, read_poses
@@ -335,20 +336,6 @@ def _away_from(centres: NDArray[np.float64], points: NDArray[np.float64], radius
     return away
 
 
-def edge_strength(image: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Edge strength ``[H, W]`` of a photo, in [0, 1]: the positive part of a high-pass filter of its grey values.
-
-    The strongest edge has strength 1; a photo without any edge is 0 everywhere.
-
-    Args:
-        image: ``[H, W, 3]`` uint8 RGB.
-        mask: Which pixels count ``[H, W]`` bool; those beside one that does not have strength 0. None if all count.
-    """
-    edges = torch.from_numpy(_high_pass(image, cv2.CV_8U, mask))  # which also clips to 0..255
-    low, high = int(edges.min()), int(edges.max())
-    return ((edges.float() - low) / max(high - low, 1)).to(image.device)
-
-
 # High-pass value, of grey values up to 255, from which a pixel counts as detailed: well above the noise of a photo.
 _DETAIL = 20
 # Photos that are looked at for the detail of a scene.
@@ -365,15 +352,5 @@ def detailed_pixels(scene: Scene) -> float:
         SceneError: An image cannot be decoded.
     """
     pictures = (scene.images[index] for index in scene.some_train(_SAMPLE))
-    counts = [int((np.abs(_high_pass(image, cv2.CV_16S, mask)) > _DETAIL).sum()) for image, mask in pictures]
+    counts = [int((np.abs(high_pass(image, cv2.CV_16S, mask)) > _DETAIL).sum()) for image, mask in pictures]
     return sum(counts) / len(counts)
-
-
-def _high_pass(image: Tensor, depth: int, mask: Tensor | None) -> NDArray[Any]:
-    """Eight times the grey value of each pixel less those of its neighbours, 0 beside pixels that do not count."""
-    grey = cv2.cvtColor(image.cpu().numpy(), cv2.COLOR_RGB2GRAY)
-    kernel = np.array([[-1, -1, -1], [-1, 8, -1], [-1, -1, -1]], np.float32)
-    passed = np.asarray(cv2.filter2D(grey, depth, kernel))
-    if mask is not None:
-        passed *= cv2.erode(mask.cpu().numpy().view(np.uint8), np.ones((3, 3), np.uint8))
-    return passed

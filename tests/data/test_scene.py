@@ -21,7 +21,7 @@ from transforms_scenes import write_blender, write_nerfstudio
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap, larger_models
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.reconstruct import reconstruct
-from nsvq_lightning.data.scene import edge_strength, load_scene
+from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.training.module import SplatModule
 
 SceneFactory = Callable[..., Path]
@@ -429,13 +429,6 @@ def test_excluded_pixels_carry_no_loss_and_no_metric(demo_scene: Path, tmp_path:
     assert scores == others
     assert all(torch.equal(a, b) for a, b in zip(splats, others_splats, strict=True))
     assert 5 < scores["test/psnr"] < 40
-
-
-def test_growth_ignores_the_edges_of_masks() -> None:
-    image = torch.full((32, 40, 3), 90, dtype=torch.uint8)
-    image[~KEPT] = 0
-    assert edge_strength(image).max() == 1
-    assert edge_strength(image, KEPT).max() == 0
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
