@@ -11,6 +11,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import BasePredictionWriter
 
 from nsvq_lightning.data.scene import View
+from nsvq_lightning.io.atomic import optional
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import FORMATS, save
 from nsvq_lightning.io.nsvq.file import as_stored
@@ -65,15 +66,17 @@ class ExportScene(WritingCallback):
         decoded = as_stored(scene, module.storage) if set(self.formats) - {"nsvq"} else scene
         for suffix in self.formats:
             path = folder / f"scene.{suffix}"
-            size = save(scene, path, module.storage) if suffix == "nsvq" else save(decoded, path)
-            log.info("wrote %s (%d bytes)", path, size)
+            with optional(path):
+                size = save(scene, path, module.storage) if suffix == "nsvq" else save(decoded, path)
+                log.info("wrote %s (%d bytes)", path, size)
         photos = scene_of(trainer)
         if "nsvq" in self.formats and photos is not None:
             page = folder / "viewer.html"
             title = page.resolve().parent.parent.name
             background = viewer.BACKGROUNDS.get(module.background, viewer.BACKGROUNDS["black"])
-            size = viewer.write_viewer(page, folder / "scene.nsvq", viewer.some_cameras(photos), title, background)
-            log.info("wrote %s (%d bytes)", page, size)
+            with optional(page):
+                size = viewer.write_viewer(page, folder / "scene.nsvq", viewer.some_cameras(photos), title, background)
+                log.info("wrote %s (%d bytes)", page, size)
 
 
 class RenderWriter(BasePredictionWriter):
@@ -160,7 +163,8 @@ class LiveScene(WritingCallback):
             if module.history:
                 state["psnr"] = f"{module.history[-1]['psnr']:.2f}"
             scene = CompressedScene.from_splats(splats, config={"antialiased": module.antialiased, "live": state})
-            save(scene, folder / viewer.LIVE_SCENE, Storage("paper"))
+            with optional(folder / viewer.LIVE_SCENE):
+                save(scene, folder / viewer.LIVE_SCENE, Storage("paper"))
         self._answered, ended = asked, time.monotonic()
         self._next = ended + (ended - began) / SHARE
 

@@ -16,6 +16,7 @@ from torchmetrics import Metric
 
 from nsvq_lightning.compute.jit import compile_seconds
 from nsvq_lightning.data.scene import View
+from nsvq_lightning.io.atomic import optional
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.file import read_nsvq
@@ -121,8 +122,10 @@ class MetricReport(WritingCallback):
         folder = run_folder(trainer)
         if trainer.is_global_zero and module.history and not is_fast_dev_run(trainer):
             with module.stopwatch.paused(module.device):
-                files.write_csv(folder / "curve.csv", module.history)
-                files.write_figure(folder / "curve.png", files.curve_figure(module.history, module.schedule))
+                with optional(folder / "curve.csv"):
+                    files.write_csv(folder / "curve.csv", module.history)
+                with optional(folder / "curve.png"):
+                    files.write_figure(folder / "curve.png", files.curve_figure(module.history, module.schedule))
 
     def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Catch up for a run that was stopped after its last iteration: when continued, it trains no further."""
@@ -148,7 +151,8 @@ class MetricReport(WritingCallback):
 
         def show(image: Tensor, photo: Tensor) -> None:
             if self.pictures and trainer.is_global_zero:
-                files.write_png(folder / "preview.png", torch.cat([eight_bit(photo), image], dim=1))
+                with optional(folder / "preview.png"):
+                    files.write_png(folder / "preview.png", torch.cat([eight_bit(photo), image], dim=1))
 
         mean_psnr, mean_ssim = files.evaluate(
             lambda camera: module.render_splats(splats, camera).image, views, module.device, show
@@ -163,8 +167,10 @@ class MetricReport(WritingCallback):
         }
         module.history.append(entry)
         if trainer.is_global_zero:
-            files.write_csv(folder / "curve.csv", module.history)
-            page.write_page(folder, module.history, module.schedule, self._other_seconds())
+            with optional(folder / "curve.csv"):
+                files.write_csv(folder / "curve.csv", module.history)
+            with optional(folder / page.NAME):
+                page.write_page(folder, module.history, module.schedule, self._other_seconds())
         values = {f"report/{name}": float(entry[name]) for name in ("psnr", "ssim", "splats")}
         trainer.callback_metrics.update({name: torch.tensor(value) for name, value in values.items()})
         for logger in trainer.loggers:
@@ -219,8 +225,9 @@ class MetricReport(WritingCallback):
         self._scores.append(score)
         if self.pictures:
             path = picture_file(trainer, run_folder(trainer) / "renders", batch.name)
-            path.parent.mkdir(exist_ok=True)
-            files.write_png(path, files.comparison(image, photo))
+            with optional(path):
+                path.parent.mkdir(exist_ok=True)
+                files.write_png(path, files.comparison(image, photo))
 
     def on_test_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Write the figures."""
@@ -236,12 +243,17 @@ class MetricReport(WritingCallback):
             folder = run_folder(trainer)
             lpips = None if self._lpips is None else fmean(score["lpips"] for score in scores), self._lpips_reason
             metrics = files.summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper_level)
-            files.write_metrics(folder / "metrics.json", metrics)
-            files.write_csv(folder / "views.csv", scores)
+            with optional(folder / "metrics.json"):
+                files.write_metrics(folder / "metrics.json", metrics)
+            with optional(folder / "views.csv"):
+                files.write_csv(folder / "views.csv", scores)
             paths = [picture_file(trainer, folder / "renders", score["name"]) for score in scores]
             views = [score | {"picture": path.name} for score, path in zip(scores, paths, strict=True)]
-            written = page.write_page(folder, module.history, module.schedule, self._other_seconds(), metrics, views)
-            log.info(f"report: {written}")
+            seconds = self._other_seconds()
+            with optional(folder / page.NAME):
+                log.info(
+                    "report: %s", page.write_page(folder, module.history, module.schedule, seconds, metrics, views)
+                )
             if self.pictures:
-                files.log_pictures(trainer.loggers, paths, trainer.global_step)
+                files.log_pictures(trainer.loggers, [path for path in paths if path.exists()], trainer.global_step)
         self._scene, self._lpips = None, None

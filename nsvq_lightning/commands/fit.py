@@ -28,7 +28,7 @@ from nsvq_lightning.commands import arguments as given
 from nsvq_lightning.commands.registry import COMMANDS
 from nsvq_lightning.data.colmap import check_name
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
-from nsvq_lightning.io.atomic import write_text
+from nsvq_lightning.io.atomic import optional, write_text
 from nsvq_lightning.skips import SKIPS, switch, switched
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.resume import check_settings, read_checkpoint
@@ -295,10 +295,19 @@ def summary(folder: Path, metrics: dict[str, Any]) -> str:
     )
 
 
+class RunLogger(loggers.CSVLogger):
+    """Lightning's, which a file that another program holds does not end the run."""
+
+    def save(self) -> None:
+        """Write what has been logged; what cannot be written now is written later."""
+        with optional(self.log_dir):
+            super().save()
+
+
 def default_loggers(folder: Path) -> list[loggers.Logger]:
     """A CSV logger that writes into ``folder``, and a TensorBoard logger if that is installed."""
     place: dict[str, Any] = {"save_dir": folder.parent, "name": "", "version": folder.name}
-    found: list[loggers.Logger] = [loggers.CSVLogger(**place)]
+    found: list[loggers.Logger] = [RunLogger(**place)]
     if find_spec("tensorboard") is not None:
         found.append(loggers.TensorBoardLogger(**place, default_hp_metric=False))
     return found

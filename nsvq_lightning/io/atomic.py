@@ -1,11 +1,14 @@
 """Files that are either complete or absent."""
 
+import logging
 import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
+
+log = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -70,6 +73,18 @@ def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write a text file as UTF-8 in one step, see :func:`atomic_write`."""
     write_bytes(path, text.encode())
+
+
+@contextmanager
+def optional(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Warn if what the block writes to ``path`` cannot be written, and go on: for what a run can do without.
+
+    A program may hold the file open, as Windows lets it, or the disk be full.
+    """
+    try:
+        yield
+    except OSError as error:
+        log.warning("%s cannot be written (%s); the run goes on without it", path, error.strerror or error)
 
 
 def remove_temporaries(folder: Path, process: str) -> None:

@@ -21,6 +21,10 @@ from nsvq_lightning.version import __version__
 Values = Mapping[str, Any]
 
 
+# The file of the page.
+NAME = "report.html"
+
+
 def write_page(
     folder: Path,
     history: Sequence[Mapping[str, Any]],
@@ -67,8 +71,8 @@ def write_page(
         "viewer": '<a class="button" href="viewer.html">Open viewer.html</a>' if viewer.exists() else "",
     }
     text = fill("report", title=title, sections="\n".join(shown), versions=escape(versions), **parts)
-    write_text(folder / "report.html", text)
-    return folder / "report.html"
+    write_text(folder / NAME, text)
+    return folder / NAME
 
 
 def _facts(history: Sequence[Values], schedule: Schedule, metrics: Values | None) -> dict[str, str]:

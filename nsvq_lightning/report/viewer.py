@@ -5,6 +5,7 @@ import json
 import os
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -201,4 +202,5 @@ def live_asked(folder: Path) -> int:
 def end_live(folder: Path) -> None:
     """Remove both files: the run has ended."""
     for name in (REQUEST, LIVE_SCENE):
-        (folder / name).unlink(missing_ok=True)
+        with suppress(OSError):  # Windows removes no file that somebody reads
+            (folder / name).unlink(missing_ok=True)
