@@ -249,11 +249,9 @@ class MetricReport(WritingCallback):
                 files.write_csv(folder / "views.csv", scores)
             paths = [picture_file(trainer, folder / "renders", score["name"]) for score in scores]
             views = [score | {"picture": path.name} for score, path in zip(scores, paths, strict=True)]
-            seconds = self._other_seconds()
             with optional(folder / page.NAME):
-                log.info(
-                    "report: %s", page.write_page(folder, module.history, module.schedule, seconds, metrics, views)
-                )
+                told = module.history, module.schedule, self._other_seconds(), metrics, views
+                log.info("report: %s", page.write_page(folder, *told))
             if self.pictures:
                 files.log_pictures(trainer.loggers, [path for path in paths if path.exists()], trainer.global_step)
         self._scene, self._lpips = None, None

@@ -1,11 +1,11 @@
-"""Cut a scene folder into parts that are trained one by one, on as many machines as there are, and then merged.
+r"""Cut a scene folder into parts that are trained one by one, on as many machines as there are, and then merged.
 
 Each part is a scene folder of its own, with the photos and points that show it. The commands that train the parts go to
 standard output, a line each; options of 'nsvq fit' may follow and are in them.
 
 Examples:
   nsvq split photos parts --blocks 4
-  nsvq split photos parts --blocks 4 --config best | xargs -P 2 -I{} sh -c {}
+  nsvq split photos parts --blocks 4 --config best | tr '\n' '\0' | xargs -0 -n 1 -P 2 sh -c
   nsvq merge parts -o scene.nsvq
 """
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
+import os
 import re
 import shlex
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from nsvq_lightning.commands import split
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import read_scene, save
@@ -50,6 +55,24 @@ def test_the_whole_is_what_lies_in_the_cores(demo_scene: Path, tmp_path: Path) -
     means = read_scene(tmp_path / "parts" / "1" / "run" / "scene.nsvq").means
     merged = read_scene(tmp_path / "x.ply").means
     assert sorted(map(tuple, merged.tolist())) == sorted(map(tuple, np.asarray(means).tolist()))
+
+
+@pytest.mark.skipif(shutil.which("xargs") is None, reason="this system has no xargs")
+@pytest.mark.parametrize("page", ["commands/split.py", "large_scenes.md", "sweep.md"])
+def test_documented_lines_keep_paths_with_spaces_and_quotes(tmp_path: Path, page: str) -> None:
+    docs = Path(__file__).parents[2] / "docs" / page
+    text = inspect.getdoc(split) if page.endswith(".py") else docs.read_text(encoding="utf-8")
+    (line,) = re.findall(r"(tr .*xargs .* sh -c)", str(text))
+    said = tmp_path / "said"
+    (tmp_path / "nsvq").write_text(f'#!/bin/sh\nfor each in "$@"; do echo "$each" >> {said}; done\n')
+    (tmp_path / "nsvq").chmod(0o755)
+    words = ["fit", "--data.root=/my scenes/it's a room/1", '--splats="9"']
+    commands = tmp_path / "commands.txt"
+    commands.write_text(f"{shlex.join(['nsvq', *words])}\n")
+    shell = line.replace("commands.txt", str(commands)) if "<" in line else f"cat {commands} | {line}"
+    environment = os.environ | {"PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}"}
+    subprocess.run(["sh", "-c", shell], env=environment, check=True, timeout=60)
+    assert said.read_text().splitlines() == words
 
 
 def test_a_folder_without_parts_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
