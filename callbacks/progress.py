@@ -39,6 +39,7 @@ class SplatProgressBar(TQDMProgressBar):
 
     def __init__(self, refresh_rate: int = 25) -> None:
         super().__init__(refresh_rate=refresh_rate)
+        self._asked_rate = refresh_rate
         self._psnr: float | None = None
         self._is_plain = False
         self._start = 0.0  # of the clock that stops while kernels are compiled
@@ -59,6 +60,7 @@ class SplatProgressBar(TQDMProgressBar):
         self._psnr = None
         # A terminal or a notebook can draw a line again.
         self._is_plain = not (sys.stdout.isatty() or "ipykernel" in sys.modules)
+        self._refresh_rate = self._asked_rate
         if stage == "fit" and self._is_plain and self._refresh_rate > 0:
             self._refresh_rate = max(self._refresh_rate, trainer.max_steps // LINES)
 

@@ -96,6 +96,11 @@ class MetricReport(WritingCallback):
         self._lpips: Metric | None = None
         self._lpips_reason: str | None = None
         self._seconds: dict[str, float] = {}
+        self._compiled_before = 0.0
+
+    def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
+        """Forget the times of an earlier fit of this process."""
+        self._seconds, self._compiled_before = {}, compile_seconds()
 
     # During training
 
@@ -178,7 +183,7 @@ class MetricReport(WritingCallback):
 
     def _other_seconds(self) -> dict[str, float]:
         """Seconds that went into anything but training steps, by what it was."""
-        return {"kernels compiled": compile_seconds(), **self._seconds}
+        return {"kernels compiled": compile_seconds() - self._compiled_before, **self._seconds}
 
     @contextmanager
     def _timed(self, part: str) -> Iterator[None]:

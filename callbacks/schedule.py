@@ -71,6 +71,9 @@ class PhaseSchedule(SplatCallback):
     least_iterations: int = 1
     minutes: float | None = None
     _steps: int = field(default=-1, init=False)
+    _asked: int = field(default=-1, init=False)
+    _max_steps: int | None = field(default=None, init=False)
+    """What this callback has set in the trainer, which a next fit does not take for what was asked."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -90,6 +93,11 @@ class PhaseSchedule(SplatCallback):
         limit = max(self.iterations_per_photo * photos, self.least_iterations)
         return max_steps if 0 <= max_steps <= limit else limit
 
+    def _set_max_steps(self, trainer: Trainer, steps: int) -> None:
+        trainer.fit_loop.epoch_loop.max_steps = self._max_steps = steps
+        if trainer.max_steps != steps:
+            raise RuntimeError(f"this version of Lightning keeps max_steps={trainer.max_steps}: set it to {steps}")
+
     def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
         """Set the module's schedule.
 
@@ -99,16 +107,17 @@ class PhaseSchedule(SplatCallback):
         """
         if self.minutes is not None:
             steps = iterations_within(self.minutes, trainer, module, self.schedule(self.reference_total or 1))
-            trainer.fit_loop.epoch_loop.max_steps = steps
+            self._set_max_steps(trainer, steps)
             log.info("iterations: %d, about %g min of training; evaluations and test come on top", steps, self.minutes)
             if steps < FEW_ITERATIONS:
                 log.warning("that is few: smaller photos (--data.factor=2) or fewer splats (--quality=0.5) give more")
         elif self.iterations_per_photo is not None and self.total is None:
             need = "a number of iterations for each photo needs the photos"
             photos = len(scene_module.needed_scene(trainer, need, "leave iterations_per_photo unset").train)
-            steps = self.limited(trainer.max_steps, photos)
+            asked = self._asked if trainer.max_steps == self._max_steps else trainer.max_steps
+            self._asked, steps = asked, self.limited(asked, photos)
             if steps != trainer.max_steps:
-                trainer.fit_loop.epoch_loop.max_steps = steps
+                self._set_max_steps(trainer, steps)
                 log.info(f"iterations: {steps} for {photos} photos; --callbacks.phases.iterations_per_photo changes it")
         self._steps = trainer.max_steps
         total = self.total if self.total is not None else trainer.max_steps
@@ -151,7 +160,7 @@ class PhaseSchedule(SplatCallback):
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Write the phase of the iteration that starts; end the run earlier by what its warm-up has saved."""
         if self._steps > 0:
-            trainer.fit_loop.epoch_loop.max_steps = self._steps - module.schedule.saved
+            self._set_max_steps(trainer, self._steps - module.schedule.saved)
         module.phase = module.schedule.phase_at(trainer.global_step + 1)
 
 

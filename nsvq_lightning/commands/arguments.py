@@ -3,9 +3,10 @@
 import argparse
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cache
+from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -99,7 +100,7 @@ def joined(arguments: Sequence[str]) -> list[str]:
 def expand(arguments: Sequence[str]) -> list[str]:
     """The joined arguments, configs that are no files as paths of shipped ones, shorthands as what they stand for.
 
-    That is their own number, and none of the others.
+    That is their own number, and none of the others. Configs come before options, which hold whatever they say.
 
     Raises:
         ValueError: Two shorthands are given, of which only one can hold, or one without its number.
@@ -123,7 +124,11 @@ def expand(arguments: Sequence[str]) -> list[str]:
             given = name
             expanded.append(f"{BUDGET}.{name}={value}")
             expanded += [f"{BUDGET}.{other}=null" for other in ("splats", "bytes") if other != name]
-    return expanded
+    # An option holds whatever a config says, also one that stands after it.
+    words = [each for each in expanded if not each.startswith("--")]
+    configs = [each for each in expanded if each.startswith(CONFIG)]
+    options = [each for each in expanded if each.startswith("--") and each not in configs]
+    return [*words, *configs, *options]
 
 
 # Types as users call them; others by their name.
@@ -147,6 +152,8 @@ def unknown_option(message: str, options: Iterable[str]) -> str:
 
 # What ``nsvq fit --help`` prints without Lightning, whose import takes seconds; a test compares it with its parser.
 FIT_HELP = Path(__file__).with_name("fit_help.txt")
+# Whose options are in it; another version may have others, which its parser knows.
+FIT_HELP_OF = {"lightning": "2.6.6", "jsonargparse": "4.53.0"}
 
 
 def check_early(arguments: Sequence[str]) -> None:
@@ -174,15 +181,8 @@ def check_early(arguments: Sequence[str]) -> None:
         raise FileNotFoundError(NO_FOLDER.format(root))
     if arguments[0] != "fit":
         return
-    known = {name for name in re.findall(r"--([\w.]+)", FIT_HELP.read_text(encoding="utf-8")) if name[-5:] != ".help"}
-    parents = {name.rpartition(".")[0] for name in known}
     other_data = not {"data", "data.class_path"}.isdisjoint(given)
-    for name in own:
-        # Options of a class that an option names are known to Lightning's parser only.
-        nested = any(name.startswith(f"{leaf}.") for leaf in (*(known - parents), *["data"] * other_data))
-        if not (nested or name.endswith((".help", ".class_path")) or any(each.startswith(name) for each in known)):
-            meant = nearest(f"--{name}", (f"--{each}" for each in known))
-            raise argparse.ArgumentError(None, f"there is no option --{name}{meant}")
+    _check_options(arguments[1:], own, other_data)
     if asks or other_data:
         return
     if root is None:
@@ -192,6 +192,25 @@ def check_early(arguments: Sequence[str]) -> None:
     folder, has_transforms = Path(root), any(Path(root).glob("transforms*.json"))
     if "data.model" not in given and not has_transforms and colmap.find_model(folder) is None:
         raise colmap.no_model(folder, colmap.FOLDERS, None)
+
+
+def _check_options(arguments: Sequence[str], own: Mapping[str, str], other_data: bool) -> None:
+    """Refuse options that ``fit`` does not have."""
+    if stray := [argument for argument in arguments if not argument.startswith("--")]:
+        place = next((argument for argument in stray if Path(argument).exists()), "path/to/scene")
+        raise argparse.ArgumentError(None, f"{stray[0]} is no option; the scene folder is --data.root={place}")
+    if any(version(name) != known for name, known in FIT_HELP_OF.items()):
+        return  # options of another version are known to its parser only
+    known = {name for name in re.findall(r"--([\w.]+)", FIT_HELP.read_text(encoding="utf-8")) if name[-5:] != ".help"}
+    parents = {name.rpartition(".")[0] for name in known}
+    for name, value in own.items():
+        # So are those of a class that an option names.
+        nested = any(name.startswith(f"{leaf}.") for leaf in (*(known - parents), *["data"] * other_data))
+        if not (nested or name.endswith((".help", ".class_path")) or any(each.startswith(name) for each in known)):
+            meant = nearest(f"--{name}", (f"--{each}" for each in known))
+            if value and Path(value).is_dir():
+                meant = f"; the scene folder is --data.root={value}"
+            raise argparse.ArgumentError(None, f"there is no option --{name}{meant}")
 
 
 def _values_by_name(options: Iterable[str]) -> dict[str, str]:

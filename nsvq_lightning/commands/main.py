@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             meant = given.nearest(arguments[0], COMMANDS)
             sys.stderr.write(f"error: there is no command {arguments[0]!r}{meant}\nAll commands: nsvq --help\n")
             return 2
-        return _run_lightning(arguments)
+        return _run_lightning(arguments, own_process=argv is None)
     except KeyboardInterrupt:
         sys.stderr.write("\n")  # below the ^C that the terminal shows
         return INTERRUPTED
@@ -144,7 +144,7 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
         return 1
 
 
-def _run_lightning(arguments: list[str]) -> int:
+def _run_lightning(arguments: list[str], own_process: bool) -> int:
     if arguments == ["fit", "--help"]:
         sys.stdout.write(given.FIT_HELP.read_text(encoding="utf-8"))
         return 0
@@ -173,7 +173,7 @@ def _run_lightning(arguments: list[str]) -> int:
         from nsvq_lightning.compute import ahead
 
         ahead.start()
-    run_cli = _import_cli()
+    run_cli = _import_cli(own_process)
     from lightning.fabric.utilities.exceptions import MisconfigurationException
     from lightning.pytorch.utilities.exceptions import SIGTERMException
 
@@ -203,13 +203,19 @@ def _run_lightning(arguments: list[str]) -> int:
 
 
 @functools.cache
-def _import_cli() -> Any:
-    """Our :class:`LightningCLI`; to look for garbage among what it imports would take a second here, two at the end."""
-    gc.disable()
-    from nsvq_lightning.commands.fit import SplatCLI
+def _import_cli(own_process: bool) -> Any:
+    """Our :class:`LightningCLI`; to look for garbage among what it imports would take a second here, two at the end.
 
-    gc.freeze()
-    gc.enable()
+    A process that is not ours alone keeps the collector that it has.
+    """
+    if own_process:
+        gc.disable()
+    try:
+        from nsvq_lightning.commands.fit import SplatCLI
+    finally:
+        if own_process:
+            gc.freeze()
+            gc.enable()
     return SplatCLI
 
 

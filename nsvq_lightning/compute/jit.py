@@ -11,6 +11,7 @@ import os
 import time
 from collections.abc import Callable
 from typing import Any
+from weakref import WeakSet
 
 import numba
 import numpy as np
@@ -39,6 +40,8 @@ class _Compilations(event.Listener):
         self.levels: list[int] = []
 
     def on_start(self, compilation: Any) -> None:
+        if compilation.data["dispatcher"] not in _ours:
+            return
         if not self.levels:
             self.since = time.perf_counter()
             if not self.announced:
@@ -49,12 +52,20 @@ class _Compilations(event.Listener):
         if compilation.data["dispatcher"].targetoptions.get("forceinline"):
             numba.config.OPT = type(level)(min(level, 1))
 
-    def on_end(self, _: Any) -> None:
+    def on_end(self, compilation: Any) -> None:
+        dispatcher = compilation.data["dispatcher"]
+        if dispatcher not in _ours:
+            return
+        failed = compilation.data["args"] not in dispatcher.overloads
+        if failed and isinstance(dispatcher._cache, kernel_cache.KernelCache):
+            dispatcher._cache.let_go()
         numba.config.OPT = self.levels.pop()
         if not self.levels:
             self.seconds += time.perf_counter() - self.since
 
 
+# What this module has made; a user's own functions are none of its business.
+_ours: WeakSet[Any] = WeakSet()
 _compilations = _Compilations()
 event.register("numba:compile", _compilations)
 
@@ -114,7 +125,9 @@ _OPTIONS: dict[str, Any] = {
 
 def inline(function: Callable[..., Any]) -> Any:
     """Compile a helper that only other kernels call."""
-    return numba.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)(function)
+    dispatcher = numba.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)(function)
+    _ours.add(dispatcher)
+    return dispatcher
 
 
 def kernel(function: Callable[..., Any], allocates: bool = True) -> Any:
@@ -127,6 +140,7 @@ def kernel(function: Callable[..., Any], allocates: bool = True) -> Any:
     It is compiled again when its module, or one that this imports, has changed.
     """
     dispatcher = numba.njit(_nrt=allocates, **_OPTIONS)(function)
+    _ours.add(dispatcher)
     with contextlib.suppress(RuntimeError):  # nowhere to keep it
         dispatcher._cache = _Cache(function)
     return dispatcher

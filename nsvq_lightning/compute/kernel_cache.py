@@ -7,6 +7,7 @@ still Numba's own, lie in a folder named after a digest of the sources of a kern
 
 import functools
 import hashlib
+import logging
 import re
 import shutil
 import sys
@@ -20,6 +21,8 @@ import numba
 from filelock import FileLock, Timeout
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.misc.appdirs import AppDirs
+
+log = logging.getLogger(__name__)
 
 
 @functools.cache
@@ -145,6 +148,8 @@ class KernelCache(FunctionCache):
     """
 
     _impl_class = _Layout
+    _lock: FileLock | None = None
+    """Held while this process compiles the kernel."""
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
         return sig, codegen.magic_tuple(), constants(self._py_func)
@@ -154,27 +159,42 @@ class KernelCache(FunctionCache):
         return Path(self._cache_file._index_path).exists()
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
-        if (found := super()._load_overload(sig, target_context)) is not None:
-            return found
+        try:
+            return super()._load_overload(sig, target_context) or self._locked(sig, target_context)
+        except OSError as error:  # a folder that cannot be read, or knows no locks
+            log.debug("%s is not looked for on the disk: %s", self._name, error)
+            return None
+
+    def _locked(self, sig: Any, target_context: Any) -> Any:
+        """The kernel if another process has compiled it by the time that this one may; None holds the lock."""
         global seconds_waited
-        begin, self._lock = time.perf_counter(), FileLock(f"{self._cache_file._index_path}.lock")
+        begin, lock = time.perf_counter(), FileLock(f"{self._cache_file._index_path}.lock")
         try:
             Path(self._cache_path).mkdir(exist_ok=True)
-            self._lock.acquire(timeout=PATIENCE if waits else 0)
+            lock.acquire(timeout=PATIENCE if waits else 0)
+            self._lock = lock
         except Timeout:
             if not waits:
                 raise BusyError from None
-        except OSError:  # a folder that knows no locks
-            return None
         seconds_waited += time.perf_counter() - begin
         found = super()._load_overload(sig, target_context)
         if found is not None:
-            self._lock.release()
+            self.let_go()
         return found
 
     def _save_overload(self, sig: Any, data: Any) -> None:
-        super()._save_overload(sig, data)
-        self._lock.release()
-        folders = (path for path in Path(self._cache_path).parent.iterdir() if path.is_dir())
-        for outdated in sorted(folders, key=lambda path: path.stat().st_mtime)[:-MAX_FOLDERS]:
-            shutil.rmtree(outdated, ignore_errors=True)  # another process may be removing it, too
+        try:
+            super()._save_overload(sig, data)
+            folders = (path for path in Path(self._cache_path).parent.iterdir() if path.is_dir())
+            for outdated in sorted(folders, key=lambda path: path.stat().st_mtime)[:-MAX_FOLDERS]:
+                shutil.rmtree(outdated, ignore_errors=True)
+        except OSError as error:  # a full disk, or another process removes folders, too
+            log.debug("%s is not kept: %s", self._name, error)
+        finally:
+            self.let_go()
+
+    def let_go(self) -> None:
+        """Let other processes compile the kernel; also where this one could not."""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None

@@ -117,9 +117,19 @@ _SLACK = 4
 _PAGE = 1024
 
 
+def _references(index: int) -> int:
+    return sys.getrefcount(_BUFFERS[index])
+
+
+# What is counted where only the list refers to a buffer: one less from Python 3.14 on, which counts no borrowed ones.
+_BUFFERS.append(np.empty(0, np.float32))
+_IDLE_REFERENCES = _references(0)
+_BUFFERS.clear()
+
+
 def _is_idle(index: int) -> bool:
-    """Whether only the list and this check refer to a buffer."""
-    return sys.getrefcount(_BUFFERS[index]) == 2
+    """Whether only the list refers to a buffer."""
+    return _references(index) == _IDLE_REFERENCES
 
 
 def _place(size: float) -> int:

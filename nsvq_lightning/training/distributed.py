@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.distributed import all_reduce
 
 from nsvq_lightning.compute.devices import to_device
+from nsvq_lightning.compute.upstream import check_replaced
 
 T = TypeVar("T")
 
@@ -113,6 +114,10 @@ def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:
 
 
 log = logging.getLogger(__name__)
+
+
+# Without them, replicas would start apart, or gradients never be averaged.
+check_replaced("lightning", DDPStrategy, "block_backward_sync", "configure_ddp", "post_backward")
 
 
 class ViewParallelStrategy(DDPStrategy):

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from nsvq_lightning.callbacks import MetricReport
 from nsvq_lightning.commands.fit import RunLogger
 from nsvq_lightning.commands.main import main
 
@@ -63,3 +64,16 @@ def test_what_a_run_is_for_must_be_written(
     held.append(name)
     assert fit(demo_scene, tmp_path / "run") == 1
     assert name in capsys.readouterr().err
+
+
+def test_the_times_of_a_second_run_are_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    report, seconds = MetricReport(), [40.0]
+    monkeypatch.setattr("nsvq_lightning.callbacks.report.compile_seconds", lambda: seconds[0])
+    nobody: Any = None
+    for compiled in (40.0, 2.0):
+        report.before_fit(nobody, nobody)
+        with report._timed("evaluations"):
+            seconds[0] += compiled
+        told = report._other_seconds()
+        assert told["kernels compiled"] == compiled
+        assert told["evaluations"] < 1

@@ -63,3 +63,29 @@ def test_a_limit_for_each_photo_leaves_shorter_runs_alone() -> None:
     phases = PhaseSchedule(iterations_per_photo=20, least_iterations=2500)
     assert [phases.limited(4500, photos) for photos in (10, 200, 1000)] == [2500, 4000, 4500]
     assert [phases.limited(-1, 10), phases.limited(300, 10), PhaseSchedule().limited(300, 10)] == [2500, 300, 300]
+
+
+def test_a_trainer_that_fits_again_asks_for_what_it_was_given() -> None:
+    phases = PhaseSchedule(iterations_per_photo=10)
+    loop = SimpleNamespace(max_steps=1000)
+    trainer = Several(loop)
+    module: Any = SimpleNamespace()
+    for photos, steps in ((20, 200), (70, 700), (300, 1000), (5, 50)):
+        trainer.datamodule = SimpleNamespace(scene=SimpleNamespace(train=range(photos)))
+        phases.before_fit(trainer, module)  # type: ignore[arg-type]
+        assert (trainer.max_steps, module.schedule.total) == (steps, steps)
+    loop.max_steps = 30  # somebody asks for something else
+    phases.before_fit(trainer, module)  # type: ignore[arg-type]
+    assert module.schedule.total == 30
+
+
+class Several:
+    """A trainer of several scenes."""
+
+    def __init__(self, loop: SimpleNamespace) -> None:
+        self.fit_loop = SimpleNamespace(epoch_loop=loop)
+        self.datamodule = SimpleNamespace()
+
+    @property
+    def max_steps(self) -> int:
+        return int(self.fit_loop.epoch_loop.max_steps)

@@ -314,7 +314,7 @@ def test_configs_are_found_as_files_first_then_by_name(tmp_path: Path) -> None:
     assert find_config(str(mine)) == str(mine)
     assert find_config("configs/paper.yaml").endswith("configs/paper.yaml")
     assert find_config("no_such_config") == "no_such_config"
-    arguments = ["fit", "--config", "paper", "--config=paper", "-c", str(mine), "--data.root", "paper"]
+    arguments = ["fit", "--config", "paper", "--data.root", "paper", "--config=paper", "-c", str(mine)]
     assert expand(arguments) == [
         *("fit", f"--config={shipped}", f"--config={shipped}", f"--config={mine}", "--data.root=paper")
     ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+import gc
 import inspect
 import io
 import re
@@ -17,6 +19,7 @@ import torch
 
 import nsvq_lightning
 from nsvq_lightning.callbacks import STANDARD
+from nsvq_lightning.commands import arguments as given
 from nsvq_lightning.commands import main as main_module
 from nsvq_lightning.commands.arguments import FIT_HELP
 from nsvq_lightning.commands.fit import SplatCLI, class_help
@@ -116,6 +119,9 @@ def test_one_callback_says_what_it_takes(capsys: pytest.CaptureFixture[str]) -> 
     [
         (["fit"], "error: which scene? Name its folder: --data.root=path/to/scene\n"),
         (["fit", "--data", "{folder}"], "the folder of a scene is --data.root=path/to/scene"),
+        (["fit", "{folder}"], "is no option; the scene folder is --data.root={folder}\n"),
+        (["fit", "-s", "{folder}"], "error: -s is no option; the scene folder is --data.root={folder}\n"),
+        (["fit", "--source_path={folder}"], "no option --source_path; the scene folder is --data.root={folder}\n"),
         (["fit", "--data", "no.Such"], "no.Such"),
         (["fit", "--data.root={folder}", "--bytes=abc"], "error: bytes: expected a whole number or null, got 'abc'\n"),
         (
@@ -174,7 +180,42 @@ def test_wrong_arguments_are_explained(
     with pytest.raises(SystemExit) as stop:
         main([argument.format(folder=tmp_path) for argument in arguments])
     assert stop.value.code == 2
-    assert message in capsys.readouterr().err
+    assert message.replace("{folder}", str(tmp_path)) in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["lightning", "jsonargparse"])
+def test_options_of_another_lightning_are_left_to_its_parser(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
+) -> None:
+    (tmp_path / "transforms.json").touch()
+    options = ["fit", f"--data.root={tmp_path}", "--trainer.of_tomorrow=1"]
+    with pytest.raises(argparse.ArgumentError, match=r"no option --trainer\.of_tomorrow"):
+        given.check_early(options)
+    monkeypatch.setitem(given.FIT_HELP_OF, name, "0.0")
+    given.check_early(options)
+
+
+def test_the_stored_help_is_of_the_versions_that_were_tested() -> None:
+    pins = (Path(__file__).parents[2] / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    assert {f"{name}=={version}" for name, version in given.FIT_HELP_OF.items()} <= set(pins)
+
+
+@pytest.mark.parametrize("collects", [True, False])
+def test_a_host_keeps_its_collector(monkeypatch: pytest.MonkeyPatch, collects: bool) -> None:
+    frozen = gc.get_freeze_count()
+    monkeypatch.setitem(sys.modules, "nsvq_lightning.commands.fit", None)  # importing it fails
+    (gc.enable if collects else gc.disable)()
+    try:
+        with pytest.raises(ImportError):
+            main_module._import_cli.__wrapped__(own_process=False)
+        assert gc.isenabled() == collects
+        assert gc.get_freeze_count() == frozen
+        with pytest.raises(ImportError):
+            main_module._import_cli.__wrapped__(own_process=True)
+        assert gc.isenabled()
+    finally:
+        gc.unfreeze()
+        gc.enable()
 
 
 def test_commands_that_do_not_exist_or_contradict_themselves_are_told_so(capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,10 +3,11 @@
 import subprocess
 import sys
 
+import numba
 import numpy as np
 import pytest
 
-from nsvq_lightning.compute.jit import parallel, thread_count
+from nsvq_lightning.compute.jit import compile_seconds, parallel, thread_count
 
 SCRIPT = """
 import sys
@@ -47,3 +48,27 @@ def test_a_part_that_gets_no_memory_is_an_error() -> None:
     thread_count()
     with pytest.raises(MemoryError, match="a kernel could not allocate memory"):
         _add_up(2, np.arange(50), 1 << 60)
+
+
+def test_functions_of_the_user_are_none_of_our_compilations(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", logger="nsvq_lightning")
+    levels: list[int] = []
+    before = compile_seconds()
+
+    @numba.njit(forceinline=True)
+    def users(x):
+        return x + len(levels_seen(x))
+
+    @numba.extending.overload(levels_seen)
+    def _(x):
+        levels.append(int(numba.config.OPT))  # while it is compiled
+        return lambda x: (1, 2)
+
+    assert users(1) == 3
+    assert compile_seconds() == before
+    assert set(levels) == {int(numba.config.OPT)}
+    assert "compiling" not in caplog.text
+
+
+def levels_seen(x):
+    """Known to Numba only."""

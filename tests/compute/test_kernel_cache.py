@@ -8,6 +8,7 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+from numba.core.caching import FunctionCache
 
 from nsvq_lightning.compute import kernel_cache
 from nsvq_lightning.compute.kernel_cache import kernel_folder, source_digest
@@ -155,3 +156,29 @@ def test_without_a_folder_they_are_compiled_in_each_process(
         kernel = write().total
         assert kernel(np.ones(4)) == 12.0
         assert not kernel.stats.cache_hits
+
+
+def test_a_kernel_works_where_its_folder_does_not(write: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A full home, a folder that another process has removed, or one without locks costs the cache, not the result."""
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    for owner, name in ((FunctionCache, "_save_overload"), (FunctionCache, "_load_overload"), (Path, "iterdir")):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, full)
+            assert write("found = 0.0", f"found = {len(name)}.0").total(np.ones(4)) == 12.0 + len(name)
+    kernel = write().total
+    assert kernel(np.ones(4)) == 12.0
+    assert kernel._cache._lock is None
+
+
+def test_a_compilation_that_fails_keeps_nobody_waiting(write: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernel_cache, "waits", False)  # a busy kernel is an error
+    before = numba.config.OPT
+    for _ in range(2):
+        kernel = write("found = 0.0", "found = None").total
+        with pytest.raises(numba.core.errors.TypingError):
+            kernel(np.ones(4))
+        assert kernel._cache._lock is None
+    assert before == numba.config.OPT
