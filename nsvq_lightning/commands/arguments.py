@@ -177,7 +177,7 @@ def check_early(arguments: Sequence[str]) -> None:
     given = _values_by_name(settings_of(configs)) | own
     asks = any(name == "print_config" or name.endswith("help") for name in given)
     root = given.get("data.root")
-    if root and not Path(root).exists() and not asks:
+    if root and not Path(root).expanduser().exists() and not asks:
         raise FileNotFoundError(NO_FOLDER.format(root))
     if arguments[0] != "fit":
         return
@@ -189,9 +189,9 @@ def check_early(arguments: Sequence[str]) -> None:
         raise argparse.ArgumentError(None, "which scene? Name its folder: --data.root=path/to/scene")
     from nsvq_lightning.data import colmap
 
-    folder, has_transforms = Path(root), any(Path(root).glob("transforms*.json"))
-    if "data.model" not in given and not has_transforms and colmap.find_model(folder) is None:
-        raise colmap.no_model(folder, colmap.FOLDERS, None)
+    folder = Path(root).expanduser()
+    if "data.model" not in given and not any(folder.glob("transforms*.json")):
+        colmap.model_files(folder)
 
 
 def _check_options(arguments: Sequence[str], own: Mapping[str, str], other_data: bool) -> None:
@@ -391,7 +391,8 @@ def photos_of(path: Path) -> Path | None:
     data = check_config(str(config)).get("data")
     data = data.get("init_args", data) if isinstance(data, dict) else None
     root = data.get("root") if isinstance(data, dict) else None
-    return Path(root) if isinstance(root, str) and Path(root).is_dir() else None
+    folder = Path(root).expanduser() if isinstance(root, str) else None
+    return folder if folder is not None and folder.is_dir() else None
 
 
 def cameras_of(path: Path, root: Path | None) -> "dict[str, Camera]":

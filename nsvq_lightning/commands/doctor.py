@@ -285,13 +285,15 @@ def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
 
 def check_sizes(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     """Whether files are of the size that the model says, and what becomes of those that lie on their side."""
-    from nsvq_lightning.data.scene import OTHER_SHAPE, same_shape
+    from nsvq_lightning.data.images import same_shape
+    from nsvq_lightning.data.scene import OTHER_SHAPE
 
     sources, scaled, others = scene.images.sources, 0, 0
     for image, source in zip(model.images, sources, strict=True):
         camera = model.cameras[image.camera_id]
-        others += not same_shape(camera, *source.size)
-        scaled += source.size != (camera.width, camera.height)
+        size = camera.width, camera.height
+        others += not same_shape(source.size, size)
+        scaled += source.size != size
     used = _range([(source.pinhole.width, source.pinhole.height) for source in sources])
     text = f"trained at {used}; {others or scaled} of {len(sources)} files "
     if others:
@@ -329,11 +331,11 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
         advice = f"most in {most}; masks are white where the photo counts; if not, invert them"
         yield judged("masks", text, share > 0.7 and advice)
     folder = scene.root / (model.images_folder or "images")
-    known = {Path(name).with_suffix("") for name in scene.names}
+    known = {source.path for source in scene.images.sources}
     # The folder of a NeRF-synthetic scene also holds maps and further views.
     found = folder.rglob("*") if folder != scene.root else ()
-    files = [path.relative_to(folder) for path in found if path.suffix.lower() in PHOTOS]
-    extra = [path for path in files if path.with_suffix("") not in known]
+    files = [path for path in found if path.suffix.lower() in PHOTOS]
+    extra = [path for path in files if path not in known]
     if extra:
         text = f"{len(extra)} of {len(files)} files in {folder} are not in the model"
         yield judged("registered", text, "they are not used; if many, photos lack overlap or sharpness")

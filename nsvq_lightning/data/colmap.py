@@ -1,24 +1,27 @@
-"""A COLMAP model: its files, checked before a reader allocates memory for them, and what they hold.
+"""A COLMAP model: where its files are, and the cameras, poses and points in them, checked.
 
 The only place that imports pycolmap.
 """
 
-import itertools
+import contextlib
+import logging
 import math
-import mmap
-import re
-import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence, Sized
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2  # noqa: F401  (before pycolmap, see import_pycolmap)
 import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.data import NO_FOLDER
+from nsvq_lightning.data import colmap_tables as tables
+
+log = logging.getLogger(__name__)
 
 
 class SceneError(ValueError):
@@ -29,6 +32,8 @@ class SceneError(ValueError):
 LARGEST_SIDE = (1 << 20) - 1
 # Upper bound on poses and intrinsics: their squares, which rendering computes in float32, stay finite.
 LARGEST = 1e18
+# Relative error of a quaternion's length that comes from writing its numbers with few digits.
+_ROUNDED = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +60,7 @@ class ColmapModel:
     Attributes:
         images: Registered images, sorted by name.
         cameras: ``pycolmap.Camera`` by id.
-        points: Sparse points ``[P, 3]`` float64, scene units, sorted by COLMAP's point id.
+        points: Sparse points ``[P, 3]`` float64, scene units, sorted by COLMAP's point id; maybe none.
         colors: Their colours ``[P, 3]`` uint8 RGB.
         observations: Row of the point and row of the image of each sighting ``[O, 2]`` int64; None unless requested.
         source: Where it comes from, for messages.
@@ -95,6 +100,12 @@ def import_pycolmap() -> Any:
     return pycolmap
 
 
+def is_outside(name: str) -> bool:
+    """Whether a name leads out of the folder that it is relative to."""
+    path = PurePath(name)
+    return bool(path.anchor) or ".." in path.parts
+
+
 def check_name(name: str, source: object, allow_outside: bool = False) -> None:
     """Check the name of a file that a model gives relative to its scene folder.
 
@@ -110,8 +121,7 @@ def check_name(name: str, source: object, allow_outside: bool = False) -> None:
         name.encode()
     except UnicodeEncodeError:
         raise SceneError(f"{source} names {name!r}, which is not UTF-8: rename that file or folder") from None
-    path = PurePath(name)
-    if not allow_outside and (path.anchor or ".." in path.parts):
+    if not allow_outside and is_outside(name):
         raise SceneError(
             f"{source} names {name}, which is not in the scene folder: copy it there, or allow it in fit and test with "
             "--data.allow_outside=true"
@@ -120,81 +130,194 @@ def check_name(name: str, source: object, allow_outside: bool = False) -> None:
 
 # Where a model may be inside a scene folder, in order of preference.
 FOLDERS = ("sparse/0", "sparse", ".")
-# The three tables every COLMAP model has.
+# The tables of a COLMAP model; a scene can do without the last one.
 TABLES = ("cameras", "images", "points3D")
 
 
 def find_model(root: Path, folders: Sequence[str] = FOLDERS) -> dict[str, Path] | None:
-    """The files of the tables of the first complete model in the folders, binary before text; None if there is none.
+    """The files of the tables of the first model in the folders, points only if there are any; None if there is none.
 
     Args:
         root: Scene folder.
         folders: Where to look inside it.
     """
-    for folder, suffix in itertools.product(folders, (".bin", ".txt")):
-        files = {table: root / folder / f"{table}{suffix}" for table in TABLES}
-        if all(path.is_file() for path in files.values()):
-            return files
-    return None
+    return next(filter(None, (_tables_in(root / folder) for folder in folders)), None)
+
+
+def _tables_in(folder: Path) -> dict[str, Path] | None:
+    """The files of the tables in a folder, binary before text; None without cameras or images."""
+    there = {path.name.lower(): path for path in folder.iterdir()} if folder.is_dir() else {}
+    binary, text = (
+        {table: there[table.lower() + suffix] for table in TABLES if table.lower() + suffix in there}
+        for suffix in (".bin", ".txt")
+    )
+    whole = [files for files in (binary, text) if len(files) == len(TABLES)]
+    files = whole[0] if whole else text | binary
+    return files if {"cameras", "images"} <= files.keys() else None
+
+
+def model_files(root: Path, chosen: str | None = None) -> dict[str, Path]:
+    """The files of the model of a scene folder: in one of :data:`FOLDERS`, or the only one anywhere in it.
+
+    Args:
+        root: Scene folder.
+        chosen: N for ``sparse/N``, or a folder inside ``root``; None looks for one.
+
+    Raises:
+        SceneError: There is none, or there are several where nobody looks first.
+    """
+    folders = FOLDERS if chosen is None else (f"sparse/{chosen}" if chosen.isdecimal() else chosen,)
+    files = find_model(root, folders)
+    if files is not None:
+        return files
+    others = other_models(root) if chosen is None else []
+    if not others:
+        raise _no_model(root, folders, chosen)
+    if len(others) > 1:
+        raise SceneError(f"{root} has models in {', '.join(others)}: choose one, such as --data.model={others[0]}")
+    log.info("%s: the COLMAP model is the one in %s", root, others[0])
+    return model_files(root, f"./{others[0]}")
+
+
+def other_models(root: Path) -> list[str]:
+    """Folders with a model, up to three levels inside a scene folder."""
+    tables = (path for depth in ("*", "*/*", "*/*/*") for path in root.glob(f"{depth}/[cC]ameras.*"))
+    folders = {path.parent for path in tables}
+    return sorted(str(folder.relative_to(root)) for folder in folders if _tables_in(folder))
 
 
 def read_model(root: Path, observations: bool = False, chosen: str | None = None) -> ColmapModel:
-    """Read the model of a scene folder: in ``sparse/0``, ``sparse`` or the folder itself, binary before text.
+    """Read the model of a scene folder; without ``points3D`` it has no points.
+
+    Poses are those in ``images``, as in every other program of this field: those in ``frames`` say the same.
 
     Args:
         root: Scene folder.
         observations: Also read which image saw which point; training does not need it.
-        chosen: N for ``sparse/N``, or a folder inside ``root``; None looks in the three places.
+        chosen: See :func:`model_files`.
 
     Raises:
-        SceneError: There is no such folder or no model, a file is damaged, or the model has no registered image or no
-            point.
+        SceneError: There is no such folder or no model, a file is damaged, or the model has no image.
     """
     if not root.is_dir():
         raise SceneError(NO_FOLDER.format(root))
-    folders = FOLDERS if chosen is None else (f"sparse/{chosen}" if chosen.isdecimal() else chosen,)
-    if (files := find_model(root, folders)) is None:
-        raise no_model(root, folders, chosen)
-    reconstruction = _read(files)
-    registered = [image for image in reconstruction.images.values() if image.has_pose]
-    try:
-        registered.sort(key=lambda image: image.name)
-    except UnicodeDecodeError as error:
-        raise SceneError(
-            f"{files['images']}: the name of a photo is not UTF-8 ({error}): rename the photo and run COLMAP "
-            "again, or copy the model again if it is damaged"
-        ) from error
-    if not registered:
+    files = model_files(root, chosen)
+    known = _lens_models()
+    cameras = {row.number: row for row in _table(files["cameras"], lambda path: tables.read_cameras(path, known))}
+    rows = sorted(_table(files["images"], tables.read_images), key=lambda row: row.name)
+    if not rows:
         raise SceneError(f"{files['images']} lists no registered image: run COLMAP's mapper again")
-    points = sorted(reconstruction.points3D.items())
-    if not points:
-        raise SceneError(
-            f"{files['points3D']} has no points, and training starts from them: triangulate with COLMAP "
-            "(`colmap point_triangulator`) or run its mapper again"
-        )
-    images = tuple(
-        ColmapImage(image.name, image.camera_id, np.array([*image.cam_from_world().matrix(), (0.0, 0.0, 0.0, 1.0)]))
-        for image in registered
-    )
-    broken = [image.name for image in images if not _is_finite(image.viewmat)]
-    if broken:
-        raise SceneError(f"{files['images']}: {len(broken)} poses are not finite, first {broken[0]}: run COLMAP again")
-    for number in dict.fromkeys(image.camera_id for image in images):
-        camera = reconstruction.cameras[number]  # of a text table, which no check has seen before, it may be anything
-        size = camera.width, camera.height
-        if not 0 < min(size) <= max(size) <= LARGEST_SIDE or not _is_finite(camera.params):
+    viewmats = _viewmats(rows, files["images"])
+    for row in rows:
+        if row.camera_id not in cameras:
             raise SceneError(
-                f"{files['cameras']}: camera {number} has size {size[0]}x{size[1]} and parameters "
-                f"{camera.params_to_string()}; needed are sizes from 1 to {LARGEST_SIDE} and finite numbers: copy the "
-                "model again or run COLMAP again"
+                f"{files['images']}: photo {row.name} is of camera {row.camera_id}, which {files['cameras'].name} does "
+                "not have: copy both files again, from one model"
             )
+    points = tables.PointTable(np.zeros((0, 3)), np.zeros((0, 3)), ())
+    if "points3D" in files:
+        points = _table(files["points3D"], lambda path: tables.read_points(path, observations))
     return ColmapModel(
-        images=images,
-        cameras=dict(reconstruction.cameras.items()),
-        points=np.array([point.xyz for _, point in points], np.float64),
-        colors=np.array([point.color for _, point in points], np.uint8),
-        observations=_observations(registered, points) if observations else None,
+        images=tuple(ColmapImage(row.name, row.camera_id, view) for row, view in zip(rows, viewmats, strict=True)),
+        cameras={row.camera_id: _camera(cameras[row.camera_id], files["cameras"]) for row in rows},
+        points=points.xyz,
+        colors=rgb_bytes(points.rgb),
+        observations=_observations(rows, points.tracks) if observations else None,
     )
+
+
+def _lens_models() -> tables.LensModels:
+    """The camera models of this pycolmap."""
+    pycolmap = import_pycolmap()
+    models = [model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"]
+    make = pycolmap.Camera.create_from_model_id
+    return {int(model.value): (model.name, len(make(1, model, 1.0, 1, 1).params)) for model in models}
+
+
+_Rows = TypeVar("_Rows", bound=Sized)
+
+
+def _table(path: Path, read: Callable[[Path], _Rows]) -> _Rows:
+    """What a table holds; warns if its head announces more.
+
+    Raises:
+        SceneError: It is damaged.
+    """
+    remedy = "copy the model again or export it anew with `colmap model_converter`"
+    try:
+        rows, announced = read(path), tables.announced_rows(path)
+    except (ValueError, OverflowError, OSError) as error:
+        raise SceneError(f"{path}: {error}; {remedy}") from error
+    found = len(rows.xyz) if isinstance(rows, tables.PointTable) else len(rows)
+    if announced > found:
+        log.warning("%s announces %d rows but has %d: unless you removed some, %s", path, announced, found, remedy)
+    return rows
+
+
+def _viewmats(rows: Sequence[tables.ImageRow], path: Path) -> NDArray[np.float64]:
+    """World to camera ``[V, 4, 4]``.
+
+    Raises:
+        SceneError: A pose is not finite or its quaternion is 0, or a photo has two poses.
+    """
+    quats, places = np.array([row.quat for row in rows]), np.array([row.translation for row in rows])
+    norms = np.linalg.norm(quats, axis=1)
+    usable = (norms > 0) & (np.abs(np.c_[quats, places]) <= LARGEST).all(1)
+    if not usable.all():
+        first = rows[int(usable.argmin())]
+        pose = f"quaternion {list(first.quat)} and translation {list(first.translation)}"
+        raise SceneError(
+            f"{path}: {(~usable).sum()} poses are no numbers, not finite or without rotation; the first is that of "
+            f"{first.name} with {pose}: remove it from the model, or run COLMAP again"
+        )
+    for one, other in pairwise(rows):
+        if one.name == other.name:
+            raise SceneError(
+                f"{path} lists {one.name} twice, as images {one.number} and {other.number}: give photos names of their "
+                "own, and run COLMAP again"
+            )
+    worst = float(np.abs(norms - 1).max())
+    if worst > _ROUNDED:
+        log.warning("%s: quaternions are up to %.2g %% too long or short; they are normalised", path, 100 * worst)
+    viewmats = np.tile(np.eye(4), (len(rows), 1, 1))
+    viewmats[:, :3, :3] = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
+    viewmats[:, :3, 3] = places
+    return viewmats
+
+
+def _camera(row: tables.CameraRow, path: Path) -> Any:
+    """The ``pycolmap.Camera``.
+
+    Raises:
+        SceneError: It is damaged.
+    """
+    side, params = (row.width, row.height), np.array(row.params)
+    if not 0 < min(side) <= max(side) <= LARGEST_SIDE or not (np.abs(params) <= LARGEST).all() or not params[0] > 0:
+        raise SceneError(
+            f"{path}: camera {row.number} has size {row.width}x{row.height} and parameters "
+            f"{', '.join(map(str, row.params))}; needed are sizes from 1 to {LARGEST_SIDE}, finite numbers and a focal "
+            "length above 0: copy the model again or run COLMAP again"
+        )
+    return import_pycolmap().Camera(
+        model=row.model, width=row.width, height=row.height, params=row.params, camera_id=row.number
+    )
+
+
+def rgb_bytes(values: NDArray[np.float64], floats: bool = False) -> NDArray[np.uint8]:
+    """Colours ``[P, 3]`` of any kind as bytes: in [0, 1] if they are fractions, in [0, 255], or of 16 bits.
+
+    Args:
+        values: The colours.
+        floats: Whether they may be fractions even if all are 0 or 1.
+    """
+    values = np.nan_to_num(values)
+    largest = float(values.max(initial=0))
+    scale = 1.0
+    if largest <= 1 and (floats or (values % 1 != 0).any()):
+        scale = 255
+    elif largest > 255:
+        scale = 255 / 65535
+    return (values * scale).clip(0, 255).round().astype(np.uint8)
 
 
 def alignment(model: ColmapModel, other: ColmapModel) -> NDArray[np.float64]:
@@ -220,25 +343,16 @@ def alignment(model: ColmapModel, other: ColmapModel) -> NDArray[np.float64]:
     return matrix
 
 
-def _is_finite(values: NDArray[np.float64]) -> bool:
-    return bool((np.abs(values) <= LARGEST).all())
-
-
-def no_model(root: Path, folders: Sequence[str], chosen: str | None) -> SceneError:
-    """What to say of a folder without a complete model."""
-    missing = []
-    for folder, suffix in itertools.product(folders, (".bin", ".txt")):
-        absent = [table + suffix for table in TABLES if not (root / folder / f"{table}{suffix}").is_file()]
-        if len(absent) < len(TABLES):
-            missing.append(f"{folder} has a {suffix} model without {', '.join(absent)}")
+def _no_model(root: Path, folders: Sequence[str], chosen: str | None) -> SceneError:
+    """What to say of a folder without a model."""
+    found = [path for folder in folders for path in (root / folder).glob("*.*") if path.stem in TABLES]
     where, advice = root, "nor is there a transforms.json: make a scene with nsvq prepare, or copy the missing files"
     if chosen is not None:
-        others = sorted({str(path.parent.relative_to(root)) for path in (root / "sparse").glob("*/cameras.*")})
         where = root / folders[0]
-        advice = f"choose another (--data.model); there is {', '.join(others) or 'none in sparse/'}"
+        advice = f"choose another (--data.model); there is {', '.join(other_models(root)) or 'none in the folder'}"
     return SceneError(
-        f"no COLMAP model in {where}: looked for cameras, images and points3D (.bin or .txt) in {', '.join(folders)}; "
-        f"{'; '.join(missing) or 'none of the three files is in any of them'}; {advice}"
+        f"no COLMAP model in {where}: looked for cameras and images (.bin or .txt) in {', '.join(folders)}; "
+        f"there is {' and '.join(str(path.relative_to(root)) for path in found) or 'neither'}; {advice}"
     )
 
 
@@ -247,136 +361,23 @@ def larger_models(root: Path) -> str | None:
 
     COLMAP numbers the parts of a scene that it could not join, not always in the order of their size.
     """
-    files = sorted((root / "sparse").glob("*/images.bin"))
-    counts = {path.parent.name: int(np.fromfile(path, "<u8", 1).sum()) for path in files}
-    larger = [f"sparse/{name} has {count}" for name, count in counts.items() if count > counts.get("0", math.inf)]
+    counts = {}
+    for folder in (root / "sparse").glob("*"):
+        files = _tables_in(folder)
+        if files is not None:
+            with contextlib.suppress(ValueError, OSError):
+                counts[folder.name] = len(tables.read_images(files["images"]))
+    first = counts.get("0", math.inf)
+    larger = [f"sparse/{name} has {count}" for name, count in sorted(counts.items()) if count > first]
     advice = "COLMAP could not join them; --data.model=N trains on sparse/N"
-    return f"sparse/0 has {counts['0']} images, {', '.join(larger)}: {advice}" if larger else None
+    return f"sparse/0 has {first} images, {', '.join(larger)}: {advice}" if larger else None
 
 
-def _read(files: Mapping[str, Path]) -> Any:
-    """The ``pycolmap.Reconstruction`` in the files.
-
-    Raises:
-        SceneError: A file is damaged.
-    """
-    pycolmap = import_pycolmap()
-    reconstruction = pycolmap.Reconstruction()
-    folder, suffix = files["cameras"].parent, files["cameras"].suffix
-    if suffix == ".bin":
-        models = [model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"]
-        params = {int(m.value): len(pycolmap.Camera.create_from_model_id(1, m, 1.0, 1, 1).params) for m in models}
-        for table in (*TABLES, "rigs", "frames"):  # the last two are COLMAP 4's
-            path = folder / f"{table}.bin"
-            if table in TABLES or path.is_file():
-                _check_table(table, path, params)
-    read = reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text
-    try:
-        read(str(folder))
-    # pycolmap's own checks give ValueError, its C++ library the others.
-    except (ValueError, RuntimeError, IndexError, KeyError, OSError, MemoryError) as error:
-        raise SceneError(
-            f"COLMAP cannot read the {suffix} model in {folder} ({error}): a file is damaged or files of "
-            "two models are mixed; copy the model again or run COLMAP again"
-        ) from error
-    if suffix == ".txt":
-        for table, path in files.items():
-            _check_rows(path, len(getattr(reconstruction, table)))
-    return reconstruction
-
-
-_U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
-_CAMERA = struct.Struct("<IiQQ")  # id, model, width, height
-
-
-def _check_table(table: str, path: Path, params: Mapping[int, int]) -> None:
-    """Walk every record of a binary table, so that a damaged file gives an error instead of an endless allocation.
-
-    COLMAP's reader trusts the counts in the files: an empty ``points3D.bin`` makes it allocate without end, and a
-    truncated ``cameras.bin`` loads as garbage.
-
-    Args:
-        table: Its name.
-        path: Its file.
-        params: Number of parameters of each camera model by its id.
-
-    Raises:
-        SceneError: The file is empty, truncated, longer than its records, or not a COLMAP table.
-    """
-    remedy = "copy the model again or export it anew with `colmap model_converter`"
-    size = path.stat().st_size
-    if size < _U64.size:
-        raise SceneError(f"{path} has {size} bytes, too few for a COLMAP table: {remedy}")
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        (count,) = _U64.unpack_from(data, 0)
-        end = _U64.size
-        for row in range(1, count + 1):
-            try:
-                end = _record_end(table, data, end, params)
-                if end > size:
-                    raise struct.error("it ends beyond the file")
-            except struct.error as error:
-                raise SceneError(
-                    f"{path} is truncated or garbled: of {count} declared records, record {row} cannot be read "
-                    f"({error}; the file has {size} bytes); {remedy}"
-                ) from error
-        if end != size:
-            raise SceneError(f"{path} is garbled: its {count} declared records end at byte {end} of {size}; {remedy}")
-
-
-def _record_end(table: str, data: mmap.mmap, start: int, params: Mapping[int, int]) -> int:
-    """Where a record of a table ends that begins at ``start``.
-
-    Raises:
-        struct.error: It is damaged, or what tells its length is beyond the end of the file.
-    """
-    match table:
-        case "cameras":
-            camera_id, model, width, height = _CAMERA.unpack_from(data, start)
-            if model not in params or not 0 < min(width, height) <= max(width, height) <= LARGEST_SIDE:
-                raise struct.error(
-                    f"camera {camera_id} has model id {model} and size {width}x{height}; this pycolmap knows the ids 0 "
-                    f"to {max(params)}, sizes go from 1 to {LARGEST_SIDE}"
-                )
-            return start + _CAMERA.size + 8 * params[model]
-        case "images":
-            terminator = data.find(b"\0", start + 64)  # after u32 id, 7 doubles of pose, u32 camera id: the name
-            if terminator < 0:
-                raise struct.error("unterminated name")
-            (points,) = _U64.unpack_from(data, terminator + 1)
-            return terminator + 1 + _U64.size + 24 * int(points)
-        case "points3D":
-            (track,) = _U64.unpack_from(data, start + 43)  # u64 id, 3 doubles, 3 bytes of colour, double error
-            return start + 51 + 8 * int(track)
-        case "frames":
-            (images,) = _U32.unpack_from(data, start + 64)  # u32 frame id, u32 rig id, 7 doubles of pose
-            return start + 68 + 16 * int(images)
-        case _:  # rigs
-            (sensors,) = _U32.unpack_from(data, start + 4)  # after u32 rig id
-            end = start + 8 + (8 if sensors else 0)  # the reference sensor has no pose
-            for _ in range(1, sensors):
-                end += 9 + (56 if data[end + 8 : end + 9] == b"\1" else 0)
-                if end > len(data):
-                    break
-            return end
-
-
-def _check_rows(path: Path, rows: int) -> None:
-    """A text table cut off between two lines reads without error, but its head comment still gives the row count."""
-    with path.open(encoding="utf-8", errors="replace") as file:
-        head = "".join(itertools.takewhile(lambda line: line.startswith("#"), file))
-    announced = re.search(r"^# Number of \w+: (\d+)", head, re.MULTILINE)
-    if announced and int(announced[1]) > rows:
-        raise SceneError(f"{path} announces {announced[1]} rows but has {rows}: it is truncated; copy it again")
-
-
-def _observations(registered: Sequence[Any], points: Sequence[tuple[int, Any]]) -> NDArray[np.int64]:
+def _observations(rows: Sequence[tables.ImageRow], tracks: Sequence[Sequence[int]]) -> NDArray[np.int64]:
     """Pairs of point row and image row, each once: a track may have two features in one image."""
-    row_of = {image.image_id: row for row, image in enumerate(registered)}
-    pairs = [
-        (row, row_of[element.image_id])
-        for row, (_, point) in enumerate(points)
-        for element in point.track.elements
-        if element.image_id in row_of
-    ]
+    row_of = {image.number: row for row, image in enumerate(rows)}
+    sightings = [(point, image) for point, track in enumerate(tracks) for image in track]
+    pairs = [(point, row_of[image]) for point, image in sightings if image in row_of]
+    if len(pairs) < len(sightings):
+        log.warning("left out %d sightings by images that the model does not have", len(sightings) - len(pairs))
     return np.unique(np.array(pairs, np.int64).reshape(-1, 2), axis=0)

@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.images import Picture
-from nsvq_lightning.data.scene import Factor, Scene, View, load_scene
+from nsvq_lightning.data.scene import Factor, Scene, View, load_scene, usable
 from nsvq_lightning.random import generator
 
 
@@ -106,7 +106,7 @@ class SceneDataModule(LightningDataModule):
         """
         if isinstance(self._scene, Scene):
             return self._scene
-        scene = self._scene()
+        scene = usable(self._scene())
         rank_zero_info(_summary(scene))
         return scene
 
@@ -141,7 +141,7 @@ class SceneDataModule(LightningDataModule):
 
     def predict_dataloader(self) -> DataLoader[View]:
         """This process's share of all views, in the order of their names."""
-        return self._ordered(range(len(self.scene)))
+        return self._ordered(sorted((*self.scene.train, *self.scene.test)))
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
         """Move a view to the device of the splats; on a GPU its photo stays there while the memory for photos lasts."""
@@ -202,7 +202,7 @@ class ColmapDataModule(SceneDataModule):
     ) -> None:
         settings = factor, max_width, test_every, cache_bytes, images_folder, model, masks, allow_outside
         super().__init__(partial(load_scene, root, *settings), seed, cache_bytes)
-        self.root, self.cache_bytes = Path(root), cache_bytes
+        self.root, self.cache_bytes = Path(root).expanduser(), cache_bytes
 
 
 class DemoDataModule(ColmapDataModule):

@@ -17,6 +17,7 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 from torch import Tensor
 
+from nsvq_lightning.data import PANORAMA
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap
 from nsvq_lightning.data.edges import Edges, edges_of
 
@@ -69,11 +70,12 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     Raises:
         SceneError: The file is damaged or has floating-point pixels.
     """
-    return np.asarray(cv2.cvtColor(_decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH), cv2.COLOR_BGR2RGB), np.uint8)
+    pixels = _to_bytes(_decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH))
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def _decoded(path: Path, flags: int) -> NDArray[np.uint8]:
-    """Decode an image as OpenCV does, to 8 bits, with the pixels as stored: those are what COLMAP works on.
+def _decoded(path: Path, flags: int) -> NDArray[Any]:
+    """Decode an image as OpenCV does, of 8 or 16 bits, with the pixels as stored: those are what COLMAP works on.
 
     Args:
         path: Image file.
@@ -100,11 +102,16 @@ def _decoded(path: Path, flags: int) -> NDArray[np.uint8]:
     except (*DAMAGED, cv2.error) as error:
         reason = f"truncated, damaged, too large or of an unknown format, {len(data)} bytes: {error}"
         raise _undecodable(path, reason) from error
-    if image.dtype == np.uint16:
-        image = cv2.convertScaleAbs(image, alpha=1 / 257)  # rounds; none of the 65536 is near a half
-    if image.dtype != np.uint8:
+    if image.dtype not in (np.uint8, np.uint16):
         raise _undecodable(path, f"its pixels are {image.dtype}; accepted are 8 and 16 bit integers")
     return _turned_back(image, applied)
+
+
+def _to_bytes(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    """Pixels of 8 or 16 bits in 8."""
+    if pixels.dtype == np.uint8:
+        return pixels
+    return np.asarray(cv2.convertScaleAbs(pixels, alpha=1 / 257), np.uint8)  # rounds; none of the 65536 is near a half
 
 
 def _check_whole(data: bytes) -> None:
@@ -122,7 +129,7 @@ def _check_whole(data: bytes) -> None:
             raise OSError("there is no end marker")  # OpenCV 4 would fill the missing part with grey
 
 
-def _turned_back(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
+def _turned_back(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
     """Pixels to which an EXIF orientation was applied, as they were stored."""
     stored = pixels.swapaxes(0, 1) if orientation >= ON_ITS_SIDE else pixels
     mirrored = {2: (1,), 3: (0, 1), 4: (0,), 6: (0,), 7: (0, 1), 8: (1,)}  # axes
@@ -133,10 +140,17 @@ def _turned_back(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint
 ROUNDED = 0.01
 
 
+def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes (width, height) have one aspect ratio, up to rounding of a side to a pixel of the first."""
+    difference = abs(one[0] * other[1] - one[1] * other[0])
+    return difference < max(ROUNDED * one[1] * other[0], *other)
+
+
 def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     """Which pixels of a photo count ``[height, width]``: those that are more than half as bright as the brightest.
 
-    So white and 1 are kept, black is excluded; a mask of another size is scaled.
+    So white and 1 are kept, in 8 or 16 bits, black is excluded. Where pixels are transparent, that is the mask; in
+    colours, as of labels or of photos cut out, all counts that is not black. A mask of another size is scaled.
 
     Args:
         path: Image file.
@@ -146,9 +160,15 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     Raises:
         SceneError: The file is damaged, or has another aspect ratio than the photo.
     """
-    grey = _decoded(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-    kept = (grey > int(grey.max()) / 2).astype(np.uint8)
-    if abs(kept.shape[1] * height / (kept.shape[0] * width) - 1) > ROUNDED:
+    pixels = _decoded(path, cv2.IMREAD_UNCHANGED)
+    pixels = pixels.reshape(*pixels.shape[:2], -1)
+    levels, black = pixels[..., :3].max(2), 1 / 2
+    if pixels.shape[2] == 4 and np.ptp(pixels[..., 3]) > 0:
+        levels = pixels[..., 3]
+    elif np.ptp(pixels[..., :3], axis=2).max() > levels.max() / 16:
+        black = 1 / 32  # also after JPEG
+    kept = (levels > black * int(levels.max())).astype(np.uint8)
+    if not same_shape(kept.shape[1::-1], (width, height)):
         raise SceneError(
             f"mask {path} is of {kept.shape[1]}x{kept.shape[0]}, its photo of {width}x{height}, another shape: "
             "make it from that photo, or remove it"
@@ -245,7 +265,7 @@ class ImageSource:
         undo = {6: 8, 8: 6}.get(self.orientation, self.orientation)  # the others undo themselves
         if not self.has_alpha:
             return _turned_back(read_image(self.path), undo), None
-        pixels = _decoded(self.path, cv2.IMREAD_UNCHANGED)
+        pixels = _to_bytes(_decoded(self.path, cv2.IMREAD_UNCHANGED))
         if pixels.ndim != 3 or pixels.shape[2] != 4:
             raise _undecodable(self.path, f"its transparency is not understood, its pixels are {pixels.shape[2:]}")
         pixels = _turned_back(pixels, undo)
@@ -377,9 +397,10 @@ class Undistortion:
         try:
             ideal = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
         except (ValueError, RuntimeError) as error:
+            remedy = PANORAMA if camera.model_name == "EQUIRECTANGULAR" else "undistort the images with COLMAP first"
             raise SceneError(
                 f"camera {camera.camera_id} with model {camera.model_name} cannot be turned into a pinhole camera "
-                f"({error}): undistort the images with COLMAP first"
+                f"({error}): {remedy}"
             ) from error
         self._camera = camera
         self._scale = (width / camera.width, height / camera.height)

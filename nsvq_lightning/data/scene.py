@@ -1,7 +1,7 @@
 """A scene: registered views with pinhole cameras, sparse points, the split into train and test, and photos' detail."""
 
 import logging
-from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -14,10 +14,19 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from nsvq_lightning.compute.devices import to_device
+from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, larger_models
 from nsvq_lightning.data.edges import high_pass
-from nsvq_lightning.data.images import ON_ITS_SIDE, ROUNDED, ImageSource, ImageStore, image_head, rectify
-from nsvq_lightning.data.reconstruct import PHOTOS
+from nsvq_lightning.data.images import (
+    ON_ITS_SIDE,
+    ImageHead,
+    ImageSource,
+    ImageStore,
+    image_head,
+    rectify,
+    same_shape,
+)
+from nsvq_lightning.data.photo_files import find_masks, locate, photo_folder
 from nsvq_lightning.data.transforms import random_points, read_poses
 from nsvq_lightning.rendering.camera import Camera
 
@@ -120,10 +129,11 @@ def load_scene(
 
     The model is in ``sparse/0``, ``sparse`` or the folder itself; if there is none, ``transforms.json`` (nerfstudio,
     instant-ngp, Polycam) or ``transforms_train.json`` and ``transforms_test.json`` (NeRF-synthetic) take its place.
-    They say where the photos are. A folder without points gets random ones.
+    They say where the photos are. Without these, the only COLMAP model anywhere in the folder is read. A folder without
+    points gets random ones. Photos that cannot be read are left out, with a warning.
 
-    Pixels that a mask excludes (see :func:`nsvq_lightning.data.scene.find_masks`) or that are transparent do not count:
-    no loss and no metric depends on them. Only NeRF-synthetic scenes are shown in front of white instead.
+    Pixels that a mask excludes (see :func:`nsvq_lightning.data.photo_files.find_masks`) or that are transparent do not
+    count: no loss and no metric depends on them. Only NeRF-synthetic scenes are shown in front of white instead.
 
     Pinhole images are used as they are; those of any other camera model are undistorted when they are decoded, like
     COLMAP's ``image_undistorter`` does.
@@ -142,7 +152,8 @@ def load_scene(
         allow_outside: Also read photos and masks that the model names outside the scene folder.
 
     Raises:
-        SceneError: The folder, the model or an image is missing or damaged, or the split leaves no train view.
+        SceneError: The folder, the model or a photo is missing, the model is damaged, or the split leaves no train
+            view.
         ValueError: An argument is out of range.
     """
     if factor is not None and factor not in get_args(Factor):
@@ -151,7 +162,7 @@ def load_scene(
         raise ValueError(f"max_width must be None or at least 1 pixel, got {max_width}")
     if test_every < 2:
         raise ValueError(f"test_every must be at least 2 (1 leaves no train view), got {test_every}")
-    root = Path(root)
+    root = Path(root).expanduser()
     poses = read_poses(root, model, allow_outside=allow_outside)
     if model is None and poses.source == "COLMAP" and (larger := larger_models(root)) is not None:
         log.warning("%s: %s", root, larger)
@@ -162,14 +173,21 @@ def load_scene(
     train = tuple(sorted(set(views) - set(test)))
     if not train or not test:
         raise SceneError(
-            f"{len(views)} registered image(s), test views {split}, leave {len(train)} train and {len(test)} test "
-            f"views; at least 1 of each is needed: {advice}"
+            f"{root}: {len(views)} registered image(s), test views {split}, leave {len(train)} train and {len(test)} "
+            f"test views; at least 1 of each is needed: {advice}"
         )
-    folder, divisor = _image_folder(root, poses.images_folder or images_folder, factor)
+    names = [image.name for image in poses.images]
+    folder, divisor = photo_folder(root, poses.images_folder or images_folder, factor, names)
+    files = locate(names, folder, f"the {poses.source} model of {root}", allow_outside)
+    lost = [name for name, path in zip(names, files, strict=True) if not path.is_file()]
+    if lost:
+        raise SceneError(
+            f"{len(lost)} of {len(names)} images of the model are not in {folder}, first {lost[0]}: "
+            "copy the photos that COLMAP was run on into that folder, under the same names"
+        )
     mask_files: list[Path | None] = [None] * len(views)
     if masks is not None:
-        mask_files = find_masks(poses.images, root, [f"{masks}_{factor}", masks] if factor else [masks])
-    files = _locate(poses.images, folder)
+        mask_files = find_masks(poses.images, root, [f"{masks}_{factor}", masks] if factor else [masks], folder)
     sources = _image_sources(poses, files, mask_files, divisor, max_width if factor is None else None)
     cameras = tuple(_camera(image, source) for image, source in zip(poses.images, sources, strict=True))
     if not len(poses.points):
@@ -201,81 +219,10 @@ def load_scene(
     )
 
 
-def _image_folder(root: Path, name: str, factor: int | None) -> tuple[Path, int]:
-    """Folder to read from, and the divisor still to be applied on load."""
-    scaled = root / f"{name}_{factor}"
-    if factor is not None and factor > 1 and scaled.is_dir():
-        return scaled, 1
-    folder = root / name
-    if not folder.is_dir():
-        others = sorted({path.parent.name for path in root.glob("*/*") if path.suffix.lower() in PHOTOS})
-        raise SceneError(
-            f"image folder {folder} does not exist: copy the photos there, or set images_folder (or factor, for "
-            f"{name}_2, _4 and _8); there is {', '.join(others) or 'no folder of photos'}"
-        )
-    return folder, factor or 1
-
-
-def _locate(images: Sequence[ColmapImage], folder: Path) -> list[Path]:
-    """Path of each image; in a downscaled copy of the folder, the suffix may differ."""
-    paths = [folder / image.name for image in images]
-    if not all(path.is_file() for path in paths):
-        by_stem = _by_stem(folder)
-        paths = [path if path.is_file() else by_stem.get(path.with_suffix(""), path) for path in paths]
-    lost = [image.name for image, path in zip(images, paths, strict=True) if not path.is_file()]
-    if lost:
-        raise SceneError(
-            f"{len(lost)} of {len(images)} images of the model are not in {folder}, first {lost[0]}: "
-            "copy the photos that COLMAP was run on into that folder, under the same names"
-        )
-    return paths
-
-
-def find_masks(images: Sequence[ColmapImage], root: Path, folders: Sequence[str]) -> list[Path | None]:
-    """The mask of each photo: the one that its model names, or the one of its name in a folder.
-
-    Of ``cam/1.jpg`` that is ``cam/1.jpg.png`` (as COLMAP has it) or ``cam/1.png`` (as nerfstudio has it), with any
-    suffix.
-
-    Args:
-        images: The photos.
-        root: Scene folder.
-        folders: Names of folders of masks in it; the first one that exists counts.
-
-    Raises:
-        SceneError: A mask that the model names does not exist.
-    """
-    folder = next((root / name for name in folders if (root / name).is_dir()), None)
-    files = {} if folder is None else _by_stem(folder)
-    names = [Path(folder or "", image.name) for image in images]
-    found = [
-        image.mask or files.get(name) or files.get(name.with_suffix(""))
-        for image, name in zip(images, names, strict=True)
-    ]
-    lost = [path for path in found if path is not None and not path.is_file()]
-    if lost:
-        raise SceneError(f"{len(lost)} masks do not exist, first {lost[0]}: copy them, or remove mask_path")
-    if folder is not None and not any(found):
-        name = Path(images[0].name)
-        usual = name.with_suffix(".png")
-        log.warning("%s has no mask of any photo: that of %s would be %s.png or %s", folder, name, name, usual)
-    return found
-
-
-def _by_stem(folder: Path) -> dict[Path, Path]:
-    """The files in a folder and the folders in it, by their path without suffix."""
-    return {path.with_suffix(""): path for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
 OTHER_SHAPE = (
     "have another aspect ratio than their camera: they were cropped, rotated or mixed up after COLMAP ran; copy the "
     "photos it ran on"
 )
-
-
-def same_shape(camera: Any, width: int, height: int) -> bool:
-    """Whether a picture has the aspect ratio of its ``pycolmap.Camera``, up to rounding of its size."""
-    return bool(abs(width * camera.height / (height * camera.width) - 1) < ROUNDED)
 
 
 # With more distorted cameras than this (say, one per photo), the undistortion maps would take more than the images.
@@ -286,16 +233,24 @@ def _image_sources(
     model: ColmapModel, paths: list[Path], masks: list[Path | None], divisor: int, max_width: int | None
 ) -> list[ImageSource]:
     """One source per view; views with the same camera and file size share their undistortion."""
-    kinds, orientations, heads = [], [], [image_head(path) for path in paths]
-    for image, head in zip(model.images, heads, strict=True):
-        camera, size, on_its_side = model.cameras[image.camera_id], head.size, head.size[::-1]
+    calibrated = {number: (camera.width, camera.height) for number, camera in model.cameras.items()}
+    kinds, orientations, heads = [], [], []
+    for image, path in zip(model.images, paths, strict=True):
+        expected = calibrated[image.camera_id]
+        try:
+            head = image_head(path)
+        except SceneError:
+            head = ImageHead(expected, 1, False)  # it is left out once its pixels are missed
+        heads.append(head)
+        size, on_its_side = head.size, head.size[::-1]
         # COLMAP calibrates photos as they are stored, other programs as their EXIF orientation shows them.
-        turned = head.orientation >= ON_ITS_SIDE and not same_shape(camera, *size) and same_shape(camera, *on_its_side)
+        on_side = not same_shape(size, expected) and same_shape(on_its_side, expected)
+        turned = head.orientation >= ON_ITS_SIDE and on_side
         kinds.append((image.camera_id, on_its_side if turned else size))
         orientations.append(head.orientation if turned else 1)
     if turned_count := sum(orientation != 1 for orientation in orientations):
         log.info("%d of %d photos are turned by their EXIF orientation, as their cameras are", turned_count, len(kinds))
-    if others := sum(not same_shape(model.cameras[camera_id], *size) for camera_id, size in kinds):
+    if others := sum(not same_shape(size, calibrated[camera_id]) for camera_id, size in kinds):
         log.warning("%d of %d photos %s", others, len(kinds), OTHER_SHAPE)
     keep_maps = len(set(kinds)) <= _CAMERAS_WITH_KEPT_MAPS
     rectified = {}
@@ -310,13 +265,40 @@ def _image_sources(
     ]
 
 
+def usable(scene: Scene) -> Scene:
+    """The scene without train and test views of which there is no picture: damaged photos, and wholly masked ones.
+
+    All photos are decoded, and kept as far as the memory for them lasts.
+
+    Raises:
+        SceneError: No train or no test view is left.
+    """
+
+    def problem(index: int) -> SceneError | None:
+        try:
+            _ = scene.images[index]
+        except SceneError as error:
+            return error
+        return None
+
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        problems = list(pool.map(problem, range(len(scene))))
+    wrong = [error for error in problems if error is not None]
+    train, test = (tuple(view for view in part if problems[view] is None) for part in (scene.train, scene.test))
+    if wrong and not (train and test):
+        raise wrong[0]
+    if wrong:
+        log.warning("left out %d of %d photos, first: %s", len(wrong), len(scene), wrong[0])
+    return replace(scene, train=train, test=test)
+
+
 def _camera(image: ColmapImage, source: ImageSource) -> Camera:
     pinhole = source.pinhole
     try:
         K, viewmat = torch.from_numpy(pinhole.K).float(), torch.from_numpy(image.viewmat).float()
         return Camera(K, viewmat, pinhole.width, pinhole.height)
     except ValueError as error:
-        raise SceneError(f"camera {image.camera_id} of image {image.name}: {error}; run COLMAP again") from error
+        raise SceneError(f"camera {image.camera_id} of image {source.path}: {error}; run COLMAP again") from error
 
 
 # Distance from a camera's centre, in extents, within which a point is a failed triangulation, not a surface.

@@ -7,7 +7,7 @@ import json
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nsvq_lightning.data import colmap
+from nsvq_lightning.data import PANORAMA, colmap
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, check_name
 from nsvq_lightning.data.images import image_head
-from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.io.ply import read_ply_columns, read_ply_header
+from nsvq_lightning.data.photo_files import locate
+from nsvq_lightning.data.points import NO_POINTS, cloud_in, read_points
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.poses import looked_at, poses
@@ -42,6 +42,7 @@ def read_poses(
     Raises:
         SceneError: There is no such model, it is damaged, or has cameras or names that cannot be used.
     """
+    root = root.expanduser()
     check_name(str(root.resolve()), "--data.root", allow_outside=True)
     files = [root / model] if model is not None and model.endswith(".json") else []
     if model is None and colmap.find_model(root) is None:
@@ -51,11 +52,33 @@ def read_poses(
         elif train.is_file():
             files = [train, *[test for test in tests if test.is_file()][:1]]  # the second one has the test views
     if files:
-        return _read_transforms(root, files, allow_outside)
+        poses = _read_transforms(root, files, allow_outside)
+        return poses if len(poses.points) else _with_colmap_points(poses, root)
     poses = colmap.read_model(root, observations, model)
-    for image in poses.images:
-        check_name(image.name, f"the COLMAP model of {root}", allow_outside)
-    return poses
+    cloud = cloud_in([colmap.model_files(root, model)["images"].parent, root]) if not len(poses.points) else None
+    if cloud is None:
+        return poses
+    log.info("%s has no points in its COLMAP model: those of %s take their place", root, cloud)
+    points, colors = read_points(cloud)
+    return replace(poses, points=points, colors=colors)
+
+
+def _with_colmap_points(poses: ColmapModel, root: Path) -> ColmapModel:
+    """Cameras with the points of the only COLMAP model in the folder that they may have been made from, if any.
+
+    Programs turn, move and scale that model; the photos that both have say how.
+    """
+    models = colmap.other_models(root)
+    if len(models) != 1:
+        return poses
+    try:
+        found = colmap.read_model(root, chosen=models[0])
+        moved = colmap.alignment(found, poses)
+    except SceneError as error:
+        log.warning("the points of %s are not used: %s", root / models[0], error)
+        return poses
+    log.info("%s names no points: those of %s are used", root / poses.source, root / models[0])
+    return replace(poses, points=found.points @ moved[:3, :3].T + moved[:3, 3], colors=found.colors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +88,12 @@ class _Frame:
     file: Path
     position: int
     values: Mapping[str, Any]
-    allow_outside: bool
+    photo: Path = Path()
+    mask: Path | None = None
 
     def error(self, problem: str, remedy: str = "export the file again") -> SceneError:
-        return SceneError(f"{self.file}: frame {self.position} {problem}: {remedy}")
+        name = self.values.get("file_path")
+        return SceneError(f"{self.file}: frame {self.position} {problem} (its file_path is {name!r}): {remedy}")
 
     def number(self, key: str, otherwise: float = 0.0) -> float:
         """A finite number.
@@ -81,27 +106,16 @@ class _Frame:
             raise self.error(f"has {key} = {value!r}, which is no finite number")
         return float(value)
 
+    def path(self, key: str) -> str | None:
+        """A path that it gives, with slashes; None if it gives none."""
+        given = self.values.get(key)
+        return _plain(given) if isinstance(given, str) and given else None
+
     @property
     def name(self) -> str:
-        """Path of its photo inside the scene folder, with the suffix that is often left out."""
-        given = self.values.get("file_path")
-        if not isinstance(given, str) or not given:
-            raise self.error("has no file_path")
-        name = self._named(given)
-        whole = (name + suffix for suffix in ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG"))
-        return next((path for path in whole if (self.file.parent / path).is_file()), name)
-
-    @property
-    def mask(self) -> Path | None:
-        """File of its mask, if it names one."""
-        given = self.values.get("mask_path")
-        return self.file.parent / self._named(given) if isinstance(given, str) and given else None
-
-    def _named(self, given: str) -> str:
-        """A path inside the scene folder, unless others are allowed."""
-        name = _plain(given)
-        check_name(name, f"{self.file}: frame {self.position}", self.allow_outside)
-        return name
+        """Path of its photo, relative to the scene folder."""
+        folder = self.file.parent
+        return str(self.photo.relative_to(folder) if self.photo.is_relative_to(folder) else self.photo)
 
     def lens(self) -> tuple[str, int, int, tuple[float, ...]]:
         """Its camera: COLMAP's name of the model, width, height, parameters.
@@ -123,7 +137,7 @@ class _Frame:
             raise self.error(
                 f"has camera_model {model}{distorted}, which cannot be read; PINHOLE, OPENCV (k1 to k3, p1, p2) and "
                 "OPENCV_FISHEYE (k1 to k4) can",
-                "export the photos undistorted, as PINHOLE",
+                PANORAMA if model == "EQUIRECTANGULAR" else "export the photos undistorted, as PINHOLE",
             )
         if any(radial) or any(tangential):
             return "FULL_OPENCV", width, height, (*pinhole, *radial[:2], *tangential, radial[2], 0.0, 0.0, 0.0)
@@ -131,10 +145,9 @@ class _Frame:
 
     def _size(self) -> tuple[int, int]:
         if "w" not in self.values or "h" not in self.values:
-            path = self.file.parent / self.name
-            if not path.is_file():
-                raise self.error(f"is of the photo {path}, which does not exist", "copy the photo there")
-            return image_head(path).size
+            if not self.photo.is_file():
+                raise self.error(f"is of the photo {self.photo}, which does not exist", "copy the photo there")
+            return image_head(self.photo).size
         size = round(self.number("w")), round(self.number("h"))
         if not 0 < min(size) <= max(size) <= colmap.LARGEST_SIDE:
             raise self.error(f"has size {size[0]}x{size[1]}; sides go from 1 to {colmap.LARGEST_SIDE}")
@@ -168,6 +181,8 @@ class _Frame:
             matrix = np.zeros(0)
         if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) <= colmap.LARGEST).all():
             raise self.error("has no transform_matrix of 4 by 4 finite numbers")
+        if not np.array_equal(matrix[3:], np.eye(4)[3:][: len(matrix) - 3]):
+            raise self.error("has a transform_matrix whose last row is not 0 0 0 1; is it transposed?")
         # Blender's cameras may be scaled.
         axes = matrix[:3, :3] / np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-30)
         left, _, right = np.linalg.svd(axes)
@@ -183,7 +198,7 @@ class _Frame:
 def _read_transforms(root: Path, files: list[Path], allow_outside: bool) -> ColmapModel:
     heads, frames = zip(*[_frames(file, allow_outside) for file in files], strict=True)
     chosen = {name: frame for part in frames for name, frame in part.items()}
-    train, test = map(set, frames) if len(files) == 2 else _listed(heads[0])
+    train, test = map(set, frames) if len(files) == 2 else _listed(heads[0], frames[0])
     if train & test:
         raise SceneError(f"{files[-1]}: {min(train & test)} is a train and a test photo: list it once")
     is_split = bool(train and test)
@@ -230,22 +245,37 @@ def _frames(file: Path, allow_outside: bool) -> tuple[dict[str, Any], dict[str, 
         raise SceneError(f"{file} has no list of frames, so it has no cameras: export it again")
     shared = {key: value for key, value in head.items() if key not in ("frames", "file_path", "mask_path")}
     frames: dict[str, _Frame] = {}
+    given = []
     for position, own in enumerate(head["frames"]):
         if not isinstance(own, dict):
             raise SceneError(f"{file}: frame {position} is no table of values: export the file again")
         values = {key: value for key, value in (shared | own).items() if value is not None}
-        frame = _Frame(file, position, values, allow_outside)
-        if (name := frame.name) in frames:
-            raise frame.error(f"is of {name}, which an earlier frame is of, too", "remove one of them")
-        frames[name] = frame
+        frame = _Frame(file, position, values)
+        if frame.path("file_path") is None:
+            raise frame.error("has no file_path")
+        given.append(frame)
+    photos, masks = (
+        locate([path for frame in given if (path := frame.path(key))], file.parent, str(file), allow_outside)
+        for key in ("file_path", "mask_path")
+    )
+    masks_left = iter(masks)
+    for frame, photo in zip(given, photos, strict=True):
+        frame = replace(frame, photo=photo, mask=next(masks_left) if frame.path("mask_path") else None)
+        if frame.name in frames:
+            raise frame.error(f"is of {frame.name}, which an earlier frame is of, too", "remove one of them")
+        frames[frame.name] = frame
     return head, frames
 
 
-def _listed(head: Mapping[str, Any]) -> list[set[str]]:
+def _listed(head: Mapping[str, Any], frames: Mapping[str, _Frame]) -> list[set[str]]:
     """Names of the train and test photos that a file lists; an empty set where it lists none of them."""
+    names = {str(PurePosixPath(name).with_suffix("")): name for name in frames}
+    names |= {frame.path("file_path"): name for name, frame in frames.items()} | {name: name for name in frames}
     lists = [head.get(f"{part}_filenames") for part in ("train", "test", "val")]
-    train, test, val = ({_plain(str(n)) for n in names} if isinstance(names, list) else set() for names in lists)
-    return [train, test or val]
+    train, test, val = (
+        {names.get(_plain(str(name)), "") for name in each} if isinstance(each, list) else set() for each in lists
+    )
+    return [train - {""}, (test or val) - {""}]
 
 
 def _plain(path: str) -> str:
@@ -255,15 +285,20 @@ def _plain(path: str) -> str:
 def _points(
     root: Path, head: dict[str, Any], images: tuple[ColmapImage, ...], cameras: dict[int, Any], allow_outside: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """The points that a file names, in the frame of its cameras; none if it names none.
+    """The points that a file names, or that lie beside it, in the frame of its cameras; none if there are none.
 
     Programs that wrote ``applied_transform`` have applied it to the cameras, and most of them to the points; where it
     is missing from the points shows in how many of them the cameras see.
     """
-    if not isinstance(name := head.get("ply_file_path"), str):
-        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    check_name(_plain(name), f"ply_file_path in {root}", allow_outside)
-    points, colors = read_points(root / _plain(name))
+    name = head.get("ply_file_path")
+    if isinstance(name, str):
+        check_name(_plain(name), f"ply_file_path in {root}", allow_outside)
+        path, (points, colors) = root / _plain(name), read_points(root / _plain(name))
+    elif (cloud := cloud_in([root])) is not None:
+        path, (points, colors) = cloud, read_points(cloud)
+        log.info("%s names no points: those of %s are used", root, path)
+    else:
+        return NO_POINTS
     try:
         applied = np.array(head.get("applied_transform"), np.float64)[:3]
     except (ValueError, TypeError, IndexError):
@@ -277,35 +312,9 @@ def _points(
     ]
     moved = points @ applied[:, :3].T + applied[:, 3]
     if share_seen(moved, pinholes) > 1.5 * share_seen(points, pinholes):
-        log.info("%s: the points are not in the frame of the cameras: applied_transform moves them there", root / name)
+        log.info("%s: the points are not in the frame of the cameras: applied_transform moves them there", path)
         return moved, colors
     return points, colors
-
-
-def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Positions ``[P, 3]`` and RGB colours ``[P, 3]`` of a ``.ply`` point cloud; points without a colour are grey.
-
-    Raises:
-        SceneError: There is no such file, or it is damaged or no point cloud.
-    """
-    if not path.is_file():
-        raise SceneError(f"points {path} do not exist: copy the file, or remove ply_file_path from the transforms file")
-    try:
-        header = read_ply_header(path)
-        if missing := [axis for axis in "xyz" if axis not in header.properties]:
-            raise FormatError(f"{path}: its vertices have no {', '.join(missing)}")
-        rgb = ("red", "green", "blue")
-        colored = set(rgb) <= set(header.properties)
-        names = ("x", "y", "z", *(rgb if colored else ()))
-        table = np.concatenate([np.zeros((0, len(names)), np.float32), *read_ply_columns(path, header, names)])
-    except FormatError as error:
-        raise SceneError(f"points {error}") from error
-    xyz = table[:, :3].astype(np.float64)
-    if not colored:
-        return xyz, np.full((len(xyz), 3), 128, np.uint8)
-    # Some programs write them in [0, 1].
-    scale = 255 if header.dtype["red"].kind == "f" else 1
-    return xyz, (np.nan_to_num(table[:, 3:]) * scale).clip(0, 255).round().astype(np.uint8)
 
 
 def share_seen(points: NDArray[np.float64], cameras: list[Camera]) -> float:

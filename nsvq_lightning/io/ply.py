@@ -256,8 +256,8 @@ def _by_coefficient(rows: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def read_ply_columns(
-    path: str | os.PathLike[str], header: PlyHeader, names: Sequence[str]
-) -> Iterator[NDArray[np.float32]]:
+    path: str | os.PathLike[str], header: PlyHeader, names: Sequence[str], dtype: type[Any] = np.float32
+) -> Iterator[NDArray[Any]]:
     """Tables ``[rows, len(names)]`` of some properties of the vertices of a ``.ply`` file, which follow each other.
 
     Raises:
@@ -269,7 +269,7 @@ def read_ply_columns(
     with naming_file(path), open(path, "rb") as file, np.errstate(over="ignore"):
         file.seek(header.offset)
         if header.encoding == "ascii":
-            yield _read_ascii(file, header)[:, columns].astype(np.float32)
+            yield _read_ascii(file, header)[:, columns].astype(dtype)
             return
         for start in range(0, header.count, _ROWS):
             rows = min(_ROWS, header.count - start)
@@ -277,7 +277,7 @@ def read_ply_columns(
             if len(data) < rows * header.dtype.itemsize:
                 raise FormatError("truncated while it was read")
             table = np.frombuffer(data, header.dtype)
-            yield np.stack([table[name] for name in names], axis=1, dtype=np.float32, casting="unsafe")
+            yield np.stack([table[name] for name in names], axis=1, dtype=dtype, casting="unsafe")
 
 
 def _read_ascii(file: BinaryIO, header: PlyHeader) -> NDArray[np.float64]:

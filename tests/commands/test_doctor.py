@@ -169,7 +169,7 @@ def _cut(path: Path) -> None:
         (lambda root: _cut(root / "sparse/0/points3D.bin"), "model", "truncated"),
         (lambda root: shutil.rmtree(root / "images"), "scene", "copy the photos"),
         (lambda root: (root / "images/view_003.png").unlink(), "scene", "view_003.png"),
-        (lambda root: (root / "images/view_003.png").write_text("no image"), "scene", "view_003.png"),
+        (lambda root: (root / "images/view_003.png").write_text("no image"), "photos", "view_003.png"),
         (lambda root: _cut(root / "images/view_003.png"), "photos", "1 of 9 cannot be used"),
     ],
 )

@@ -174,3 +174,21 @@ def test_a_gpu_gives_a_part_of_what_is_free(monkeypatch: pytest.MonkeyPatch) -> 
     first = [photos.move(each, ELSEWHERE) for each in views]
     assert photos.move(views[0], ELSEWHERE).image is first[0].image
     assert photos.move(views[1], ELSEWHERE).image is not first[1].image
+
+
+def test_a_damaged_photo_leaves_the_views_of_every_process_and_of_a_resumed_run(
+    make_scene: SceneFactory, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = make_scene(views=18)
+    path = root / "images" / "005.png"
+    path.write_bytes(path.read_bytes()[:-100])
+    (root / "images" / "008.png").write_bytes(b"")
+    left = [name for name in (f"{i:03d}.png" for i in range(18)) if name not in ("000.png", "005.png", "008.png")]
+    for step, rank in ((0, 0), (0, 1), (4, 0), (4, 1)):
+        data = _on(ColmapDataModule(str(root)), step, rank, 2)
+        seen = islice(iter(data.train_dataloader()), 7)
+        order = view_order(14, 0, rank, 2, step)  # oracle: the sampler, on the train views that are left
+        trained = [name for name in left if name != "016.png"]
+        assert [view.name for view in seen] == [trained[next(order)] for _ in range(7)]
+        assert [data.scene.names[i] for i in data.scene.test] == ["000.png", "016.png"]
+    assert caplog.text.count("left out 2 of 18 photos, first: ") == 4

@@ -25,6 +25,7 @@ from nsvq_lightning.data.images import (
     read_image,
     read_mask,
     rectify,
+    same_shape,
 )
 from nsvq_lightning.data.scene import load_scene
 
@@ -147,6 +148,49 @@ def test_floating_point_pictures_are_refused(tmp_path: Path) -> None:
     assert cv2.imwrite(str(tmp_path / "deep.tiff"), RGB[..., 0].astype(np.float32))
     with pytest.raises(SceneError, match="float32"):
         read_mask(tmp_path / "deep.tiff", 9, 6)
+
+
+KEPT = np.arange(9) >= np.full((6, 1), 4)
+GREY = np.uint8(255) * KEPT
+LABELS = np.array([0, 1, 2, 3, 4, 5])[:, None] * KEPT + KEPT
+PALETTE = [0, 0, 0, 64, 0, 0, 0, 64, 0, 0, 0, 128, 128, 128, 0, 192, 128, 0, 224, 224, 224]
+
+
+def _palette(indices: np.ndarray, colours: list[int]) -> PIL.Image.Image:
+    picture = PIL.Image.fromarray(indices.astype(np.uint8))
+    picture.putpalette(colours)
+    return picture
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        PIL.Image.fromarray(GREY).convert("1"),
+        PIL.Image.fromarray(np.uint16(1) * KEPT),
+        PIL.Image.fromarray(np.uint16(65535) * KEPT),
+        _palette(KEPT, [0, 0, 0, 255, 255, 255]),
+        _palette(~KEPT, [255, 255, 255, 0, 0, 0]),
+        _palette(KEPT, [0, 0, 0, 128, 0, 0]),
+        _palette(LABELS, PALETTE),
+        PIL.Image.fromarray(np.dstack([np.full((6, 9, 3), 255, np.uint8), GREY])),
+        PIL.Image.fromarray(np.dstack([RGB, GREY])),
+        PIL.Image.fromarray(np.dstack([np.full((6, 9), 255, np.uint8), GREY]), "LA"),
+        PIL.Image.fromarray(np.dstack([GREY, GREY, GREY, np.full((6, 9), 255, np.uint8)])),
+        PIL.Image.fromarray(np.maximum(RGB, 40) * KEPT[..., None].astype(np.uint8)),
+    ],
+)
+def test_masks_of_any_kind(tmp_path: Path, picture: PIL.Image.Image) -> None:
+    picture.save(tmp_path / "mask.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png", 9, 6), KEPT)
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [((194, 130), True), ((25, 16), True), ((24, 16), True), ((97, 65), True), ((130, 194), False), ((25, 25), False)],
+)
+def test_shapes_are_compared_up_to_a_pixel(size: tuple[int, int], expected: bool) -> None:
+    assert same_shape(size, (194, 130)) is expected
+    assert same_shape((99, 100), (100, 99)) is False
 
 
 def test_downscaling_averages_areas(tmp_path: Path) -> None:
@@ -330,7 +374,7 @@ def test_spherical_camera_is_refused() -> None:
     if "EQUIRECTANGULAR" not in pycolmap.CameraModelId.__members__:
         pytest.skip("this pycolmap has no spherical camera")
     camera = pycolmap.Camera.create_from_model_name(3, "EQUIRECTANGULAR", 100.0, 400, 200)
-    with pytest.raises(SceneError, match="EQUIRECTANGULAR cannot be turned into a pinhole"):
+    with pytest.raises(SceneError, match=r"EQUIRECTANGULAR cannot be turned into a pinhole.*: cut the panoramas"):
         rectify(camera, 400, 200)
 
 

@@ -21,7 +21,7 @@ from transforms_scenes import write_blender, write_nerfstudio
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap, larger_models
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.reconstruct import reconstruct
-from nsvq_lightning.data.scene import load_scene
+from nsvq_lightning.data.scene import load_scene, usable
 from nsvq_lightning.training.module import SplatModule
 
 SceneFactory = Callable[..., Path]
@@ -54,6 +54,10 @@ def test_photos_of_another_shape_than_their_camera_are_warned_of(
 def test_a_larger_model_beside_the_first_is_named(make_scene: SceneFactory, caplog: pytest.LogCaptureFixture) -> None:
     root = make_scene(views=9)
     shutil.copytree(make_scene("more", views=10) / "sparse/0", root / "sparse/1")
+    model = import_pycolmap().Reconstruction(str(root / "sparse/1"))
+    shutil.rmtree(root / "sparse/1")
+    (root / "sparse/1").mkdir()
+    model.write_text(str(root / "sparse/1"))
     shutil.copytree(make_scene("equal", views=9) / "sparse/0", root / "sparse/2")
     load_scene(root)
     assert caplog.messages == [f"{root}: {larger_models(root)}"]
@@ -162,7 +166,42 @@ def test_missing_and_damaged_pictures(make_scene: SceneFactory) -> None:
     root = make_scene("other")
     (root / "images" / "004.png").write_bytes(b"")
     with pytest.raises(SceneError, match=r"004\.png cannot be decoded"):
-        load_scene(root)
+        load_scene(root).view(4)
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "masked", "transparent"])
+def test_views_without_a_picture_are_left_out(
+    make_scene: SceneFactory, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = make_scene()
+    photo = root / "images" / "004.png"
+    whole = usable(load_scene(root))
+    assert (whole.train, whole.test) == ((1, 2, 3, 4, 5, 6, 7), (0, 8))
+    match damage:
+        case "empty":
+            photo.write_bytes(b"")
+        case "cut":
+            photo.write_bytes(photo.read_bytes()[:-100])
+        case "masked":
+            write_masks(root, ["004.png"], np.zeros((32, 40), np.uint8))
+        case _:
+            assert cv2.imwrite(str(photo), np.zeros((32, 40, 4), np.uint8))
+    scene = usable(load_scene(root))
+    assert (scene.train, scene.test) == ((1, 2, 3, 5, 6, 7), (0, 8))
+    assert scene.names == whole.names
+    assert "left out 1 of 9 photos, first: " in caplog.text
+    assert "004.png" in caplog.text
+    for name in ("000.png", "008.png"):
+        (root / "images" / name).write_bytes(b"")
+    with pytest.raises(SceneError, match=r"000\.png cannot be decoded"):
+        usable(load_scene(root))
+
+
+def test_home_is_a_tilde(make_scene: SceneFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = make_scene()
+    monkeypatch.setenv("HOME", str(root.parent))
+    assert load_scene("~/scene").root == root
+    assert ColmapDataModule("~/scene").root == root
 
 
 def test_a_photo_that_is_deleted_while_a_run_reads_it_is_named(make_scene: SceneFactory) -> None:
@@ -198,17 +237,15 @@ def test_names_that_are_not_utf_8_are_refused(make_scene: SceneFactory) -> None:
 def test_missing_image_folder(make_scene: SceneFactory) -> None:
     root = make_scene()
     shutil.move(root / "images", root / "images_2")
-    with pytest.raises(
-        SceneError, match=r"or set images_folder \(or factor, for images_2, _4 and _8\); there is images_2$"
-    ):
-        load_scene(root)
+    assert len(load_scene(root)) == 9
     assert len(load_scene(root, factor=2)) == 9
-    assert len(load_scene(root, images_folder="images_2")) == 9
-    shutil.move(root / "images_2", root / "photos")
-    with pytest.raises(SceneError, match=r"there is photos$"):
+    shutil.copytree(root / "images_2", root / "images_4")
+    with pytest.raises(SceneError, match=r"\(or factor, for images_2, _4 and _8\); they are in images_2 and images_4$"):
         load_scene(root)
-    shutil.rmtree(root / "photos")
-    with pytest.raises(SceneError, match=r"there is no folder of photos$"):
+    assert len(load_scene(root, images_folder="images_2")) == 9
+    shutil.rmtree(root / "images_2")
+    shutil.rmtree(root / "images_4")
+    with pytest.raises(SceneError, match=r"they are in no other folder$"):
         load_scene(root)
 
 

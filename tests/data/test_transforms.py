@@ -19,7 +19,7 @@ from nsvq_lightning.data import transforms
 from nsvq_lightning.data.colmap import SceneError, read_model
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import Scene, load_scene
-from nsvq_lightning.data.transforms import random_points, read_points, share_seen
+from nsvq_lightning.data.transforms import random_points, share_seen
 
 SceneFactory = Callable[..., Path]
 FEW = 500
@@ -194,7 +194,7 @@ def test_a_colmap_model_comes_first_and_any_can_be_chosen(make_scene: SceneFacto
 @pytest.mark.parametrize(
     ("frame", "head", "message"),
     [
-        ({}, {"camera_model": "EQUIRECTANGULAR"}, "RECTANGULAR, which cannot"),
+        ({}, {"camera_model": "EQUIRECTANGULAR"}, "RECTANGULAR, which cannot .*: cut the panoramas"),
         ({}, {"k4": 0.1}, "OPENCV and k4 = 0.1, which cannot"),
         ({}, {"fl_x": None, "fl_y": None}, "frame 0 has no focal length"),
         ({}, {"fl_x": -3}, "focal length -3"),
@@ -203,7 +203,9 @@ def test_a_colmap_model_comes_first_and_any_can_be_chosen(make_scene: SceneFacto
         ({}, {"w": 0}, "size 0x32"),
         ({"transform_matrix": [[1, 2], [3]]}, {}, "no transform_matrix"),
         ({"transform_matrix": None}, {}, "no transform_matrix"),
-        ({"transform_matrix": np.diag([-1.0, 1, 1, 1]).tolist()}, {}, "skewed or mirrored"),
+        ({"transform_matrix": np.diag([-1.0, 1, 1, 1]).tolist()}, {}, r"skewed or mirrored \(.*'\./images/000\.png'"),
+        ({"transform_matrix": [[1, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, {}, "skewed or mirrored"),
+        ({"transform_matrix": (np.eye(4) + np.eye(4)[[3, 0, 1, 2]].T).T.tolist()}, {}, "is it transposed"),
         ({"file_path": None}, {}, "no file_path"),
         ({"file_path": "images/001.png"}, {}, "an earlier frame is of"),
         ({"file_path": "images/gone.png"}, {}, r"first gone\.png"),
@@ -230,37 +232,47 @@ def test_damage_is_named(
         load_scene(path.parent)
 
 
-@pytest.mark.parametrize("order", ["<", ">"])
-def test_binary_point_clouds(tmp_path: Path, order: str) -> None:
-    kind = [("red", "f4"), ("x", "f8"), ("y", "f4"), ("z", "f4"), ("green", "f4"), ("blue", "f4")]
-    names = {"f4": "float", "f8": "double"}
-    table = np.array([(0, 1.5, 2, 3, 0.5, 1), (1, -1, -2, 9, 0, 0.25)], [(name, order + code) for name, code in kind])
-    head = "".join(f"property {names[code]} {name}\n" for name, code in kind)
-    form = "binary_little_endian" if order == "<" else "binary_big_endian"
-    tail = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    path = tmp_path / "points.ply"
-    path.write_bytes(
-        f"ply\nformat {form} 1.0\ncomment x\nelement vertex 2\n{head}{tail}".encode() + table.tobytes() + b"abc"
-    )
-    xyz, rgb = read_points(path)
-    np.testing.assert_array_equal(xyz, [[1.5, 2, 3], [-1, -2, 9]])
-    np.testing.assert_array_equal(rgb, [[0, 128, 255], [255, 0, 64]])
-    whole = path.read_bytes()
-    for length in range(0, len(whole) - 3, 5):
-        path.write_bytes(whole[:length])
-        with pytest.raises(SceneError, match=r"points .*points\.ply: .*copy the file again"):
-            read_points(path)
+def test_names_are_those_of_the_nearest_photos(
+    make_scene: SceneFactory, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Names in capitals, of another machine, and lists without suffix; sizes are those of the photos."""
+    caplog.set_level("INFO", logger="nsvq_lightning")
+    root = write_pinhole(make_scene(), tmp_path / "json", w=None, h=None)
+    path = root / "transforms.json"
+    document = json.loads(path.read_text())
+    for number, frame in enumerate(document["frames"]):
+        frame["file_path"] = f"C:\\scans\\one\\images\\00{number}.PNG"
+    document |= {"train_filenames": ["images/001", "images/002"], "test_filenames": ["C:/scans/one/images/000.PNG"]}
+    path.write_text(json.dumps(document))
+    scene = load_scene(root)
+    assert scene.names == ("000.png", "001.png", "002.png")
+    assert (scene.train, scene.test) == ((1, 2), (0,))
+    assert (scene.cameras[0].width, scene.cameras[0].height) == (40, 32)
+    assert "9 of 9 files have other names than in" in caplog.text
 
 
-def test_points_without_colours_are_grey_and_short_files_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "points.ply"
-    properties = "".join(f"property float {axis}\n" for axis in "xyz")
-    head = f"ply\nformat ascii 1.0\nelement vertex 2\n{properties}end_header\n"
-    path.write_text(f"{head}1 2 3\n4 5 6\n")
-    xyz, rgb = read_points(path)
-    np.testing.assert_array_equal(xyz, [[1, 2, 3], [4, 5, 6]])
-    assert (rgb == 128).all()
-    for rows in ("1 2 3\n", "1 2 3\n4 5 x\n", "1 2 3\n4 5\n"):
-        path.write_text(head + rows)
-        with pytest.raises(SceneError, match=r"points\.ply: "):
-            read_points(path)
+@pytest.mark.parametrize("name", ["points3d.ply", "dense.PLY", "colmap/sparse/0"])
+def test_points_that_no_file_names_are_used(
+    demo_scene: Path, tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Those of COLMAP are where the cameras are, whatever moved these."""
+    caplog.set_level("INFO", logger="nsvq_lightning")
+    moved = APPLIED if "colmap" in name else None
+    root = write_nerfstudio(demo_scene, tmp_path / "scene", moved, ply_file_path=None)
+    change(root / "transforms.json", applied_transform=None)
+    if moved is not None:
+        shutil.copytree(demo_scene / "sparse", root / "colmap/sparse")
+        (root / "points.ply").unlink()
+    else:
+        (root / "points.ply").rename(root / name)
+    expected = load_scene(demo_scene).points
+    if moved is not None:
+        expected = expected @ torch.from_numpy(APPLIED[:, :3]).float().T
+    torch.testing.assert_close(load_scene(root).points, expected, rtol=0, atol=1e-4)
+    assert f"names no points: those of {root / name} are used" in caplog.text
+    if moved is None:
+        shutil.copy(root / name, root / f"other_{name}")
+        shutil.copy(root / name, root / f"sparse_pc{name[-4:]}")
+        (root / name).rename(root / "points3D.ply")
+        with pytest.raises(SceneError, match=r"points3D\.ply and .*sparse_pc\.(ply|PLY) may be the points"):
+            load_scene(root)

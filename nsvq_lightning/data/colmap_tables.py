@@ -1,0 +1,255 @@
+"""The tables of a COLMAP model, binary or text, read record by record: what is wrong is named by its place.
+
+Errors are ``ValueError`` without the name of the file. Text tables are read more leniently than COLMAP does: names with
+spaces, images without a second line, colours of any kind, points without identifier, error and track.
+"""
+
+import mmap
+import re
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class CameraRow(NamedTuple):
+    """A camera: its identifier, COLMAP's name of its model, width and height in pixels, parameters."""
+
+    number: int
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+class ImageRow(NamedTuple):
+    """An image: its identifier, pose from world to camera (quaternion wxyz of any norm, scene units), camera, name."""
+
+    number: int
+    quat: tuple[float, ...]
+    translation: tuple[float, ...]
+    camera_id: int
+    name: str
+
+
+class PointTable(NamedTuple):
+    """Points, sorted by identifier.
+
+    Attributes:
+        xyz: ``[P, 3]`` float64, scene units.
+        rgb: ``[P, 3]`` float64, as they are in the file.
+        tracks: Identifiers of the images that saw each point; none unless requested.
+    """
+
+    xyz: NDArray[np.float64]
+    rgb: NDArray[np.float64]
+    tracks: Sequence[Sequence[int]]
+
+
+# Camera models by COLMAP's number: their name, and how many parameters they have.
+LensModels = Mapping[int, tuple[str, int]]
+
+
+def read_cameras(path: Path, models: LensModels) -> list[CameraRow]:
+    """The cameras in ``cameras.bin`` or ``cameras.txt``.
+
+    Args:
+        path: The file.
+        models: The known camera models.
+
+    Raises:
+        ValueError: The file is damaged, or a camera has an unknown model.
+    """
+    if path.suffix.lower() == ".bin":
+        return list(_records(path, lambda data, start: _camera_record(data, start, models)))
+    counts = dict(models.values())
+    return [_camera_line(line, text.split(), counts) for line, text in _lines(path)]
+
+
+def read_images(path: Path) -> list[ImageRow]:
+    """The images in ``images.bin`` or ``images.txt``.
+
+    Raises:
+        ValueError: The file is damaged, or a name is not UTF-8.
+    """
+    images = list(_records(path, _image_record) if path.suffix.lower() == ".bin" else _image_lines(path))
+    for image in images:
+        try:
+            image.name.encode()
+        except UnicodeEncodeError:
+            raise ValueError(f"the name of a photo is not UTF-8, {image.name!r}: rename it and run COLMAP") from None
+    return images
+
+
+def read_points(path: Path, tracks: bool = False) -> PointTable:
+    """The points in ``points3D.bin`` or ``points3D.txt``.
+
+    Args:
+        path: The file.
+        tracks: Also read which images saw each point.
+
+    Raises:
+        ValueError: The file is damaged.
+    """
+    if path.suffix.lower() == ".bin":
+        records = _records(path, lambda data, start: _point_record(data, start, tracks))
+    else:
+        records = _point_lines(path, tracks)
+    points = sorted(records, key=lambda point: point[0])
+    values = np.array([point[1:7] for point in points], np.float64).reshape(-1, 6)
+    return PointTable(values[:, :3], values[:, 3:], [[int(image) for image in point[7:]] for point in points])
+
+
+def announced_rows(path: Path) -> int:
+    """Number of rows that the comment at the head of a text table gives; 0 if it gives none."""
+    with path.open("rb") as file:
+        found = re.search(rb"^# Number of \w+: (\d+)", file.read(1 << 12), re.MULTILINE)
+    return int(found[1]) if found else 0
+
+
+_Row = TypeVar("_Row")
+# Identifier, position and colour of a point, then the images that saw it.
+_Point = tuple[int | float, ...]
+
+_U64 = struct.Struct("<Q")
+_CAMERA = struct.Struct("<IiQQ")  # identifier, model, width, height
+_IMAGE = struct.Struct("<I7dI")  # identifier, pose, camera; the name and the 2D points follow
+_POINT = struct.Struct("<Q3d3BdQ")  # identifier, position, colour, error, length of the track, which follows
+
+
+def _records(path: Path, record: Callable[[mmap.mmap, int], tuple[_Row, int]]) -> Iterator[_Row]:
+    """The records of a binary table, none of which may end beyond the file.
+
+    Args:
+        path: The file.
+        record: Reads the record that begins at a byte, and says where it ends.
+
+    Raises:
+        ValueError: The file is empty, truncated, or longer than its records.
+    """
+    size = path.stat().st_size
+    if size < _U64.size:
+        raise ValueError(f"it has {size} bytes, too few for a COLMAP table")
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        (count,) = _U64.unpack_from(data, 0)
+        end = _U64.size
+        for row in range(1, count + 1):
+            try:
+                values, end = record(data, end)
+                if end > size:
+                    raise struct.error("it ends beyond the file")
+            except struct.error as error:
+                raise ValueError(
+                    f"it is truncated or garbled: of {count} declared records, record {row} cannot be read ({error}; "
+                    f"the file has {size} bytes)"
+                ) from error
+            yield values
+        if end != size:
+            raise ValueError(f"it is garbled: its {count} declared records end at byte {end} of {size}")
+
+
+def _camera_record(data: mmap.mmap, start: int, models: LensModels) -> tuple[CameraRow, int]:
+    number, model, width, height = _CAMERA.unpack_from(data, start)
+    if model not in models:
+        raise struct.error(
+            f"camera {number} has model id {model} and size {width}x{height}; this pycolmap knows the ids 0 to "
+            f"{max(models)}"
+        )
+    name, count = models[model]
+    params = struct.unpack_from(f"<{count}d", data, start + _CAMERA.size)
+    return CameraRow(number, name, width, height, params), start + _CAMERA.size + 8 * count
+
+
+def _image_record(data: mmap.mmap, start: int) -> tuple[ImageRow, int]:
+    number, *pose, camera_id = _IMAGE.unpack_from(data, start)
+    end = data.find(b"\0", start + _IMAGE.size)
+    if end < 0:
+        raise struct.error("its name does not end")
+    name = data[start + _IMAGE.size : end].decode(errors="surrogateescape")
+    (points,) = _U64.unpack_from(data, end + 1)
+    row = ImageRow(number, tuple(pose[:4]), tuple(pose[4:]), camera_id, name)
+    return row, end + 1 + _U64.size + 24 * int(points)
+
+
+def _point_record(data: mmap.mmap, start: int, tracks: bool) -> tuple[_Point, int]:
+    *values, _, length = _POINT.unpack_from(data, start)
+    first = start + _POINT.size
+    end = first + 8 * int(length)
+    if end > len(data) or not tracks:
+        return tuple(values), end
+    images = struct.unpack_from(f"<{2 * length}I", data, first)[::2]
+    return (*values, *images), end
+
+
+def _encoding(path: Path) -> str:
+    """UTF-8 with or without a mark, or UTF-16, which PowerShell writes."""
+    with path.open("rb") as file:
+        return "utf-16" if file.read(2) in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """The lines of a text table with their numbers, without comments and empty ones."""
+    with path.open(encoding=_encoding(path), errors="surrogateescape") as file:
+        for number, line in enumerate(file, 1):
+            text = line.strip()
+            if text and not text.startswith("#"):
+                yield number, text
+
+
+def _numbers(line: int, words: Sequence[str]) -> list[float]:
+    """Words of a line as numbers.
+
+    Raises:
+        ValueError: One is none.
+    """
+    numbers = []
+    for word in words:
+        try:
+            numbers.append(float(word))
+        except ValueError:
+            hint = "; decimals need a point, not a comma" if "," in word else ""
+            raise ValueError(f"line {line} has {word[:40]!r} in place of a number{hint}") from None
+    return numbers
+
+
+def _camera_line(line: int, words: Sequence[str], counts: Mapping[str, int]) -> CameraRow:
+    if len(words) < 4:
+        raise ValueError(f"line {line} has {len(words)} words; a camera has identifier, model, width, height, numbers")
+    number, width, height, *params = _numbers(line, [words[0], *words[2:]])
+    model = words[1].upper()
+    if model not in counts:
+        raise ValueError(f"line {line}: camera {number:g} has the model {model}; known are {', '.join(counts)}")
+    if len(params) != counts[model]:
+        raise ValueError(
+            f"line {line}: camera {number:g} of model {model} has {len(params)} parameters in place of {counts[model]}"
+        )
+    return CameraRow(int(number), model, int(width), int(height), tuple(params))
+
+
+def _image_lines(path: Path) -> Iterator[ImageRow]:
+    """The images of a text table. A line of 2D points, three numbers each, may follow the line of an image."""
+    after_image = False
+    for line, text in _lines(path):
+        words = text.split(maxsplit=9)
+        if after_image and re.search(r"(^|\s)-?\d+$", text) and len(text.split()) % 3 == 0:
+            after_image = False
+            continue
+        if len(words) < 10:
+            raise ValueError(f"line {line} has {len(words)} words; an image has identifier, pose of 7, camera, name")
+        number, *pose, camera_id = _numbers(line, words[:9])
+        yield ImageRow(int(number), tuple(pose[:4]), tuple(pose[4:]), int(camera_id), words[9])
+        after_image = True
+
+
+def _point_lines(path: Path, tracks: bool) -> Iterator[_Point]:
+    """The points of a text table; one of six numbers is position and colour only."""
+    for line, text in _lines(path):
+        words = text.split()
+        if len(words) == 6:
+            words = [str(line), *words]
+        if len(words) < 7:
+            raise ValueError(f"line {line} has {len(words)} words; a point has identifier, position of 3, colour of 3")
+        yield tuple(_numbers(line, [*words[:7], *(words[8::2] if tracks else ())]))

@@ -1,0 +1,192 @@
+"""Where the photos and masks of a scene are: under the names that its model gives, or under the nearest ones."""
+
+import logging
+import unicodedata
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from pathlib import Path, PurePosixPath
+
+from nsvq_lightning.data.colmap import ColmapImage, SceneError, check_name, is_outside
+from nsvq_lightning.data.reconstruct import PHOTOS
+
+log = logging.getLogger(__name__)
+
+
+def locate(names: Sequence[str], folder: Path, source: str, allow_outside: bool = False) -> list[Path]:
+    """The file of each photo or mask.
+
+    A name that is no file is taken for the one that differs least: in capitals or Unicode form, then in its suffix.
+    Where no name fits, folders at its beginning are disregarded, such as those of another machine.
+
+    Args:
+        names: What a model calls them.
+        folder: Where they are.
+        source: The model, for messages.
+        allow_outside: Also read files that are not in the scene folder.
+
+    Returns:
+        Paths, of which those of missing files do not exist.
+
+    Raises:
+        SceneError: Two files fit a name, two names fit a file, or a name leads out of the scene folder.
+    """
+    paths = {name: folder / name for name in names}
+    exact = {name for name, path in paths.items() if (allow_outside or not is_outside(name)) and path.is_file()}
+    if len(exact) == len(paths):
+        return [paths[name] for name in names]
+    taken = {paths[name] for name in exact}
+    files = _Files(folder, (path for path in _photos_in(folder) if path not in taken), whole=bool(exact))
+    used: dict[Path, str] = {}
+    for name in sorted(paths.keys() - exact):
+        fitting = files.nearest(name)
+        if len(fitting) > 1:
+            raise SceneError(f"{source} names {name}, which may be {fitting[0]} or {fitting[1]}: remove or rename one")
+        if not fitting:
+            check_name(name, source, allow_outside)
+            continue
+        paths[name] = fitting[0]
+        if fitting[0] in used:
+            raise SceneError(f"{source} names {used[fitting[0]]} and {name}, but there is only {fitting[0]}: copy both")
+        used[fitting[0]] = name
+    for path, name in list(used.items())[:1]:
+        log.info("%d of %d files have other names than in %s: %s is %s", len(used), len(paths), source, name, path)
+    return [paths[name] for name in names]
+
+
+class _Files:
+    """Files by their path without suffix, or also by its last parts, as :func:`_key` compares them.
+
+    Args:
+        folder: What paths are relative to.
+        paths: Files in it.
+        whole: Compare whole paths only.
+    """
+
+    def __init__(self, folder: Path, paths: Iterable[Path], whole: bool = True) -> None:
+        self._whole = whole
+        self._found: defaultdict[str, list[Path]] = defaultdict(list)
+        for path in paths:
+            for key in self._keys(path.relative_to(folder).as_posix()):
+                self._found[key].append(path)
+
+    def _keys(self, name: str) -> list[str]:
+        parts = PurePosixPath(_key(_stem(name))).parts
+        return ["/".join(parts[start:]) for start in range(1 if self._whole else len(parts))]
+
+    def nearest(self, name: str) -> list[Path]:
+        """The files that fit a name best, by most of its parts, in the fewest folders, with its suffix."""
+        fitting = next((self._found[key] for key in self._keys(name) if key in self._found), [])
+        wanted = _kind(name)
+        closeness = {path: (-len(path.parts), _kind(path.name) == wanted) for path in fitting}
+        return [path for path in fitting if closeness[path] == max(closeness.values())]
+
+
+def _key(name: str) -> str:
+    """A path as it is compared: with slashes, composed letters and no capitals."""
+    return unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
+
+
+def _stem(name: str) -> str:
+    """A path without the suffix of a photo."""
+    stem, dot, suffix = name.rpartition(".")
+    return stem if dot + suffix.lower() in PHOTOS else name
+
+
+def _kind(name: str) -> str:
+    """The suffix of a file, of which some have two spellings."""
+    return name.lower().rpartition(".")[2].replace("jpeg", "jpg").replace("tiff", "tif")
+
+
+def _photos_in(folder: Path) -> list[Path]:
+    """The files in a folder and the folders in it that end as photos do, sorted."""
+    return sorted(path for path in folder.rglob("*") if path.suffix.lower() in PHOTOS and path.is_file())
+
+
+def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]) -> tuple[Path, int]:
+    """The folder to read photos from, and the divisor of their size that is still to be applied.
+
+    Args:
+        root: Scene folder.
+        name: What the folder should be called; if there is none, the only one that has the photos.
+        factor: Divisor that is asked for.
+        names: The photos.
+
+    Raises:
+        SceneError: None has the photos, or several have.
+    """
+    scaled = root / f"{name}_{factor}"
+    if factor is not None and factor > 1 and scaled.is_dir():
+        return scaled, 1
+    if (root / name).is_dir():
+        return root / name, factor or 1
+    plain = [given.replace("\\", "/") for given in names]
+    folders = [root, *(path for depth in ("*", "*/*") for path in sorted(root.glob(depth)) if "mask" not in path.name)]
+    found = [path for path in folders if all((path / given).is_file() for given in plain)]
+    if len(found) != 1:
+        others = " and ".join(str(path.relative_to(root)) for path in found)
+        raise SceneError(
+            f"image folder {root / name} does not exist: copy the photos there, or set images_folder (or factor, for "
+            f"{name}_2, _4 and _8); they are in {others or 'no other folder'}"
+        )
+    log.info("%s does not exist: photos are read from %s", root / name, found[0])
+    return found[0], factor or 1
+
+
+def find_masks(images: Sequence[ColmapImage], root: Path, folders: Sequence[str], photos: Path) -> list[Path | None]:
+    """The mask of each photo: the one that its model names, or the one of its name in a folder.
+
+    Of ``cam/1.jpg`` that is ``cam/1.jpg.png`` (as COLMAP has it), ``cam/1.png`` (as nerfstudio has it) or
+    ``cam/1_mask.png``, with any suffix of a photo. Without the usual folder, masks are taken from the only place that
+    has some: a folder whose name says so, or beside the photos.
+
+    Args:
+        images: The photos.
+        root: Scene folder.
+        folders: Names of folders of masks in it; the first one that exists counts.
+        photos: Folder of the photos.
+
+    Raises:
+        SceneError: A mask that the model names does not exist, or two files fit a photo.
+    """
+    given = [image.mask for image in images if image.mask is not None]
+    lost = [path for path in given if not path.is_file()]
+    if lost:
+        raise SceneError(f"{len(lost)} masks do not exist, first {lost[0]}: copy them, or remove mask_path")
+    places = [root / name for name in folders if (root / name).is_dir()][:1]
+    expected = bool(places)
+    if not places and not given and folders[-1] == "masks":
+        places = [*sorted(path for path in root.glob("*") if path.is_dir() and "mask" in path.name.lower()), photos]
+    found = {place: masks for place in places if (masks := _masks_in(place, images, beside=place == photos))}
+    if expected and not found and not given:
+        name = Path(images[0].name)
+        usual = name.with_suffix(".png")
+        log.warning("%s has no mask of any photo: that of %s would be %s.png or %s", places[0], name, name, usual)
+    elif not places and not given:
+        log.warning("there is no folder %s: no photo has a mask", root / folders[-1])
+    elif len(found) > 1:
+        log.warning("masks in %s are not used: choose a folder (--data.masks)", " and in ".join(map(str, found)))
+        found = {}
+    elif found and not expected:
+        log.info("masks are read from %s", *found)
+    elif any(path.name.startswith("dynamic_mask_") for path in photos.glob("*")):
+        log.warning("dynamic_mask_* in %s are not used: white leaves out in them; put inverted ones in masks/", photos)
+    chosen = next(iter(found.values()), {})
+    return [image.mask or chosen.get(image.name) for image in images]
+
+
+def _masks_in(folder: Path, images: Sequence[ColmapImage], beside: bool = False) -> dict[str, Path]:
+    """The masks in a folder by the name of their photo; ``beside`` the photos, none has the name of its photo."""
+    files = _Files(folder, _photos_in(folder))
+    found = {}
+    for image in images:
+        stem = _stem(image.name)
+        last = stem.replace("\\", "/").rpartition("/")[2]
+        names = [f"{image.name}.png", f"{stem}_mask", f"{stem}.mask", f"{stem.removesuffix(last)}mask_{last}"]
+        if not beside:
+            names.insert(1, stem)
+        fitting = next(filter(None, map(files.nearest, names)), [])
+        if len(fitting) > 1:
+            raise SceneError(f"{fitting[0]} and {fitting[1]} are masks of {image.name}: remove one of them")
+        if fitting:
+            found[image.name] = fitting[0]
+    return found

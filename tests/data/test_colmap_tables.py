@@ -1,0 +1,88 @@
+"""Tables of COLMAP models as people and programs leave them; binary ones are damaged in ``test_colmap.py``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from nsvq_lightning.data.colmap_tables import read_cameras, read_images, read_points
+
+MODELS = {1: ("PINHOLE", 4)}
+POSE = "1 0 0 0 0.5 -1e-002 2"
+TWO_LINES = f"# IMAGE_ID, ...\n1 {POSE} 1 a b (2).jpg\n1.5 2 -1 3 4.5 6\n2 {POSE} 1 cam/c.png\n\n"
+NAMES = ["a b (2).jpg", "cam/c.png"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text,
+        lambda text: text.replace("\n", "\r\n"),
+        lambda text: text.replace("1 0 0 0", "1\t0\t0\t0"),
+        lambda text: text.replace("\n", "\n# comment\n"),
+        lambda text: text + "\n\n",
+        lambda text: text.replace("1.5 2 -1 3 4.5 6\n", "").strip(),  # one line for each image
+        lambda text: text.replace("1.5 2 -1 3 4.5 6\n", "").replace("\n\n", ""),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_images_as_text(tmp_path: Path, change: Callable[[str], str], encoding: str) -> None:
+    path = tmp_path / "images.txt"
+    path.write_bytes(change(TWO_LINES).encode(encoding))
+    images = read_images(path)
+    assert [image.name for image in images] == NAMES
+    assert images[1].quat == (1, 0, 0, 0)
+    assert images[1].translation == (0.5, -0.01, 2)
+    assert [(image.number, image.camera_id) for image in images] == [(1, 1), (2, 1)]
+
+
+@pytest.mark.parametrize(
+    ("line", "tracks"),
+    [
+        ("7 1 2 3 10 20 30 0.5 4 0 5 1", [4, 5]),
+        ("7 1 2 3 10.0 20.0 30.0 0.5", []),
+        ("7 1 2 3 10 20 30", []),
+        ("1 2 3 10 20 30", []),
+    ],
+)
+def test_points_as_text(tmp_path: Path, line: str, tracks: list[int]) -> None:
+    path = tmp_path / "points3D.txt"
+    path.write_text(f"{line}\n")
+    points = read_points(path, tracks=True)
+    assert (points.xyz.tolist(), points.rgb.tolist()) == ([[1, 2, 3]], [[10, 20, 30]])
+    assert list(points.tracks) == [tracks]
+    assert list(read_points(path).tracks) == [[]]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1 PINHOLE 40 32 30 30 20", "line 2: camera 1 of model PINHOLE has 3 parameters in place of 4"),
+        ("1 PINHOLE 40 32 -nan(ind) 30 20 16", r"line 2 has '-nan\(ind\)' in place of a number"),
+        ("1 PINHOLE 40 32 30,5 30 20 16", "line 2 has '30,5' in place of a number; decimals need a point"),
+        ("1 FISHEYE_X 40 32 30", "line 2: camera 1 has the model FISHEYE_X; known are PINHOLE"),
+        ("1 PINHOLE", "line 2 has 2 words"),
+    ],
+)
+def test_cameras_that_cannot_be_read_are_named(tmp_path: Path, line: str, message: str) -> None:
+    path = tmp_path / "cameras.txt"
+    path.write_text(f"# cameras\n{line}\n")
+    with pytest.raises(ValueError, match=message):
+        read_cameras(path, MODELS)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"1 {POSE} 1\n", "line 1 has 9 words; an image has"),
+        (f"1 {POSE} x a.jpg\n".replace("0.5", "0,5"), "line 1 has '0,5' in place of a number; decimals"),
+        (f"1 {POSE} 1 a.jpg\n1 2 3\n4 5 6\n", "line 3 has 3 words"),
+    ],
+)
+def test_images_that_cannot_be_read_are_named(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "images.txt"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_images(path)

@@ -1,0 +1,111 @@
+"""Photos and masks under other names than the model's."""
+
+from __future__ import annotations
+
+import unicodedata
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nsvq_lightning.data.colmap import ColmapImage, SceneError
+from nsvq_lightning.data.photo_files import find_masks, locate, photo_folder
+
+
+def write(root: Path, *names: str) -> None:
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(b"")
+
+
+def images(*names: str) -> list[ColmapImage]:
+    return [ColmapImage(name, 1, np.eye(4)) for name in names]
+
+
+@pytest.mark.parametrize(
+    ("names", "files"),
+    [
+        (["IMG_1.JPG"], ["img_1.jpg", "img_1.png", "img_1.xmp"]),
+        (["1.jpg"], ["1.JPEG", "1.png"]),
+        (["1.jpg"], ["1.png", "1.jpg.png", "1.xmp"]),
+        (["1"], ["1.tiff", "1.txt"]),
+        (["v1.0"], ["v1.0.webp"]),
+        (
+            [unicodedata.normalize("NFD", "K\u00fcche/\u00e4.jpg")],
+            [unicodedata.normalize("NFC", "K\u00fcche/\u00e4.jpg")],
+        ),
+        (["cam0\\1.jpg", "cam1\\1.jpg"], ["cam0/1.jpg", "cam1/1.jpg"]),
+        (["images/cam0/1.jpg", "images/cam1/1.jpg"], ["cam0/1.jpg", "cam1/1.jpg"]),
+        (["/home/me/scan/1.jpg"], ["1.jpg"]),
+        (["C:\\scan\\1.jpg"], ["1.jpg"]),
+        (["../raw/1.jpg"], ["1.jpg"]),
+        (["1.jpg", "2.jpg"], ["sub/1.jpg", "sub/2.jpg"]),
+    ],
+)
+def test_a_name_is_taken_for_the_nearest_photo(
+    tmp_path: Path, names: list[str], files: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", logger="nsvq_lightning")
+    write(tmp_path, *files)
+    assert locate(names, tmp_path, "the model") == [tmp_path / file for file in files[: len(names)]]
+    assert f"{len(names)} of {len(names)} files have other names than in the model" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("names", "files", "message"),
+    [
+        (["1.JPG"], ["1.png", "1.tif"], r"names 1\.JPG, which may be .*1\.png or .*1\.tif: remove or rename"),
+        (["1.jpg"], ["a/1.jpg", "b/1.jpg"], r"may be .*a/1\.jpg or .*b/1\.jpg"),
+        (["a/1.jpg", "b/1.jpg"], ["1.jpg"], r"names a/1\.jpg and b/1\.jpg, but there is only .*/1\.jpg"),
+        (["../2.jpg"], ["1.jpg"], r"names \.\./2\.jpg, which is not in the scene folder.*allow_outside"),
+    ],
+)
+def test_what_is_not_clear_is_refused(tmp_path: Path, names: list[str], files: list[str], message: str) -> None:
+    write(tmp_path, *files)
+    with pytest.raises(SceneError, match=message):
+        locate(names, tmp_path, "the model")
+
+
+def test_a_photo_of_another_folder_is_not_taken_for_one_that_is_gone(tmp_path: Path) -> None:
+    write(tmp_path, "a/1.jpg", "a/2.jpg")
+    assert not locate(["a/1.jpg", "b/2.jpg"], tmp_path, "the model")[1].exists()
+
+
+@pytest.mark.parametrize("place", [".", "input", "colmap/pictures", "sparse/0"])
+def test_the_only_folder_that_has_the_photos_is_used(tmp_path: Path, place: str) -> None:
+    names = ["cam/1.jpg", "cam/2.jpg"]
+    write(tmp_path / place, *names)
+    write(tmp_path / "masks", *names)
+    assert photo_folder(tmp_path, "images", 2, names) == (tmp_path / place, 2)
+    write(tmp_path / "other", *names)
+    with pytest.raises(SceneError, match=r"or set images_folder .*; they are in (.* and other|other and .*)"):
+        photo_folder(tmp_path, "images", None, names)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["mask/{}.png", "Masks/{}.JPG.PNG", "images/{}_mask.png", "images/{}.jpg.png", "images_masks/mask_{}.PNG"],
+)
+def test_masks_are_found_in_the_only_place_that_has_some(
+    tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", logger="nsvq_lightning")
+    write(tmp_path, "images/1.jpg", "images/2.jpg", name.format("1"))
+    photos = images("1.jpg", "2.jpg")
+    assert find_masks(photos, tmp_path, ["masks"], tmp_path / "images") == [tmp_path / name.format("1"), None]
+    assert "masks are read from" in caplog.text or name.startswith("Masks")
+    write(tmp_path, "more_masks/2.png")
+    assert find_masks(photos, tmp_path, ["masks"], tmp_path / "images") == [None, None]
+    assert "are not used: choose a folder (--data.masks)" in caplog.text
+    assert find_masks(photos, tmp_path, ["more_masks"], tmp_path / "images") == [None, tmp_path / "more_masks/2.png"]
+
+
+def test_masks_that_are_not_clear_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write(tmp_path, "images/1.jpg", "images/dynamic_mask_1.png")
+    assert find_masks(images("1.jpg"), tmp_path, ["masks"], tmp_path / "images") == [None]
+    assert "white leaves out in them" in caplog.text
+    assert find_masks(images("1.jpg"), tmp_path, ["missing"], tmp_path / "images") == [None]
+    assert "there is no folder" in caplog.text
+    write(tmp_path, "masks/1.png", "masks/1.jpg")
+    with pytest.raises(SceneError, match=r"1\.jpg and .*1\.png are masks of 1\.jpg: remove one"):
+        find_masks(images("1.jpg"), tmp_path, ["masks"], tmp_path / "images")
