@@ -270,7 +270,7 @@ def _frames(file: Path, allow_outside: bool) -> tuple[dict[str, Any], dict[str, 
 def _listed(head: Mapping[str, Any], frames: Mapping[str, _Frame]) -> list[set[str]]:
     """Names of the train and test photos that a file lists; an empty set where it lists none of them."""
     names = {str(PurePosixPath(name).with_suffix("")): name for name in frames}
-    names |= {frame.path("file_path"): name for name, frame in frames.items()} | {name: name for name in frames}
+    names |= {str(frame.path("file_path")): name for name, frame in frames.items()} | {name: name for name in frames}
     lists = [head.get(f"{part}_filenames") for part in ("train", "test", "val")]
     train, test, val = (
         {names.get(_plain(str(name)), "") for name in each} if isinstance(each, list) else set() for each in lists
